@@ -1,0 +1,1 @@
+"""The live node: a camera in, virtual camera views out over ZeroMQ. `gcd_node.subscriber` is for planners."""

@@ -1,0 +1,5 @@
+"""`python -m gcd_node` is `gcd-node`."""
+
+from gcd_node.cli import main
+
+main()

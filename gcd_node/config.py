@@ -1,0 +1,204 @@
+"""The node's settings, as a launch file states them (TOML)."""
+
+import difflib
+import hashlib
+import re
+from pathlib import Path
+from typing import Annotated, Literal, TypeAlias
+
+import msgspec
+from msgspec import Meta
+
+from gcd_node.errors import ConfigError
+
+Positive: TypeAlias = Annotated[float, Meta(gt=0)]
+Count: TypeAlias = Annotated[int, Meta(ge=1)]
+ViewId: TypeAlias = Annotated[str, Meta(pattern="^[a-z0-9_]{1,16}$")]
+
+
+class _Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A table of a launch file; an unknown key is an error."""
+
+
+class SourcePose(_Section):
+    """Where the source camera stands. Views are differences, so this is needed for rigid transforms only.
+
+    elevation_deg: above the ground plane. radius: distance to the scene's centre, metres or scene units.
+    """
+
+    elevation_deg: Annotated[float, Meta(gt=-90, lt=90)] = 5.0
+    radius: Positive = 15.0
+
+
+class SourceConfig(_Section):
+    """Where frames come from.
+
+    path: a video file or a folder of images; `package:drive.mp4` is the clip that ships. Not for `synthetic`.
+    pace: "realtime" plays at the recorded speed; "lockstep" waits for the model and skips nothing.
+    fps: of an image folder, which cannot say; otherwise leave it out.
+    hfov_deg: horizontal field of view of the source picture, if known; published as intrinsics.
+    resize: "released" is the bilinear resize the checkpoints were trained with, "area" averages (less aliasing).
+    frames: stop a synthetic source after this many.
+    """
+
+    kind: Literal["file", "folder", "synthetic"] = "file"
+    path: str | None = None
+    pace: Literal["realtime", "lockstep"] = "realtime"
+    loop: bool = False
+    fps: Positive | None = None
+    hfov_deg: Annotated[float, Meta(gt=0, lt=180)] | None = None
+    resize: Literal["released", "area"] = "released"
+    allow_upscale: bool = False
+    frames: Count | None = None
+    seed: int = 0
+    pose: SourcePose | None = None
+
+    def __post_init__(self) -> None:
+        if (self.path is None) != (self.kind == "synthetic"):
+            raise ValueError(f"source kind {self.kind!r} {'takes no' if self.path else 'needs a'} path")
+        if self.kind == "folder" and self.fps is None:
+            raise ValueError("an image folder does not know its frame rate: give fps")
+
+
+class WindowConfig(_Section):
+    """How frames become windows.
+
+    fps: frame rate of a window; left out, the nearest trained rate the source can give.
+    stride: grid frames from one window to the next; left out, as many as a window holds (no overlap).
+    max_skew: how far, in frame periods, a frame may lie from its place in time.
+    """
+
+    fps: Positive | None = None
+    stride: Count | None = None
+    max_skew: Annotated[float, Meta(gt=0, le=0.5)] = 0.5
+
+
+class ModelSection(_Section):
+    """The model and how it is sampled. What is left out is as the checkpoint was made for.
+
+    weights: a checkpoint, a diffusers folder, `package:NAME`, or `random:FAMILY` (noise, for trying the plumbing).
+    threads: CPU threads for the model; leave the rest of the robot its cores.
+    guidance: scale of the first and of the last frame.
+    """
+
+    weights: str
+    family: str | None = None
+    device: str = "auto"
+    dtype: str | None = None
+    threads: Count | None = None
+    steps: Count | None = None
+    guidance: tuple[float, float] | None = None
+    samples: Count = 1
+    seed: int = 0
+    motion_bucket: float | None = None
+    move_time: Annotated[int, Meta(ge=0)] | None = None
+    cond_aug: Annotated[float, Meta(ge=0)] = 0.02
+    head_width: Count | None = None
+    image_heads: Count | None = None
+
+
+class ViewConfig(_Section):
+    """A virtual camera.
+
+    fixed: its goal pose, as differences from the source camera; none for a checkpoint with one fixed view.
+    orbit: starts there and swings in azimuth by rate_deg_s, between -amplitude_deg and +amplitude_deg.
+    """
+
+    kind: Literal["fixed", "orbit"] = "fixed"
+    azimuth_deg: float = 0.0
+    elevation_deg: float = 0.0
+    radius: float = 0.0
+    rate_deg_s: float | None = None
+    amplitude_deg: Positive | None = None
+
+    def __post_init__(self) -> None:
+        moving = (self.rate_deg_s is not None, self.amplitude_deg is not None)
+        if self.kind == "orbit" and not all(moving):
+            raise ValueError("an orbit needs rate_deg_s and amplitude_deg")
+        if self.kind == "fixed" and any(moving):
+            raise ValueError('a fixed view has no rate_deg_s and no amplitude_deg; for these say kind = "orbit"')
+
+
+class PublishConfig(_Section):
+    """Where views go, and how.
+
+    data, status: endpoints, or "ipc" for the runtime folder.
+    min_subscribers: in lockstep, how many must be there before the first window is sent.
+    end_delay_ms: how long the end-of-stream message follows the last window.
+    """
+
+    data: str = "ipc"
+    status: str = "ipc"
+    encoding: Literal["rgb8", "jpeg"] = "rgb8"
+    jpeg_quality: Annotated[int, Meta(ge=50, le=100)] = 90
+    min_subscribers: Annotated[int, Meta(ge=0)] = 0
+    end_delay_ms: Annotated[int, Meta(ge=0)] = 500
+
+
+class NodeConfig(_Section):
+    """A whole launch file. strict: refuse what would only be flagged as out of the trained domain."""
+
+    source: SourceConfig
+    model: ModelSection
+    view: Annotated[dict[ViewId, ViewConfig], Meta(min_length=1)]
+    window: WindowConfig = WindowConfig()
+    publish: PublishConfig = PublishConfig()
+    node_id: Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{1,32}$")] = "gcd"
+    strict: bool = False
+
+    @property
+    def digest(self) -> str:
+        """12 hex digits that name this configuration: what is rendered, not where it is sent."""
+        rendered = msgspec.json.encode((self.source, self.model, self.view, self.window), order="deterministic")
+        return hashlib.sha256(rendered).hexdigest()[:12]
+
+
+def load_config(path: Path) -> NodeConfig:
+    """Read a launch file.
+
+    Raises:
+        ConfigError: missing, not TOML, an unknown key (the nearest known one is named), a value out of range.
+    """
+    try:
+        text = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(
+            f"cannot read the launch file {path}: {error.strerror}; give the path of a TOML file"
+        ) from error
+    return parse_config(text, str(path))
+
+
+def parse_config(text: bytes, name: str) -> NodeConfig:
+    """Read a launch file's content; `name` is for the message. Raises ConfigError as `load_config`."""
+    try:
+        return msgspec.toml.decode(text, type=NodeConfig)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{name}: {_explained(str(error))}") from error
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{name} is not valid TOML: {error}") from error
+
+
+def _explained(message: str) -> str:
+    """msgspec's message, with the nearest known key where an unknown one is named."""
+    unknown = re.search(r"unknown field `([^`]+)`(?: - at `\$?\.?([^`]*)`)?", message)
+    if unknown is None:
+        return message.replace("`$.", "`")
+    key, place = unknown.group(1), unknown.group(2) or ""
+    known = _keys_at(place)
+    near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+    where = f" in [{place.replace('[...]', '.*')}]" if place else ""
+    hint = f"did you mean `{near[0]}`?" if near else f"known are {', '.join(known)}"
+    return f"unknown key `{key}`{where}; {hint}"
+
+
+def _keys_at(place: str) -> list[str]:
+    sections: dict[str, type[msgspec.Struct]] = {
+        "": NodeConfig,
+        "source": SourceConfig,
+        "source.pose": SourcePose,
+        "model": ModelSection,
+        "view": ViewConfig,
+        "window": WindowConfig,
+        "publish": PublishConfig,
+    }
+    return list(sections[place.split("[")[0].strip(".")].__struct_fields__)

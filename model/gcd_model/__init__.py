@@ -1,0 +1,1 @@
+"""Generative Camera Dolly (being assembled)."""

@@ -1,0 +1,111 @@
+"""The types that cross the door: a Clip goes in, a View comes out."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from gcd_model.errors import OptionError, ShapeError
+from gcd_model.geometry import Trajectory
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Clip:
+    """A short video as the model takes it.
+
+    video: float32 [T, 3, H, W], RGB in [-1, 1].
+    fps: frames per second of the clip itself, not of the camera; the network is told this number.
+    """
+
+    video: Tensor
+    fps: float
+
+    def __post_init__(self) -> None:
+        if self.video.ndim != 4 or self.video.shape[1] != 3:
+            raise ShapeError(f"video must be [T, 3, H, W], got {list(self.video.shape)}")
+        if self.video.dtype != torch.float32:
+            raise ShapeError(f"video must be float32 in [-1, 1], got {self.video.dtype}")
+        if not self.fps > 0:
+            raise OptionError(f"fps must be positive, got {self.fps}")
+
+    @property
+    def frames(self) -> int:
+        """T."""
+        return self.video.shape[0]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class View:
+    """The clip as another camera would have seen it. Every pixel is generated.
+
+    samples: float32 [S, T, 3, H, W], RGB in [0, 1], on the CPU; S draws of the same view.
+    latents: float32 [S, T, C, h, w], what was decoded, in the scaled space the network works in.
+    trajectory: the camera path that was asked for.
+    motion_bucket: the motion number the network was told.
+    """
+
+    samples: Tensor
+    latents: Tensor
+    trajectory: Trajectory
+    motion_bucket: float
+
+    @property
+    def video(self) -> Tensor:
+        """The first sample, [T, 3, H, W]."""
+        return self.samples[0]
+
+    @property
+    def std(self) -> Tensor | None:
+        """Per-pixel population standard deviation over samples, channel mean: [T, H, W]; None with one sample."""
+        if self.samples.shape[0] < 2:
+            return None
+        return self.samples.std(dim=0, correction=0).mean(dim=1)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Augmentation:
+    """The noise added in pixel space to the conditioning frames the VAE sees (CLIP sees them clean).
+
+    strength: its standard deviation on frames in [-1, 1]; the network is told this number.
+    seed: where the noise is drawn from.
+    noise: float32 [T, 3, H, W], unit variance, used instead of a draw.
+    """
+
+    strength: float = 0.02
+    seed: int = 0
+    noise: Tensor | None = None
+
+
+class CancelSignal(Protocol):
+    """Whatever can be asked to stop: a threading.Event."""
+
+    def is_set(self) -> bool:
+        """True once the work should stop."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RenderOptions:
+    """How to sample. None means: as the checkpoint was made for.
+
+    steps: network evaluations. guidance: scale of the first and the last frame, linear between.
+    samples: draws per view. seed: sample s draws from (seed, s), whatever else is rendered with it.
+    initial_noise: float32 [T, C, h, w] or [S, T, C, h, w], unit variance, used instead of a draw.
+    motion_bucket: the motion number, instead of the formula's.
+    progress: called with (steps done, steps). cancel: asked between steps.
+    """
+
+    steps: int | None = None
+    guidance: tuple[float, float] | None = None
+    samples: int = 1
+    seed: int = 0
+    initial_noise: Tensor | None = None
+    motion_bucket: float | None = None
+    progress: Callable[[int, int], None] | None = None
+    cancel: CancelSignal | None = None
+
+    def __post_init__(self) -> None:
+        if self.samples < 1 or (self.steps is not None and self.steps < 1):
+            raise OptionError(f"samples and steps must be at least 1, got {self.samples} and {self.steps}")

@@ -1,0 +1,261 @@
+"""What a checkpoint's names and shapes cannot tell: limits, rates, motion, the fixed path.
+
+A family is how a checkpoint was trained; `Traits` is one loaded checkpoint: its family and its own facts.
+"""
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from gcd_model.config import CameraControl, ModelConfig
+from gcd_model.errors import OptionError, PoseError, ViewFixedError, ViewRangeError
+from gcd_model.geometry import (
+    Interpolation,
+    Spherical,
+    SphericalDelta,
+    Trajectory,
+    driving_trajectory,
+    fitted_trajectory,
+    motion_bucket,
+    pose_trajectory,
+    spherical_trajectory,
+)
+
+FamilyName = Literal["kubric90", "kubric180", "driving", "driving-semantic", "svd"]
+
+ASSUMED_SOURCE = Spherical(azimuth_deg=0.0, elevation_deg=5.0, radius_m=15.0)
+"""Where the source camera is taken to stand when nobody says: low, looking at the scene's centre."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ViewLimits:
+    """How far a target camera may stand from the source camera, and where at all.
+
+    Source: Van Hoorick et al. 2024 (GCD), section 4; elevation as in the released configurations.
+    """
+
+    azimuth_deg: float
+    elevation_deg: float
+    radius_m: float = 3.0
+    absolute_elevation_deg: tuple[float, float] = (0.0, 50.0)
+    absolute_radius_m: tuple[float, float] = (12.0, 18.0)
+
+    def allowed(self, source: Spherical | None) -> dict[str, tuple[float, float]]:
+        """Intervals of the three differences; narrower when it is known where the source stands."""
+        elevation, radius = (-self.elevation_deg, self.elevation_deg), (-self.radius_m, self.radius_m)
+        if source is not None:
+            elevation = _within(elevation, self.absolute_elevation_deg, source.elevation_deg)
+            radius = _within(radius, self.absolute_radius_m, source.radius_m)
+        return {
+            "azimuth_deg": (-self.azimuth_deg, self.azimuth_deg),
+            "elevation_deg": elevation,
+            "radius_m": radius,
+        }
+
+
+def _within(relative: tuple[float, float], absolute: tuple[float, float], at: float) -> tuple[float, float]:
+    return max(relative[0], absolute[0] - at), min(relative[1], absolute[1] - at)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Family:
+    """How a group of checkpoints was trained.
+
+    camera: control the checkpoint must have. rates: trained frames per second, empty if any. fps: the default label.
+    hfov_deg: trained horizontal field of view. height, width: trained size in pixels.
+    motion_bucket: the constant the network was told, None where the formula gives it.
+    """
+
+    name: FamilyName
+    camera: CameraControl
+    limits: ViewLimits | None = None
+    rates: tuple[float, ...]
+    fps: float
+    hfov_deg: float | None
+    height: int = 256
+    width: int = 384
+    interpolation: Interpolation = "linear"
+    motion_bucket: float | None = None
+    pose_units: Literal["m", "scene"] = "scene"
+    output: Literal["rgb", "semantic"] = "rgb"
+
+
+KUBRIC90 = Family(
+    name="kubric90",
+    camera="spherical",
+    limits=ViewLimits(azimuth_deg=90.0, elevation_deg=30.0),
+    rates=(6.0, 8.0, 12.0, 24.0),
+    fps=12.0,
+    hfov_deg=53.13,
+)
+KUBRIC180 = Family(
+    name="kubric180",
+    camera="spherical",
+    limits=ViewLimits(azimuth_deg=180.0, elevation_deg=60.0),
+    rates=(6.0, 8.0, 12.0, 24.0),
+    fps=12.0,
+    hfov_deg=53.13,
+)
+DRIVING = Family(
+    name="driving",
+    camera="none",
+    rates=(5.0, 10.0),
+    fps=10.0,
+    hfov_deg=85.0,
+    interpolation="sine",
+    motion_bucket=127.0,
+    pose_units="m",
+)
+DRIVING_SEMANTIC = Family(
+    name="driving-semantic",
+    camera="none",
+    rates=(5.0, 10.0),
+    fps=10.0,
+    hfov_deg=85.0,
+    interpolation="sine",
+    motion_bucket=127.0,
+    pose_units="m",
+    output="semantic",
+)
+SVD = Family(name="svd", camera="none", rates=(), fps=7.0, hfov_deg=None, height=576, width=1024, motion_bucket=127.0)
+
+FAMILIES: dict[str, Family] = {family.name: family for family in (KUBRIC90, KUBRIC180, DRIVING, DRIVING_SEMANTIC, SVD)}
+
+
+def family_named(name: str) -> Family:
+    """The family of that name. Raises OptionError for another."""
+    if name not in FAMILIES:
+        raise OptionError(f"no family is called {name!r}; there are {', '.join(get_args(FamilyName))}")
+    return FAMILIES[name]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Traits:
+    """One loaded checkpoint as its users need to know it.
+
+    family: None if nobody could tell; then no limits are checked.
+    move_time: frame in which the goal pose is reached; 0 for a direct checkpoint.
+    sha256_12: first 12 hex digits of the digest of the weights file.
+    trained: False for random weights, whose pictures are noise.
+    """
+
+    name: str
+    config: ModelConfig
+    family: Family | None
+    move_time: int
+    sha256_12: str
+    precision: str
+    device: str
+    trained: bool = True
+
+    @property
+    def fps(self) -> float:
+        """The frame rate the network is told when nobody says another."""
+        return 12.0 if self.family is None else self.family.fps
+
+    @property
+    def rates(self) -> tuple[float, ...]:
+        """Trained frame rates; empty if any will do."""
+        return () if self.family is None else self.family.rates
+
+    def check_size(self, height: int, width: int) -> None:
+        """Raises OptionError if the network cannot take frames of this size."""
+        factor = self.config.size_factor
+        if height % factor or width % factor or min(height, width) < factor:
+            raise OptionError(
+                f"height and width must be multiples of {factor} for {self.name}, got {height}x{width}; "
+                f"the trained size is {self.config.height}x{self.config.width}"
+            )
+
+    def motion_bucket(self, trajectory: Trajectory) -> float:
+        """The motion number for a camera path. Raises OptionError where only the user can know it.
+
+        Source: Van Hoorick et al. 2024 (GCD), appendix, with the angle ranges of the released configurations.
+        """
+        if self.family is not None and self.family.motion_bucket is not None:
+            return self.family.motion_bucket
+        if self.family is None or self.family.limits is None or trajectory.goal_delta is None:
+            raise OptionError(
+                f"the motion number cannot be worked out for {self.name}: its family or the path's angles are not "
+                "known; give --motion-bucket, or name the family with --family"
+            )
+        limits = self.family.limits
+        return motion_bucket(
+            trajectory.goal_delta, max_azimuth_deg=limits.azimuth_deg, max_elevation_deg=limits.elevation_deg
+        )
+
+    def plan_view(
+        self,
+        delta: SphericalDelta | None = None,
+        *,
+        source: Spherical | None = None,
+        move_time: int | None = None,
+        interpolation: Interpolation | None = None,
+    ) -> Trajectory:
+        """The camera path to a goal given as differences of angles and radius.
+
+        Args:
+            delta: destination minus source; None for the checkpoint's own fixed view.
+            source: where the source camera stands, if known; absolute limits are checked only then.
+            move_time: frame in which the goal is reached, instead of the checkpoint's.
+        Raises:
+            ViewFixedError: the checkpoint takes no camera command.
+            ViewRangeError: the goal lies outside the family's limits.
+        """
+        frames, move_time = self.config.frames, self.move_time if move_time is None else move_time
+        if self.config.camera == "none":
+            return self._fixed_view(delta, move_time)
+        delta = SphericalDelta() if delta is None else delta
+        self._check_limits(delta, source)
+        if interpolation is None:
+            interpolation = "linear" if self.family is None else self.family.interpolation
+        start = source or ASSUMED_SOURCE
+        return spherical_trajectory(start, delta, frames=frames, move_time=move_time, interpolation=interpolation)
+
+    def plan_poses(self, source_from_target: Tensor, *, source: Spherical | None = None) -> Trajectory:
+        """A camera path given as rigid transforms [T, 4, 4].
+
+        A checkpoint with spherical control gets the nearest angles and radius, frame by frame; one with relative
+        poses gets them as they are.
+        Raises: ViewFixedError, ViewRangeError, PoseError as `plan_view`.
+        """
+        if self.config.camera == "none":
+            raise ViewFixedError(f"{self.name} has one fixed view and takes no poses; leave the poses out")
+        if source_from_target.shape[:1] != (self.config.frames,):
+            raise PoseError(f"poses must be [{self.config.frames}, 4, 4], got {list(source_from_target.shape)}")
+        fitted, _ = fitted_trajectory(source_from_target, source or ASSUMED_SOURCE)
+        assert fitted.delta is not None
+        for azimuth, elevation, radius in fitted.delta.tolist():
+            self._check_limits(SphericalDelta(azimuth_deg=azimuth, elevation_deg=elevation, radius_m=radius), source)
+        if self.config.camera == "spherical":
+            return fitted
+        return Trajectory(
+            source_from_target=source_from_target.double(),
+            delta=fitted.delta,
+            at_goal=fitted.at_goal,
+            source=fitted.source,
+        )
+
+    def _fixed_view(self, delta: SphericalDelta | None, move_time: int) -> Trajectory:
+        if delta is not None and delta != SphericalDelta():
+            raise ViewFixedError(
+                f"{self.name} has one fixed view and takes no camera command; leave azimuth, elevation and radius out"
+            )
+        if self.family is not None and self.family.name.startswith("driving"):
+            return driving_trajectory(frames=self.config.frames, move_time=move_time)
+        return pose_trajectory(torch.eye(4, dtype=torch.float64).repeat(self.config.frames, 1, 1))
+
+    def _check_limits(self, delta: SphericalDelta, source: Spherical | None) -> None:
+        if self.family is None or self.family.limits is None:
+            return
+        allowed, slack = self.family.limits.allowed(source), 1e-6
+        for axis, (low, high) in allowed.items():
+            value = getattr(delta, axis)
+            if not low - slack <= value <= high + slack:
+                raise ViewRangeError(
+                    f"{axis} {value:g} is outside [{low:g}, {high:g}], the limits of {self.family.name}; "
+                    "choose a view inside, or another checkpoint",
+                    allowed,
+                )

@@ -1,0 +1,225 @@
+"""Camera paths: one pose per frame, seen from the source camera, which stands still."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from gcd_model.errors import OptionError, ShapeError
+from gcd_model.geometry.pose import look_at, relative_pose, require_rigid
+from gcd_model.geometry.spherical import DeltaFit, Spherical, SphericalDelta, nearest_delta, sphere_poses, to_pose
+
+Interpolation = Literal["linear", "sine"]
+
+DRIVING_SOURCE_POSITION = (1.6, 0.0, 1.55)
+"""ParallelDomain-4D: the forward camera in the vehicle's frame (x ahead, y left, z up), metres."""
+DRIVING_SOURCE_TARGET = (6.6, 0.0, 1.55)
+"""What it looks at."""
+DRIVING_GOAL_POSITION = (-8.0, 0.0, 8.0)
+"""ParallelDomain-4D: the virtual camera above and behind the vehicle."""
+DRIVING_GOAL_TARGET = (5.6, 0.0, 1.55)
+"""What it looks at."""
+
+_SAME_POSE = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Trajectory:
+    """Where the camera of a view is in each of T frames.
+
+    source_from_target: float64 [T, 4, 4], metres.
+    delta: float64 [T, 3], the same as azimuth and elevation in degrees and radius in metres, destination minus source;
+        None for a path that is not on the sphere.
+    at_goal: whether the camera stands at its goal pose, T flags.
+    source: where the source camera stands, if that is known or assumed.
+    Raises ShapeError where sizes disagree, PoseError where a pose is not rigid.
+    """
+
+    source_from_target: Tensor
+    delta: Tensor | None
+    at_goal: tuple[bool, ...]
+    source: Spherical | None
+
+    def __post_init__(self) -> None:
+        _require_pose_list(self.source_from_target)
+        if self.source_from_target.dtype != torch.float64:
+            raise ShapeError(f"source_from_target must be float64, got {self.source_from_target.dtype}")
+        if len(self.at_goal) != self.frames:
+            raise ShapeError(f"at_goal must have one flag for each of {self.frames} poses, got {len(self.at_goal)}")
+        if self.delta is not None:
+            _require_deltas(self.delta, self.frames)
+
+    @property
+    def frames(self) -> int:
+        """T."""
+        return self.source_from_target.shape[0]
+
+    @property
+    def goal_delta(self) -> SphericalDelta | None:
+        """The whole change, from the source camera to the last frame's; None for a path that is not on the sphere."""
+        if self.delta is None:
+            return None
+        azimuth_deg, elevation_deg, radius_m = self.delta[-1].tolist()
+        return SphericalDelta(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, radius_m=radius_m)
+
+
+def path_progress(frames: int, move_time: int, interpolation: Interpolation = "linear") -> Tensor:
+    """How much of the way from source to goal is done in each frame.
+
+        linear: a = t / move_time        sine: a = (1 - cos(pi t / move_time)) / 2
+
+    Args:
+        frames: T.
+        move_time: the first frame that is at the goal: T - 1 is gradual, 0 is direct.
+        interpolation: the pace between.
+    Returns:
+        float64 [T] in [0, 1], exactly 1 from move_time on.
+    Raises:
+        OptionError: no frames, an unknown pace, or a path that would not reach its goal within T frames.
+    Source: Generative Camera Dolly, section 3; the sine as released (as printed, it would hardly leave the source).
+    """
+    if frames < 1 or not 0 <= move_time < frames:
+        raise OptionError(
+            f"move_time must lie within 0 (direct) .. {max(frames - 1, 0)} (gradual) "
+            f"for {frames} frames, got {move_time}"
+        )
+    t = torch.arange(frames, dtype=torch.float64)
+    done = (t / max(move_time, 1)).clamp(max=1.0)
+    if interpolation == "sine":
+        done = (1.0 - torch.cos(math.pi * done)) / 2.0
+    elif interpolation != "linear":
+        raise OptionError(f"interpolation must be 'linear' or 'sine', got {interpolation!r}")
+    return torch.where(t >= move_time, 1.0, done)
+
+
+def spherical_trajectory(
+    source: Spherical,
+    delta: SphericalDelta,
+    *,
+    frames: int,
+    move_time: int,
+    interpolation: Interpolation = "linear",
+) -> Trajectory:
+    """A path over the sphere, interpolated in azimuth, elevation and radius.
+
+    Args:
+        source: where the source camera stands.
+        delta: the whole change.
+        frames, move_time, interpolation: see path_progress().
+    Raises:
+        OptionError: see path_progress().
+        PoseError: no camera can stand at the goal (over the top, or no distance left).
+    Source: Generative Camera Dolly, Kubric-4D; linear, gradual or direct.
+    """
+    _ = source + delta  # a goal where no camera can stand is an error before any step towards it
+    return _trajectory_on_sphere(source, path_progress(frames, move_time, interpolation)[:, None] * _numbers(delta))
+
+
+def driving_trajectory(*, frames: int, move_time: int) -> Trajectory:
+    """ParallelDomain-4D's one path: from the forward camera to one above and behind the vehicle.
+
+    Position and looked-at point move separately, each straight and at a sine pace.
+
+    Args:
+        frames, move_time: see path_progress().
+    Source: Generative Camera Dolly, ParallelDomain-4D, as released.
+    """
+    done = path_progress(frames, move_time, "sine")[:, None]
+    position = torch.lerp(_point(DRIVING_SOURCE_POSITION), _point(DRIVING_GOAL_POSITION), done)  # [T, 3]
+    target = torch.lerp(_point(DRIVING_SOURCE_TARGET), _point(DRIVING_GOAL_TARGET), done)
+    world_from_source = look_at(_point(DRIVING_SOURCE_POSITION), _point(DRIVING_SOURCE_TARGET))
+    return pose_trajectory(relative_pose(world_from_source, look_at(position, target)))
+
+
+def pose_trajectory(source_from_target: Tensor) -> Trajectory:
+    """A free path; the last pose is the goal.
+
+    Args:
+        source_from_target: [T, 4, 4] rigid, metres.
+    Raises:
+        ShapeError, PoseError: not a list of rigid poses.
+    """
+    poses = _require_pose_list(source_from_target)
+    return Trajectory(source_from_target=poses, delta=None, at_goal=_at_last_pose(poses), source=None)
+
+
+def fitted_trajectory(source_from_target: Tensor, source: Spherical) -> tuple[Trajectory, list[DeltaFit]]:
+    """The path over the sphere nearest to a free path, for a network that is told spherical changes only.
+
+    Args:
+        source_from_target: [T, 4, 4] rigid, metres: the asked path.
+        source: where the source camera stands.
+    Returns:
+        The fitted path (its poses are the fitted, not the asked ones), and for each frame the fit with what it leaves
+        over. The azimuth starts from the value nearest 0 and does not jump: full turns are kept.
+    Raises:
+        ShapeError, PoseError: not a list of rigid poses, or one of them stands at the look-at point.
+    """
+    asked = _require_pose_list(source_from_target)
+    fits = _unwrapped([nearest_delta(pose, source) for pose in asked.unbind(0)])
+    return _trajectory_on_sphere(source, torch.stack([_numbers(fit.delta) for fit in fits])), fits
+
+
+def motion_bucket(
+    delta: SphericalDelta, *, max_azimuth_deg: float, max_elevation_deg: float, low: float = 0.0, high: float = 255.0
+) -> int:
+    """The number that tells the network how far the camera moves.
+
+        round(low + (high - low) * |(d_azimuth, d_elevation)| / |(max_azimuth, max_elevation)|)
+
+    Args:
+        delta: the whole change; the radius does not count.
+        max_azimuth_deg, max_elevation_deg: the largest change the checkpoint was trained for.
+        low, high: the numbers for no change and for both angles at their largest. Not clamped beyond.
+    Raises:
+        OptionError: both limits are 0.
+    Source: Generative Camera Dolly, Kubric-4D, as released.
+    """
+    largest_deg = math.hypot(max_azimuth_deg, max_elevation_deg)
+    if not largest_deg > 0.0:
+        raise OptionError("the motion number needs a largest angle above 0; give the motion number itself instead")
+    share = math.hypot(delta.azimuth_deg, delta.elevation_deg) / largest_deg
+    return round(low + (high - low) * share)
+
+
+def _trajectory_on_sphere(source: Spherical, deltas: Tensor) -> Trajectory:
+    poses = relative_pose(to_pose(source), sphere_poses(_numbers(source) + deltas))  # [T, 4, 4]
+    return Trajectory(source_from_target=poses, delta=deltas, at_goal=_at_last_pose(poses), source=source)
+
+
+def _unwrapped(fits: list[DeltaFit]) -> list[DeltaFit]:
+    unwrapped: list[DeltaFit] = []
+    azimuth_deg = 0.0
+    for fit in fits:
+        azimuth_deg += math.remainder(fit.delta.azimuth_deg - azimuth_deg, 360.0)
+        unwrapped.append(replace(fit, delta=replace(fit.delta, azimuth_deg=azimuth_deg)))
+    return unwrapped
+
+
+def _at_last_pose(poses: Tensor) -> tuple[bool, ...]:
+    # By pose, not by time: a camera that is asked to stay stands at its goal from the first frame on.
+    apart = (poses - poses[-1]).abs().amax(dim=(-2, -1))
+    return tuple((apart <= _SAME_POSE).tolist())
+
+
+def _numbers(view: Spherical | SphericalDelta) -> Tensor:
+    return torch.tensor([view.azimuth_deg, view.elevation_deg, view.radius_m], dtype=torch.float64)
+
+
+def _point(xyz: tuple[float, float, float]) -> Tensor:
+    return torch.tensor(xyz, dtype=torch.float64)
+
+
+def _require_pose_list(poses: Tensor) -> Tensor:
+    if poses.ndim != 3 or poses.shape[0] < 1:
+        raise ShapeError(f"source_from_target must be [T, 4, 4], one pose per frame, got {list(poses.shape)}")
+    return require_rigid(poses, "source_from_target")
+
+
+def _require_deltas(deltas: Tensor, frames: int) -> None:
+    if deltas.shape != (frames, 3) or deltas.dtype != torch.float64:
+        raise ShapeError(f"delta must be float64 [{frames}, 3], got {deltas.dtype} {list(deltas.shape)}")
+    if not bool(deltas.isfinite().all()):
+        raise ShapeError("delta holds NaN or infinite numbers; changes must be finite")

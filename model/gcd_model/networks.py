@@ -1,0 +1,50 @@
+"""All networks of one checkpoint, built from its config."""
+
+import torch
+from torch import nn
+
+from gcd_model.conditioning import CameraEmbedder
+from gcd_model.config import ModelConfig
+from gcd_model.image_encoder import ImageEncoder
+from gcd_model.unet import VideoUNet
+from gcd_model.vae import Encoder, TemporalDecoder
+
+
+class Networks(nn.Module):
+    """U-Net, camera embedder, image tower and autoencoders.
+
+    Attribute names are ours; `checkpoints.py` knows the published ones. With a shared VAE the target encoder is
+    also the condition encoder.
+    """
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.unet = VideoUNet(config.unet, config.frames)
+        self.camera = None if config.camera == "none" else CameraEmbedder(config.camera, config.unet.camera_width)
+        self.image_encoder = None if config.image_encoder is None else ImageEncoder(config.image_encoder)
+        self.target_encoder = Encoder(config.vae, quant=config.vae.shared)
+        self.own_condition_encoder = None if config.vae.shared else Encoder(config.vae, quant=True)
+        self.decoder = TemporalDecoder(config.vae)
+
+    @property
+    def condition_encoder(self) -> Encoder:
+        """The encoder the source frames go through."""
+        return self.target_encoder if self.own_condition_encoder is None else self.own_condition_encoder
+
+
+def empty_networks(config: ModelConfig) -> Networks:
+    """Networks without storage, on the meta device, to be filled from a checkpoint."""
+    with torch.device("meta"):
+        return Networks(config)
+
+
+def random_networks(config: ModelConfig, seed: int) -> Networks:
+    """Freshly initialised networks; layers that start at zero get random values too, so that every path is live."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        networks = Networks(config)
+        for parameter in networks.parameters():
+            if not parameter.any():
+                nn.init.normal_(parameter, std=0.02)
+    return networks

@@ -1,0 +1,242 @@
+"""The door: `encode` a clip once, `render` it as other cameras would have seen it."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from gcd_model.clip import Augmentation, Clip, RenderOptions, View
+from gcd_model.conditioning import (
+    Conditioning,
+    SourceFeatures,
+    condition_latents,
+    condition_tokens,
+    micro_conditioning,
+)
+from gcd_model.errors import NonFiniteError, OptionError, ShapeError
+from gcd_model.families import Traits
+from gcd_model.geometry import Trajectory
+from gcd_model.image_encoder import clip_pixels
+from gcd_model.layers import prepare
+from gcd_model.networks import Networks
+from gcd_model.noise import edm_sigmas, guidance_scale, preconditioning, unit_noise
+from gcd_model.sampler import euler, guided
+from gcd_model.vae import to_pixels
+
+_ENCODE_FRAMES = 2  # frames per encoder call: the largest activations are per frame, so this bounds memory
+
+
+class ViewSynthesizer(Protocol):
+    """What the node knows of a model."""
+
+    @property
+    def traits(self) -> Traits:
+        """Family, sizes, limits and identity of the weights."""
+        ...
+
+    def encode(
+        self, clip: Clip, augmentation: Augmentation | None = None, extra: Tensor | None = None
+    ) -> SourceFeatures:
+        """What the network needs to know of the source, computed once per clip."""
+        ...
+
+    def render(
+        self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
+    ) -> list[View]:
+        """The clip as cameras on `trajectories` would have seen it, all in one batch.
+
+        Raises:
+            ShapeError: a trajectory and the clip differ in length.
+            Cancelled: `options.cancel` was set; noticed between two denoising steps.
+            NonFiniteError: the result holds NaN or Inf.
+        """
+        ...
+
+
+def synthesize(
+    synthesizer: ViewSynthesizer, clip: Clip, trajectory: Trajectory, options: RenderOptions | None = None
+) -> View:
+    """One clip, one view: `encode`, then `render`."""
+    return synthesizer.render(synthesizer.encode(clip), [trajectory], options)[0]
+
+
+class Synthesizer:
+    """A checkpoint ready to run.
+
+    The U-Net and the encoders compute in the networks' own precision, the sampler state and the decoder in float32.
+    """
+
+    def __init__(self, networks: Networks, traits: Traits) -> None:
+        self._networks, self._traits = networks, traits
+        networks.requires_grad_(False)
+        prepare(networks)
+
+    @property
+    def traits(self) -> Traits:
+        """Family, sizes, limits and identity of the weights."""
+        return self._traits
+
+    @property
+    def networks(self) -> Networks:
+        """The networks themselves, for measuring and exporting."""
+        return self._networks
+
+    @torch.inference_mode()
+    def encode(
+        self, clip: Clip, augmentation: Augmentation | None = None, extra: Tensor | None = None
+    ) -> SourceFeatures:
+        """See ViewSynthesizer. Frames are independent of each other here; any number of them may be given.
+
+        extra: [T, C', h, w], for checkpoints with further condition channels.
+        """
+        augmentation = Augmentation() if augmentation is None else augmentation
+        self._traits.check_size(*clip.video.shape[-2:])
+        self._check_extra(extra)
+        noise = augmentation.noise
+        if noise is None:
+            noise = unit_noise(tuple(clip.video.shape), augmentation.seed)
+        if noise.shape != clip.video.shape:
+            raise ShapeError(f"augmentation noise must be {list(clip.video.shape)}, got {list(noise.shape)}")
+        noisy = clip.video + augmentation.strength * noise
+        return SourceFeatures(
+            tokens=self._tokens(clip.video),
+            latents=_in_chunks(self._condition_mean, noisy),
+            extra=None if extra is None else extra.to(self._like),
+            fps=clip.fps,
+            augmentation=augmentation.strength,
+        )
+
+    @torch.inference_mode()
+    def render(
+        self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
+    ) -> list[View]:
+        """See ViewSynthesizer."""
+        options = RenderOptions() if options is None else options
+        self._check_lengths(features, trajectories)
+        buckets = [self._bucket(path, options) for path in trajectories]
+        latents = self._denoise(_Job(features, tuple(trajectories), tuple(buckets), options))  # [V, S, T, C, h, w]
+        pixels = self._decode(latents)  # [V, S, T, 3, H, W]
+        latents = latents.cpu()
+        return [
+            View(samples=pixels[v], latents=latents[v], trajectory=path, motion_bucket=buckets[v])
+            for v, path in enumerate(trajectories)
+        ]
+
+    @property
+    def _like(self) -> Tensor:
+        return self._networks.unet.stem.weight
+
+    def _check_extra(self, extra: Tensor | None) -> None:
+        wanted, given = self._traits.config.extra_condition_channels, 0 if extra is None else extra.shape[1]
+        if wanted != given:
+            raise ShapeError(f"{self._traits.name} wants {wanted} extra condition channels, got {given}")
+
+    def _check_lengths(self, features: SourceFeatures, trajectories: Sequence[Trajectory]) -> None:
+        frames = self._traits.config.frames
+        if not trajectories:
+            raise ShapeError("at least one trajectory is wanted, got none")
+        for length in (features.frames, *(path.frames for path in trajectories)):
+            if length != frames:
+                raise ShapeError(f"{self._traits.name} works on {frames} frames, got {length}")
+
+    def _bucket(self, trajectory: Trajectory, options: RenderOptions) -> float:
+        given = options.motion_bucket
+        return self._traits.motion_bucket(trajectory) if given is None else given
+
+    def _tokens(self, video: Tensor) -> Tensor | None:
+        tower = self._networks.image_encoder
+        if tower is None:
+            return None
+        size = tower.config.image_size
+        return _in_chunks(lambda frames: tower(clip_pixels(frames, size).to(self._like)), video.to(self._like.device))
+
+    def _condition_mean(self, frames: Tensor) -> Tensor:
+        return self._networks.condition_encoder(frames.to(self._like)).mean
+
+    def _denoise(self, job: "_Job") -> Tensor:
+        config, options = self._traits.config, job.options
+        first, last = options.guidance or config.sampling.guidance
+        scale = guidance_scale(first, last, config.frames).to(self._like.device)
+        conditioning = self._condition(job, unconditional=(first, last) != (1.0, 1.0))
+        sigmas = edm_sigmas(config.sampling, options.steps or config.sampling.steps)
+        denoise = self._denoiser(conditioning, sigmas, scale)
+        noise = job.noise(config.frames).to(self._like.device)  # [S, T, C, h, w]
+        start = noise.repeat(len(job.trajectories), 1, 1, 1, 1) * (sigmas[0] ** 2 + 1).sqrt().item()
+        latents = euler(denoise, start, sigmas, progress=options.progress, cancel=options.cancel)
+        if not latents.isfinite().all():
+            raise NonFiniteError(
+                f"{self._traits.name} produced NaN or Inf in the latents (precision {self._traits.precision}, seed "
+                f"{options.seed}); try --dtype float32, and look at the weights with `gcd-node weights inspect`"
+            )
+        return latents.unflatten(0, (len(job.trajectories), options.samples))
+
+    def _condition(self, job: "_Job", *, unconditional: bool) -> Conditioning:
+        """Rows are ordered view by view, sample by sample."""
+        samples, width = job.options.samples, self._traits.config.unet.vector_width
+        vectors = [
+            micro_conditioning(job.features.fps, bucket, job.features.augmentation, width) for bucket in job.buckets
+        ]
+        per_frame = samples * job.features.frames
+        camera = self._networks.camera
+        cameras = None if camera is None else [camera(path).repeat(samples, 1) for path in job.trajectories]
+        views = samples * len(job.trajectories)
+        return Conditioning(
+            vector=torch.cat([vector.expand(per_frame, -1) for vector in vectors]).to(self._like),
+            camera=None if cameras is None else torch.cat(cameras),
+            tokens=condition_tokens(job.features, views, unconditional=unconditional),
+            latents=condition_latents(job.features, views, unconditional=unconditional),
+            branches=2 if unconditional else 1,
+        )
+
+    def _denoiser(self, given: Conditioning, sigmas: Tensor, scale: Tensor) -> Callable[[Tensor, int], Tensor]:
+        """D(x, sigma_i) with guidance, on x: [K, T, C, h, w] float32."""
+        unet, like = self._networks.unet, self._like
+        levels = preconditioning(sigmas[:-1])
+        labels = levels.c_noise.float().to(like.device)
+        plan = unet.plan(labels, given.vector, given.camera, given.tokens, repeats=given.branches)
+        c_in, c_out, c_skip = (c.tolist() for c in (levels.c_in, levels.c_out, levels.c_skip))
+
+        def denoise(x: Tensor, i: int) -> Tensor:
+            rows = (x * c_in[i]).flatten(0, 1).to(like).repeat(given.branches, 1, 1, 1)
+            raw = unet(rows, given.latents, plan.step(i)).float().unflatten(0, (-1, *x.shape[:2]))
+            branches = c_skip[i] * x + c_out[i] * raw  # [R, K, T, C, h, w]
+            return guided(branches[0], branches[1], scale) if given.branches == 2 else branches[0]
+
+        return denoise
+
+    def _decode(self, latents: Tensor) -> Tensor:
+        """[V, S, T, C, h, w] -> RGB in [0, 1], [V, S, T, 3, H, W] on the CPU, one clip at a time."""
+        decoder, frames = self._networks.decoder, self._traits.config.frames
+        scaled = (latents / self._traits.config.vae.scale).flatten(0, 1)
+        clips = [to_pixels(decoder(clip.to(decoder.stem.weight), frames)).cpu() for clip in scaled]
+        pixels = torch.stack(clips).unflatten(0, latents.shape[:2])
+        if not pixels.isfinite().all():
+            raise NonFiniteError(f"{self._traits.name} decoded to NaN or Inf; the weights are damaged")
+        return pixels
+
+
+@dataclass(frozen=True, slots=True)
+class _Job:
+    """What one call of `render` was asked for."""
+
+    features: SourceFeatures
+    trajectories: tuple[Trajectory, ...]
+    buckets: tuple[float, ...]
+    options: RenderOptions
+
+    def noise(self, frames: int) -> Tensor:
+        """Unit noise the sampling starts from, [S, T, C, h, w]; the same for every view."""
+        samples, given = self.options.samples, self.options.initial_noise
+        shape = (frames, self.features.latents.shape[1], *self.features.latents.shape[2:])
+        if given is None:
+            return torch.stack([unit_noise(shape, self.options.seed, 1 + s) for s in range(samples)])
+        given = given[None] if given.ndim == 4 else given
+        if tuple(given.shape) != (samples, *shape):
+            raise OptionError(f"initial noise must be {[samples, *shape]}, got {list(given.shape)}")
+        return given.float()
+
+
+def _in_chunks(network: Callable[[Tensor], Tensor], frames: Tensor) -> Tensor:
+    return torch.cat([network(chunk) for chunk in frames.split(_ENCODE_FRAMES)])

@@ -1,0 +1,236 @@
+"""The video U-Net of Stable Video Diffusion.
+
+Nothing that is constant over a window or a schedule is computed in `forward`: `plan` does that once.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from gcd_model.config import UNetConfig
+from gcd_model.layers import Downsample, Layers, Upsample, embedding_mlp, sinusoid, zeroed
+from gcd_model.temporal import TemporalShare, VideoResBlock, VideoTransformer
+
+
+@dataclass(frozen=True, slots=True)
+class StageInputs:
+    """What one stage needs besides the pixels, for one denoising step.
+
+    embeddings: [N, C], noise level, micro-conditioning and camera, projected for this stage.
+    crosses: what the image token adds; spatial [N, C], temporal [B, C]; None without attention or image tower.
+    """
+
+    spatial_embedding: Tensor
+    temporal_embedding: Tensor
+    spatial_cross: Tensor | None
+    temporal_cross: Tensor | None
+
+
+@dataclass(frozen=True, slots=True)
+class StagePlan:
+    """StageInputs of all steps: embeddings [S, N, C], crosses as there (they do not depend on the step)."""
+
+    spatial_embedding: Tensor
+    temporal_embedding: Tensor
+    spatial_cross: Tensor | None
+    temporal_cross: Tensor | None
+
+    def step(self, index: int, repeats: int) -> StageInputs:
+        """Inputs of one step; embeddings repeat when several branches share them."""
+        return StageInputs(
+            self.spatial_embedding[index].repeat(repeats, 1),
+            self.temporal_embedding[index].repeat(repeats, 1),
+            self.spatial_cross,
+            self.temporal_cross,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class UNetPlan:
+    """All that the U-Net takes besides pixels, for every step of a schedule.
+
+    repeats: how often the rows of the embeddings repeat in the batch (2 when an unconditional branch rides along).
+    """
+
+    stages: tuple[StagePlan, ...]
+    repeats: int
+
+    def step(self, index: int) -> tuple[StageInputs, ...]:
+        """What `VideoUNet.forward` takes at one step."""
+        return tuple(stage.step(index, self.repeats) for stage in self.stages)
+
+
+class Stage(nn.Module):
+    """A residual block and, where the level attends, a transformer."""
+
+    def __init__(self, in_channels: int, out_channels: int, config: UNetConfig, *, attends: bool, frames: int) -> None:
+        super().__init__()
+        self.res = VideoResBlock(
+            in_channels,
+            out_channels,
+            groups=config.norm_groups,
+            embedding_width=config.embedding_width,
+            eps=1e-5,
+            share=TemporalShare(of_sigmoid="space", initial=0.5),
+        )
+        self.attention = (
+            VideoTransformer(
+                out_channels,
+                head_width=config.head_width,
+                context_width=config.context_width,
+                groups=config.norm_groups,
+                frames=frames,
+            )
+            if attends
+            else None
+        )
+
+    def plan(self, embedding: Tensor, tokens: Tensor | None, frames: int) -> StagePlan:
+        """embedding: [S, N, E]. tokens: [N', D], one per frame of the whole batch."""
+        return StagePlan(
+            self.res.spatial.project(embedding),
+            self.res.temporal.project(embedding),
+            *self._crosses(tokens, frames),
+        )
+
+    def _crosses(self, tokens: Tensor | None, frames: int) -> tuple[Tensor | None, Tensor | None]:
+        if self.attention is None or tokens is None:
+            return None, None
+        spatial, temporal = self.attention.spatial.token, self.attention.temporal.token
+        assert spatial is not None, "tokens were given to a U-Net without cross-attention"
+        assert temporal is not None, "tokens were given to a U-Net without cross-attention"
+        return spatial(tokens), temporal(tokens[::frames])  # across frames only the first frame's token counts
+
+    def forward(self, x: Tensor, inputs: StageInputs, frames: int) -> Tensor:
+        """x: [N, C, h, w] -> [N, C', h, w]."""
+        x = self.res(x, frames, inputs.spatial_embedding, inputs.temporal_embedding)
+        if self.attention is None:
+            return x
+        return self.attention(x, frames, inputs.spatial_cross, inputs.temporal_cross)
+
+
+class DownLevel(nn.Module):
+    """Stages at one resolution, then half of it."""
+
+    def __init__(self, in_channels: int, level: int, config: UNetConfig, frames: int) -> None:
+        super().__init__()
+        width, attends = config.widths[level], config.attention[level]
+        self.stages = Layers[Stage](
+            Stage(in_channels if i == 0 else width, width, config, attends=attends, frames=frames)
+            for i in range(config.blocks_per_level)
+        )
+        self.down = Downsample(width, pad="both") if level + 1 < len(config.widths) else None
+
+
+class UpLevel(nn.Module):
+    """Stages at one resolution, each taking one skip connection, then twice that resolution."""
+
+    def __init__(self, in_channels: int, skips: list[int], level: int, config: UNetConfig, frames: int) -> None:
+        super().__init__()
+        width, attends = config.widths[level], config.attention[level]
+        self.stages = Layers[Stage](
+            Stage((in_channels if i == 0 else width) + skips.pop(), width, config, attends=attends, frames=frames)
+            for i in range(config.blocks_per_level + 1)
+        )
+        self.up = Upsample(width) if level > 0 else None
+
+
+class VideoUNet(nn.Module):
+    """Noisy latents and source latents in, prediction out.
+
+    Source: Blattmann et al. 2023 (SVD); the camera vector as in Van Hoorick et al. 2024 (GCD), section 3.2.
+    """
+
+    def __init__(self, config: UNetConfig, frames: int) -> None:
+        super().__init__()
+        self.config, self.frames = config, frames
+        width, embedding = config.width, config.embedding_width
+        self.embed_noise = embedding_mlp(width, embedding, embedding)
+        self.embed_vector = embedding_mlp(config.vector_width, embedding, embedding)
+        self.embed_camera = embedding_mlp(config.camera_width, embedding, embedding) if config.camera_width else None
+        self.stem = nn.Conv2d(config.latent_channels + config.condition_channels, width, 3, padding=1)
+        before = [width, *config.widths[:-1]]
+        self.down = Layers[DownLevel](DownLevel(before[i], i, config, frames) for i in range(len(config.widths)))
+        self.middle = Layers[Stage](
+            Stage(config.widths[-1], config.widths[-1], config, attends=attends, frames=frames)
+            for attends in (True, False)
+        )
+        skips, above = _skip_widths(config), [*config.widths[1:], config.widths[-1]]
+        self.up = Layers[UpLevel](
+            UpLevel(above[i], skips, i, config, frames) for i in reversed(range(len(config.widths)))
+        )
+        self.norm_out = nn.GroupNorm(config.norm_groups, width, eps=1e-5)
+        self.conv_out = nn.Conv2d(width, config.latent_channels, 3, padding=1)
+        self._start_as_identity()
+
+    def plan(
+        self, noise_labels: Tensor, vector: Tensor, camera: Tensor | None, tokens: Tensor | None, *, repeats: int = 1
+    ) -> UNetPlan:
+        """Compute all that does not depend on the pixels.
+
+        Args:
+            noise_labels: [S] one per step (or [S, N]), c_noise. vector: [N, V], micro-conditioning.
+            camera: [N, camera_width] or None. tokens: [N * repeats, D] image tokens of the whole batch, or None.
+            repeats: how often the N rows occur in the batch (2 with an unconditional branch).
+        """
+        labels = noise_labels if noise_labels.ndim == 2 else noise_labels[:, None]
+        embedding = self.embed_noise(sinusoid(labels, self.config.width).to(vector.dtype)) + self.embed_vector(vector)
+        if self.embed_camera is not None:
+            assert camera is not None, "this U-Net wants a camera vector"
+            embedding = embedding + self.embed_camera(camera)  # [S, N, E]
+        return UNetPlan(tuple(stage.plan(embedding, tokens, self.frames) for stage in self.all_stages()), repeats)
+
+    def all_stages(self) -> Iterator[Stage]:
+        """Every stage in the order of the forward pass."""
+        for level in self.down:
+            yield from level.stages
+        yield from self.middle
+        for level in self.up:
+            yield from level.stages
+
+    def forward(self, latents: Tensor, condition: Tensor, inputs: Sequence[StageInputs]) -> Tensor:
+        """One evaluation of the network F.
+
+        Args:
+            latents: [B*T, C, h, w], scaled noisy latents. condition: [B*T, C', h, w], source latents, unscaled.
+            inputs: one step of a plan made for this batch.
+        Returns:
+            [B*T, C, h, w].
+        """
+        inputs_left = iter(inputs)
+        x = self.stem(torch.cat([latents, condition], dim=1))
+        skips = [x]
+        for level in self.down:
+            for stage in level.stages:
+                x = stage(x, next(inputs_left), self.frames)
+                skips.append(x)
+            if level.down is not None:
+                x = level.down(x)
+                skips.append(x)
+        for stage in self.middle:
+            x = stage(x, next(inputs_left), self.frames)
+        for level in self.up:
+            for stage in level.stages:
+                x = stage(torch.cat([x, skips.pop()], dim=1), next(inputs_left), self.frames)
+            if level.up is not None:
+                x = level.up(x)
+        return self.conv_out(F.silu(self.norm_out(x)))
+
+    def _start_as_identity(self) -> None:
+        for stage in self.all_stages():
+            zeroed(stage.res.spatial.conv2)
+            zeroed(stage.res.temporal.conv2)
+            if stage.attention is not None:
+                zeroed(stage.attention.proj_out)
+        zeroed(self.conv_out)
+
+
+def _skip_widths(config: UNetConfig) -> list[int]:
+    """Channels of the stem and of every stage and down-sampling, in forward order."""
+    widths = [config.width]
+    for level, width in enumerate(config.widths):
+        widths += [width] * (config.blocks_per_level + (level + 1 < len(config.widths)))
+    return widths

@@ -1,0 +1,116 @@
+import math
+from itertools import accumulate, product
+
+import pytest
+
+from gcd_model.errors import OptionError
+from gcd_model.geometry import Orbit, SphericalDelta
+
+ORBITS = [
+    Orbit(rate_deg_s=rate, amplitude_deg=amplitude, azimuth_deg=share * amplitude, direction=direction)
+    for rate, amplitude, share, direction in product([25.0, -7.3], [45.0, 0.1], [-0.9, 0.0, 0.35], [1, -1])
+]
+
+
+def swing_seconds(orbit: Orbit) -> float:
+    return 4 * orbit.amplitude_deg / abs(orbit.rate_deg_s)
+
+
+def ends_together(one: Orbit, other: Orbit) -> bool:
+    """The same motion up to rounding: same place, and same way unless both are at a turn."""
+    near = math.isclose(one.azimuth_deg, other.azimuth_deg, abs_tol=1e-6)
+    at_turn = math.isclose(abs(one.azimuth_deg), one.amplitude_deg, abs_tol=1e-6)
+    return near and (at_turn or one.direction == other.direction)
+
+
+@pytest.mark.parametrize("orbit", ORBITS)
+def test_the_azimuth_never_leaves_the_amplitude(orbit: Orbit) -> None:
+    steps = [0.0, 0.01, 0.5, 0.583333, 3.0, 100.0, 12345.678]
+    visited = list(accumulate(steps * 5, lambda place, step: place.advanced(step), initial=orbit))
+    assert all(abs(place.azimuth_deg) <= orbit.amplitude_deg for place in visited)
+    assert {place.amplitude_deg for place in visited} == {orbit.amplitude_deg}
+
+
+@pytest.mark.parametrize("orbit", ORBITS)
+@pytest.mark.parametrize(("first_s", "second_s"), [(0.0, 0.4), (0.13, 0.4), (2.0, 9.1), (5.7, 0.0), (3.3, -1.2)])
+def test_two_steps_are_one_step_of_their_sum(orbit: Orbit, first_s: float, second_s: float) -> None:
+    assert ends_together(orbit.advanced(first_s).advanced(second_s), orbit.advanced(first_s + second_s))
+
+
+@pytest.mark.parametrize("orbit", ORBITS)
+def test_going_back_undoes_going_ahead(orbit: Orbit) -> None:
+    assert ends_together(orbit.advanced(7.7).advanced(-7.7), orbit)
+
+
+@pytest.mark.parametrize("orbit", ORBITS)
+def test_a_whole_swing_leads_back_and_half_a_swing_to_the_mirror_image(orbit: Orbit) -> None:
+    whole, half = orbit.advanced(swing_seconds(orbit)), orbit.advanced(swing_seconds(orbit) / 2)
+    assert ends_together(whole, orbit)
+    assert half.azimuth_deg == pytest.approx(-orbit.azimuth_deg, abs=1e-9)
+    assert half.direction == -orbit.direction
+
+
+@pytest.mark.parametrize("orbit", ORBITS)
+def test_negative_rate_is_the_other_direction(orbit: Orbit) -> None:
+    twin = Orbit(
+        rate_deg_s=-orbit.rate_deg_s,
+        amplitude_deg=orbit.amplitude_deg,
+        azimuth_deg=orbit.azimuth_deg,
+        direction=-orbit.direction,
+    )
+    one, other = orbit.advanced(3.21), twin.advanced(3.21)
+    assert other.azimuth_deg == one.azimuth_deg
+    assert other.direction == -one.direction
+
+
+def test_five_windows_continue_from_each_other_and_turn_round_at_the_limit() -> None:
+    orbit = Orbit(rate_deg_s=40.0, amplitude_deg=45.0)
+    windows = list(accumulate([0.75] * 5, lambda place, step: place.advanced(step), initial=orbit))
+    assert [window.azimuth_deg for window in windows] == pytest.approx([0.0, 30.0, 30.0, 0.0, -30.0, -30.0])
+    assert [window.direction for window in windows] == [1, 1, -1, -1, -1, 1]
+
+
+def test_one_long_window_may_turn_many_times() -> None:
+    orbit = Orbit(rate_deg_s=100.0, amplitude_deg=10.0).advanced(1.25)  # 125 degrees: 10 up, 5 whole ways, 15 more
+    assert orbit.azimuth_deg == pytest.approx(5.0)
+    assert orbit.direction == 1
+
+
+def test_exactly_at_the_limit_the_orbit_has_turned() -> None:
+    orbit = Orbit(rate_deg_s=15.0, amplitude_deg=45.0).advanced(3.0)
+    assert orbit == Orbit(rate_deg_s=15.0, amplitude_deg=45.0, azimuth_deg=45.0, direction=-1)
+    assert orbit.advanced(0.0) == orbit
+
+
+@pytest.mark.parametrize(
+    "orbit", [Orbit(rate_deg_s=0.0, amplitude_deg=20.0, azimuth_deg=5.0), Orbit(rate_deg_s=9.0, amplitude_deg=0.0)]
+)
+def test_an_orbit_without_rate_or_amplitude_stays(orbit: Orbit) -> None:
+    assert orbit.advanced(17.0) == orbit
+
+
+def test_the_destination_is_a_change_in_azimuth_alone() -> None:
+    orbit = Orbit(rate_deg_s=10.0, amplitude_deg=45.0).advanced(1.5)
+    assert orbit.delta == SphericalDelta(azimuth_deg=15.0)
+
+
+@pytest.mark.parametrize(
+    ("rate", "amplitude", "azimuth", "direction", "message"),
+    [
+        (1.0, -1.0, 0.0, 1, "within its amplitude"),
+        (1.0, 10.0, 10.1, 1, "within its amplitude.*10.1 and 10"),
+        (1.0, 10.0, 0.0, 0, "direction must be 1 or -1"),
+        (math.nan, 10.0, 0.0, 1, "finite"),
+        (1.0, math.inf, 0.0, 1, "finite"),
+    ],
+)
+def test_an_impossible_orbit_is_refused(
+    rate: float, amplitude: float, azimuth: float, direction: int, message: str
+) -> None:
+    with pytest.raises(OptionError, match=message):
+        Orbit(rate_deg_s=rate, amplitude_deg=amplitude, azimuth_deg=azimuth, direction=direction)
+
+
+def test_an_orbit_advances_by_a_finite_time() -> None:
+    with pytest.raises(OptionError, match="finite time"):
+        Orbit(rate_deg_s=1.0, amplitude_deg=1.0).advanced(math.inf)

@@ -1,0 +1,221 @@
+import math
+from itertools import product
+
+import pytest
+import torch
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from torch import Tensor
+from torch.testing import assert_close
+
+from gcd_model.errors import PoseError
+from gcd_model.geometry import (
+    LOOK_AT,
+    Spherical,
+    SphericalDelta,
+    from_pose,
+    invert_rigid,
+    look_at,
+    nearest_delta,
+    relative_pose,
+    require_rigid,
+    sphere_poses,
+    to_pose,
+)
+
+AZIMUTHS_DEG = [-179.0, -90.0, 0.0, 15.0, 123.4, 180.0]
+ELEVATIONS_DEG = [-60.0, 0.0, 5.0, 50.0, 89.0]
+SOURCE = Spherical(azimuth_deg=15.0, elevation_deg=5.0, radius_m=15.0)
+CENTRE = torch.tensor(LOOK_AT, dtype=torch.float64)
+
+
+def spherical(azimuth_deg: float, elevation_deg: float, radius_m: float = 12.0) -> Spherical:
+    return Spherical(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, radius_m=radius_m)
+
+
+def change(azimuth_deg: float = 0.0, elevation_deg: float = 0.0, radius_m: float = 0.0) -> SphericalDelta:
+    return SphericalDelta(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, radius_m=radius_m)
+
+
+def asked_change(delta: SphericalDelta) -> Tensor:
+    return relative_pose(to_pose(SOURCE), to_pose(SOURCE + delta))
+
+
+def turned(axis_angle_deg: tuple[float, float, float]) -> Tensor:
+    pose = torch.eye(4, dtype=torch.float64)
+    axis_angle = torch.deg2rad(torch.tensor([axis_angle_deg], dtype=torch.float64))
+    pose[:3, :3] = axis_angle_to_rotation_matrix(axis_angle)[0]
+    return pose
+
+
+@pytest.mark.parametrize(("azimuth_deg", "elevation_deg"), product(AZIMUTHS_DEG, [-90.0, *ELEVATIONS_DEG, 90.0]))
+def test_spherical_survives_the_round_trip(azimuth_deg: float, elevation_deg: float) -> None:
+    back = from_pose(to_pose(spherical(azimuth_deg, elevation_deg)))
+    assert back.azimuth_deg == pytest.approx(azimuth_deg, abs=1e-9)
+    assert back.elevation_deg == pytest.approx(elevation_deg, abs=1e-6)
+    assert back.radius_m == pytest.approx(12.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(("azimuth_deg", "elevation_deg"), product(AZIMUTHS_DEG, ELEVATIONS_DEG))
+def test_a_spherical_camera_is_the_upright_camera_that_looks_at_the_middle(
+    azimuth_deg: float, elevation_deg: float
+) -> None:
+    pose = require_rigid(to_pose(spherical(azimuth_deg, elevation_deg)), "pose")
+    centre_in_camera = invert_rigid(pose) @ torch.cat([CENTRE, CENTRE.new_ones(1)])
+    assert_close(pose, look_at(pose[:3, 3], CENTRE), rtol=0, atol=1e-11)
+    assert_close(centre_in_camera[:3], torch.tensor([0.0, 0.0, 12.0], dtype=torch.float64), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(("azimuth_deg", "elevation_deg"), product(AZIMUTHS_DEG, ELEVATIONS_DEG))
+def test_each_change_moves_the_camera_the_way_it_says(azimuth_deg: float, elevation_deg: float) -> None:
+    view = spherical(azimuth_deg, elevation_deg)
+
+    def step(delta: SphericalDelta) -> list[float]:
+        return relative_pose(to_pose(view), to_pose(view + delta))[:3, 3].tolist()
+
+    right, _, _ = step(change(azimuth_deg=0.5))
+    _, down, _ = step(change(elevation_deg=0.5))
+    sideways, dropped, ahead = step(change(radius_m=-2.0))
+    assert right > 0.0
+    assert down < 0.0
+    assert (sideways, dropped, ahead) == pytest.approx((0.0, 0.0, 2.0), abs=1e-11)
+
+
+@pytest.mark.parametrize("turns", [-2, -1, 1])
+def test_whole_turns_give_the_same_pose(turns: int) -> None:
+    assert_close(to_pose(SOURCE + change(azimuth_deg=360.0 * turns)), to_pose(SOURCE), rtol=0, atol=1e-12)
+
+
+def test_many_cameras_at_once_are_the_same_as_one_by_one() -> None:
+    views = torch.tensor([[10.0, 5.0, 12.0], [-70.0, 40.0, 18.0]])
+    assert_close(sphere_poses(views), torch.stack([to_pose(spherical(*view)) for view in views.tolist()]))
+
+
+@pytest.mark.parametrize("height", [7.0, -7.0])
+def test_a_camera_straight_above_or_below_takes_its_azimuth_from_its_right_axis(height: float) -> None:
+    pose = to_pose(spherical(-130.0, math.copysign(90.0, height)))
+    pose[:3, 3] = CENTRE + CENTRE.new_tensor([0.0, 0.0, height])
+    assert from_pose(pose).azimuth_deg == pytest.approx(-130.0)
+
+
+def test_a_camera_straight_above_with_an_upright_right_axis_has_azimuth_zero() -> None:
+    pose = turned((0.0, 90.0, 0.0))
+    pose[2, 3] = 9.0
+    assert from_pose(pose) == spherical(0.0, 90.0, 8.0)
+
+
+def test_behind_the_middle_azimuth_is_180_and_never_minus_180() -> None:
+    pose = to_pose(spherical(-180.0, 0.0))
+    assert from_pose(pose).azimuth_deg == 180.0
+
+
+def test_adding_a_change_and_taking_the_difference_are_inverse_and_never_wrap() -> None:
+    delta = change(azimuth_deg=-475.0, elevation_deg=20.0, radius_m=-3.0)
+    moved = SOURCE + delta
+    assert moved.azimuth_deg == -460.0
+    assert moved - SOURCE == delta
+
+
+@pytest.mark.parametrize(
+    "delta",
+    [change(*numbers) for numbers in product([-170.0, -35.0, 0.0, 90.0], [-60.0, 0.0, 45.0, 84.0], [-3.0, 2.0])],
+)
+def test_a_spherical_change_is_found_again_with_nothing_left_over(delta: SphericalDelta) -> None:
+    fit = nearest_delta(asked_change(delta), SOURCE)
+    assert fit.delta.azimuth_deg == pytest.approx(delta.azimuth_deg, abs=1e-9)
+    assert fit.delta.elevation_deg == pytest.approx(delta.elevation_deg, abs=1e-9)
+    assert fit.delta.radius_m == pytest.approx(delta.radius_m, abs=1e-9)
+    assert fit.position_error_m == pytest.approx(0.0, abs=1e-9)
+    assert fit.rotation_error_deg == pytest.approx(0.0, abs=1e-6)
+
+
+def test_any_position_is_met_whatever_the_camera_looks_at() -> None:
+    generator = torch.Generator().manual_seed(7)
+    for axis_angle_deg, shift in zip(
+        90 * torch.randn(20, 3, generator=generator), 8 * torch.randn(20, 3, generator=generator), strict=True
+    ):
+        x, y, z = axis_angle_deg.tolist()
+        asked = turned((x, y, z))
+        asked[:3, 3] = shift
+        fit = nearest_delta(asked, SOURCE)
+        modelled = relative_pose(to_pose(SOURCE), to_pose(SOURCE + fit.delta))
+        assert fit.position_error_m == pytest.approx(0.0, abs=1e-9)
+        assert_close(modelled[:3, 3], asked[:3, 3], rtol=0, atol=1e-9)
+        assert 0.0 <= fit.rotation_error_deg <= 180.0
+
+
+@pytest.mark.parametrize("axis_angle_deg", [(0.0, 30.0, 0.0), (-75.0, 0.0, 0.0), (0.0, 0.0, 180.0)])
+def test_turning_on_the_spot_is_all_rotation_error(axis_angle_deg: tuple[float, float, float]) -> None:
+    fit = nearest_delta(turned(axis_angle_deg), SOURCE)
+    assert fit.delta.azimuth_deg == pytest.approx(0.0, abs=1e-9)
+    assert fit.delta.elevation_deg == pytest.approx(0.0, abs=1e-9)
+    assert fit.delta.radius_m == pytest.approx(0.0, abs=1e-9)
+    assert fit.rotation_error_deg == pytest.approx(math.hypot(*axis_angle_deg), abs=1e-6)
+
+
+def test_an_extra_roll_at_the_goal_is_reported_in_degrees() -> None:
+    fit = nearest_delta(asked_change(change(azimuth_deg=40.0)) @ turned((0.0, 0.0, 12.5)), SOURCE)
+    assert fit.delta.azimuth_deg == pytest.approx(40.0)
+    assert fit.rotation_error_deg == pytest.approx(12.5, abs=1e-9)
+
+
+@pytest.mark.parametrize(("asked_deg", "found_deg"), [(190.0, -170.0), (-200.0, 160.0), (359.0, -1.0)])
+def test_of_equivalent_azimuths_the_one_nearest_zero_is_found(asked_deg: float, found_deg: float) -> None:
+    fit = nearest_delta(asked_change(change(azimuth_deg=asked_deg)), SOURCE)
+    assert fit.delta.azimuth_deg == pytest.approx(found_deg, abs=1e-9)
+
+
+@pytest.mark.parametrize("azimuth_deg", [-100.0, 0.0, 60.0])
+def test_a_view_from_straight_above_keeps_its_heading(azimuth_deg: float) -> None:
+    above = change(azimuth_deg=azimuth_deg, elevation_deg=85.0)
+    fit = nearest_delta(asked_change(above), SOURCE)
+    assert fit.delta.azimuth_deg == pytest.approx(azimuth_deg, abs=1e-9)
+    assert fit.delta.elevation_deg == pytest.approx(85.0, abs=1e-6)
+    assert fit.rotation_error_deg == pytest.approx(0.0, abs=1e-6)
+
+
+def test_no_change_leads_to_the_look_at_point_itself() -> None:
+    at_centre = torch.eye(4, dtype=torch.float64)
+    at_centre[2, 3] = SOURCE.radius_m
+    with pytest.raises(PoseError, match="stands at the look-at point"):
+        nearest_delta(at_centre, SOURCE)
+
+
+def test_a_fit_needs_one_rigid_pose() -> None:
+    with pytest.raises(PoseError, match="source_from_target must be rigid"):
+        nearest_delta(2 * torch.eye(4) - torch.diag(torch.tensor([0.0, 0.0, 0.0, 1.0])), SOURCE)
+    with pytest.raises(PoseError, match="one pose"):
+        nearest_delta(torch.eye(4).expand(2, 4, 4), SOURCE)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ((0.0, 90.5, 10.0), "elevation.*-90..90.*90.5"),
+        ((0.0, -91.0, 10.0), "elevation"),
+        ((0.0, 0.0, 0.0), "radius must be positive"),
+        ((0.0, 0.0, -1.0), "radius must be positive"),
+        ((math.nan, 0.0, 1.0), "finite"),
+        ((0.0, 0.0, math.inf), "finite"),
+    ],
+)
+def test_a_camera_that_cannot_stand_there_is_refused(numbers: tuple[float, float, float], message: str) -> None:
+    with pytest.raises(PoseError, match=message):
+        spherical(*numbers)
+
+
+def test_a_change_over_the_top_or_through_the_middle_is_refused() -> None:
+    with pytest.raises(PoseError, match="over the top"):
+        _ = SOURCE + change(elevation_deg=86.0)
+    with pytest.raises(PoseError, match="pass the look-at point"):
+        _ = SOURCE + change(radius_m=-15.0)
+    with pytest.raises(PoseError, match="finite"):
+        change(azimuth_deg=math.inf)
+
+
+def test_the_recorded_pose_of_kubric_view_4() -> None:
+    """Position and axes of the camera at (15 deg, 5 deg, 15 m), as the released data have it."""
+    right, down, ahead, position = to_pose(SOURCE)[:3].unbind(-1)
+    assert position.tolist() == pytest.approx([14.433753, 3.867512, 2.307336], abs=1e-6)
+    assert right.tolist() == pytest.approx([-0.258819, 0.965926, 0.0], abs=1e-6)
+    assert down.tolist() == pytest.approx([0.084186, 0.022558, -0.996195], abs=1e-6)
+    assert ahead.tolist() == pytest.approx([-0.96225, -0.257834, -0.087156], abs=1e-6)

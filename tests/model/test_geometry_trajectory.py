@@ -1,0 +1,335 @@
+import math
+from typing import get_args
+
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from gcd_model.errors import OptionError, PoseError, ShapeError
+from gcd_model.geometry import (
+    DRIVING_GOAL_POSITION,
+    DRIVING_GOAL_TARGET,
+    DRIVING_SOURCE_POSITION,
+    DRIVING_SOURCE_TARGET,
+    Interpolation,
+    Spherical,
+    SphericalDelta,
+    Trajectory,
+    driving_trajectory,
+    fitted_trajectory,
+    invert_rigid,
+    look_at,
+    motion_bucket,
+    path_progress,
+    pose_trajectory,
+    relative_pose,
+    spherical_trajectory,
+    to_pose,
+)
+
+SOURCE = Spherical(azimuth_deg=15.0, elevation_deg=5.0, radius_m=15.0)
+DELTA = SphericalDelta(azimuth_deg=-70.3, elevation_deg=25.1, radius_m=-2.2)
+IDENTITY = torch.eye(4, dtype=torch.float64)
+PACES: tuple[Interpolation, ...] = get_args(Interpolation)
+SINE_14 = [0, 0.014529, 0.057272, 0.125745, 0.215968, 0.322698, 0.439732]
+"""First half of the sine pace over 14 frames, as released."""
+
+
+def point(xyz: tuple[float, float, float]) -> Tensor:
+    return torch.tensor(xyz, dtype=torch.float64)
+
+
+def gradual(delta: SphericalDelta = DELTA, interpolation: Interpolation = "linear") -> Trajectory:
+    return spherical_trajectory(SOURCE, delta, frames=14, move_time=13, interpolation=interpolation)
+
+
+def deltas_of(trajectory: Trajectory) -> list[SphericalDelta]:
+    assert trajectory.delta is not None
+    return [
+        SphericalDelta(azimuth_deg=azimuth, elevation_deg=elevation, radius_m=radius)
+        for azimuth, elevation, radius in trajectory.delta.tolist()
+    ]
+
+
+# The pace
+
+
+@pytest.mark.parametrize("interpolation", PACES)
+@pytest.mark.parametrize(("frames", "move_time"), [(14, 13), (14, 5), (14, 1), (2, 1), (7, 6)])
+def test_progress_rises_from_0_and_is_exactly_1_from_move_time_on(
+    frames: int, move_time: int, interpolation: Interpolation
+) -> None:
+    done = path_progress(frames, move_time, interpolation)
+    assert done.shape == (frames,)
+    assert done.dtype == torch.float64
+    assert done[0].item() == 0.0
+    assert bool((done[move_time:] == 1.0).all())
+    assert bool((done[: move_time + 1].diff() > 0.0).all())
+
+
+@pytest.mark.parametrize("interpolation", PACES)
+def test_both_paces_are_symmetric_in_time(interpolation: Interpolation) -> None:
+    done = path_progress(14, 13, interpolation)
+    assert_close(done + done.flip(0), torch.ones(14, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("interpolation", PACES)
+@pytest.mark.parametrize("frames", [1, 14])
+def test_a_direct_path_is_at_the_goal_from_frame_0(frames: int, interpolation: Interpolation) -> None:
+    assert path_progress(frames, 0, interpolation).tolist() == [1.0] * frames
+
+
+def test_the_linear_pace_is_t_over_13() -> None:
+    assert path_progress(14, 13).tolist() == pytest.approx([t / 13 for t in range(14)], abs=1e-15)
+
+
+def test_the_recorded_sine_pace() -> None:
+    mirrored = [1 - done for done in reversed(SINE_14)]
+    assert path_progress(14, 13, "sine").tolist() == pytest.approx(SINE_14 + mirrored, abs=1e-6)
+
+
+@pytest.mark.parametrize(("frames", "move_time"), [(0, 0), (14, 14), (14, -1), (1, 1)])
+def test_a_path_must_reach_its_goal_within_the_clip(frames: int, move_time: int) -> None:
+    with pytest.raises(OptionError, match=f"move_time must lie within 0 .* got {move_time}"):
+        path_progress(frames, move_time)
+
+
+def test_an_unknown_pace_is_refused() -> None:
+    with pytest.raises(OptionError, match="'linear' or 'sine', got 'cubic'"):
+        path_progress(14, 13, "cubic")  # pyright: ignore[reportArgumentType]
+
+
+# Paths over the sphere
+
+
+@pytest.mark.parametrize("interpolation", PACES)
+def test_poses_and_deltas_of_a_spherical_path_say_the_same(interpolation: Interpolation) -> None:
+    trajectory = gradual(interpolation=interpolation)
+    for pose, delta in zip(trajectory.source_from_target, deltas_of(trajectory), strict=True):
+        assert_close(pose, relative_pose(to_pose(SOURCE), to_pose(SOURCE + delta)), rtol=0, atol=1e-12)
+
+
+def test_a_gradual_path_starts_at_the_source_and_only_its_last_frame_is_at_the_goal() -> None:
+    trajectory = gradual()
+    assert trajectory.frames == 14
+    assert trajectory.source == SOURCE
+    assert trajectory.at_goal == (False,) * 13 + (True,)
+    assert_close(trajectory.source_from_target[0], IDENTITY, rtol=0, atol=1e-12)
+    assert deltas_of(trajectory)[0] == SphericalDelta()
+
+
+def test_a_gradual_path_moves_by_a_thirteenth_each_frame() -> None:
+    for t, delta in enumerate(deltas_of(gradual())):
+        assert delta.azimuth_deg == pytest.approx(DELTA.azimuth_deg * t / 13)
+        assert delta.elevation_deg == pytest.approx(DELTA.elevation_deg * t / 13)
+        assert delta.radius_m == pytest.approx(DELTA.radius_m * t / 13)
+
+
+def test_a_direct_path_is_all_goal() -> None:
+    trajectory = spherical_trajectory(SOURCE, DELTA, frames=14, move_time=0)
+    goal = relative_pose(to_pose(SOURCE), to_pose(SOURCE + DELTA))
+    assert trajectory.at_goal == (True,) * 14
+    assert deltas_of(trajectory) == [DELTA] * 14
+    assert_close(trajectory.source_from_target, goal.expand(14, 4, 4), rtol=0, atol=1e-12)
+
+
+def test_from_move_time_on_the_camera_stands_at_the_goal() -> None:
+    trajectory = spherical_trajectory(SOURCE, DELTA, frames=14, move_time=5)
+    assert trajectory.at_goal == (False,) * 5 + (True,) * 9
+    assert deltas_of(trajectory)[5:] == [DELTA] * 9
+
+
+@pytest.mark.parametrize("move_time", [0, 5, 13])
+def test_the_goal_is_exactly_the_asked_change(move_time: int) -> None:
+    assert spherical_trajectory(SOURCE, DELTA, frames=14, move_time=move_time).goal_delta == DELTA
+
+
+def test_a_camera_asked_to_stay_is_at_its_goal_all_the_time() -> None:
+    trajectory = gradual(SphericalDelta())
+    assert trajectory.at_goal == (True,) * 14
+    assert_close(trajectory.source_from_target, IDENTITY.expand(14, 4, 4), rtol=0, atol=1e-12)
+
+
+def test_a_full_turn_is_a_path_and_not_a_standstill() -> None:
+    trajectory = gradual(SphericalDelta(azimuth_deg=360.0))
+    assert deltas_of(trajectory)[-1].azimuth_deg == 360.0
+    assert not any(trajectory.at_goal[1:13])
+    assert_close(trajectory.source_from_target[-1], IDENTITY, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("delta", "message"),
+    [(SphericalDelta(elevation_deg=86.0), "over the top"), (SphericalDelta(radius_m=-15.0), "radius must be positive")],
+)
+def test_a_goal_where_no_camera_can_stand_is_refused(delta: SphericalDelta, message: str) -> None:
+    with pytest.raises(PoseError, match=message):
+        gradual(delta)
+
+
+# The driving path
+
+
+def test_the_driving_path_leads_from_the_forward_camera_to_above_and_behind() -> None:
+    trajectory = driving_trajectory(frames=14, move_time=13)
+    vehicle_from_source = look_at(point((1.6, 0.0, 1.55)), point((6.6, 0.0, 1.55)))
+    vehicle_from_goal = vehicle_from_source @ trajectory.source_from_target[-1]
+    target_in_goal = invert_rigid(vehicle_from_goal) @ point((5.6, 0.0, 1.55)).new_tensor([5.6, 0.0, 1.55, 1.0])
+
+    assert_close(trajectory.source_from_target[0], IDENTITY, rtol=0, atol=1e-12)
+    assert_close(vehicle_from_goal[:3, 3], point((-8.0, 0.0, 8.0)), rtol=0, atol=1e-12)
+    assert_close(target_in_goal[:3], point((0.0, 0.0, math.hypot(13.6, 6.45))), rtol=0, atol=1e-12)
+    assert_close(vehicle_from_goal[:3, 0], point((0.0, -1.0, 0.0)), rtol=0, atol=1e-12)
+
+
+def test_on_the_driving_path_position_and_target_move_separately_at_a_sine_pace() -> None:
+    trajectory = driving_trajectory(frames=14, move_time=13)
+    vehicle_from_source = look_at(point(DRIVING_SOURCE_POSITION), point(DRIVING_SOURCE_TARGET))
+    for t, done in enumerate(SINE_14):
+        vehicle_from_camera = vehicle_from_source @ trajectory.source_from_target[t]
+        position = (1 - done) * point(DRIVING_SOURCE_POSITION) + done * point(DRIVING_GOAL_POSITION)
+        target = (1 - done) * point(DRIVING_SOURCE_TARGET) + done * point(DRIVING_GOAL_TARGET)
+        assert_close(vehicle_from_camera, look_at(position, target), rtol=0, atol=1e-4)
+
+
+def test_a_direct_driving_path_is_the_gradual_ones_goal_throughout() -> None:
+    goal = driving_trajectory(frames=14, move_time=13).source_from_target[-1]
+    direct = driving_trajectory(frames=14, move_time=0)
+    assert direct.at_goal == (True,) * 14
+    assert_close(direct.source_from_target, goal.expand(14, 4, 4), rtol=0, atol=1e-12)
+
+
+def test_the_driving_path_is_not_on_the_sphere() -> None:
+    trajectory = driving_trajectory(frames=14, move_time=13)
+    assert trajectory.delta is None
+    assert trajectory.goal_delta is None
+    assert trajectory.source is None
+    assert trajectory.at_goal == (False,) * 13 + (True,)
+
+
+# Free paths
+
+
+def test_a_free_path_is_at_its_goal_where_its_pose_is_the_last_one() -> None:
+    asked = gradual().source_from_target[[0, 13, 7, 13, 13]]
+    trajectory = pose_trajectory(asked)
+    assert trajectory.at_goal == (False, True, False, True, True)
+    assert trajectory.delta is None
+    assert_close(trajectory.source_from_target, asked, rtol=0, atol=0)
+
+
+def test_a_free_path_may_come_in_single_precision() -> None:
+    assert pose_trajectory(gradual().source_from_target.float()).source_from_target.dtype == torch.float64
+
+
+@pytest.mark.parametrize("delta", [DELTA, SphericalDelta(azimuth_deg=-300.0), SphericalDelta(azimuth_deg=725.0)])
+def test_a_spherical_path_is_found_again_without_jumps(delta: SphericalDelta) -> None:
+    asked = gradual(delta)
+    fitted, fits = fitted_trajectory(asked.source_from_target, SOURCE)
+    assert asked.delta is not None
+    assert fitted.delta is not None
+    assert_close(fitted.delta, asked.delta, rtol=0, atol=1e-9)
+    assert_close(fitted.source_from_target, asked.source_from_target, rtol=0, atol=1e-9)
+    assert fitted.source == SOURCE
+    assert fitted.at_goal[-1]
+    assert [fit.delta for fit in fits] == deltas_of(fitted)
+    assert max(fit.rotation_error_deg for fit in fits) < 1e-6
+    assert max(fit.position_error_m for fit in fits) < 1e-9
+
+
+def test_a_fitted_path_holds_the_fitted_poses_and_reports_the_rest() -> None:
+    asked = gradual().source_from_target.clone()
+    asked[5] = asked[5] @ torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))  # upside down
+    fitted, fits = fitted_trajectory(asked, SOURCE)
+    assert_close(fitted.source_from_target, gradual().source_from_target, rtol=0, atol=1e-9)
+    assert [round(fit.rotation_error_deg, 3) for fit in fits] == [0.0] * 5 + [180.0] + [0.0] * 8
+
+
+def test_a_fitted_path_marks_repeated_goal_frames() -> None:
+    asked = spherical_trajectory(SOURCE, DELTA, frames=6, move_time=3).source_from_target
+    assert fitted_trajectory(asked, SOURCE)[0].at_goal == (False, False, False, True, True, True)
+
+
+@pytest.mark.parametrize("poses", [IDENTITY, torch.zeros(0, 4, 4), torch.zeros(2, 3, 4, 4)])
+def test_a_free_path_must_be_a_list_of_poses(poses: Tensor) -> None:
+    for make in (pose_trajectory, lambda asked: fitted_trajectory(asked, SOURCE)):
+        with pytest.raises(ShapeError, match=r"must be \[T, 4, 4\]"):
+            make(poses)
+
+
+def test_a_free_path_must_be_rigid() -> None:
+    with pytest.raises(PoseError, match="source_from_target must be rigid"):
+        pose_trajectory(torch.diag(torch.tensor([2.0, 1.0, 1.0, 1.0])).expand(14, 4, 4))
+
+
+# The type itself
+
+
+def test_trajectories_are_compared_by_identity() -> None:
+    one = gradual()
+    assert one == one
+    assert one != gradual()
+
+
+@pytest.mark.parametrize(
+    ("poses", "delta", "flags", "error", "message"),
+    [
+        (IDENTITY.expand(2, 4, 4), None, 3, ShapeError, "one flag for each of 2 poses, got 3"),
+        (IDENTITY.expand(2, 4, 4), torch.zeros(3, 3).double(), 2, ShapeError, r"\[2, 3\]"),
+        (IDENTITY.expand(2, 4, 4), torch.zeros(2, 3), 2, ShapeError, "float64"),
+        (IDENTITY.expand(2, 4, 4), torch.full((2, 3), math.nan).double(), 2, ShapeError, "finite"),
+        (IDENTITY.expand(2, 4, 4).float(), None, 2, ShapeError, "float64"),
+        (IDENTITY, None, 4, ShapeError, r"\[T, 4, 4\]"),
+        (torch.zeros(2, 4, 4).double(), None, 2, PoseError, "last row"),
+    ],
+)
+def test_a_trajectory_checks_itself(
+    poses: Tensor, delta: Tensor | None, flags: int, error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        Trajectory(source_from_target=poses, delta=delta, at_goal=(True,) * flags, source=None)
+
+
+# The motion number
+
+
+def max90(azimuth_deg: float, elevation_deg: float, high: float = 255.0) -> int:
+    delta = SphericalDelta(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, radius_m=2.0)
+    return motion_bucket(delta, max_azimuth_deg=90.0, max_elevation_deg=30.0, high=high)
+
+
+def max180(azimuth_deg: float, elevation_deg: float, high: float = 255.0) -> int:
+    delta = SphericalDelta(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg)
+    return motion_bucket(delta, max_azimuth_deg=180.0, max_elevation_deg=60.0, high=high)
+
+
+def test_the_motion_number_does_not_care_for_direction() -> None:
+    assert {max90(a, e) for a in (-40.0, 40.0) for e in (-20.0, 20.0)} == {max90(40.0, 20.0)}
+
+
+def test_the_motion_number_is_255_only_with_both_angles_at_their_largest() -> None:
+    assert max90(90.0, 30.0) == max180(180.0, 60.0) == 255
+    assert max90(90.0, 0.0) == max180(180.0, 0.0) == 242
+    assert max90(0.0, 30.0) == max180(0.0, 60.0) == 81
+    assert max90(0.0, 0.0) == 0
+
+
+def test_the_motion_number_is_not_clamped() -> None:
+    assert max90(180.0, 60.0) == 510
+    assert max180(180.0, 61.0) > 255
+
+
+def test_the_recorded_denominators_of_the_motion_number() -> None:
+    assert max90(1.0, 0.0, high=94.868e6) == pytest.approx(1e6, rel=1e-5)
+    assert max180(1.0, 0.0, high=189.737e6) == pytest.approx(1e6, rel=1e-5)
+    assert max90(30.0, 15.0) == 90
+
+
+def test_the_motion_number_starts_at_its_low_end() -> None:
+    still = SphericalDelta(radius_m=-1.0)
+    assert motion_bucket(still, max_azimuth_deg=90.0, max_elevation_deg=30.0, low=100.0, high=200.0) == 100
+
+
+def test_the_motion_number_needs_a_largest_angle() -> None:
+    with pytest.raises(OptionError, match="largest angle above 0"):
+        motion_bucket(DELTA, max_azimuth_deg=0.0, max_elevation_deg=0.0)

@@ -1,0 +1,145 @@
+"""The tree's rules: who may import whom, how large things may grow. Plain `ast`, no import of the packages."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+from statistics import median
+
+ROOT = Path(__file__).parent.parent
+PACKAGES = {
+    "gcd_model": ROOT / "model" / "gcd_model",
+    "gcd_node": ROOT / "gcd_node",
+    "gcd_train": ROOT / "train" / "gcd_train",
+}
+SOCKET_FILES = {"publisher.py", "subscriber.py", "control.py", "security.py"}
+OPENING_CALLS = {
+    *("open", "safe_open", "load", "save", "save_file"),
+    *("read_text", "read_bytes", "write_text", "write_bytes"),
+}
+    "open",
+    "safe_open",
+    "load",
+    "save",
+    "save_file",
+    "read_text",
+    "read_bytes",
+    "write_text",
+    "write_bytes",
+}
+MAY_OPEN_FILES = {"checkpoints.py", "onnx_export.py"}
+
+
+def files(package: str) -> list[Path]:
+    found = sorted(PACKAGES[package].rglob("*.py"))
+    assert found, f"{package} has no files: the test looks in the wrong place"
+    return found
+
+
+def imports(path: Path, *, top_level_only: bool = False) -> Iterator[str]:
+    """Dotted names a file imports; `from a import b` gives `a` and `a.b`."""
+    tree = ast.parse(path.read_text())
+    for node in tree.body if top_level_only else ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: imports are absolute here"
+            yield node.module or ""
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def offenders(paths: list[Path], *roots: str, top_level_only: bool = False) -> list[str]:
+    return [
+        f"{path.relative_to(ROOT)}: {name}"
+        for path in paths
+        for name in imports(path, top_level_only=top_level_only)
+        if any(name == root or name.startswith(root + ".") for root in roots)
+    ]
+
+
+def functions(path: Path) -> Iterator[tuple[str, int]]:
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            yield node.name, (node.end_lineno or node.lineno) - node.lineno + 1
+
+
+def test_the_model_knows_neither_node_nor_training() -> None:
+    assert offenders(files("gcd_model"), "gcd_node", "gcd_train") == []
+
+
+def test_the_model_imports_without_cameras_sockets_and_onnx() -> None:
+    assert offenders(files("gcd_model"), "zmq", "depthai", "cv2", "onnxruntime", top_level_only=True) == []
+
+
+def test_only_checkpoints_and_exporters_open_files_in_the_model() -> None:
+    found = [
+        f"{path.name}:{node.lineno}"
+        for path in files("gcd_model")
+        if path.name not in MAY_OPEN_FILES
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call) and _called_name(node.func) in OPENING_CALLS
+    ]
+    assert found == []
+
+
+def _called_name(function: ast.expr) -> str:
+    if isinstance(function, ast.Attribute):
+        return function.attr
+    return function.id if isinstance(function, ast.Name) else ""
+
+
+def test_geometry_stands_on_errors_alone() -> None:
+    paths = sorted((PACKAGES["gcd_model"] / "geometry").glob("*.py"))
+    assert paths
+    names = [name for path in paths for name in imports(path) if name.startswith("gcd_model")]
+    assert [name for name in names if not name.startswith(("gcd_model.errors", "gcd_model.geometry"))] == []
+
+
+def test_the_node_enters_the_model_by_its_door() -> None:
+    inside = {path.stem for path in files("gcd_model")} | {"geometry"}
+    reached = [name for path in files("gcd_node") for name in imports(path) if name.startswith("gcd_model.")]
+    assert [name for name in reached if name.count(".") > 1 or name.split(".")[1] in inside - {"__init__"}] == []
+
+
+def test_node_and_training_never_meet() -> None:
+    assert offenders(files("gcd_node"), "gcd_train") == []
+    assert offenders(files("gcd_train"), "gcd_node") == []
+
+
+def test_only_the_socket_files_know_zeromq() -> None:
+    outside = [path for path in files("gcd_node") if path.name not in SOCKET_FILES]
+    assert offenders(outside, "zmq") == []
+
+
+def test_only_the_oak_source_knows_depthai_and_only_lazily() -> None:
+    assert offenders([path for path in files("gcd_node") if path.name != "oak_camera.py"], "depthai") == []
+    assert offenders(files("gcd_node"), "depthai", top_level_only=True) == []
+
+
+def test_what_a_planner_imports_is_light() -> None:
+    paths = [PACKAGES["gcd_node"] / name for name in ("subscriber.py", "envelope.py")]
+    assert offenders(paths, "torch", "gcd_model", "kornia", "msgspec", "rich", "typer") == []
+    assert offenders(paths, "cv2", top_level_only=True) == []
+
+
+def test_nothing_imports_launch_or_tests() -> None:
+    everything = [path for package in PACKAGES for path in files(package)]
+    assert offenders(everything, "launch", "tests", "model", "train") == []
+
+
+def test_functions_fit_a_screen() -> None:
+    for package in PACKAGES:
+        sizes = [size for path in files(package) for _, size in functions(path)]
+        assert median(sizes) <= 12, package
+        assert sorted(sizes)[int(0.9 * len(sizes))] <= 35, package
+    longest = [(path.name, name, size) for p in PACKAGES for path in files(p) for name, size in functions(path)]
+    assert [row for row in longest if row[2] > 60] == []
+
+
+def test_files_stay_readable() -> None:
+    long = [(path.name, len(path.read_text().splitlines())) for p in PACKAGES for path in files(p)]
+    assert [row for row in long if row[1] > 400] == []
+
+
+def test_packages_are_at_most_two_deep() -> None:
+    depths = [len(path.relative_to(root).parts) for root in PACKAGES.values() for path in root.rglob("*.py")]
+    assert max(depths) <= 3  # package / subpackage / file

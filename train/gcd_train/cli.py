@@ -1,0 +1,75 @@
+"""`gcd-train`: data, training and evaluation from the command line."""
+
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from gcd_model import FAMILIES, SMALL, SVD_14, Family, ModelConfig
+
+app = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    help="Data, training and evaluation for virtual camera views.\n\n"
+    "What is here so far describes what can be trained; generators and the trainer come with the next releases.",
+)
+
+
+@app.callback()
+def about() -> None:
+    """Keep `gcd-train` a command with sub-commands, however many there are."""
+
+
+@app.command()
+def families(
+    name: Annotated[str | None, typer.Argument(help="Show one family only.", metavar="FAMILY")] = None,
+) -> None:
+    """List the model families: how each was trained, and what a finetuned checkpoint will accept."""
+    if name is not None and name not in FAMILIES:
+        raise typer.BadParameter(f"no family is called {name!r}; there are {', '.join(FAMILIES)}")
+    table = Table(title="Model families")
+    for column in ("family", "camera", "azimuth", "elevation", "radius", "rates", "hfov", "size", "output"):
+        table.add_column(column)
+    for family in FAMILIES.values():
+        if name in (None, family.name):
+            table.add_row(*_family_row(family))
+    Console().print(table)
+
+
+@app.command()
+def architectures() -> None:
+    """List the network set-ups with their sizes."""
+    table = Table(title="Network set-ups")
+    for column in ("set-up", "size", "frames", "U-Net widths", "VAE widths", "image tower", "steps"):
+        table.add_column(column)
+    for name, config in (("SVD_14", SVD_14), ("SMALL", SMALL)):
+        table.add_row(name, *_config_row(config))
+    Console().print(table)
+
+
+def _family_row(family: Family) -> tuple[str, ...]:
+    limits = family.limits
+    span = ("fixed", "fixed", "fixed")
+    if limits is not None:
+        span = (f"±{limits.azimuth_deg:g}°", f"±{limits.elevation_deg:g}°", f"±{limits.radius_m:g}")
+    rates = ", ".join(f"{rate:g}" for rate in family.rates) or "any"
+    hfov = "any" if family.hfov_deg is None else f"{family.hfov_deg:g}°"
+    return family.name, family.camera, *span, rates, hfov, f"{family.width}x{family.height}", family.output
+
+
+def _config_row(config: ModelConfig) -> tuple[str, ...]:
+    tower = config.image_encoder
+    return (
+        f"{config.width}x{config.height}",
+        str(config.frames),
+        ", ".join(map(str, config.unet.widths)),
+        ", ".join(map(str, config.vae.widths)),
+        "none" if tower is None else f"{tower.layers} x {tower.width}",
+        str(config.sampling.steps),
+    )
+
+
+def main() -> None:
+    """Entry point."""
+    app()
