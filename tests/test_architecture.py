@@ -16,16 +16,6 @@ OPENING_CALLS = {
     *("open", "safe_open", "load", "save", "save_file"),
     *("read_text", "read_bytes", "write_text", "write_bytes"),
 }
-    "open",
-    "safe_open",
-    "load",
-    "save",
-    "save_file",
-    "read_text",
-    "read_bytes",
-    "write_text",
-    "write_bytes",
-}
 MAY_OPEN_FILES = {"checkpoints.py", "onnx_export.py"}
 
 

@@ -47,7 +47,7 @@ def turned(axis_angle_deg: tuple[float, float, float]) -> Tensor:
     return pose
 
 
-@pytest.mark.parametrize(("azimuth_deg", "elevation_deg"), product(AZIMUTHS_DEG, [-90.0, *ELEVATIONS_DEG, 90.0]))
+@pytest.mark.parametrize(("azimuth_deg", "elevation_deg"), list(product(AZIMUTHS_DEG, [-90.0, *ELEVATIONS_DEG, 90.0])))
 def test_spherical_survives_the_round_trip(azimuth_deg: float, elevation_deg: float) -> None:
     back = from_pose(to_pose(spherical(azimuth_deg, elevation_deg)))
     assert back.azimuth_deg == pytest.approx(azimuth_deg, abs=1e-9)
@@ -55,7 +55,7 @@ def test_spherical_survives_the_round_trip(azimuth_deg: float, elevation_deg: fl
     assert back.radius_m == pytest.approx(12.0, abs=1e-9)
 
 
-@pytest.mark.parametrize(("azimuth_deg", "elevation_deg"), product(AZIMUTHS_DEG, ELEVATIONS_DEG))
+@pytest.mark.parametrize(("azimuth_deg", "elevation_deg"), list(product(AZIMUTHS_DEG, ELEVATIONS_DEG)))
 def test_a_spherical_camera_is_the_upright_camera_that_looks_at_the_middle(
     azimuth_deg: float, elevation_deg: float
 ) -> None:
@@ -65,7 +65,7 @@ def test_a_spherical_camera_is_the_upright_camera_that_looks_at_the_middle(
     assert_close(centre_in_camera[:3], torch.tensor([0.0, 0.0, 12.0], dtype=torch.float64), rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize(("azimuth_deg", "elevation_deg"), product(AZIMUTHS_DEG, ELEVATIONS_DEG))
+@pytest.mark.parametrize(("azimuth_deg", "elevation_deg"), list(product(AZIMUTHS_DEG, ELEVATIONS_DEG)))
 def test_each_change_moves_the_camera_the_way_it_says(azimuth_deg: float, elevation_deg: float) -> None:
     view = spherical(azimuth_deg, elevation_deg)
 
@@ -158,7 +158,7 @@ def test_an_extra_roll_at_the_goal_is_reported_in_degrees() -> None:
     assert fit.rotation_error_deg == pytest.approx(12.5, abs=1e-9)
 
 
-@pytest.mark.parametrize(("asked_deg", "found_deg"), [(190.0, -170.0), (-200.0, 160.0), (359.0, -1.0)])
+@pytest.mark.parametrize(("asked_deg", "found_deg"), [(170.0, 170.0), (190.0, -170.0), (-200.0, 160.0), (359.0, -1.0)])
 def test_of_equivalent_azimuths_the_one_nearest_zero_is_found(asked_deg: float, found_deg: float) -> None:
     fit = nearest_delta(asked_change(change(azimuth_deg=asked_deg)), SOURCE)
     assert fit.delta.azimuth_deg == pytest.approx(found_deg, abs=1e-9)

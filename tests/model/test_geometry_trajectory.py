@@ -20,7 +20,6 @@ from gcd_model.geometry import (
     fitted_trajectory,
     invert_rigid,
     look_at,
-    motion_bucket,
     path_progress,
     pose_trajectory,
     relative_pose,
@@ -91,12 +90,12 @@ def test_the_recorded_sine_pace() -> None:
 
 @pytest.mark.parametrize(("frames", "move_time"), [(0, 0), (14, 14), (14, -1), (1, 1)])
 def test_a_path_must_reach_its_goal_within_the_clip(frames: int, move_time: int) -> None:
-    with pytest.raises(OptionError, match=f"move_time must lie within 0 .* got {move_time}"):
+    with pytest.raises(OptionError, match=f"move_time must lie between 0 .* got {move_time}"):
         path_progress(frames, move_time)
 
 
 def test_an_unknown_pace_is_refused() -> None:
-    with pytest.raises(OptionError, match="'linear' or 'sine', got 'cubic'"):
+    with pytest.raises(OptionError, match="'linear', 'sine'.*got 'cubic'"):
         path_progress(14, 13, "cubic")  # pyright: ignore[reportArgumentType]
 
 
@@ -252,9 +251,10 @@ def test_a_fitted_path_marks_repeated_goal_frames() -> None:
 
 @pytest.mark.parametrize("poses", [IDENTITY, torch.zeros(0, 4, 4), torch.zeros(2, 3, 4, 4)])
 def test_a_free_path_must_be_a_list_of_poses(poses: Tensor) -> None:
-    for make in (pose_trajectory, lambda asked: fitted_trajectory(asked, SOURCE)):
-        with pytest.raises(ShapeError, match=r"must be \[T, 4, 4\]"):
-            make(poses)
+    with pytest.raises(ShapeError, match=r"must be \[T, 4, 4\]"):
+        pose_trajectory(poses)
+    with pytest.raises(ShapeError, match=r"must be \[T, 4, 4\]"):
+        fitted_trajectory(poses, SOURCE)
 
 
 def test_a_free_path_must_be_rigid() -> None:
@@ -288,48 +288,3 @@ def test_a_trajectory_checks_itself(
 ) -> None:
     with pytest.raises(error, match=message):
         Trajectory(source_from_target=poses, delta=delta, at_goal=(True,) * flags, source=None)
-
-
-# The motion number
-
-
-def max90(azimuth_deg: float, elevation_deg: float, high: float = 255.0) -> int:
-    delta = SphericalDelta(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, radius_m=2.0)
-    return motion_bucket(delta, max_azimuth_deg=90.0, max_elevation_deg=30.0, high=high)
-
-
-def max180(azimuth_deg: float, elevation_deg: float, high: float = 255.0) -> int:
-    delta = SphericalDelta(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg)
-    return motion_bucket(delta, max_azimuth_deg=180.0, max_elevation_deg=60.0, high=high)
-
-
-def test_the_motion_number_does_not_care_for_direction() -> None:
-    assert {max90(a, e) for a in (-40.0, 40.0) for e in (-20.0, 20.0)} == {max90(40.0, 20.0)}
-
-
-def test_the_motion_number_is_255_only_with_both_angles_at_their_largest() -> None:
-    assert max90(90.0, 30.0) == max180(180.0, 60.0) == 255
-    assert max90(90.0, 0.0) == max180(180.0, 0.0) == 242
-    assert max90(0.0, 30.0) == max180(0.0, 60.0) == 81
-    assert max90(0.0, 0.0) == 0
-
-
-def test_the_motion_number_is_not_clamped() -> None:
-    assert max90(180.0, 60.0) == 510
-    assert max180(180.0, 61.0) > 255
-
-
-def test_the_recorded_denominators_of_the_motion_number() -> None:
-    assert max90(1.0, 0.0, high=94.868e6) == pytest.approx(1e6, rel=1e-5)
-    assert max180(1.0, 0.0, high=189.737e6) == pytest.approx(1e6, rel=1e-5)
-    assert max90(30.0, 15.0) == 90
-
-
-def test_the_motion_number_starts_at_its_low_end() -> None:
-    still = SphericalDelta(radius_m=-1.0)
-    assert motion_bucket(still, max_azimuth_deg=90.0, max_elevation_deg=30.0, low=100.0, high=200.0) == 100
-
-
-def test_the_motion_number_needs_a_largest_angle() -> None:
-    with pytest.raises(OptionError, match="largest angle above 0"):
-        motion_bucket(DELTA, max_azimuth_deg=0.0, max_elevation_deg=0.0)

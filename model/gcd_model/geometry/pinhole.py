@@ -101,30 +101,29 @@ class Intrinsics:
 
 
 def center_crop_box(width: int, height: int, aspect: float, tolerance: float = 2e-3) -> tuple[int, int, int, int]:
-    """The largest centred part of a picture with another shape.
+    """The largest centred part of a picture that has a given shape.
 
     Args:
         width, height: of the picture, pixels.
         aspect: wanted width / height.
-        tolerance: a picture whose aspect differs by no more is left whole.
+        tolerance: a picture whose own width / height is this near is taken whole.
     Returns:
-        left, top, width, height in pixels; sizes and offsets are cut to whole numbers, not rounded.
+        left, top, width, height of the part, whole pixels, rounded down.
     Raises:
-        OptionError: the aspect is not positive. ShapeError: the picture is empty, or nothing of it would be left.
-    Source: Generative Camera Dolly, loading of custom videos, as released.
+        ShapeError: an empty picture, or a shape that leaves no pixel. OptionError: an aspect that is not positive.
+    Source: the preparation of custom videos for Generative Camera Dolly.
     """
-    if not 0.0 < aspect < math.inf:
-        raise OptionError(f"an aspect must be a positive number (width / height), got {aspect:g}")
     if width < 1 or height < 1:
         raise ShapeError(f"a picture must be at least 1 x 1, got {width} x {height}")
-    crop_width, crop_height = width, height
-    if width / height > aspect + tolerance:
-        crop_width = int(height * aspect)
-    elif width / height < aspect - tolerance:
-        crop_height = int(width / aspect)
-    if crop_width < 1 or crop_height < 1:
-        raise ShapeError(f"nothing is left of a {width} x {height} picture at aspect {aspect:g}: give a larger one")
-    return (width - crop_width) // 2, (height - crop_height) // 2, crop_width, crop_height
+    if not (math.isfinite(aspect) and aspect > 0.0):
+        raise OptionError(f"an aspect must be a positive number, width / height, got {aspect}")
+    surplus = width / height - aspect
+    if abs(surplus) <= tolerance:
+        return 0, 0, width, height
+    kept_width, kept_height = (int(height * aspect), height) if surplus > 0 else (width, int(width / aspect))
+    if kept_width < 1 or kept_height < 1:
+        raise ShapeError(f"a picture of {width} x {height} has no part of aspect {aspect:g}; give a larger one")
+    return (width - kept_width) // 2, (height - kept_height) // 2, kept_width, kept_height
 
 
 def _angle_deg(focal: float, centre: float, size: int) -> float:

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -66,32 +66,29 @@ class Trajectory:
 
 
 def path_progress(frames: int, move_time: int, interpolation: Interpolation = "linear") -> Tensor:
-    """How much of the way from source to goal is done in each frame.
+    """The share `a` of the way from source to goal that is done in frame t.
 
-        linear: a = t / move_time        sine: a = (1 - cos(pi t / move_time)) / 2
+        linear: a = t / move_time        sine: a = (1 - cos(pi t / move_time)) / 2        t >= move_time: a = 1
 
     Args:
         frames: T.
-        move_time: the first frame that is at the goal: T - 1 is gradual, 0 is direct.
-        interpolation: the pace between.
+        move_time: the frame in which the goal is reached; T - 1 is gradual, 0 is direct.
     Returns:
-        float64 [T] in [0, 1], exactly 1 from move_time on.
+        float64 [T] in [0, 1].
     Raises:
-        OptionError: no frames, an unknown pace, or a path that would not reach its goal within T frames.
-    Source: Generative Camera Dolly, section 3; the sine as released (as printed, it would hardly leave the source).
+        OptionError: no frames, an unknown interpolation, or a goal that T frames cannot reach.
+    Source: Van Hoorick et al. 2024 (GCD), section 3; in the sine as printed pi stands in the wrong place.
     """
-    if frames < 1 or not 0 <= move_time < frames:
+    if interpolation not in get_args(Interpolation):
+        raise OptionError(f"interpolation must be one of {get_args(Interpolation)}, got {interpolation!r}")
+    if not 0 <= move_time < frames:
         raise OptionError(
-            f"move_time must lie within 0 (direct) .. {max(frames - 1, 0)} (gradual) "
-            f"for {frames} frames, got {move_time}"
+            f"move_time must lie between 0 (direct) and {max(frames - 1, 0)} (gradual) for {frames} frames, "
+            f"got {move_time}"
         )
-    t = torch.arange(frames, dtype=torch.float64)
-    done = (t / max(move_time, 1)).clamp(max=1.0)
-    if interpolation == "sine":
-        done = (1.0 - torch.cos(math.pi * done)) / 2.0
-    elif interpolation != "linear":
-        raise OptionError(f"interpolation must be 'linear' or 'sine', got {interpolation!r}")
-    return torch.where(t >= move_time, 1.0, done)
+    moving = torch.arange(move_time, dtype=torch.float64) / max(move_time, 1)  # [move_time]
+    share = moving if interpolation == "linear" else torch.sin(moving * (math.pi / 2)) ** 2  # = (1 - cos(pi a)) / 2
+    return torch.cat([share, share.new_ones(frames - move_time)])
 
 
 def spherical_trajectory(

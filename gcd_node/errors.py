@@ -1,0 +1,76 @@
+"""What can go wrong in the node, and the exit code each becomes (sysexits).
+
+    NodeError 70
+    ├── UsageError 64         options that contradict each other or make no sense
+    ├── SourceError 66        an input is missing, empty, damaged or undecodable; a camera is lost
+    │   └── TooShortError 65      an input has fewer frames than one window
+    ├── MessageError 65       bytes that are not a valid message of this protocol
+    ├── StaleError 69         a view arrived too old to be used
+    ├── EndpointError 73      an endpoint is in use or cannot be bound
+    ├── OutputError 73        a result cannot be written
+    ├── ModelFailedError 70   the model keeps producing unusable views
+    └── ConfigError 78        a launch file or a setting is wrong
+
+Every message says what was wanted, what came, and what to do. Standard library only, Python 3.10 syntax: planners
+import this.
+"""
+
+
+class NodeError(Exception):
+    """Root of all errors of this package."""
+
+    exit_code = 70
+
+
+class UsageError(NodeError):
+    """Options that contradict each other or make no sense."""
+
+    exit_code = 64
+
+
+class SourceError(NodeError):
+    """An input is missing, empty, damaged or undecodable, or a camera is lost."""
+
+    exit_code = 66
+
+
+class TooShortError(SourceError):
+    """An input has fewer frames than one window."""
+
+    exit_code = 65
+
+
+class MessageError(NodeError):
+    """Bytes that are not a valid message of this protocol."""
+
+    exit_code = 65
+
+
+class StaleError(NodeError):
+    """A view arrived too old to be used."""
+
+    exit_code = 69
+
+
+class EndpointError(NodeError):
+    """An endpoint is in use or cannot be bound."""
+
+    exit_code = 73
+
+
+class OutputError(NodeError):
+    """A result cannot be written."""
+
+    exit_code = 73
+
+
+class ModelFailedError(NodeError):
+    """The model keeps producing unusable views."""
+
+    exit_code = 70
+
+
+class ConfigError(NodeError):
+    """A launch file or a setting is wrong."""
+
+    exit_code = 78

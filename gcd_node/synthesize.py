@@ -1,0 +1,162 @@
+"""One clip, one view, offline: what `gcd-node synthesize` does between reading its input and writing its output."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from gcd_model import (
+    Augmentation,
+    RenderOptions,
+    Spherical,
+    SphericalDelta,
+    Trajectory,
+    View,
+    ViewSynthesizer,
+)
+from numpy.typing import NDArray
+
+from gcd_node.errors import OutputError, SourceError, UsageError
+from gcd_node.offline_clip import OfflineClip
+from gcd_node.pictures import Image, heat, side_by_side, spread, strip, to_u8, write_frames, write_png, write_video
+
+_STRIP_FRAMES = 7
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ViewRequest:
+    """The wanted camera path, in the words of the command line.
+
+    delta: destination minus source; None if no angle was named. poses: a .npy file of [T, 4, 4] source-from-target.
+    trajectory: "gradual" or "direct"; move_time, if given, wins. source: where the source camera stands, if known.
+    """
+
+    delta: SphericalDelta | None = None
+    poses: Path | None = None
+    trajectory: str | None = None
+    move_time: int | None = None
+    source: Spherical | None = None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class InjectedNoise:
+    """Unit-variance noise from a file: initial [T, C, h, w], augmentation [T, 3, H, W]."""
+
+    initial: torch.Tensor | None = None
+    augmentation: torch.Tensor | None = None
+
+
+def plan(synthesizer: ViewSynthesizer, request: ViewRequest) -> Trajectory:
+    """The camera path for a request.
+
+    Raises:
+        UsageError: angles and poses at once, or an unknown kind of trajectory.
+        PoseError and its kind: see Traits.plan_view and Traits.plan_poses.
+    """
+    traits = synthesizer.traits
+    if request.poses is not None:
+        if request.delta is not None or request.trajectory is not None or request.move_time is not None:
+            raise UsageError("--poses states the whole path; leave out the angles, --trajectory and --move-time")
+        return traits.plan_poses(torch.from_numpy(read_poses(request.poses)), source=request.source)
+    times = {None: None, "gradual": traits.config.frames - 1, "direct": 0}
+    if request.trajectory not in times:
+        raise UsageError(f"--trajectory is gradual or direct, got {request.trajectory!r}")
+    move_time = times[request.trajectory] if request.move_time is None else request.move_time
+    return traits.plan_view(request.delta, source=request.source, move_time=move_time)
+
+
+def read_poses(path: Path) -> NDArray[np.float64]:
+    """[T, 4, 4] from a .npy file. Raises SourceError."""
+    try:
+        poses = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise SourceError(f"cannot read poses from {path}: {_reason(error)}; give a .npy file of [T, 4, 4]") from error
+    if not isinstance(poses, np.ndarray) or poses.ndim != 3 or poses.shape[1:] != (4, 4) or poses.dtype.kind not in "fiu":
+        raise SourceError(f"poses in {path} must be numbers [T, 4, 4], got {getattr(poses, 'shape', 'an archive')}")
+    return poses.astype(np.float64)
+
+
+def read_noise(path: Path) -> InjectedNoise:
+    """Noise from an .npz file with `initial` and `augmentation`, either may be missing. Raises SourceError."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, EOFError, AttributeError, TypeError) as error:
+        raise SourceError(f"cannot read noise from {path}: {_reason(error)}; give an .npz file") from error
+    unknown = sorted(set(arrays) - {"initial", "augmentation"})
+    if unknown or not arrays:
+        raise SourceError(f"{path} must hold `initial` and `augmentation`, got {unknown or 'nothing'}")
+    for name, array in arrays.items():
+        if array.dtype.kind != "f" or array.ndim != 4 or not np.isfinite(array).all():
+            raise SourceError(f"`{name}` in {path} must be finite floats with 4 axes, got {array.dtype} {array.shape}")
+    tensors = {name: torch.from_numpy(array.astype(np.float32)) for name, array in arrays.items()}
+    return InjectedNoise(initial=tensors.get("initial"), augmentation=tensors.get("augmentation"))
+
+
+def render(
+    synthesizer: ViewSynthesizer,
+    source: OfflineClip,
+    trajectory: Trajectory,
+    options: RenderOptions,
+    augmentation: Augmentation,
+    on_encoded: Callable[[], None],
+) -> View:
+    """Encode the clip, tell the caller, render the view."""
+    features = synthesizer.encode(source.clip, augmentation)
+    on_encoded()
+    return synthesizer.render(features, [trajectory], options)[0]
+
+
+def write_view(out: Path, source: OfflineClip, view: View, fps: float) -> list[Path]:
+    """Write frames, videos and pictures; gives the paths worth telling. Raises OutputError.
+
+    The first sample goes to frames/ and view.mp4, further ones to frames_s1/, view_s1.mp4, and so on.
+    """
+    written: list[Path] = []
+    try:
+        for number, sample in enumerate(view.samples):
+            ending = f"_s{number}" if number else ""
+            frames = to_u8(sample.numpy())
+            write_frames(out / f"frames{ending}", frames)
+            write_video(out / f"view{ending}.mp4", list(frames), fps)
+            written += [out / f"frames{ending}", out / f"view{ending}.mp4"]
+        write_png(out / "strip.png", input_and_view(source.pictures, to_u8(view.video.numpy())))
+        written.append(out / "strip.png")
+        if view.std is not None:
+            write_png(out / "uncertainty.png", uncertainty_picture(view.std.numpy()))
+            written.append(out / "uncertainty.png")
+    except OSError as error:
+        raise OutputError(f"cannot write to {out}: {error.strerror}; name another folder with --out") from error
+    return written
+
+
+def save_arrays(path: Path, view: View) -> None:
+    """Write `latents` [T, C, h, w] (final, scaled space) and `frames` [T, H, W, 3] in [0, 1], both float32.
+
+    The file appears whole or not at all. Raises OutputError.
+    """
+    part = path.with_name(path.name + ".part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with part.open("wb") as file:
+            np.savez(file, latents=view.latents[0].numpy(), frames=view.video.permute(0, 2, 3, 1).contiguous().numpy())
+        part.replace(path)
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}; name another file with --save") from error
+
+
+def input_and_view(inputs: Image, views: Image) -> Image:
+    """Input above view, at a few moments from the first to the last."""
+    chosen = spread(len(views), _STRIP_FRAMES)
+    return strip([[inputs[i] for i in chosen], [views[i] for i in chosen]])
+
+
+def uncertainty_picture(std: NDArray[np.float32]) -> Image:
+    """Per-pixel deviation over samples at a few moments, [T, H, W]; bright is uncertain."""
+    top = max(float(std.max()), 1e-6)
+    return side_by_side(*(heat(std[i], top) for i in spread(len(std), _STRIP_FRAMES)))
+
+
+def _reason(error: Exception) -> str:
+    return error.strerror or str(error) if isinstance(error, OSError) else str(error).splitlines()[0]

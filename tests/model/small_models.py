@@ -1,0 +1,100 @@
+"""Small networks with the published layout and random weights, for tests that compare numbers."""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+
+from gcd_model.clip import Clip
+from gcd_model.config import ImageEncoderConfig, ModelConfig, SamplingConfig, UNetConfig, VAEConfig
+from gcd_model.families import KUBRIC90, Traits
+from gcd_model.networks import Networks
+from gcd_model.synthesizer import Synthesizer
+
+UNET = UNetConfig(
+    width=32,
+    multipliers=(1, 2, 4, 4),
+    attention=(True, True, True, False),
+    embedding_width=128,
+    head_width=16,
+    context_width=48,
+    vector_width=48,
+    camera_width=24,
+    norm_groups=32,
+)
+"""Levels, blocks, attention and norm groups as published; only the widths are small."""
+
+TINY = ModelConfig(
+    frames=3,
+    height=32,
+    width=64,
+    unet=UNetConfig(
+        width=16,
+        multipliers=(1, 2),
+        attention=(False, True),
+        blocks_per_level=1,
+        embedding_width=32,
+        head_width=16,
+        context_width=24,
+        vector_width=24,
+        camera_width=8,
+        norm_groups=8,
+    ),
+    vae=VAEConfig(width=8, multipliers=(1, 1, 2), blocks_per_level=1, norm_groups=4),
+    image_encoder=ImageEncoderConfig(
+        image_size=28, patch=14, width=16, layers=1, heads=2, hidden_width=32, output_width=24
+    ),
+    sampling=SamplingConfig(steps=3),
+)
+"""As little network as shows every behaviour of the synthesizer."""
+
+
+def draw(*shape: int, seed: int = 0) -> Tensor:
+    """Standard normal float32, the same in every run."""
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+
+
+def randomise(module: nn.Module, seed: int = 0) -> None:
+    """Give every parameter its own random value, also norms, blends and what starts at zero or one."""
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for parameter in module.parameters():
+            values = torch.randn(parameter.shape, generator=generator)
+            if parameter.ndim > 1:
+                parameter.copy_(values * parameter[0].numel() ** -0.5)
+            else:
+                parameter.add_(values, alpha=0.3)
+
+
+def tiny_traits(config: ModelConfig = TINY) -> Traits:
+    """Traits of a gradual Kubric-4D checkpoint with limits of 90 and 30 degrees."""
+    return Traits(
+        name="tiny",
+        config=config,
+        family=KUBRIC90,
+        move_time=config.frames - 1,
+        sha256_12="0" * 12,
+        precision="float32",
+        device="cpu",
+        trained=False,
+    )
+
+
+def tiny_synthesizer(config: ModelConfig = TINY, *, family_known: bool = True, seed: int = 0) -> Synthesizer:
+    """A random checkpoint, ready to run."""
+    networks = Networks(config)
+    randomise(networks, seed)
+    traits = tiny_traits(config)
+    return Synthesizer(networks, traits if family_known else replace(traits, family=None))
+
+
+def random_clip(config: ModelConfig = TINY, *, frames: int | None = None, seed: int = 0) -> Clip:
+    """Noise in [-1, 1] in the trained size, at 12 frames per second."""
+    shape = (config.frames if frames is None else frames, 3, config.height, config.width)
+    return Clip(video=torch.rand(shape, generator=torch.Generator().manual_seed(seed)) * 2 - 1, fps=12.0)
+
+
+def relative_error(ours: Tensor, theirs: Tensor) -> float:
+    """Largest absolute difference over the largest absolute value."""
+    assert ours.shape == theirs.shape, f"{list(ours.shape)} against {list(theirs.shape)}"
+    return ((ours.double() - theirs.double()).abs().max() / theirs.double().abs().max()).item()

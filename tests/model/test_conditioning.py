@@ -1,0 +1,175 @@
+"""Conditioning: camera features, the micro-conditioning vector, guidance branches, frames that stay apart."""
+
+import math
+
+import pytest
+import torch
+from small_models import TINY, draw, random_clip, randomise, tiny_synthesizer
+from torch import Tensor
+from torch.testing import assert_close
+
+from gcd_model.clip import Augmentation
+from gcd_model.conditioning import (
+    CameraEmbedder,
+    SourceFeatures,
+    condition_latents,
+    condition_tokens,
+    micro_conditioning,
+    relative_pose_features,
+    spherical_features,
+)
+from gcd_model.errors import ShapeError
+from gcd_model.geometry import Spherical, SphericalDelta, pose_trajectory, spherical_trajectory
+
+SOURCE = Spherical(azimuth_deg=0.0, elevation_deg=5.0, radius_m=15.0)
+
+
+def test_no_camera_change_gives_ones_and_zeros_in_thirteen_features() -> None:
+    assert spherical_features(torch.zeros(1, 3)).tolist() == [[1.0, 0.0] * 6 + [0.0]]
+
+
+def test_angles_become_cosines_and_sines_of_one_two_and_four_times_in_radians_and_the_radius_stays() -> None:
+    azimuth, elevation = math.radians(30.0), math.radians(-10.0)
+    expected = [
+        function(multiple * angle)
+        for angle in (azimuth, elevation)
+        for multiple in (1, 2, 4)
+        for function in (math.cos, math.sin)
+    ]
+    features = spherical_features(torch.tensor([[30.0, -10.0, 1.5]], dtype=torch.float64))
+    assert_close(features, torch.tensor([[*expected, 1.5]]))
+    recorded = [0.866025, 0.5, 0.5, 0.866025, -0.5, 0.866025]  # worked out by hand for 30 degrees
+    assert_close(features[0, :6], torch.tensor(recorded), atol=1e-6, rtol=0)
+
+
+def test_angle_differences_beyond_half_a_turn_are_not_wrapped_before_the_path_is_made() -> None:
+    path = spherical_trajectory(SOURCE, SphericalDelta(azimuth_deg=200.0), frames=3, move_time=2)
+    assert path.delta is not None
+    halfway = spherical_features(path.delta)[1]
+    assert_close(halfway[:2], torch.tensor([math.cos(math.radians(100)), math.sin(math.radians(100))]))
+
+
+def test_relative_poses_become_their_top_three_rows_row_by_row() -> None:
+    poses = torch.arange(32, dtype=torch.float64).reshape(2, 4, 4)
+    expected = [list(range(12)), list(range(16, 28))]
+    assert relative_pose_features(poses).tolist() == expected
+    assert relative_pose_features(poses).dtype == torch.float32
+
+
+def test_the_camera_embedder_is_one_linear_map_of_the_features_of_each_frame() -> None:
+    path = spherical_trajectory(SOURCE, SphericalDelta(azimuth_deg=40.0, radius_m=1.0), frames=4, move_time=3)
+    for control, features in (
+        ("spherical", spherical_features(path.delta)),  # pyright: ignore[reportArgumentType]
+        ("relative_pose", relative_pose_features(path.source_from_target)),
+    ):
+        embedder = CameraEmbedder(control, 5)  # pyright: ignore[reportArgumentType]
+        randomise(embedder)
+        assert_close(embedder(path), features @ embedder.proj.weight.T + embedder.proj.bias)
+
+
+def test_a_free_path_is_refused_by_spherical_control_with_the_way_out() -> None:
+    free = pose_trajectory(torch.eye(4, dtype=torch.float64).repeat(3, 1, 1))
+    with pytest.raises(ShapeError, match="plan_view"):
+        CameraEmbedder("spherical", 5)(free)
+
+
+def _sinusoid_by_formula(value: float, width: int) -> list[float]:
+    half = width // 2
+    angles = [value * 10000 ** (-i / half) for i in range(half)]
+    return [math.cos(angle) for angle in angles] + [math.sin(angle) for angle in angles]
+
+
+def test_the_vector_holds_frame_rate_then_motion_then_augmentation_as_sinusoids() -> None:
+    vector = micro_conditioning(12.0, 127.0, 0.02, 768)
+    expected = [number for value in (12.0, 127.0, 0.02) for number in _sinusoid_by_formula(value, 256)]
+    assert vector.shape == (768,)
+    assert_close(vector, torch.tensor(expected), atol=2e-5, rtol=0)
+
+
+def test_the_network_is_told_the_frame_rate_itself_and_not_one_less() -> None:
+    vector = micro_conditioning(24.0, 0.0, 0.0, 768)
+    assert vector[0].item() == pytest.approx(math.cos(24.0), abs=1e-6)
+    assert vector[0].item() != pytest.approx(math.cos(23.0), abs=1e-2)
+
+
+def _features(frames: int = 3, extra: Tensor | None = None) -> SourceFeatures:
+    return SourceFeatures(
+        tokens=draw(frames, 5), latents=draw(frames, 4, 2, 3), extra=extra, fps=12.0, augmentation=0.02
+    )
+
+
+@pytest.mark.parametrize("views", [1, 3])
+def test_the_unconditional_branch_comes_first_and_sees_zeros_in_both_image_streams(views: int) -> None:
+    features = _features()
+    tokens = condition_tokens(features, views, unconditional=True)
+    latents = condition_latents(features, views, unconditional=True)
+    assert tokens is not None
+    assert features.tokens is not None
+    assert not tokens[: 3 * views].any()
+    assert not latents[: 3 * views].any()
+    for view in range(views):
+        rows = slice(3 * (views + view), 3 * (views + view + 1))
+        assert torch.equal(tokens[rows], features.tokens)
+        assert torch.equal(latents[rows], features.latents)
+
+
+def test_without_guidance_there_is_one_branch_and_without_a_tower_no_token() -> None:
+    features = _features()
+    tokens = condition_tokens(features, 2, unconditional=False)
+    assert tokens is not None
+    assert tokens.shape == (6, 5)
+    assert condition_latents(features, 2, unconditional=False).shape == (6, 4, 2, 3)
+    blind = SourceFeatures(tokens=None, latents=features.latents, extra=None, fps=12.0, augmentation=0.02)
+    assert condition_tokens(blind, 2, unconditional=True) is None
+
+
+def test_extra_condition_channels_follow_the_source_latents() -> None:
+    features = _features(extra=draw(3, 2, 2, 3, seed=1))
+    assert features.extra is not None
+    expected = torch.cat([features.latents, features.extra], dim=1)
+    assert torch.equal(condition_latents(features, 1, unconditional=False), expected)
+
+
+def test_rows_and_followed_by_undo_each_other() -> None:
+    features = _features(frames=5, extra=draw(5, 2, 2, 3, seed=1))
+    joined = features.rows(0, 2).followed_by(features.rows(2, 5))
+    for name in ("tokens", "latents", "extra"):
+        assert torch.equal(getattr(joined, name), getattr(features, name))
+    assert joined.frames == 5
+    assert features.rows(1, 4).frames == 3
+
+
+@pytest.mark.parametrize(("fps", "augmentation"), [(10.0, 0.02), (12.0, 0.0)])
+def test_features_encoded_differently_are_not_joined(fps: float, augmentation: float) -> None:
+    first = _features()
+    other = SourceFeatures(tokens=first.tokens, latents=first.latents, extra=None, fps=fps, augmentation=augmentation)
+    with pytest.raises(ShapeError, match="encode them alike"):
+        first.followed_by(other)
+
+
+def test_condition_latents_are_the_posterior_mean_of_the_noised_frames_and_not_scaled() -> None:
+    synthesizer, clip = tiny_synthesizer(), random_clip()
+    noise = draw(*clip.video.shape, seed=7)
+    features = synthesizer.encode(clip, Augmentation(strength=0.3, noise=noise))
+    with torch.inference_mode():
+        posterior = synthesizer.networks.condition_encoder(clip.video + 0.3 * noise)
+    assert TINY.vae.scale == 0.18215
+    assert_close(features.latents, posterior.mean)
+    assert features.augmentation == 0.3
+
+
+def test_the_image_tower_sees_the_frames_clean() -> None:
+    synthesizer, clip = tiny_synthesizer(), random_clip()
+    clean = synthesizer.encode(clip, Augmentation(strength=0.0))
+    noisy = synthesizer.encode(clip, Augmentation(strength=0.5))
+    assert clean.tokens is not None
+    assert noisy.tokens is not None
+    assert torch.equal(clean.tokens, noisy.tokens)
+    assert not torch.allclose(clean.latents, noisy.latents)
+
+
+def test_the_condition_encoder_has_the_quant_convolution_and_the_target_encoder_has_none() -> None:
+    networks = tiny_synthesizer().networks
+    assert networks.condition_encoder is not networks.target_encoder
+    assert networks.condition_encoder.quant is not None
+    assert networks.target_encoder.quant is None

@@ -1,0 +1,217 @@
+"""The parts: up-sampling by phases, one-token attention, blends, and what is kept of derived values."""
+
+import math
+
+import pytest
+import torch
+import torch.nn.functional as F
+from small_models import draw, randomise, relative_error
+from torch import Tensor, nn
+from torch.testing import assert_close
+
+from gcd_model.layers import (
+    Attention,
+    Derived,
+    Downsample,
+    FeedForward,
+    Layers,
+    ResBlock,
+    TokenAttention,
+    Upsample,
+    embedding_mlp,
+    phase_kernels,
+    prepare,
+    sinusoid,
+    zeroed,
+)
+from gcd_model.temporal import FramePositions, TemporalShare, VideoResBlock, VideoTransformer
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 4), (3, 5), (4, 6), (7, 2)])
+@pytest.mark.parametrize("prepared", [False, True])
+def test_up_sampling_by_phases_equals_nearest_neighbour_then_convolution(
+    height: int, width: int, prepared: bool
+) -> None:
+    up = Upsample(5).double()
+    randomise(up)
+    if prepared:
+        prepare(up)
+    x = draw(2, 5, height, width).double()
+    plain = F.conv2d(F.interpolate(x, scale_factor=2.0, mode="nearest"), up.conv.weight, up.conv.bias, padding=1)
+    assert relative_error(up(x), plain) < 1e-12
+
+
+def test_each_phase_kernel_keeps_the_sum_of_the_kernel_it_came_from() -> None:
+    weight = draw(4, 3, 3, 3).double()
+    kernels = phase_kernels(weight)
+    assert kernels.shape == (2, 2, 4, 3, 2, 2)
+    assert_close(kernels.sum(dim=(-2, -1)), weight.sum(dim=(-2, -1)).expand(2, 2, 4, 3))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_up_sampling_keeps_the_precision_it_is_given(dtype: torch.dtype) -> None:
+    up = Upsample(4).to(dtype)
+    prepare(up)
+    assert up(torch.ones(1, 4, 2, 3, dtype=dtype)).dtype == dtype
+
+
+def test_down_sampling_pads_every_side_in_the_u_net_and_the_end_in_the_autoencoder() -> None:
+    x = draw(1, 3, 6, 8)
+    both, end = Downsample(3, pad="both"), Downsample(3, pad="end")
+    randomise(both)
+    end.load_state_dict(both.state_dict())
+    assert both(x).shape == end(x).shape == (1, 3, 3, 4)
+    weight, bias = both.conv.weight, both.conv.bias
+    assert_close(both(x), F.conv2d(F.pad(x, (1, 1, 1, 1)), weight, bias, stride=2))
+    assert_close(end(x), F.conv2d(F.pad(x, (0, 1, 0, 1)), weight, bias, stride=2))
+
+
+def test_attention_to_one_token_is_what_full_attention_gives_whatever_query_and_key_are() -> None:
+    attention = TokenAttention(16, 8)
+    randomise(attention)
+    x, token = draw(2, 5, 16), draw(2, 1, 8)
+    normed = F.layer_norm(x, (16,), attention.dormant.norm_weight, attention.dormant.norm_bias)
+    query, key = F.linear(normed, attention.dormant.query), F.linear(token, attention.dormant.key)
+    full = attention.out(F.scaled_dot_product_attention(query, key, attention.value(token)))
+    assert_close(attention(token[:, 0])[:, None].expand(2, 5, 16), full)
+
+
+def test_heads_are_consecutive_slices_of_the_width() -> None:
+    attention = Attention(12, heads=3)
+    randomise(attention)
+    x = draw(2, 7, 12)
+    query, key, value = attention.query(x), attention.key(x), attention.value(x)
+    heads = []
+    for low in range(0, 12, 4):
+        part = slice(low, low + 4)
+        weights = (query[..., part] @ key[..., part].transpose(1, 2) / math.sqrt(4)).softmax(dim=-1)
+        heads.append(weights @ value[..., part])
+    assert_close(attention(x), attention.out(torch.cat(heads, dim=-1)))
+
+
+def test_the_feed_forward_gates_its_first_half_with_the_exact_gelu_of_its_second() -> None:
+    feed = FeedForward(6)
+    randomise(feed)
+    x = draw(3, 6)
+    hidden = feed.expand(x)
+    value, gate = hidden[:, :24], hidden[:, 24:]
+    gelu = gate * 0.5 * (1 + torch.erf(gate / math.sqrt(2)))
+    assert_close(feed(x), feed.contract(value * gelu))
+
+
+def test_sinusoids_are_cosines_then_sines_at_falling_frequencies() -> None:
+    position, width = 3.5, 8
+    angles = [position * 10000 ** (-i / 4) for i in range(4)]
+    expected = [math.cos(angle) for angle in angles] + [math.sin(angle) for angle in angles]
+    assert_close(sinusoid(torch.tensor(position), width), torch.tensor(expected))
+    assert sinusoid(torch.zeros(2, 3), width).shape == (2, 3, width)
+
+
+def test_the_embedding_is_added_between_the_convolutions_and_comes_through_silu_and_a_linear_map() -> None:
+    block = ResBlock(8, 12, groups=4, eps=1e-5, embedding_width=6)
+    randomise(block)
+    x, embedding = draw(2, 8, 3, 3), draw(2, 6)
+    assert block.embed is not None
+    assert block.skip is not None
+    h = block.conv1(F.silu(F.group_norm(x, 4, block.norm1.weight, block.norm1.bias, 1e-5)))
+    h = h + block.embed(F.silu(embedding))[:, :, None, None]
+    h = block.conv2(F.silu(F.group_norm(h, 4, block.norm2.weight, block.norm2.bias, 1e-5)))
+    assert_close(block(x, block.project(embedding)[..., None, None]), block.skip(x) + h)
+
+
+@pytest.mark.parametrize(("of_sigmoid", "time_counts"), [("space", 1 / (1 + math.e)), ("time", math.e / (1 + math.e))])
+def test_the_sigmoid_weighs_space_in_the_u_net_and_time_in_the_decoder(of_sigmoid: str, time_counts: float) -> None:
+    share = TemporalShare(of_sigmoid=of_sigmoid, initial=1.0)
+    space, change = draw(4, 3), draw(4, 3, seed=1)
+    expected = (1 - time_counts) * space + time_counts * (space + change)
+    assert_close(share.add(space, change), expected)
+    assert_close(share.blend(space, space + change), expected)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 5])
+def test_a_video_block_normalises_over_all_frames_of_a_clip_and_of_no_other(frames: int) -> None:
+    share = TemporalShare(of_sigmoid="space", initial=0.3)
+    block = VideoResBlock(8, 8, groups=2, embedding_width=None, eps=1e-5, share=share)
+    randomise(block)
+    clips = draw(2, frames, 8, 3, 4, seed=frames)
+    together = block(clips.flatten(0, 1), frames)
+    alone = torch.cat([block(clip, frames) for clip in clips])
+    assert_close(together, alone)
+    shifted = clips.clone()
+    shifted[:, -1] *= 3
+    changed = block(shifted.flatten(0, 1), frames).unflatten(0, (2, frames))[:, 0]
+    assert not torch.allclose(changed, together.unflatten(0, (2, frames))[:, 0], atol=1e-3)
+
+
+def test_the_frame_table_is_the_mlp_of_each_frame_number() -> None:
+    positions = FramePositions(8, frames=5)
+    randomise(positions)
+    rows = [positions.mlp(sinusoid(torch.tensor(float(t)), 8)) for t in range(5)]
+    assert_close(positions.derived(), torch.stack(rows))
+
+
+def test_a_transformer_without_image_token_works_and_is_changed_by_one() -> None:
+    transformer = VideoTransformer(16, head_width=8, context_width=None, groups=4, frames=3)
+    randomise(transformer)
+    x = draw(6, 16, 2, 4)
+    without = transformer(x, 3, None, None)
+    assert without.shape == x.shape
+    assert not torch.allclose(without, transformer(x, 3, torch.ones(6, 16), torch.ones(2, 16)), atol=1e-3)
+
+
+def _derived_modules() -> list[Derived[Tensor]]:
+    return [Upsample(4), FramePositions(4, 3), TemporalShare(of_sigmoid="space", initial=0.5)]
+
+
+@pytest.mark.parametrize("module", _derived_modules(), ids=lambda module: type(module).__name__)
+def test_a_derived_value_carries_gradient_until_it_is_prepared_and_is_then_kept(module: Derived[Tensor]) -> None:
+    module.train()
+    before = module.derived()
+    assert before.requires_grad
+    assert module.derived() is not before
+    prepare(module)
+    assert not module.training
+    assert module.derived() is module.derived()
+    assert not module.derived().requires_grad
+    assert_close(module.derived(), before.detach())
+
+
+@pytest.mark.parametrize("module", _derived_modules(), ids=lambda module: type(module).__name__)
+def test_what_was_kept_is_dropped_with_new_weights_a_new_dtype_or_training(module: Derived[Tensor]) -> None:
+    model = nn.Sequential(module)
+    prepare(model)
+    old = module.derived()
+    model.load_state_dict({name: value + 1 for name, value in model.state_dict().items()})
+    assert not torch.allclose(module.derived(), old)
+    prepare(model)
+    model.double()
+    assert module.derived().dtype == torch.float64
+    model.float()
+    prepare(model)
+    kept = module.derived()
+    model.train()
+    assert module.derived() is not kept
+    assert module.derived().requires_grad
+
+
+def test_dormant_weights_survive_the_round_trip_but_are_never_moved_cast_or_trained() -> None:
+    attention = TokenAttention(8, 6)
+    attention.double().to("meta")
+    assert attention.value.weight.device.type == "meta"
+    for parameter in attention.dormant.parameters():
+        assert parameter.device.type == "cpu"
+        assert parameter.dtype == torch.float32
+        assert not parameter.requires_grad
+    assert {name for name in attention.state_dict() if name.startswith("dormant.")} == {
+        "dormant.query",
+        "dormant.key",
+        "dormant.norm_weight",
+        "dormant.norm_bias",
+    }
+
+
+def test_a_list_of_layers_gives_them_in_order_and_zeroed_layers_give_nothing() -> None:
+    mlp = embedding_mlp(3, 4, 5)
+    layers = Layers[nn.Linear](layer for layer in mlp if isinstance(layer, nn.Linear))
+    assert [layer.out_features for layer in layers] == [4, 5]
+    assert not zeroed(mlp)(torch.ones(2, 3)).any()

@@ -1,0 +1,83 @@
+from pathlib import Path
+
+import pytest
+
+from gcd_node.config import NodeConfig, load_config, parse_config
+from gcd_node.errors import ConfigError
+
+MINIMAL = """
+[source]
+path = "drive.mp4"
+[model]
+weights = "random:driving"
+[view.topdown]
+"""
+
+
+def parsed(text: str) -> NodeConfig:
+    return parse_config(text.encode(), "test.toml")
+
+
+def test_every_launch_file_for_this_package_is_valid() -> None:
+    paths = sorted((Path(__file__).parents[2] / "launch").glob("*.toml"))
+    assert paths
+    for path in paths:
+        assert load_config(path).view
+
+
+def test_defaults_are_those_of_a_live_node_on_this_machine() -> None:
+    config = parsed(MINIMAL)
+    assert config.source.kind == "file"
+    assert config.source.pace == "realtime"
+    assert config.publish.data == "ipc"
+    assert config.view["topdown"].kind == "fixed"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "near", "place"),
+    [
+        (MINIMAL.replace("path =", "pathh ="), "path", "source"),
+        (MINIMAL.replace("weights", "wieghts"), "weights", "model"),
+        (MINIMAL + 'knid = "fixed"', "kind", "view"),
+        (MINIMAL + "[publsh]\ndata = 'ipc'", "publish", ""),
+        (MINIMAL + "[source.pose]\nelevation = 3.0", "elevation_deg", "source.pose"),
+    ],
+)
+def test_an_unknown_key_is_an_error_that_names_the_nearest_known_one(wrong: str, near: str, place: str) -> None:
+    with pytest.raises(ConfigError, match=f"did you mean `{near}`") as caught:
+        parsed(wrong)
+    assert place in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("wrong", "reason"),
+    [
+        (MINIMAL.replace('path = "drive.mp4"', ""), "needs a path"),
+        (MINIMAL.replace('path = "drive.mp4"', 'path = "a"\nkind = "synthetic"'), "takes no path"),
+        (MINIMAL.replace('path = "drive.mp4"', 'path = "a"\nkind = "folder"'), "give fps"),
+        (MINIMAL + 'kind = "orbit"', "rate_deg_s and amplitude_deg"),
+        (MINIMAL + "rate_deg_s = 3.0", "orbit"),
+        (MINIMAL.replace("[view.topdown]", '[view."Top Down"]'), "a-z0-9_"),
+        (MINIMAL.replace("[view.topdown]", "[view]"), ">= 1"),
+        (MINIMAL + "[publish]\njpeg_quality = 20", ">= 50"),
+        (MINIMAL + "[window]\nmax_skew = 2.0", "<= 0.5"),
+        (MINIMAL + "[window]\nfps = 'ten'", "Expected `float"),
+        (MINIMAL + "[source", "not valid TOML"),
+    ],
+)
+def test_a_wrong_value_is_an_error_that_says_what_was_wanted(wrong: str, reason: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parsed(wrong)
+    assert reason in str(caught.value)
+
+
+def test_a_missing_launch_file_is_an_error_that_names_it(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"no\.toml"):
+        load_config(tmp_path / "no.toml")
+
+
+def test_the_digest_names_what_is_rendered_and_not_where_it_goes() -> None:
+    base = parsed(MINIMAL).digest
+    assert parsed(MINIMAL + "[publish]\ndata = 'tcp://127.0.0.1:1'").digest == base
+    assert parsed(MINIMAL.replace('driving"', 'driving"\nseed = 1')).digest != base
