@@ -16,11 +16,7 @@ Count: TypeAlias = Annotated[int, Meta(ge=1)]
 ViewId: TypeAlias = Annotated[str, Meta(pattern="^[a-z0-9_]{1,16}$")]
 
 
-class _Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A table of a launch file; an unknown key is an error."""
-
-
-class SourcePose(_Section):
+class SourcePose(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Where the source camera stands. Views are differences, so this is needed for rigid transforms only.
 
     elevation_deg: above the ground plane. radius: distance to the scene's centre, metres or scene units.
@@ -30,7 +26,7 @@ class SourcePose(_Section):
     radius: Positive = 15.0
 
 
-class SourceConfig(_Section):
+class SourceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Where frames come from.
 
     path: a video file or a folder of images; `package:drive.mp4` is the clip that ships. Not for `synthetic`.
@@ -60,7 +56,7 @@ class SourceConfig(_Section):
             raise ValueError("an image folder does not know its frame rate: give fps")
 
 
-class WindowConfig(_Section):
+class WindowConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How frames become windows.
 
     fps: frame rate of a window; left out, the nearest trained rate the source can give.
@@ -73,7 +69,7 @@ class WindowConfig(_Section):
     max_skew: Annotated[float, Meta(gt=0, le=0.5)] = 0.5
 
 
-class ModelSection(_Section):
+class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The model and how it is sampled. What is left out is as the checkpoint was made for.
 
     weights: a checkpoint, a diffusers folder, `package:NAME`, or `random:FAMILY` (noise, for trying the plumbing).
@@ -97,7 +93,7 @@ class ModelSection(_Section):
     image_heads: Count | None = None
 
 
-class ViewConfig(_Section):
+class ViewConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A virtual camera.
 
     fixed: its goal pose, as differences from the source camera; none for a checkpoint with one fixed view.
@@ -119,7 +115,7 @@ class ViewConfig(_Section):
             raise ValueError('a fixed view has no rate_deg_s and no amplitude_deg; for these say kind = "orbit"')
 
 
-class PublishConfig(_Section):
+class PublishConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Where views go, and how.
 
     data, status: endpoints, or "ipc" for the runtime folder.
@@ -135,7 +131,7 @@ class PublishConfig(_Section):
     end_delay_ms: Annotated[int, Meta(ge=0)] = 500
 
 
-class NodeConfig(_Section):
+class NodeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A whole launch file. strict: refuse what would only be flagged as out of the trained domain."""
 
     source: SourceConfig

@@ -73,7 +73,7 @@ def heat(values: NDArray[np.float32], top: float) -> Image:
 def write_frames(folder: Path, frames: Iterable[Image]) -> int:
     """Write frames as 0000.png, 0001.png, ...; gives how many. Raises OutputError."""
     count = 0
-    for count, frame in enumerate(frames, start=1):  # noqa: B007  the last count is the answer
+    for count, frame in enumerate(frames, start=1):
         write_png(folder / f"{count - 1:04d}.png", frame)
     return count
 

@@ -1,11 +1,12 @@
 """One clip, one view, offline: what `gcd-node synthesize` does between reading its input and writing its output."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+
 from gcd_model import (
     Augmentation,
     RenderOptions,
@@ -15,8 +16,6 @@ from gcd_model import (
     View,
     ViewSynthesizer,
 )
-from numpy.typing import NDArray
-
 from gcd_node.errors import OutputError, SourceError, UsageError
 from gcd_node.offline_clip import OfflineClip
 from gcd_node.pictures import Image, heat, side_by_side, spread, strip, to_u8, write_frames, write_png, write_video
@@ -72,7 +71,12 @@ def read_poses(path: Path) -> NDArray[np.float64]:
         poses = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise SourceError(f"cannot read poses from {path}: {_reason(error)}; give a .npy file of [T, 4, 4]") from error
-    if not isinstance(poses, np.ndarray) or poses.ndim != 3 or poses.shape[1:] != (4, 4) or poses.dtype.kind not in "fiu":
+    if (
+        not isinstance(poses, np.ndarray)
+        or poses.ndim != 3
+        or poses.shape[1:] != (4, 4)
+        or poses.dtype.kind not in "fiu"
+    ):
         raise SourceError(f"poses in {path} must be numbers [T, 4, 4], got {getattr(poses, 'shape', 'an archive')}")
     return poses.astype(np.float64)
 
@@ -94,18 +98,21 @@ def read_noise(path: Path) -> InjectedNoise:
     return InjectedNoise(initial=tensors.get("initial"), augmentation=tensors.get("augmentation"))
 
 
+def require_input(path: Path) -> None:
+    """Raises SourceError if there is nothing at `path`: cheaper to know before the weights are loaded."""
+    if not path.exists():
+        raise SourceError(f"{path} does not exist; give a video, a folder of pictures, a still or a .npy file")
+
+
 def render(
     synthesizer: ViewSynthesizer,
     source: OfflineClip,
     trajectory: Trajectory,
     options: RenderOptions,
     augmentation: Augmentation,
-    on_encoded: Callable[[], None],
 ) -> View:
-    """Encode the clip, tell the caller, render the view."""
-    features = synthesizer.encode(source.clip, augmentation)
-    on_encoded()
-    return synthesizer.render(features, [trajectory], options)[0]
+    """Encode the clip and render the view."""
+    return synthesizer.render(synthesizer.encode(source.clip, augmentation), [trajectory], options)[0]
 
 
 def write_view(out: Path, source: OfflineClip, view: View, fps: float) -> list[Path]:

@@ -1,1 +1,79 @@
-"""Generative Camera Dolly (being assembled)."""
+"""Generative Camera Dolly: a video in, the same moments from another camera out. Tensors in, tensors out.
+
+    synthesizer = load_synthesizer("kubric_gradual_max90.ckpt")
+    trajectory = synthesizer.traits.plan_view(SphericalDelta(azimuth_deg=30.0, elevation_deg=15.0))
+    view = synthesize(synthesizer, Clip(video=video, fps=12.0), trajectory)
+
+The node imports from here only. Source: Van Hoorick et al., "Generative Camera Dolly", ECCV 2024.
+"""
+
+from gcd_model.clip import Augmentation, Clip, RenderOptions, View
+from gcd_model.conditioning import SourceFeatures
+from gcd_model.config import SMALL, SVD_14, ModelConfig
+from gcd_model.errors import (
+    Cancelled,
+    CheckpointError,
+    ModelError,
+    NonFiniteError,
+    OptionError,
+    PoseError,
+    ShapeError,
+    ViewFixedError,
+    ViewRangeError,
+)
+from gcd_model.families import ASSUMED_SOURCE, FAMILIES, Family, Traits, ViewLimits
+from gcd_model.geometry import (
+    DeltaFit,
+    Intrinsics,
+    Orbit,
+    Spherical,
+    SphericalDelta,
+    Trajectory,
+    center_crop_box,
+    driving_trajectory,
+    fitted_trajectory,
+    nearest_delta,
+    pose_trajectory,
+    spherical_trajectory,
+)
+from gcd_model.synthesizer import Synthesizer, ViewSynthesizer, synthesize
+
+__all__ = [
+    "ASSUMED_SOURCE",
+    "FAMILIES",
+    "SMALL",
+    "SVD_14",
+    "Augmentation",
+    "Cancelled",
+    "CheckpointError",
+    "Clip",
+    "DeltaFit",
+    "Family",
+    "Intrinsics",
+    "ModelConfig",
+    "ModelError",
+    "NonFiniteError",
+    "OptionError",
+    "Orbit",
+    "PoseError",
+    "RenderOptions",
+    "ShapeError",
+    "SourceFeatures",
+    "Spherical",
+    "SphericalDelta",
+    "Synthesizer",
+    "Traits",
+    "Trajectory",
+    "View",
+    "ViewFixedError",
+    "ViewLimits",
+    "ViewRangeError",
+    "ViewSynthesizer",
+    "center_crop_box",
+    "driving_trajectory",
+    "fitted_trajectory",
+    "nearest_delta",
+    "pose_trajectory",
+    "spherical_trajectory",
+    "synthesize",
+]

@@ -12,17 +12,17 @@ from gcd_model.networks import Networks
 from gcd_model.synthesizer import Synthesizer
 
 UNET = UNetConfig(
-    width=32,
-    multipliers=(1, 2, 4, 4),
+    width=64,
+    multipliers=(1, 1, 2, 2),
     attention=(True, True, True, False),
-    embedding_width=128,
+    embedding_width=256,
     head_width=16,
     context_width=48,
     vector_width=48,
     camera_width=24,
     norm_groups=32,
 )
-"""Levels, blocks, attention and norm groups as published; only the widths are small."""
+"""Levels, blocks, attention and norm groups as published; only the widths are small (but two channels a group)."""
 
 TINY = ModelConfig(
     frames=3,
@@ -63,7 +63,13 @@ def randomise(module: nn.Module, seed: int = 0) -> None:
             if parameter.ndim > 1:
                 parameter.copy_(values * parameter[0].numel() ** -0.5)
             else:
-                parameter.add_(values, alpha=0.3)
+                parameter.copy_(_constant(parameter) + 0.3 * values)
+
+
+def _constant(parameter: Tensor) -> float:
+    """Where norms and blends start; zero for what was drawn, so that no earlier draw shows through."""
+    first = parameter[0].item()
+    return first if torch.equal(parameter, torch.full_like(parameter, first)) else 0.0
 
 
 def tiny_traits(config: ModelConfig = TINY) -> Traits:

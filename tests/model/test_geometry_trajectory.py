@@ -95,7 +95,7 @@ def test_a_path_must_reach_its_goal_within_the_clip(frames: int, move_time: int)
 
 
 def test_an_unknown_pace_is_refused() -> None:
-    with pytest.raises(OptionError, match="'linear', 'sine'.*got 'cubic'"):
+    with pytest.raises(OptionError, match=r"'linear', 'sine'.*got 'cubic'"):
         path_progress(14, 13, "cubic")  # pyright: ignore[reportArgumentType]
 
 

@@ -1,0 +1,131 @@
+"""The reader thread, and the slot through which the model thread gets its windows."""
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+from gcd_node.errors import TooShortError
+from gcd_node.frame import FrameSource
+from gcd_node.window import FrameWindow, WindowBuilder
+
+T = TypeVar("T")
+
+
+class Newest(Generic[T]):
+    """A slot for one item between two threads. A newer item replaces an unread one, which counts as dropped.
+
+    With `lossless` a full slot makes `put` wait instead, and nothing is dropped.
+    The giver ends with `finish`, the taker with `close`.
+    """
+
+    def __init__(self, *, lossless: bool = False) -> None:
+        self._lossless = lossless
+        self._changed = threading.Condition()
+        self._slot: list[T] = []
+        self._dropped = 0
+        self._finished = False
+        self._closed = False
+        self._error: Exception | None = None
+
+    @property
+    def dropped(self) -> int:
+        """Items that were replaced before anybody took them."""
+        with self._changed:
+            return self._dropped
+
+    @property
+    def closed(self) -> bool:
+        """True once the taker wants no more."""
+        with self._changed:
+            return self._closed
+
+    def put(self, item: T) -> bool:
+        """Leave an item; waits for room if lossless. False, and the item is not left, once the slot is closed."""
+        with self._changed:
+            if self._lossless:
+                self._changed.wait_for(lambda: self._closed or not self._slot)
+            if self._closed:
+                return False
+            self._dropped += len(self._slot)
+            self._slot = [item]
+            self._changed.notify_all()
+            return True
+
+    def take(self) -> T | None:
+        """Wait for an item. None after `close`, or after `finish` once the last item was taken.
+
+        Raises:
+            the error given to `finish`, once, after the last item was taken.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or self._finished or bool(self._slot))
+            if self._closed:
+                return None
+            if self._slot:
+                self._changed.notify_all()
+                return self._slot.pop()
+            error, self._error = self._error, None
+        if error is not None:
+            raise error
+        return None
+
+    def finish(self, error: Exception | None = None) -> None:
+        """Giver: nothing more comes. What was left can still be taken; then `take` raises `error`, if there is one."""
+        with self._changed:
+            self._finished = True
+            self._error = error
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """Taker: stop at once. Everybody who waits is let go; an item that was left is forgotten."""
+        with self._changed:
+            self._closed = True
+            self._slot = []
+            self._changed.notify_all()
+
+
+def read(
+    source: FrameSource,
+    windows: WindowBuilder,
+    newest: Newest[FrameWindow],
+    clock_ns: Callable[[], int] = time.monotonic_ns,
+) -> None:
+    """Reader thread: every frame is used; of complete windows the newest wins.
+
+    Returns when the source has ended or `newest` was closed; an error of the source goes to whoever takes from
+    `newest`. To stop early, close `newest` first, then the source.
+
+    Args:
+        clock_ns: the monotonic clock that arrivals are stamped with.
+    """
+    try:
+        _read_all(source, windows, newest, clock_ns)
+    except Exception as error:  # the end of a thread: whoever takes gets it
+        newest.finish(error)
+    else:
+        newest.finish()
+
+
+def _read_all(
+    source: FrameSource, windows: WindowBuilder, newest: Newest[FrameWindow], clock_ns: Callable[[], int]
+) -> None:
+    for frame in source.frames():
+        for window in windows.push(frame, clock_ns()):
+            newest.put(window)
+        if newest.closed:
+            return
+    for window in windows.flush():
+        newest.put(window)
+    if windows.counts.built == 0 and not newest.closed:
+        raise _too_short(source.info.id, windows)
+
+
+def _too_short(name: str, windows: WindowBuilder) -> TooShortError:
+    counts = windows.counts
+    spoilt = "".join(f", {count} x {reason}" for reason, count in sorted(counts.reasons.items()))
+    return TooShortError(
+        f"TOO_SHORT n={counts.frames}: {name} has {counts.frames} frames, {counts.placed} of them usable{spoilt}; "
+        f"a window takes {windows.frames} in a row at {windows.fps:g} FPS: give a longer recording, or another fps "
+        "in [window]"
+    )

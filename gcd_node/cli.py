@@ -1,0 +1,83 @@
+"""`gcd-node`: the node from the command line. The only file here that prints."""
+
+import logging
+import sys
+from typing import Annotated
+
+import click
+import typer
+from rich.console import Console
+from rich.logging import RichHandler
+
+from gcd_model import (
+    Cancelled,
+    CheckpointError,
+    ModelError,
+    NonFiniteError,
+    OptionError,
+    PoseError,
+    ShapeError,
+)
+from gcd_node.cli_node import demo, run, view
+from gcd_node.cli_synthesize import synthesize
+from gcd_node.cli_weights import weights
+from gcd_node.errors import NodeError
+
+app = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    help="Virtual camera views from one camera, live.\n\n"
+    "Start with [bold]gcd-node demo[/bold]. Every pixel of a view is generated: never evidence of free space.",
+)
+app.command()(demo)
+app.command()(run)
+app.command()(view)
+app.command()(synthesize)
+app.add_typer(weights, name="weights")
+
+EXIT_CODES: tuple[tuple[type[ModelError], int], ...] = (
+    (CheckpointError, 65),
+    (OptionError, 64),
+    (PoseError, 64),
+    (ShapeError, 65),
+    (NonFiniteError, 70),
+    (Cancelled, 130),
+    (ModelError, 70),
+)
+"""sysexits of the model's errors; the node's own carry theirs."""
+
+
+@app.callback()
+def setup(
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log what happens, with times.")] = False,
+) -> None:
+    """Log to stderr, so that stdout stays for results."""
+    handler = RichHandler(console=Console(stderr=True), show_time=verbose, show_path=False, show_level=True)
+    logging.basicConfig(level="INFO" if verbose else "WARNING", format="%(message)s", handlers=[handler], force=True)
+
+
+def main() -> None:
+    """Entry point: runs a command; an expected error becomes one line and its exit code."""
+    sys.exit(run_app(sys.argv[1:]))
+
+
+def run_app(arguments: list[str]) -> int:
+    """Run one command line and give its exit code."""
+    try:
+        return int(app(arguments, standalone_mode=False) or 0)
+    except NodeError as error:
+        return _failed(str(error), error.exit_code)
+    except ModelError as error:
+        return _failed(str(error), next(code for kind, code in EXIT_CODES if isinstance(error, kind)))
+    except click.UsageError as error:
+        error.show()
+        return 64
+    except (KeyboardInterrupt, click.Abort):
+        return _failed("interrupted", 130)
+
+
+def _failed(message: str, code: int) -> int:
+    line = " ".join(message.split())
+    click.echo(click.style("error: ", fg="red", bold=True) + line, err=True)
+    return code

@@ -1,0 +1,274 @@
+"""A message as bytes: 64-byte prefix, JSON header, payload, all in one part (wire protocol, section 2).
+
+Pure functions, no socket. Standard library and numpy only, Python 3.10 syntax: planners import this.
+"""
+
+import enum
+import itertools
+import re
+import struct
+import types
+import uuid
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcd_node.errors import ConfigError, MessageError
+from gcd_node.header import EndHeader, OriginHeader, ViewHeader, check_version
+from gcd_node.record_json import dump, from_json, parse, to_json
+
+PREFIX = struct.Struct("<32s4sHHQQII")
+"""topic, magic, header length / 16, flags, payload length, sequence, CRC32, reserved."""
+
+MAGIC = b"GCD1"
+TOPIC_BYTES = 32
+MAX_HEADER = 64 * 1024
+MAX_PAYLOAD = 64 * 1024 * 1024
+WELCOME = bytes(PREFIX.size)
+"""What a publisher sends to each new subscriber; not a message."""
+
+ViewKind: TypeAlias = Literal["win", "frm", "std"]
+NoteTopic: TypeAlias = Literal["status", "event", "meta"]
+Buffer: TypeAlias = bytes | memoryview
+
+_VIEW_ID = re.compile(r"[a-z0-9_]{1,16}")
+_VIEW_TOPIC = re.compile(r"view/([a-z0-9_]{1,16})/(?:win|frm|std)|(src)/frm")
+_NOTES = ("status", "event", "meta")
+
+
+class Flags(enum.IntFlag):
+    """Bits of the prefix; readers ignore bits they do not know."""
+
+    PAYLOAD = 1
+    END_OF_STREAM = 2
+    REPLAY_CLOCK = 4
+
+
+_KNOWN_FLAGS = 7
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ViewMessage:
+    """Pixels of one view: a window of frames, single frames, or their standard deviation.
+
+    topic: `view/<id>/win`, `/frm` or `/std`, or `src/frm`. payload: the bytes `header` describes.
+    sequence: number on this topic, counted by the publisher.
+
+    Raises:
+        MessageError: topic, header and payload contradict each other.
+    """
+
+    topic: str
+    header: ViewHeader
+    payload: Buffer
+    sequence: int = 0
+
+    def __post_init__(self) -> None:
+        _check_view_topic(self.topic, self.header.view_id)
+        if self.topic.endswith("/std") and self.header.scale is None:
+            raise MessageError("a std message needs `scale` in its header")
+        if self.header.offsets is not None:
+            _check_offsets(self.header.offsets, self.header.shape[0])
+        wanted, got = self.header.payload_bytes, len(self.payload)
+        if wanted != got:
+            shape = list(self.header.shape)
+            raise MessageError(f"{self.header.encoding} of shape {shape} needs {wanted} payload bytes, got {got}")
+
+    @property
+    def flags(self) -> Flags:
+        """The prefix bits that follow from the content."""
+        return Flags.PAYLOAD | _clock_flag(self.header.clock)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class EndMessage:
+    """Nothing more will come on this topic until the node starts a stream again. Raises MessageError as ViewMessage."""
+
+    topic: str
+    header: EndHeader
+    sequence: int = 0
+
+    def __post_init__(self) -> None:
+        _check_view_topic(self.topic, self.header.view_id)
+
+    @property
+    def flags(self) -> Flags:
+        """The prefix bits that follow from the content."""
+        return Flags.END_OF_STREAM | _clock_flag(self.header.clock)
+
+    @property
+    def payload(self) -> Buffer:
+        """Always empty."""
+        return b""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class NoteMessage:
+    """A message of the status socket: header only. fields: what stands in the header besides its origin."""
+
+    topic: NoteTopic
+    header: OriginHeader
+    fields: Mapping[str, Any]
+    sequence: int = 0
+
+    def __post_init__(self) -> None:
+        if self.topic not in _NOTES:
+            raise MessageError(f"a note's topic is one of {', '.join(_NOTES)}, got {self.topic!r}")
+
+    @property
+    def flags(self) -> Flags:
+        """No bit applies to a note."""
+        return Flags(0)
+
+    @property
+    def payload(self) -> Buffer:
+        """Always empty."""
+        return b""
+
+
+Message: TypeAlias = ViewMessage | EndMessage | NoteMessage
+
+
+def encode(message: Message) -> bytes:
+    """One ZeroMQ part. The join is the only copy of the payload. See decode().
+
+    Raises:
+        MessageError: the header is not plain JSON, or longer than 64 KiB.
+    """
+    header = _header_bytes(message)
+    crc = zlib.crc32(message.payload, zlib.crc32(header))
+    size = len(message.payload)
+    key = topic_key(message.topic)
+    prefix = PREFIX.pack(key, MAGIC, len(header) // 16, message.flags, size, message.sequence, crc, 0)
+    return b"".join((prefix, header, message.payload))
+
+
+def decode(part: Buffer, max_payload: int = MAX_PAYLOAD) -> Message:
+    """Inverse of encode(). The payload is a read-only view into `part`, not a copy.
+
+    Raises:
+        MessageError: not this protocol, another major version, a length, checksum, header or shape that does not fit.
+    """
+    data = memoryview(part).toreadonly().cast("B")
+    if len(data) < PREFIX.size:
+        raise MessageError(f"a message has at least {PREFIX.size} bytes, got {len(data)}")
+    key, magic, header_16, flags, size, sequence, crc, _ = PREFIX.unpack_from(data)
+    if magic != MAGIC:
+        raise MessageError(f"magic must be {MAGIC!r}, got {magic!r}; is this a gcd data or status socket?")
+    start = PREFIX.size + 16 * header_16
+    _check_sizes(len(data), start, size, max_payload)
+    if crc and crc != zlib.crc32(data[PREFIX.size :]):
+        raise MessageError(f"checksum must be {crc:08x}, got {zlib.crc32(data[PREFIX.size :]):08x}: damaged on the way")
+    header = parse(bytes(data[PREFIX.size : start]))
+    check_version(header.get("proto"))
+    message = _message(_topic_of(key), header, data[start:], sequence, Flags(flags & _KNOWN_FLAGS))
+    if message.flags != flags & _KNOWN_FLAGS:
+        raise MessageError(f"flags must be {message.flags:#x} for this content, got {flags:#x}")
+    return message
+
+
+def images(message: ViewMessage) -> NDArray[np.uint8]:
+    """The pixels, u8 [T, H, W, C], read-only; RGB for rgb8 and jpeg. Raw encodings are not copied.
+
+    Raises:
+        MessageError: a JPEG frame is damaged or has another size.
+        ConfigError: the view is JPEG and cv2 is not installed here.
+    """
+    header = message.header
+    if header.offsets is None:
+        return np.frombuffer(message.payload, np.uint8).reshape(header.shape)
+    try:
+        from gcd_node.jpeg import decode_frames  # needs cv2, which readers of rgb8 can do without
+    except ImportError as error:
+        remedy = 'install opencv-python-headless here, or let the node publish encoding = "rgb8"'
+        raise ConfigError(f"this view is JPEG and cv2 cannot be imported ({error}); {remedy}") from error
+    return decode_frames(message.payload, header.offsets, header.shape)
+
+
+def payload_of(pixels: NDArray[np.uint8]) -> memoryview:
+    """An image array as a raw payload: read-only bytes, copied only if `pixels` is not contiguous."""
+    return np.ascontiguousarray(pixels).data.toreadonly().cast("B")
+
+
+def view_topic(view_id: str, kind: ViewKind) -> str:
+    """The topic of a view. Raises MessageError for an id that is not [a-z0-9_]{1,16}."""
+    if not _VIEW_ID.fullmatch(view_id):
+        raise MessageError(f"a view id is 1 to 16 of a-z, 0-9 and _, got {view_id!r}")
+    return f"view/{view_id}/{kind}"
+
+
+def topic_key(topic: str) -> bytes:
+    """What to subscribe to for this topic alone: 32 bytes, NUL-padded, so no topic is a prefix of another."""
+    if _VIEW_TOPIC.fullmatch(topic) is None and topic not in _NOTES:
+        raise MessageError(f"a topic is view/<id>/win|frm|std, src/frm or {', '.join(_NOTES)}, got {topic[:40]!r}")
+    return topic.encode("ascii").ljust(TOPIC_BYTES, b"\0")
+
+
+def new_boot_id() -> str:
+    """128 random bits as 32 hex digits; make one each time the node starts."""
+    return uuid.uuid4().hex
+
+
+def _header_bytes(message: Message) -> bytes:
+    content = to_json(message.header)
+    if isinstance(message, NoteMessage):
+        content = {**message.fields, **content}
+    text = dump(content)
+    padded = text.ljust(-(-len(text) // 16) * 16)
+    if len(padded) > MAX_HEADER:
+        raise MessageError(f"a header has at most {MAX_HEADER} bytes, got {len(padded)}")
+    return padded
+
+
+def _check_sizes(total: int, start: int, payload: int, max_payload: int) -> None:
+    if start - PREFIX.size > MAX_HEADER:
+        raise MessageError(f"a header has at most {MAX_HEADER} bytes, got {start - PREFIX.size}")
+    if payload > max_payload:
+        raise MessageError(f"a payload has at most {max_payload} bytes here, got {payload}; raise max_payload")
+    if total != start + payload:
+        raise MessageError(f"the prefix promises {start + payload} bytes, got {total}")
+
+
+def _topic_of(key: bytes) -> str:
+    topic = key.rstrip(b"\0").decode("ascii", "backslashreplace")
+    if topic_key(topic) != key:
+        raise MessageError(f"a topic is padded with NUL, got {key!r}")
+    return topic
+
+
+def _message(topic: str, header: dict[str, Any], payload: memoryview, sequence: int, flags: Flags) -> Message:
+    if topic not in _NOTES and Flags.END_OF_STREAM not in flags:
+        parsed = from_json(ViewHeader, header)
+        return ViewMessage(topic=topic, header=parsed, payload=payload, sequence=sequence)
+    if len(payload) > 0:
+        raise MessageError(f"{topic} with flags {flags:#x} carries no payload, got {len(payload)} bytes")
+    if topic not in _NOTES:
+        return EndMessage(topic=topic, header=from_json(EndHeader, header), sequence=sequence)
+    fields = types.MappingProxyType({key: header[key] for key in header if key not in _ORIGIN_KEYS})
+    origin = from_json(OriginHeader, header)
+    return NoteMessage(topic=topic, header=origin, fields=fields, sequence=sequence)
+
+
+_ORIGIN_KEYS = frozenset({"proto", "node_id", "boot_id", "t_publish"})
+
+
+def _check_view_topic(topic: str, view_id: str) -> None:
+    match = _VIEW_TOPIC.fullmatch(topic)
+    if match is None:
+        raise MessageError(f"a view's topic is view/<id>/win|frm|std or src/frm, got {topic[:40]!r}")
+    if view_id not in match.groups():
+        raise MessageError(f"topic {topic} must carry view_id {match.group(1) or 'src'}, got {view_id[:40]!r}")
+
+
+def _check_offsets(offsets: tuple[int, ...], frames: int) -> None:
+    rising = all(a < b for a, b in itertools.pairwise(offsets))
+    if len(offsets) != frames + 1 or offsets[0] != 0 or not rising:
+        raise MessageError(f"offsets must be {frames + 1} rising positions from 0, got {str(offsets)[:60]}")
+
+
+def _clock_flag(clock: str) -> Flags:
+    return Flags.REPLAY_CLOCK if clock == "replay" else Flags(0)

@@ -1,0 +1,90 @@
+"""One picture with its capture stamp, and what every source of such pictures promises."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcd_node.errors import SourceError
+
+Image: TypeAlias = NDArray[np.uint8]
+"""u8 [H, W, 3], RGB."""
+
+Clock: TypeAlias = Literal["realtime", "replay"]
+"""Domain of a stamp: "realtime" is a clock other devices share, "replay" counts from the start of a recording."""
+
+
+MAX_FPS = 1000.0
+"""Frame rates above this are taken for a mistake."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Frame:
+    """A picture as the camera took it.
+
+    image: u8 [H, W, 3], RGB. The frame takes the array over: it is read-only from here on.
+    stamp_ns: when it was captured, on the source's clock.
+    seq: the source's own sequence number, gaps included.
+    Raises SourceError for an array of another type or shape.
+    """
+
+    image: Image
+    stamp_ns: int
+    seq: int
+
+    def __post_init__(self) -> None:
+        if self.image.dtype != np.uint8 or self.image.ndim != 3 or self.image.shape[2] != 3 or self.image.size == 0:
+            raise SourceError(
+                f"frame {self.seq} must be u8 [H, W, 3], got {self.image.dtype} {list(self.image.shape)}: "
+                "convert it in the source"
+            )
+        self.image.setflags(write=False)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, pixels."""
+        return self.image.shape[1], self.image.shape[0]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SourceInfo:
+    """What is known of a source once it is open.
+
+    kind: as a launch file names it. id: a short name, no folder in it.
+    width, height: of the first frame, pixels.
+    fps_nominal: the rate the source states; stamps are what counts.
+    clock: domain of the stamps.
+    codec: of a recording, four characters or a picture format; None if there is none.
+    hfov_deg: horizontal field of view, if the source itself knows it.
+    """
+
+    kind: Literal["file", "folder", "synthetic"]
+    id: str
+    width: int
+    height: int
+    fps_nominal: float
+    clock: Clock
+    codec: str | None = None
+    hfov_deg: float | None = None
+
+
+class FrameSource(Protocol):
+    """Where frames come from. It is open once it is made; what cannot be opened raises SourceError there."""
+
+    @property
+    def info(self) -> SourceInfo:
+        """What is known of the source; does not change."""
+        ...
+
+    def frames(self) -> Iterator[Frame]:
+        """Yield frames with rising `stamp_ns`; return at the end; raise SourceError if the device is lost.
+
+        Of a recording, every call starts at its beginning.
+        """
+        ...
+
+    def close(self) -> None:
+        """End `frames` soon, from any thread, for good; a second call does nothing."""
+        ...

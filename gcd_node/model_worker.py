@@ -1,0 +1,193 @@
+"""The model thread: takes windows, renders every view of each, hands the messages over. Owns the device."""
+
+import hashlib
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import torch
+
+from gcd_model import Augmentation, Cancelled, Clip, NonFiniteError, RenderOptions, View, ViewSynthesizer
+from gcd_node.capture import Newest
+from gcd_node.envelope import EndMessage, NoteTopic, ViewMessage
+from gcd_node.errors import ModelFailedError
+from gcd_node.frame_pacer import FramePacer
+from gcd_node.header import OriginHeader
+from gcd_node.preprocess import to_clip_tensor
+from gcd_node.view_message import Rendered, Run, messages, origin
+from gcd_node.virtual_view import VirtualView
+from gcd_node.window import FrameWindow
+
+_LOG = logging.getLogger(__name__)
+_BAD_WINDOWS_IN_A_ROW = 3
+
+
+class Outbox(Protocol):
+    """Where messages go: a Publisher, or a list in a test."""
+
+    def send(self, message: ViewMessage) -> object:
+        """Hand over a view."""
+        ...
+
+    def end(self, message: EndMessage, *, delay_ms: int | None = None) -> None:
+        """Hand over an end-of-stream, to follow the last view."""
+        ...
+
+    def note(self, topic: NoteTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
+        """Hand over a status, event or meta note."""
+        ...
+
+
+@dataclass(slots=True)
+class WorkCounts:
+    """What the model thread has done. render_s: inference time of each window. age_ms: of each, at publish."""
+
+    windows: int = 0
+    nan_windows: int = 0
+    last_window_id: int = -1
+    render_s: list[float] = field(default_factory=list[float])
+    age_ms: list[float] = field(default_factory=list[float])
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class WindowReport:
+    """A window that was just published, for whoever watches. render_s, age_ms: see WorkCounts."""
+
+    window: FrameWindow
+    render_s: float
+    age_ms: float
+
+
+class ModelWorker:
+    """Renders windows until there are no more, it is cancelled, or the model has failed."""
+
+    def __init__(
+        self,
+        run: Run,
+        synthesizer: ViewSynthesizer,
+        views: Sequence[VirtualView],
+        outbox: Outbox,
+        on_window: Callable[[WindowReport], None] | None = None,
+    ) -> None:
+        self.counts = WorkCounts()
+        self._run, self._synthesizer, self._views, self._outbox = run, synthesizer, views, outbox
+        self._on_window = on_window
+        self._pacer = FramePacer(outbox.send)
+        self._cancel = threading.Event()
+        self._bad_in_a_row = 0
+
+    def cancel(self) -> None:
+        """Abandon the window in work at its next denoising step; from any thread."""
+        self._cancel.set()
+
+    def warm_up(self) -> bool:
+        """Render a grey clip in one step, so that the first window does not pay for what happens only once.
+
+        Returns:
+            False if it was cancelled.
+        """
+        traits = self._run.traits
+        video = torch.zeros(traits.config.frames, 3, traits.config.height, traits.config.width)
+        features = self._synthesizer.encode(Clip(video=video, fps=traits.fps))
+        options = RenderOptions(steps=1, motion_bucket=0.0, cancel=self._cancel)
+        try:
+            self._synthesizer.render(features, [view.planned() for view in self._views], options)
+        except (Cancelled, NonFiniteError):
+            return not self._cancel.is_set()  # a model that gives NaN is dealt with window by window
+        return True
+
+    def work(self, newest: Newest[FrameWindow]) -> None:
+        """Take windows and publish their views.
+
+        Raises:
+            ModelFailedError: three windows in a row came out with NaN or Inf, twice each.
+            whatever the source failed with, once its last window is done.
+        """
+        try:
+            while (window := newest.take()) is not None:
+                self._render_or_count(window)
+        except Cancelled:
+            _LOG.info("the window in work was abandoned")
+        finally:
+            self._pacer.finish(abandon=self._cancel.is_set())
+
+    def _render_or_count(self, window: FrameWindow) -> None:
+        """One retry with another seed; a window that fails again is counted and not published."""
+        for attempt in (0, 1):
+            try:
+                self._publish(window, window_seed(self._run.config.digest, window.window_id, attempt))
+            except NonFiniteError as error:
+                _LOG.warning("window %d, attempt %d: %s", window.window_id, attempt + 1, error)
+            else:
+                self._bad_in_a_row = 0
+                return
+        self.counts.nan_windows += 1
+        self._bad_in_a_row += 1
+        fields = {"code": "MODEL_NAN", "level": 2, "window_id": window.window_id}
+        self._outbox.note("event", origin(self._run), fields)
+        if self._bad_in_a_row >= _BAD_WINDOWS_IN_A_ROW:
+            raise ModelFailedError(
+                f"{self._bad_in_a_row} windows in a row came out with NaN or Inf; nothing of them was published. "
+                'Try dtype = "float32" in [model], and look at the weights with `gcd-node weights inspect`'
+            )
+
+    def _publish(self, window: FrameWindow, seed: int) -> None:
+        started_ns = time.monotonic_ns()
+        rendered = self._render(window, seed)
+        ended_ns = time.monotonic_ns()
+        steps = self._run.config.model.steps or self._run.traits.config.sampling.steps
+        for virtual, view in zip(self._views, rendered, strict=True):
+            described = Rendered(
+                window=window,
+                view=view,
+                view_id=virtual.view_id,
+                view_rev=virtual.rev,
+                started_ns=started_ns,
+                ended_ns=ended_ns,
+                steps=steps,
+                seed=seed,
+            )
+            self._send(messages(self._run, described), window.fps)
+        self._count(window, (ended_ns - started_ns) / 1e9)
+
+    def _send(self, made: Sequence[ViewMessage], fps: float) -> None:
+        """Single frames leave at the rhythm they were taken in, unless nobody waits for the clock."""
+        realtime = self._run.config.source.pace == "realtime"
+        frames_sent = 0
+        for message in made:
+            is_frame = message.topic.endswith("/frm")
+            self._pacer.send(message, frames_sent / fps if is_frame and realtime else 0.0)
+            frames_sent += is_frame
+
+    def _render(self, window: FrameWindow, seed: int) -> list[View]:
+        model = self._run.config.model
+        clip = Clip(video=torch.from_numpy(to_clip_tensor(window.images)), fps=window.fps)
+        features = self._synthesizer.encode(clip, Augmentation(strength=model.cond_aug, seed=seed))
+        options = RenderOptions(
+            steps=model.steps,
+            guidance=model.guidance,
+            samples=model.samples,
+            seed=seed,
+            motion_bucket=model.motion_bucket,
+            cancel=self._cancel,
+        )
+        paths = [view.trajectory(window.stamps_ns[-1]) for view in self._views]
+        return self._synthesizer.render(features, paths, options)
+
+    def _count(self, window: FrameWindow, seconds: float) -> None:
+        self.counts.windows += 1
+        self.counts.last_window_id = window.window_id
+        self.counts.render_s.append(seconds)
+        age_ms = (time.monotonic_ns() - window.arrival_ns) / 1e6
+        self.counts.age_ms.append(age_ms)
+        if self._on_window is not None:
+            self._on_window(WindowReport(window=window, render_s=seconds, age_ms=age_ms))
+
+
+def window_seed(config_digest: str, window_id: int, attempt: int) -> int:
+    """The seed of a window: the same in every run of a configuration, below 2^48 so that JSON holds it."""
+    text = f"{config_digest}/{window_id}/{attempt}"
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:6], "big")

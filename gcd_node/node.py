@@ -1,0 +1,230 @@
+"""The node: source, reader thread, model thread and publisher, started and stopped together."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from gcd_model import Intrinsics, Traits, ViewSynthesizer
+from gcd_node.capture import Newest, read
+from gcd_node.config import NodeConfig
+from gcd_node.envelope import NoteTopic, new_boot_id
+from gcd_node.errors import ConfigError
+from gcd_node.frame import FrameSource, SourceInfo
+from gcd_node.model_worker import ModelWorker, Outbox, WindowReport, WorkCounts
+from gcd_node.preprocess import Fit
+from gcd_node.view_message import Run, camera_matrix, end_messages, origin
+from gcd_node.virtual_view import virtual_views
+from gcd_node.window import FrameWindow, WindowBuilder, choose_fps
+
+_LOG = logging.getLogger(__name__)
+_HFOV_TOLERANCE_DEG = 2.0
+_TICK_S = 0.1
+_STATUS_PERIOD_S = 1.0
+_STOP_DELAY_MS = 100
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Summary:
+    """What a run came to. fps: of a window. window_s: from one window to the next. dropped: windows never rendered."""
+
+    counts: WorkCounts
+    fps: float
+    dropped: int
+    frames: int
+    rejected: dict[str, int] = field(default_factory=dict[str, int])
+    window_s: float
+
+
+def prepare_run(config: NodeConfig, traits: Traits, source: SourceInfo) -> tuple[Run, float]:
+    """Everything that can be said before the first frame, and the frame rate windows will have.
+
+    Raises:
+        ConfigError: in strict mode, a frame rate or field of view the model was not trained for.
+    """
+    fps, foreign_rate = config.window.fps, False
+    if fps is None:
+        fps, foreign_rate = choose_fps(source.fps_nominal, traits.rates)
+    elif traits.rates:
+        foreign_rate = fps not in traits.rates
+    intrinsics, foreign_field = _intrinsics(config, traits, source)
+    ood = tuple(name for name, is_foreign in (("fps", foreign_rate), ("hfov", foreign_field)) if is_foreign)
+    if ood and config.strict:
+        raise ConfigError(
+            f"strict: {' and '.join(ood)} of the source ({fps:g} FPS) lie outside what {traits.name} was trained "
+            "with; use another source or [window] fps, or leave strict out to have views flagged"
+        )
+    for name in ood:
+        _LOG.warning("%s of the source lies outside what %s was trained with: views are flagged", name, traits.name)
+    run = Run(config=config, traits=traits, source=source, boot_id=new_boot_id(), intrinsics=intrinsics, ood=ood)
+    return run, fps
+
+
+def _intrinsics(config: NodeConfig, traits: Traits, source: SourceInfo) -> tuple[Intrinsics | None, bool]:
+    """The generated picture's camera, and whether the source's field of view is not the trained one."""
+    trained = None if traits.family is None else traits.family.hfov_deg
+    stated = config.source.hfov_deg or source.hfov_deg
+    if stated is None:
+        size = traits.config.width, traits.config.height
+        return (None if trained is None else Intrinsics.from_hfov(trained, *size)), False
+    fitted = _fit(config, traits).intrinsics(Intrinsics.from_hfov(stated, source.width, source.height))
+    return fitted, trained is not None and abs(fitted.hfov_deg - trained) > _HFOV_TOLERANCE_DEG
+
+
+def _fit(config: NodeConfig, traits: Traits) -> Fit:
+    return Fit(
+        width=traits.config.width,
+        height=traits.config.height,
+        resize=config.source.resize,
+        allow_upscale=config.source.allow_upscale,
+    )
+
+
+class Node:
+    """One run over one source. `run` blocks; `stop` may be called from any thread or signal handler."""
+
+    def __init__(
+        self,
+        config: NodeConfig,
+        synthesizer: ViewSynthesizer,
+        source: FrameSource,
+        outbox: Outbox,
+        on_window: Callable[[WindowReport], None] | None = None,
+    ) -> None:
+        """Check everything that can be checked without a frame.
+
+        Raises:
+            ConfigError, ViewRangeError, ViewFixedError: see prepare_run() and virtual_views().
+        """
+        self._info, fps = prepare_run(config, synthesizer.traits, source.info)
+        self._source, self._outbox = source, outbox
+        self._views = virtual_views(config, synthesizer.traits)
+        fit = _fit(config, synthesizer.traits)
+        fit.crop_box(source.info.width, source.info.height)
+        self._builder = WindowBuilder(
+            frames=synthesizer.traits.config.frames,
+            fps=fps,
+            stride=config.window.stride,
+            max_skew=config.window.max_skew,
+            source_fps=source.info.fps_nominal,
+            fit=fit.image,
+        )
+        self._newest = Newest[FrameWindow](lossless=config.source.pace == "lockstep")
+        self._worker = ModelWorker(self._info, synthesizer, self._views, outbox, on_window)
+        self._window_s = (config.window.stride or self._builder.frames) / fps
+        self._failure: Exception | None = None
+        self._stopped = False
+        self._beats = 0
+
+    @property
+    def traits(self) -> Traits:
+        """The model's."""
+        return self._info.traits
+
+    def run(self) -> Summary:
+        """Work until the source ends or `stop` is called, then announce the end of every view.
+
+        Raises:
+            SourceError: the source was lost, or gave too few frames. ModelFailedError: see ModelWorker.work().
+        """
+        self._note("meta", self._meta())
+        self._note("status", self._status("activating", "connecting"))
+        if self._info.config.source.pace == "realtime" and not self._worker.warm_up():
+            return self._ended()
+        reader = threading.Thread(target=read, args=(self._source, self._builder, self._newest), name="reader")
+        model = threading.Thread(target=self._work, name="model")
+        reader.start()
+        model.start()
+        self._watch(model)
+        self._close()
+        reader.join()
+        return self._ended()
+
+    def _ended(self) -> Summary:
+        self._announce_end()
+        if self._failure is not None:
+            raise self._failure
+        return self._summary()
+
+    def stop(self) -> None:
+        """End soon: no new window begins, the one in work is abandoned at its next step."""
+        self._stopped = True
+        self._worker.cancel()
+        self._close()
+
+    def _close(self) -> None:
+        self._newest.close()
+        self._source.close()
+
+    def _work(self) -> None:
+        try:
+            self._worker.work(self._newest)
+        except Exception as error:
+            self._failure = error
+
+    def _watch(self, model: threading.Thread) -> None:
+        next_s = 0.0
+        while model.is_alive():
+            if time.monotonic() >= next_s:
+                next_s = time.monotonic() + _STATUS_PERIOD_S
+                self._note("status", self._status("active", "streaming"))
+            model.join(_TICK_S)
+
+    def _announce_end(self) -> None:
+        code = "SRC_ENDED" if self._failure is None else type(self._failure).__name__
+        self._note("event", {"code": code, "level": 0 if self._failure is None else 2})
+        self._note("status", self._status("inactive", "ended"))
+        for view in self._views:
+            for message in end_messages(self._info, view.view_id, view.rev, self._worker.counts.last_window_id):
+                self._outbox.end(message, delay_ms=_STOP_DELAY_MS if self._stopped else None)
+
+    def _note(self, topic: NoteTopic, fields: dict[str, object]) -> None:
+        self._outbox.note(topic, origin(self._info), fields)
+
+    def _summary(self) -> Summary:
+        built = self._builder.counts
+        return Summary(
+            counts=self._worker.counts,
+            fps=self._builder.fps,
+            dropped=self._newest.dropped,
+            frames=built.frames,
+            rejected={str(reason): count for reason, count in built.reasons.items()},
+            window_s=self._window_s,
+        )
+
+    def _status(self, state: str, source: str) -> dict[str, object]:
+        """As wire protocol, section 4, as far as this node knows it."""
+        self._beats += 1
+        built, counts = self._builder.counts, self._worker.counts
+        return {
+            "state": state,
+            "level": 1 if self._info.ood else 0,
+            "reasons": list(self._info.ood),
+            "source": {"state": source, "fps": self._info.source.fps_nominal, "dropped": built.dropped},
+            "window": {
+                "built": built.built,
+                "rejected": sum(built.reasons.values()),
+                "reason_counts": dict(built.reasons),
+                "skipped": self._newest.dropped,
+            },
+            "model": {"state": "busy" if source == "streaming" else "ready", "nan_windows": counts.nan_windows},
+            "heartbeat_seq": self._beats,
+        }
+
+    def _meta(self) -> dict[str, object]:
+        """What does not change during a run: weights, views, camera."""
+        traits, camera = self._info.traits, self._info.intrinsics
+        return {
+            "weights": {
+                "name": traits.name,
+                "family": "unknown" if traits.family is None else traits.family.name,
+                "sha256_12": traits.sha256_12,
+                "trained": traits.trained,
+            },
+            "views": [view.view_id for view in self._views],
+            "K": None if camera is None else list(camera_matrix(camera)),
+            "size": [traits.config.width, traits.config.height],
+            "fps": self._builder.fps,
+            "cfg_digest": self._info.config.digest,
+        }

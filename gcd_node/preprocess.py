@@ -1,0 +1,77 @@
+"""From a camera's picture to the network's: crop, resize, and what that does to the camera's intrinsics."""
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gcd_model import Intrinsics, ShapeError, center_crop_box
+from gcd_node.errors import ConfigError
+from gcd_node.frame import Image
+
+Resize: TypeAlias = Literal["released", "area"]
+"""released: bilinear, as in training; it aliases when it shrinks a lot. area: averages, and does not."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Fit:
+    """How pictures of any size become `width` x `height`: the largest centred crop of that shape, resized.
+
+    resize: the name published as `src.resize`.
+    allow_upscale: enlarge pictures that are too small instead of refusing them.
+    Source: Generative Camera Dolly, loading of custom videos, as released; wire protocol, section 7, F7.
+    """
+
+    width: int
+    height: int
+    resize: Resize = "released"
+    allow_upscale: bool = False
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise ConfigError(f"frames must be fitted to at least 1 x 1 pixels, got {self.width} x {self.height}")
+
+    def crop_box(self, width: int, height: int) -> tuple[int, int, int, int]:
+        """The part of a `width` x `height` picture that is used: left, top, width, height, pixels.
+
+        Raises:
+            ConfigError: it would have to be enlarged, and `allow_upscale` is not set.
+        """
+        try:
+            left, top, wide, high = center_crop_box(width, height, self.width / self.height)
+        except ShapeError as error:
+            raise ConfigError(str(error)) from error
+        if not self.allow_upscale and (wide < self.width or high < self.height):
+            raise ConfigError(
+                f"a {width} x {height} picture (cropped to {wide} x {high}) is smaller than the {self.width} x "
+                f"{self.height} the model takes; use a larger one or set allow_upscale"
+            )
+        return left, top, wide, high
+
+    def image(self, image: Image) -> Image:
+        """Crop and resize one picture: u8 [H, W, 3] to [height, width, 3]. Raises ConfigError as `crop_box`."""
+        left, top, wide, high = self.crop_box(image.shape[1], image.shape[0])
+        part = image[top : top + high, left : left + wide]
+        if (wide, high) == (self.width, self.height):
+            return np.ascontiguousarray(part)
+        shrinks = self.width < wide or self.height < high
+        how = cv2.INTER_AREA if self.resize == "area" and shrinks else cv2.INTER_LINEAR
+        return np.asarray(cv2.resize(part, (self.width, self.height), interpolation=how), np.uint8)
+
+    def intrinsics(self, source: Intrinsics) -> Intrinsics:
+        """The camera of the fitted picture, from the camera of the whole. Raises ConfigError as `crop_box`."""
+        return source.cropped(*self.crop_box(source.width, source.height)).resized(self.width, self.height)
+
+
+def to_clip_tensor(images: Image) -> NDArray[np.float32]:
+    """u8 [T, H, W, 3] in 0..255 -> float32 [T, 3, H, W] in [-1, 1], contiguous.
+
+    Raises:
+        ConfigError: another type or shape.
+    """
+    if images.dtype != np.uint8 or images.ndim != 4 or images.shape[3] != 3:
+        raise ConfigError(f"images must be u8 [T, H, W, 3], got {images.dtype} {list(images.shape)}")
+    planes = np.ascontiguousarray(images.transpose(0, 3, 1, 2), dtype=np.float32)
+    return planes / np.float32(127.5) - np.float32(1.0)

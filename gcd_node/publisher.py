@@ -1,0 +1,365 @@
+"""Sends encoded messages: one thread owns the data and the status socket (wire protocol, section 1).
+
+ZeroMQ sockets belong to one thread, so callers hand messages over through a bounded queue. The thread looks at its
+sockets at least every 10 ms: without that, welcome messages and subscriptions would never be served.
+
+Longer than most files: the two sockets and the thread that owns them are one matter, and only here is ZeroMQ bound.
+"""
+
+import logging
+import queue
+import threading
+import time
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import zmq
+
+from gcd_node.endpoints import Channel, check_bindable, free_ipc_path, is_ipv6, make_runtime_folder, resolve_endpoint
+from gcd_node.envelope import TOPIC_BYTES, WELCOME, EndMessage, NoteMessage, NoteTopic, ViewMessage, encode
+from gcd_node.errors import EndpointError, NodeError
+from gcd_node.header import OriginHeader
+
+_LOG = logging.getLogger(__name__)
+_IDLE_S = 0.01
+_RETRY_MS = 3
+_DATA_HWM = 4
+_STATUS_HWM = 100
+_MAX_SUBSCRIPTION = 4096
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PublisherOptions:
+    """Where and how to send.
+
+    data, status: endpoints, or "ipc" for the runtime folder; status None opens no status socket.
+    lockstep: wait for slow readers instead of skipping, and for min_subscribers before the first message.
+    end_delay_ms: how long an end-of-stream message follows the last window, so that a conflated reader gets both.
+    linger_ms: how long an orderly close waits for readers; drain_ms: the same in lockstep, without any progress.
+    queue_size: messages between the callers and the thread.
+    """
+
+    data: str = "ipc"
+    status: str | None = "ipc"
+    lockstep: bool = False
+    min_subscribers: int = 0
+    end_delay_ms: int = 500
+    linger_ms: int = 1000
+    drain_ms: int = 10_000
+    queue_size: int = 8
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PublisherStats:
+    """sent, bytes: handed to ZeroMQ on the data socket. dropped: refused because the queue was full.
+    subscribers: subscriptions on the data socket now. What ZeroMQ drops for a slow reader shows in no counter here:
+    that reader sees a gap in the sequence."""
+
+    sent: int
+    dropped: int
+    subscribers: int
+    bytes: int
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Parcel:
+    """An encoded message; follow_s: how long it must come after the last one, None for at once."""
+
+    part: bytes
+    follow_s: float | None = None
+
+
+class Publisher:
+    """Publishes views, ends and notes. Use it as a context manager; every method may be called from any thread.
+
+    Make one per boot_id: sequences count from 0 here.
+
+    Raises:
+        EndpointError: an endpoint is in use or cannot be bound.
+        ConfigError: an endpoint is no endpoint, or others than this machine could reach it.
+    """
+
+    def __init__(self, options: PublisherOptions) -> None:
+        self._options = options
+        self._queue: queue.Queue[_Parcel] = queue.Queue(options.queue_size)
+        self._notes: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._sequences: Counter[tuple[str, str]] = Counter()
+        self._hand_over = threading.Lock()
+        self._closing, self._abandoned, self._closed = threading.Event(), threading.Event(), threading.Event()
+        self._failure: Exception | None = None
+        self._dropped = 0
+        self._context = zmq.Context()
+        try:
+            self._data = _DataSocket(self._context, options)
+            self._status = None if options.status is None else _StatusSocket(self._context, options.status)
+        except BaseException:
+            self._context.destroy(linger=0)
+            raise
+        self._thread = threading.Thread(target=self._serve, name="publisher", daemon=True)
+        self._thread.start()
+
+    def send(self, message: ViewMessage) -> bool:
+        """Number, encode and hand over one message; its own `sequence` is replaced.
+
+        Realtime never waits: with a full queue the message is dropped and counted. Lockstep waits for room.
+
+        Returns:
+            Whether it was accepted.
+        Raises:
+            MessageError: it cannot be encoded. NodeError: the publisher is closed, or its thread failed.
+        """
+        with self._hand_over:
+            self.check()
+            if self._queue.full() and not self._options.lockstep:
+                self._dropped += 1
+                return False
+            self._put(_Parcel(part=self._encoded(message)))
+        return True
+
+    def end(self, message: EndMessage, *, delay_ms: int | None = None) -> None:
+        """Queue an end-of-stream message, to leave `delay_ms` (else end_delay_ms) after the last window; never dropped.
+
+        Raises: as send().
+        """
+        delay = self._options.end_delay_ms if delay_ms is None else delay_ms
+        with self._hand_over:
+            self.check()
+            self._put(_Parcel(part=self._encoded(message), follow_s=delay / 1000))
+
+    def note(self, topic: NoteTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
+        """Send a status, event or meta message; the last of each topic is repeated to whoever subscribes later.
+
+        Raises: as send().
+        """
+        with self._hand_over:
+            self.check()
+            self._notes.put(self._encoded(NoteMessage(topic=topic, header=header, fields=fields)))
+
+    def check(self) -> None:
+        """Raises what stopped the thread, or NodeError if the publisher is closed."""
+        self._raise_failure()
+        if self._closed.is_set():
+            raise NodeError("the publisher is closed; make a new one")
+
+    @property
+    def stats(self) -> PublisherStats:
+        """Counters since the start."""
+        data = self._data
+        return PublisherStats(sent=data.sent, dropped=self._dropped, subscribers=data.subscribers, bytes=data.bytes)
+
+    @property
+    def endpoint(self) -> str:
+        """Where data was bound, with the port that was chosen if 0 was asked for."""
+        return self._data.endpoint
+
+    @property
+    def status_endpoint(self) -> str | None:
+        """Where status was bound, None without a status socket."""
+        return None if self._status is None else self._status.endpoint
+
+    def close(self, *, orderly: bool = True) -> None:
+        """Send what is queued, give readers `linger_ms`, close. Not orderly: close at once. A second call does nothing.
+
+        Raises:
+            EndpointError: lockstep messages that no reader took. Else whatever stopped the thread.
+        """
+        if not self._closed.is_set():
+            self._shut(orderly)
+            self._raise_failure()
+
+    def __enter__(self) -> "Publisher":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        if error is None:
+            self.close()
+            return
+        self._shut(orderly=False)
+        if self._failure is not None:
+            _LOG.error("the publisher had failed too: %s", self._failure)
+
+    def _encoded(self, message: ViewMessage | EndMessage | NoteMessage) -> bytes:
+        key = (message.header.boot_id, message.topic)
+        part = encode(replace(message, sequence=self._sequences[key]))
+        self._sequences[key] += 1
+        return part
+
+    def _put(self, parcel: _Parcel) -> None:
+        while True:
+            try:
+                return self._queue.put(parcel, timeout=0.05)
+            except queue.Full:
+                self.check()
+
+    def _raise_failure(self) -> None:
+        if isinstance(self._failure, NodeError):
+            raise self._failure
+        if self._failure is not None:
+            raise NodeError(f"the publisher thread stopped: {self._failure}") from self._failure
+
+    def _shut(self, orderly: bool) -> None:
+        if self._closed.is_set():
+            return
+        self._closed.set()
+        if not orderly:
+            self._abandoned.set()
+        self._closing.set()
+        self._thread.join()
+        self._context.term()
+
+    # What follows runs in the publisher thread alone.
+
+    def _serve(self) -> None:
+        linger_ms = 0
+        try:
+            self._run()
+            if not self._abandoned.is_set():
+                linger_ms = self._options.drain_ms if self._options.lockstep else self._options.linger_ms
+        except Exception as error:
+            self._failure = error
+        finally:
+            self._data.close(linger_ms)
+            if self._status is not None:
+                self._status.close(linger_ms)
+
+    def _run(self) -> None:
+        parcel: _Parcel | None = None
+        progress = time.monotonic()
+        while not self._abandoned.is_set():
+            closing = self._closing.is_set()  # read first: what was queued before it is seen below
+            self._serve_sockets()
+            parcel = parcel or self._take()
+            if parcel is None and closing:
+                return
+            if parcel is None or self._data.send(parcel):
+                parcel, progress = None, time.monotonic()
+            elif closing and time.monotonic() - progress > self._options.drain_ms / 1000:
+                raise EndpointError(self._undelivered())
+            else:
+                self._data.wait(_RETRY_MS)
+
+    def _serve_sockets(self) -> None:
+        self._data.serve()
+        while not self._notes.empty():
+            part = self._notes.get()
+            if self._status is not None:
+                self._status.send(part)
+        if self._status is not None:
+            self._status.serve()
+
+    def _take(self) -> _Parcel | None:
+        try:
+            return self._queue.get(timeout=_IDLE_S)
+        except queue.Empty:
+            return None
+
+    def _undelivered(self) -> str:
+        count, seconds = self._queue.qsize() + 1, self._options.drain_ms / 1000
+        have, wanted = self._data.subscribers, self._options.min_subscribers
+        readers = f"{have} subscribers, wanted {wanted}"
+        return f"{count} messages were not taken within {seconds:g} s at {self.endpoint} ({readers}); start the reader"
+
+
+class _DataSocket:
+    """The data socket; in lockstep it refuses rather than skips."""
+
+    def __init__(self, context: "zmq.Context[zmq.Socket[bytes]]", options: PublisherOptions) -> None:
+        self._options = options
+        self._socket = _bound(context, _own_endpoint(options.data, "data"), _DATA_HWM, no_drop=options.lockstep)
+        self.endpoint = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        self.sent = self.bytes = self.subscribers = 0
+        self._last_sent = time.monotonic()
+
+    def serve(self) -> None:
+        """Count subscriptions; those to the welcome message alone are none."""
+        for event in _events(self._socket):
+            if event[1:] != WELCOME[: len(event) - 1] or len(event) == 1:
+                self.subscribers += 1 if event[0] else -1
+
+    def send(self, parcel: _Parcel) -> bool:
+        """Whether it left; if not, try again later."""
+        if self._options.lockstep and self.sent == 0 and self.subscribers < self._options.min_subscribers:
+            return False
+        if parcel.follow_s is not None and time.monotonic() < self._last_sent + parcel.follow_s:
+            return False
+        try:
+            self._socket.send(parcel.part, zmq.NOBLOCK)
+        except zmq.Again:
+            return False
+        self.sent += 1
+        self.bytes += len(parcel.part)
+        if parcel.follow_s is None:
+            self._last_sent = time.monotonic()
+        return True
+
+    def wait(self, timeout_ms: int) -> None:
+        """Until a subscription arrives, at most `timeout_ms`."""
+        self._socket.poll(timeout_ms)
+
+    def close(self, linger_ms: int) -> None:
+        self._socket.close(linger_ms)
+
+
+class _StatusSocket:
+    """The status socket: keeps the last message of each topic for whoever comes later."""
+
+    def __init__(self, context: "zmq.Context[zmq.Socket[bytes]]", endpoint: str) -> None:
+        self._socket = _bound(context, _own_endpoint(endpoint, "status"), _STATUS_HWM, no_drop=False)
+        self.endpoint = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        self._last: dict[bytes, bytes] = {}
+
+    def serve(self) -> None:
+        """Repeat what a new subscriber asks for; ZeroMQ sends it to all, who know it by its sequence."""
+        for event in _events(self._socket):
+            for part in [part for key, part in self._last.items() if event[0] and key.startswith(event[1:])]:
+                self._socket.send(part)
+
+    def send(self, part: bytes) -> None:
+        self._last[part[:TOPIC_BYTES]] = part
+        self._socket.send(part)
+
+    def close(self, linger_ms: int) -> None:
+        self._socket.close(linger_ms)
+
+
+def _events(socket: "zmq.Socket[bytes]") -> list[bytes]:
+    """Pending subscribe (first byte 1) and unsubscribe (first byte 0) events; anything else a peer sends is ignored."""
+    found: list[bytes] = []
+    while socket.poll(0):
+        event = socket.recv(zmq.NOBLOCK)
+        if event[:1] in (b"\0", b"\1"):
+            found.append(event)
+    return found
+
+
+def _own_endpoint(endpoint: str, channel: Channel) -> str:
+    if endpoint == "ipc":
+        make_runtime_folder()
+    return resolve_endpoint(endpoint, channel)
+
+
+def _bound(
+    context: "zmq.Context[zmq.Socket[bytes]]", endpoint: str, high_water_mark: int, *, no_drop: bool
+) -> "zmq.Socket[bytes]":
+    check_bindable(endpoint)
+    if endpoint.startswith("ipc://"):
+        free_ipc_path(
+            Path(endpoint.removeprefix("ipc://"))
+        )  # ZeroMQ itself would take a live endpoint away without a word
+    socket = context.socket(zmq.XPUB)
+    socket.set(zmq.XPUB_VERBOSER, 1)  # VERBOSE, and unsubscriptions too: only so can subscribers be counted
+    socket.set(zmq.XPUB_NODROP, int(no_drop))
+    socket.set(zmq.XPUB_WELCOME_MSG, WELCOME)
+    socket.set(zmq.SNDHWM, high_water_mark)
+    socket.set(zmq.MAXMSGSIZE, _MAX_SUBSCRIPTION)
+    socket.set(zmq.LINGER, 0)
+    socket.set(zmq.IPV6, int(is_ipv6(endpoint)))
+    try:
+        socket.bind(endpoint)
+    except zmq.ZMQError as error:
+        raise EndpointError(f"cannot bind {endpoint}: {error.strerror}; stop who uses it or choose another") from error
+    return socket

@@ -1,0 +1,75 @@
+"""The virtual cameras of a node: which path each wants for the next window."""
+
+from dataclasses import replace
+
+from gcd_model import Orbit, Spherical, SphericalDelta, Traits, Trajectory
+from gcd_node.config import NodeConfig, ViewConfig
+
+NANOSECONDS = 1_000_000_000
+
+
+class VirtualView:
+    """One configured virtual camera; an orbit remembers where it stands.
+
+    rev: counts changes of the view; receivers drop older ones.
+    """
+
+    def __init__(
+        self, view_id: str, config: ViewConfig, traits: Traits, source: Spherical | None, move_time: int
+    ) -> None:
+        self.view_id, self.rev = view_id, 1
+        self._traits, self._source, self._move_time = traits, source, move_time
+        self._goal = SphericalDelta(
+            azimuth_deg=config.azimuth_deg, elevation_deg=config.elevation_deg, radius_m=config.radius
+        )
+        self._orbit = _orbit(config)
+        self._stamp_ns: int | None = None
+        self._check_reach()
+
+    def trajectory(self, stamp_ns: int) -> Trajectory:
+        """The camera path for a window whose newest frame was captured at `stamp_ns`.
+
+        An orbit's destination goes on from the last window's by the time between them, and turns at its limit.
+        """
+        if self._orbit is not None and self._stamp_ns is not None:
+            self._orbit = self._orbit.advanced((stamp_ns - self._stamp_ns) / NANOSECONDS)
+        self._stamp_ns = stamp_ns
+        return self.planned()
+
+    def planned(self) -> Trajectory:
+        """The path to where the view is now; an orbit does not move on."""
+        return self._plan(self._destination(self._orbit))
+
+    def _destination(self, orbit: Orbit | None) -> SphericalDelta:
+        return self._goal if orbit is None else replace(self._goal, azimuth_deg=orbit.azimuth_deg)
+
+    def _plan(self, goal: SphericalDelta) -> Trajectory:
+        return self._traits.plan_view(goal, source=self._source, move_time=self._move_time)
+
+    def _check_reach(self) -> None:
+        """Raises ViewRangeError or ViewFixedError before the first window rather than in the middle of a run."""
+        self._plan(self._goal)
+        if self._orbit is not None:
+            for azimuth_deg in (-self._orbit.amplitude_deg, self._orbit.amplitude_deg):
+                self._plan(replace(self._goal, azimuth_deg=azimuth_deg))
+
+
+def _orbit(config: ViewConfig) -> Orbit | None:
+    if config.kind == "fixed" or config.rate_deg_s is None or config.amplitude_deg is None:
+        return None
+    return Orbit(rate_deg_s=config.rate_deg_s, amplitude_deg=config.amplitude_deg, azimuth_deg=config.azimuth_deg)
+
+
+def virtual_views(config: NodeConfig, traits: Traits) -> list[VirtualView]:
+    """The views a launch file configures.
+
+    Raises:
+        ViewRangeError, ViewFixedError: the checkpoint cannot give one of them. OptionError: an impossible orbit.
+    """
+    pose, move_time = config.source.pose, config.model.move_time
+    source = None
+    if pose is not None:
+        source = Spherical(azimuth_deg=0.0, elevation_deg=pose.elevation_deg, radius_m=pose.radius)
+    if move_time is None:
+        move_time = traits.move_time
+    return [VirtualView(name, view, traits, source, move_time) for name, view in config.view.items()]

@@ -1,0 +1,78 @@
+"""The CLIP image tower: its pixels, and its tokens against transformers."""
+
+import kornia
+import pytest
+import torch
+from naming import diffusers_state, levels_of
+from small_models import draw, randomise, relative_error
+from torch.testing import assert_close
+from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
+
+from gcd_model.config import ImageEncoderConfig
+from gcd_model.image_encoder import ImageEncoder, clip_pixels
+
+TOWER = ImageEncoderConfig(image_size=28, patch=7, width=32, layers=3, heads=4, hidden_width=64, output_width=24)
+
+
+def test_the_image_token_equals_transformers() -> None:
+    ours = ImageEncoder(TOWER)
+    randomise(ours)
+    theirs = CLIPVisionModelWithProjection(
+        CLIPVisionConfig(
+            image_size=TOWER.image_size,
+            patch_size=TOWER.patch,
+            hidden_size=TOWER.width,
+            intermediate_size=TOWER.hidden_width,
+            num_hidden_layers=TOWER.layers,
+            num_attention_heads=TOWER.heads,
+            projection_dim=TOWER.output_width,
+            hidden_act="gelu",
+        )
+    ).eval()
+    theirs.load_state_dict(diffusers_state(ours, "image_encoder", "image_encoder/", levels_of(tower=TOWER)))
+    pixels = draw(3, 3, 28, 28)
+    with torch.inference_mode():
+        expected, result = theirs(pixels).image_embeds, ours(pixels)
+    assert result.shape == (3, 24)
+    assert relative_error(result, expected) < 1e-5
+
+
+def test_the_token_is_not_normalised_to_unit_length() -> None:
+    ours = ImageEncoder(TOWER)
+    randomise(ours)
+    with torch.no_grad():
+        token = ours(draw(2, 3, 28, 28))
+        ours.projection.mul_(3.0)
+        assert_close(ours(draw(2, 3, 28, 28)), 3 * token)
+
+
+@pytest.mark.parametrize(("height", "width"), [(64, 96), (300, 200), (224, 224), (30, 400)])
+def test_pixels_are_squeezed_by_kornias_antialiased_bicubic_before_the_range_changes(height: int, width: int) -> None:
+    frames = draw(2, 3, height, width).clamp(-1, 1)
+    squeezed = kornia.geometry.resize(frames, (224, 224), interpolation="bicubic", align_corners=True, antialias=True)
+    mean = torch.tensor([0.48145466, 0.4578275, 0.40821073]).reshape(3, 1, 1)
+    deviation = torch.tensor([0.26862954, 0.26130258, 0.27577711]).reshape(3, 1, 1)
+    assert_close(clip_pixels(frames, 224), ((squeezed + 1) / 2 - mean) / deviation)
+
+
+def test_the_whole_picture_is_kept_when_it_is_not_square() -> None:
+    frames = torch.full((1, 3, 64, 256), -1.0)
+    frames[..., :32], frames[..., -32:] = 1.0, 1.0  # a centre crop would lose both bright edges
+    pixels = clip_pixels(frames, 56)
+    assert pixels.shape == (1, 3, 56, 56)
+    assert pixels[0, 0, 28, 2] > 1.0
+    assert pixels[0, 0, 28, -3] > 1.0
+    assert pixels[0, 0, 28, 28] < 0.0
+
+
+def test_black_and_white_become_clips_extremes() -> None:
+    black, white = clip_pixels(torch.full((1, 3, 56, 56), -1.0), 56), clip_pixels(torch.ones(1, 3, 56, 56), 56)
+    assert_close(black[0, :, 20, 20], torch.tensor([-1.792263, -1.752097, -1.480220]), atol=1e-5, rtol=0)
+    assert_close(white[0, :, 20, 20], torch.tensor([1.930336, 2.074888, 2.145897]), atol=1e-5, rtol=0)
+
+
+def test_torchs_own_antialiasing_would_be_another_filter() -> None:
+    frames = draw(1, 3, 256, 384).clamp(-1, 1)
+    other = torch.nn.functional.interpolate(frames, (224, 224), mode="bicubic", align_corners=False, antialias=True)
+    mean, deviation = torch.tensor([0.48145466]), torch.tensor([0.26862954])
+    assert relative_error(clip_pixels(frames, 224)[:, :1], ((other + 1) / 2 - mean)[:, :1] / deviation) > 1e-2

@@ -1,0 +1,149 @@
+"""The sampler: noise levels, preconditioning, guidance, Euler steps, and the whole of it against a plain reference."""
+
+import math
+import threading
+from itertools import pairwise
+
+import pytest
+import torch
+from small_models import draw
+from torch import Tensor
+from torch.testing import assert_close
+
+from gcd_model.config import SamplingConfig
+from gcd_model.errors import Cancelled
+from gcd_model.noise import edm_sigmas, guidance_scale, preconditioning, unit_noise
+from gcd_model.sampler import euler, guided
+
+PUBLISHED = SamplingConfig()
+
+
+def test_25_noise_levels_have_the_published_values() -> None:
+    sigmas = edm_sigmas(PUBLISHED, 25)
+    expected = {
+        0: 700.0,
+        1: 545.729246,
+        2: 421.569136,
+        3: 322.453683,
+        12: 15.589968,
+        22: 0.024803,
+        23: 0.007882,
+        24: 0.002,
+        25: 0.0,
+    }
+    assert sigmas.shape == (26,)
+    assert {i: round(sigmas[i].item(), 6) for i in expected} == expected
+
+
+@pytest.mark.parametrize("steps", [1, 2, 4, 25, 100])
+def test_noise_levels_fall_from_the_largest_through_the_smallest_to_zero(steps: int) -> None:
+    sigmas = edm_sigmas(PUBLISHED, steps).tolist()
+    assert len(sigmas) == steps + 1
+    assert all(earlier > later for earlier, later in pairwise(sigmas))
+    assert sigmas[0] == pytest.approx(700.0)
+    assert sigmas[-1] == 0.0
+    if steps > 1:
+        assert sigmas[-2] == pytest.approx(0.002)
+
+
+@pytest.mark.parametrize("sigma", [0.002, 0.5, 1.0, 30.0, 700.0])
+def test_a_network_that_predicts_v_exactly_makes_the_denoiser_exact(sigma: float) -> None:
+    clean, noise = draw(5).double(), draw(5, seed=1).double()
+    noisy = clean + sigma * noise
+    v = (noise - sigma * clean) / math.sqrt(1 + sigma**2)
+    c = preconditioning(torch.tensor(sigma, dtype=torch.float64))
+    assert_close(c.c_skip * noisy + c.c_out * v, clean, rtol=0, atol=1e-9)
+
+
+def test_preconditioning_has_the_published_coefficients() -> None:
+    c = preconditioning(torch.tensor([3.0], dtype=torch.float64))
+    assert c.c_skip.item() == pytest.approx(1 / 10)
+    assert c.c_out.item() == pytest.approx(-3 / math.sqrt(10))
+    assert c.c_in.item() == pytest.approx(1 / math.sqrt(10))
+    assert c.c_noise.item() == pytest.approx(0.25 * math.log(3))
+
+
+def test_noisy_input_has_unit_variance_after_c_in() -> None:
+    for sigma in edm_sigmas(PUBLISHED, 25)[:-1]:
+        assert (preconditioning(sigma).c_in ** 2 * (1 + sigma**2)).item() == pytest.approx(1.0)
+
+
+def test_guidance_rises_linearly_from_the_first_frame_to_the_last() -> None:
+    scale = guidance_scale(1.0, 1.5, 14)
+    assert scale[0].item() == 1.0
+    assert scale[-1].item() == 1.5
+    assert_close(scale.diff(), torch.full((13,), 0.038462, dtype=torch.float64), atol=1e-6, rtol=0)
+
+
+def test_guidance_moves_each_frame_away_from_the_unconditional_prediction_by_its_own_scale() -> None:
+    unconditional, conditional = draw(2, 3, 4, 2, 2), draw(2, 3, 4, 2, 2, seed=1)
+    scale = torch.tensor([0.0, 1.0, 2.5], dtype=torch.float64)
+    result = guided(unconditional, conditional, scale)
+    assert_close(result[:, 0], unconditional[:, 0])
+    assert_close(result[:, 1], conditional[:, 1])
+    assert_close(result[:, 2], 2.5 * conditional[:, 2] - 1.5 * unconditional[:, 2])
+
+
+def test_euler_reaches_a_constant_prediction_exactly() -> None:
+    target = draw(3).double()
+    sigmas = edm_sigmas(PUBLISHED, 7)
+    assert_close(euler(lambda _x, _i: target, draw(3, seed=1).double() * 700, sigmas), target)
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.3, 0.9])
+def test_euler_follows_the_closed_form_for_a_denoiser_that_scales(slope: float) -> None:
+    sigmas = edm_sigmas(PUBLISHED, 25)
+    start = draw(4).double()
+    factor = 1.0
+    for sigma, following in pairwise(sigmas.tolist()):
+        factor *= slope + (1 - slope) * following / sigma
+    assert_close(euler(lambda x, _i: slope * x, start, sigmas), start * factor)
+
+
+def test_euler_approaches_the_true_flow_of_a_gaussian_in_proportion_to_its_step() -> None:
+    spread = 2.0  # data ~ N(0, 2^2): D(x, s) = x * 4 / (4 + s^2), and x(s) grows with sqrt(4 + s^2)
+    start = torch.tensor([1.0], dtype=torch.float64)
+    exact = start * spread / math.sqrt(spread**2 + PUBLISHED.sigma_max**2)
+
+    def error(steps: int) -> float:
+        sigmas = edm_sigmas(PUBLISHED, steps)
+        final = euler(lambda x, i: x * spread**2 / (spread**2 + sigmas[i] ** 2), start, sigmas)
+        return (final / exact - 1).abs().item()
+
+    assert error(400) < 0.02
+    assert error(200) / error(400) == pytest.approx(2.0, abs=0.1)
+
+
+def test_progress_counts_every_step_once() -> None:
+    seen: list[tuple[int, int]] = []
+    euler(lambda x, _i: x, draw(2), edm_sigmas(PUBLISHED, 4), progress=lambda done, total: seen.append((done, total)))
+    assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
+
+
+def test_a_cancelled_run_stops_before_the_next_network_evaluation() -> None:
+    stop, evaluations = threading.Event(), list[int]()
+
+    def denoise(x: Tensor, i: int) -> Tensor:
+        evaluations.append(i)
+        if i == 1:
+            stop.set()
+        return x
+
+    with pytest.raises(Cancelled, match="before step 3 of 5"):
+        euler(denoise, draw(2), edm_sigmas(PUBLISHED, 5), cancel=stop)
+    assert evaluations == [0, 1]
+
+
+def test_unit_noise_is_fixed_by_seed_and_stream_and_differs_between_them() -> None:
+    shape = (4, 5000)
+    first = unit_noise(shape, seed=3, stream=1)
+    assert torch.equal(first, unit_noise(shape, seed=3, stream=1))
+    others = [
+        unit_noise(shape, seed=3, stream=2),
+        unit_noise(shape, seed=4, stream=1),
+        unit_noise(shape, seed=1, stream=3),
+    ]
+    for other in others:
+        assert torch.corrcoef(torch.stack([first.flatten(), other.flatten()]))[0, 1].abs() < 0.03
+    assert first.mean().abs() < 0.03
+    assert first.std().item() == pytest.approx(1.0, abs=0.03)

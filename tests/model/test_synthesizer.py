@@ -1,0 +1,354 @@
+"""The door: what `encode` and `render` promise, on the smallest network that has every part."""
+
+import threading
+from collections.abc import Callable
+
+import msgspec
+import pytest
+import torch
+from small_models import TINY, draw, random_clip, relative_error, tiny_synthesizer
+from torch import Tensor
+from torch.testing import assert_close
+
+from gcd_model.clip import Augmentation, Clip, RenderOptions, View
+from gcd_model.config import ModelConfig
+from gcd_model.errors import Cancelled, NonFiniteError, OptionError, ShapeError
+from gcd_model.geometry import SphericalDelta, Trajectory, pose_trajectory
+from gcd_model.noise import unit_noise
+from gcd_model.synthesizer import Synthesizer, synthesize
+from gcd_model.vae import to_pixels
+
+LATENTS = (TINY.frames, 4, TINY.height // 4, TINY.width // 4)
+
+
+@pytest.fixture(scope="module")
+def synthesizer() -> Synthesizer:
+    return tiny_synthesizer()
+
+
+def paths(synthesizer: Synthesizer) -> list[Trajectory]:
+    goals = [(30.0, 10.0, 1.0), (-80.0, 0.0, 0.0), (0.0, 20.0, -2.0)]
+    return [
+        synthesizer.traits.plan_view(SphericalDelta(azimuth_deg=azimuth, elevation_deg=elevation, radius_m=radius))
+        for azimuth, elevation, radius in goals
+    ]
+
+
+def path(synthesizer: Synthesizer) -> Trajectory:
+    return paths(synthesizer)[0]
+
+
+def with_unet(**changes: object) -> ModelConfig:
+    """TINY with other fields in its U-Net."""
+    return msgspec.structs.replace(TINY, unet=msgspec.structs.replace(TINY.unet, **changes))
+
+
+def test_a_view_has_one_picture_per_frame_in_zero_to_one_and_the_latents_they_were_decoded_from(
+    synthesizer: Synthesizer,
+) -> None:
+    view = synthesize(synthesizer, random_clip(), path(synthesizer))
+    assert view.video.shape == (TINY.frames, 3, TINY.height, TINY.width)
+    assert view.video.dtype == view.latents.dtype == torch.float32
+    assert view.video.min() >= 0.0
+    assert view.video.max() <= 1.0
+    assert view.latents.shape == (1, *LATENTS)
+    with torch.inference_mode():
+        decoded = synthesizer.networks.decoder(view.latents[0] / 0.18215, TINY.frames)
+    assert_close(view.video, torch.clamp((decoded + 1) / 2, 0, 1))
+
+
+def test_decoded_values_map_from_minus_one_and_one_to_black_and_white_and_are_clamped() -> None:
+    assert to_pixels(torch.tensor([-3.0, -1.0, 0.0, 1.0, 2.0])).tolist() == [0.0, 0.0, 0.5, 1.0, 1.0]
+
+
+def test_several_views_and_samples_in_one_batch_equal_each_alone(synthesizer: Synthesizer) -> None:
+    features = synthesizer.encode(random_clip())
+    together = synthesizer.render(features, paths(synthesizer), RenderOptions(samples=2, seed=5))
+    for one, view in zip(paths(synthesizer), together, strict=True):
+        (alone,) = synthesizer.render(features, [one], RenderOptions(seed=5))
+        assert relative_error(view.latents[:1], alone.latents) < 1e-5
+        assert relative_error(view.samples[:1], alone.samples) < 1e-5
+        assert view.motion_bucket == alone.motion_bucket
+        second = RenderOptions(initial_noise=unit_noise(LATENTS, 5, stream=2))
+        (alone,) = synthesizer.render(features, [one], second)
+        assert relative_error(view.latents[1:], alone.latents) < 1e-5
+    assert len({view.motion_bucket for view in together}) == 3
+
+
+def test_samples_do_not_depend_on_how_many_are_drawn(synthesizer: Synthesizer) -> None:
+    features = synthesizer.encode(random_clip())
+    (two,) = synthesizer.render(features, [path(synthesizer)], RenderOptions(samples=2))
+    (three,) = synthesizer.render(features, [path(synthesizer)], RenderOptions(samples=3))
+    assert relative_error(two.latents, three.latents[:2]) < 1e-5
+
+
+def test_the_uncertainty_is_the_population_deviation_over_samples_averaged_over_colours(
+    synthesizer: Synthesizer,
+) -> None:
+    features = synthesizer.encode(random_clip())
+    (view,) = synthesizer.render(features, [path(synthesizer)], RenderOptions(samples=3))
+    mean = view.samples.mean(dim=0)
+    expected = ((view.samples - mean) ** 2).mean(dim=0).sqrt().mean(dim=1)
+    assert view.std is not None
+    assert view.std.shape == (TINY.frames, TINY.height, TINY.width)
+    assert_close(view.std, expected)
+    assert view.std.max() > 0
+    assert synthesize(synthesizer, random_clip(), path(synthesizer)).std is None
+
+
+def test_the_same_seed_gives_the_same_view_and_another_seed_another(synthesizer: Synthesizer) -> None:
+    def view(seed: int) -> View:
+        return synthesize(synthesizer, random_clip(), path(synthesizer), RenderOptions(seed=seed))
+
+    assert torch.equal(view(3).samples, view(3).samples)
+    assert not torch.allclose(view(3).latents, view(4).latents, atol=1e-3)
+
+
+def test_injected_noise_reproduces_the_draws_it_stands_for(synthesizer: Synthesizer) -> None:
+    clip = random_clip()
+    drawn = synthesizer.encode(clip, Augmentation(seed=8))
+    given = synthesizer.encode(clip, Augmentation(noise=unit_noise(tuple(clip.video.shape), 8)))
+    assert torch.equal(drawn.latents, given.latents)
+    (by_seed,) = synthesizer.render(drawn, [path(synthesizer)], RenderOptions(seed=8, samples=2))
+    noise = torch.stack([unit_noise(LATENTS, 8, stream=1 + sample) for sample in range(2)])
+    (by_noise,) = synthesizer.render(drawn, [path(synthesizer)], RenderOptions(initial_noise=noise, samples=2))
+    assert torch.equal(by_seed.samples, by_noise.samples)
+
+
+@pytest.mark.parametrize("shape", [(3, 4, 8, 8), (2, *LATENTS), (4, *LATENTS[1:])])
+def test_initial_noise_of_another_shape_is_refused(synthesizer: Synthesizer, shape: tuple[int, ...]) -> None:
+    features = synthesizer.encode(random_clip())
+    with pytest.raises(OptionError, match=r"initial noise must be \[1, 3, 4, 8, 16\]"):
+        synthesizer.render(features, [path(synthesizer)], RenderOptions(initial_noise=draw(*shape)))
+
+
+def test_augmentation_noise_of_another_shape_is_refused(synthesizer: Synthesizer) -> None:
+    with pytest.raises(ShapeError, match="augmentation noise must be"):
+        synthesizer.encode(random_clip(), Augmentation(noise=draw(3, 3, 8, 8)))
+
+
+def test_the_number_of_steps_is_the_checkpoints_unless_asked_and_progress_counts_them(
+    synthesizer: Synthesizer,
+) -> None:
+    features, seen = synthesizer.encode(random_clip()), list[tuple[int, int]]()
+
+    def note(done: int, total: int) -> None:
+        seen.append((done, total))
+
+    synthesizer.render(features, [path(synthesizer)], RenderOptions(progress=note))
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+    seen.clear()
+    synthesizer.render(features, [path(synthesizer)], RenderOptions(progress=note, steps=1))
+    assert seen == [(1, 1)]
+
+
+def test_cancelling_between_two_steps_raises_and_leaves_the_synthesizer_usable(synthesizer: Synthesizer) -> None:
+    features, stop = synthesizer.encode(random_clip()), threading.Event()
+
+    def note(done: int, _total: int) -> None:
+        if done == 2:
+            stop.set()
+
+    with pytest.raises(Cancelled, match="before step 3 of 3"):
+        synthesizer.render(features, [path(synthesizer)], RenderOptions(progress=note, cancel=stop))
+    stop.clear()
+    (view,) = synthesizer.render(features, [path(synthesizer)], RenderOptions(cancel=stop))
+    assert view.samples.isfinite().all()
+
+
+@pytest.mark.parametrize(("height", "width"), [(30, 64), (32, 60), (0, 64), (4, 4)])
+def test_a_size_the_network_cannot_take_is_refused_with_the_size_it_was_trained_on(
+    synthesizer: Synthesizer, height: int, width: int
+) -> None:
+    with pytest.raises(OptionError, match=r"multiples of 8 .* got .* trained size is 32x64"):
+        synthesizer.encode(Clip(video=torch.zeros(3, 3, height, width), fps=12.0))
+
+
+def test_another_size_that_is_a_multiple_of_the_factor_works(synthesizer: Synthesizer) -> None:
+    clip = Clip(video=random_clip().video[..., :24, :40].contiguous(), fps=12.0)
+    assert synthesize(synthesizer, clip, path(synthesizer)).video.shape == (3, 3, 24, 40)
+
+
+@pytest.mark.parametrize("shape", [(3, 32, 64), (3, 1, 32, 64), (1, 3, 3, 32, 64)])
+def test_a_clip_that_is_no_list_of_colour_pictures_is_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ShapeError, match=r"video must be \[T, 3, H, W\]"):
+        Clip(video=torch.zeros(shape), fps=12.0)
+
+
+def test_a_clip_in_another_type_or_without_frame_rate_is_refused() -> None:
+    with pytest.raises(ShapeError, match="float32"):
+        Clip(video=torch.zeros(3, 3, 8, 8, dtype=torch.uint8), fps=12.0)
+    for fps in (0.0, -1.0, float("nan")):
+        with pytest.raises(OptionError, match="fps must be positive"):
+            Clip(video=torch.zeros(3, 3, 8, 8), fps=fps)
+
+
+@pytest.mark.parametrize("frames", [2, 4])
+def test_clip_and_trajectory_must_have_the_trained_length(synthesizer: Synthesizer, frames: int) -> None:
+    features = synthesizer.encode(random_clip())
+    with pytest.raises(ShapeError, match=f"works on 3 frames, got {frames}"):
+        synthesizer.render(synthesizer.encode(random_clip(frames=frames)), [path(synthesizer)])
+    still = pose_trajectory(torch.eye(4, dtype=torch.float64).repeat(frames, 1, 1))
+    with pytest.raises(ShapeError, match=f"works on 3 frames, got {frames}"):
+        synthesizer.render(features, [still])
+
+
+def test_at_least_one_trajectory_sample_and_step_are_wanted(synthesizer: Synthesizer) -> None:
+    with pytest.raises(ShapeError, match="at least one trajectory"):
+        synthesizer.render(synthesizer.encode(random_clip()), [])
+    with pytest.raises(OptionError, match="at least 1"):
+        RenderOptions(samples=0)
+    with pytest.raises(OptionError, match="at least 1"):
+        RenderOptions(steps=0)
+
+
+def test_features_of_parts_joined_equal_features_of_the_whole_clip(synthesizer: Synthesizer) -> None:
+    clip = random_clip(frames=5)
+    noise = draw(*clip.video.shape, seed=2)
+    whole = synthesizer.encode(clip, Augmentation(noise=noise))
+
+    def part(start: int, stop: int) -> tuple[Clip, Augmentation]:
+        return Clip(video=clip.video[start:stop], fps=clip.fps), Augmentation(noise=noise[start:stop])
+
+    joined = synthesizer.encode(*part(0, 3)).followed_by(synthesizer.encode(*part(3, 5))).rows(1, 4)
+    assert joined.tokens is not None
+    assert whole.tokens is not None
+    assert relative_error(joined.tokens, whole.tokens[1:4]) < 1e-5
+    assert relative_error(joined.latents, whole.latents[1:4]) < 1e-5
+
+
+def _break_unet(synthesizer: Synthesizer) -> Tensor:
+    return synthesizer.networks.unet.conv_out.bias
+
+
+def _break_decoder(synthesizer: Synthesizer) -> Tensor:
+    return synthesizer.networks.decoder.conv_out.bias
+
+
+@pytest.mark.parametrize("part", [_break_unet, _break_decoder])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_network_that_gives_nan_or_infinity_raises(part: Callable[[Synthesizer], Tensor], value: float) -> None:
+    broken = tiny_synthesizer()
+    with torch.no_grad():
+        part(broken).fill_(value)
+    with pytest.raises(NonFiniteError):
+        synthesize(broken, random_clip(), path(broken))
+
+
+def test_the_motion_number_comes_from_the_formula_unless_it_is_given(synthesizer: Synthesizer) -> None:
+    features = synthesizer.encode(random_clip())
+    (view,) = synthesizer.render(features, [path(synthesizer)])
+    assert view.motion_bucket == round(255 * (30**2 + 10**2) ** 0.5 / (90**2 + 30**2) ** 0.5)
+    (other,) = synthesizer.render(features, [path(synthesizer)], RenderOptions(motion_bucket=200.0))
+    assert other.motion_bucket == 200.0
+    assert not torch.allclose(view.latents, other.latents, atol=1e-4)
+
+
+def test_without_a_family_the_motion_number_must_be_given() -> None:
+    unknown = tiny_synthesizer(family_known=False)
+    features = unknown.encode(random_clip())
+    with pytest.raises(OptionError, match=r"--motion-bucket.*--family"):
+        unknown.render(features, [path(unknown)])
+    (view,) = unknown.render(features, [path(unknown)], RenderOptions(motion_bucket=127.0))
+    assert view.motion_bucket == 127.0
+
+
+class _Calls:
+    """What the U-Net was called with."""
+
+    def __init__(self, synthesizer: Synthesizer) -> None:
+        self.inputs: list[tuple[Tensor, Tensor]] = []
+        synthesizer.networks.unet.register_forward_pre_hook(lambda _, given: self.inputs.append(given[:2]))
+
+
+def test_c_in_scales_the_noisy_channels_and_never_the_source_latents() -> None:
+    synthesizer = tiny_synthesizer()
+    calls, features, noise = _Calls(synthesizer), synthesizer.encode(random_clip()), draw(*LATENTS)
+    synthesizer.render(features, [path(synthesizer)], RenderOptions(initial_noise=noise))
+    noisy, condition = calls.inputs[0]
+    assert_close(noisy, torch.cat([noise, noise]))  # sigma * noise, scaled back to unit variance
+    for _, condition in calls.inputs:
+        assert torch.equal(condition, torch.cat([torch.zeros_like(features.latents), features.latents]))
+
+
+def test_guidance_of_one_throughout_runs_the_conditional_branch_alone_and_gives_its_result() -> None:
+    synthesizer = tiny_synthesizer()
+    calls, features = _Calls(synthesizer), synthesizer.encode(random_clip())
+    (alone,) = synthesizer.render(features, [path(synthesizer)], RenderOptions(guidance=(1.0, 1.0)))
+    assert all(noisy.shape[0] == TINY.frames for noisy, _ in calls.inputs)
+    calls.inputs.clear()
+    (both,) = synthesizer.render(features, [path(synthesizer)], RenderOptions(guidance=(1.0, 1.0 + 1e-12)))
+    assert all(noisy.shape[0] == 2 * TINY.frames for noisy, _ in calls.inputs)
+    assert relative_error(alone.latents, both.latents) < 1e-5
+
+
+def test_guidance_changes_the_view_only_where_it_is_not_one(synthesizer: Synthesizer) -> None:
+    features = synthesizer.encode(random_clip())
+    one_step = RenderOptions(steps=1, guidance=(1.0, 1.5))
+    (guided,) = synthesizer.render(features, [path(synthesizer)], one_step)
+    (plain,) = synthesizer.render(features, [path(synthesizer)], RenderOptions(steps=1, guidance=(1.0, 1.0)))
+    assert relative_error(guided.latents[:, 0], plain.latents[:, 0]) < 1e-5
+    assert relative_error(guided.latents[:, 2], plain.latents[:, 2]) > 1e-3
+
+
+def test_the_camera_path_changes_the_view(synthesizer: Synthesizer) -> None:
+    features = synthesizer.encode(random_clip())
+    options = RenderOptions(motion_bucket=100.0)
+    first, second, _ = synthesizer.render(features, paths(synthesizer), options)
+    assert relative_error(first.latents, second.latents) > 1e-3
+
+
+@pytest.mark.parametrize("channels", [0, 3])
+def test_a_checkpoint_with_extra_condition_channels_wants_exactly_those(channels: int) -> None:
+    synthesizer = tiny_synthesizer(with_unet(condition_channels=6))
+    extra = draw(3, channels, *LATENTS[2:]) if channels else None
+    with pytest.raises(ShapeError, match=f"2 extra condition channels, got {channels}"):
+        synthesizer.encode(random_clip(), extra=extra)
+    features = synthesizer.encode(random_clip(), extra=draw(3, 2, *LATENTS[2:]))
+    assert synthesizer.render(features, [path(synthesizer)])[0].samples.isfinite().all()
+
+
+def test_one_autoencoder_may_serve_both_source_and_target_frames() -> None:
+    shared = msgspec.structs.replace(TINY, vae=msgspec.structs.replace(TINY.vae, shared=True))
+    synthesizer = tiny_synthesizer(shared)
+    assert synthesizer.networks.condition_encoder is synthesizer.networks.target_encoder
+    assert synthesize(synthesizer, random_clip(), path(synthesizer)).samples.isfinite().all()
+
+
+def test_a_model_without_image_tower_has_no_tokens_and_still_renders() -> None:
+    unet = msgspec.structs.replace(TINY.unet, context_width=None)
+    synthesizer = tiny_synthesizer(msgspec.structs.replace(TINY, unet=unet, image_encoder=None))
+    assert synthesizer.encode(random_clip()).tokens is None
+    assert synthesize(synthesizer, random_clip(), path(synthesizer)).samples.isfinite().all()
+
+
+@pytest.mark.parametrize("control", ["relative_pose", "none"])
+def test_the_other_camera_controls_render_too(control: str) -> None:
+    unet = msgspec.structs.replace(TINY.unet, camera_width=0 if control == "none" else TINY.unet.camera_width)
+    synthesizer = tiny_synthesizer(msgspec.structs.replace(TINY, unet=unet, camera=control), family_known=False)
+    options = RenderOptions(motion_bucket=127.0)
+    angle = torch.tensor([0.0, 0.1, 0.2], dtype=torch.float64)
+    poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    poses[:, 0, 0], poses[:, 0, 2], poses[:, 2, 0], poses[:, 2, 2] = angle.cos(), angle.sin(), -angle.sin(), angle.cos()
+    features = synthesizer.encode(random_clip())
+    still, moving = synthesizer.render(
+        features, [pose_trajectory(poses[:1].repeat(3, 1, 1)), pose_trajectory(poses)], options
+    )
+    assert (relative_error(still.latents, moving.latents) > 1e-3) == (control == "relative_pose")
+
+
+def test_networks_in_bfloat16_give_float32_views_near_those_of_float32(synthesizer: Synthesizer) -> None:
+    half = tiny_synthesizer()
+    for name, network in half.networks.named_children():
+        if name != "decoder":
+            network.bfloat16()
+    exact = synthesize(synthesizer, random_clip(), path(synthesizer))
+    rounded = synthesize(half, random_clip(), path(half))
+    assert rounded.samples.dtype == rounded.latents.dtype == torch.float32
+    assert 0 < relative_error(rounded.latents, exact.latents) < 0.05
+
+
+def test_the_synthesizer_neither_trains_nor_keeps_gradients(synthesizer: Synthesizer) -> None:
+    assert not synthesizer.networks.training
+    assert not any(parameter.requires_grad for parameter in synthesizer.networks.parameters())
+    assert not synthesize(synthesizer, random_clip(), path(synthesizer)).samples.requires_grad

@@ -1,0 +1,132 @@
+"""The autoencoders against diffusers, and what the published layout asks of them."""
+
+import pytest
+import torch
+from diffusers import AutoencoderKLTemporalDecoder
+from naming import diffusers_state, levels_of
+from small_models import draw, randomise, relative_error
+from torch import Tensor, nn
+from torch.testing import assert_close
+
+from gcd_model.config import VAEConfig
+from gcd_model.layers import prepare
+from gcd_model.temporal import VideoResBlock
+from gcd_model.vae import DecoderLevel, Encoder, Posterior, TemporalDecoder
+
+VAE = VAEConfig(width=32, multipliers=(1, 2, 4, 4), norm_groups=32)
+FRAMES = 3
+
+
+class _Vae(nn.Module):
+    """What one diffusers autoencoder holds."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder = Encoder(VAE, quant=True)
+        self.decoder = TemporalDecoder(VAE)
+        randomise(self)
+        prepare(self)
+
+
+@pytest.fixture(scope="module")
+def ours() -> _Vae:
+    return _Vae()
+
+
+@pytest.fixture(scope="module")
+def theirs(ours: _Vae) -> AutoencoderKLTemporalDecoder:
+    model = AutoencoderKLTemporalDecoder(
+        down_block_types=("DownEncoderBlock2D",) * 4,  # pyright: ignore[reportArgumentType]
+        block_out_channels=VAE.widths,  # pyright: ignore[reportArgumentType]
+        layers_per_block=VAE.blocks_per_level,
+    ).eval()
+    levels = levels_of(vae=VAE)
+    encoder = diffusers_state(ours.encoder, "target_encoder", "vae/", levels)
+    model.load_state_dict(encoder | diffusers_state(ours.decoder, "decoder", "vae/", levels))
+    return model
+
+
+def test_the_encoder_equals_diffusers(ours: _Vae, theirs: AutoencoderKLTemporalDecoder) -> None:
+    frames = draw(2, 3, 32, 48)
+    with torch.inference_mode():
+        expected = theirs.encode(frames).latent_dist
+        result = ours.encoder(frames)
+    assert result.mean.shape == (2, 4, 4, 6)
+    assert relative_error(result.mean, expected.mean) < 1e-5
+    assert relative_error(result.log_variance, expected.logvar) < 1e-5
+
+
+def test_the_temporal_decoder_equals_diffusers(ours: _Vae, theirs: AutoencoderKLTemporalDecoder) -> None:
+    latents = draw(2 * FRAMES, 4, 4, 6)
+    with torch.inference_mode():
+        expected = theirs.decode(latents, num_frames=FRAMES).sample
+        result = ours.decoder(latents, FRAMES)
+    assert result.shape == (6, 3, 32, 48)
+    assert relative_error(result, expected) < 1e-5
+
+
+def test_the_decoder_in_training_equals_the_prepared_one(ours: _Vae) -> None:
+    latents = draw(FRAMES, 4, 4, 6)
+    with torch.inference_mode():
+        prepared = ours.decoder(latents, FRAMES)
+    fresh = TemporalDecoder(VAE).train()
+    fresh.load_state_dict(ours.decoder.state_dict())
+    assert relative_error(fresh(latents, FRAMES).detach(), prepared) < 1e-5
+
+
+def test_frames_are_encoded_each_alone_and_decoded_together(ours: _Vae) -> None:
+    frames, latents = draw(FRAMES, 3, 32, 32), draw(FRAMES, 4, 4, 4)
+    with torch.inference_mode():
+        alone = torch.cat([ours.encoder(frame).mean for frame in frames.split(1)])
+        assert relative_error(alone, ours.encoder(frames).mean) < 1e-5
+        together = ours.decoder(latents, FRAMES)
+        apart = torch.cat([ours.decoder(latent, 1) for latent in latents.split(1)])
+    assert relative_error(apart, together) > 1e-3
+
+
+def test_clips_in_a_batch_are_decoded_each_alone(ours: _Vae) -> None:
+    latents = draw(2 * FRAMES, 4, 4, 4)
+    with torch.inference_mode():
+        alone = torch.cat([ours.decoder(clip, FRAMES) for clip in latents.split(FRAMES)])
+        assert relative_error(ours.decoder(latents, FRAMES), alone) < 1e-5
+
+
+def test_a_fresh_decoder_has_temporal_branches_that_add_nothing_and_even_shares() -> None:
+    decoder = TemporalDecoder(VAE)
+    blocks = [module for module in decoder.modules() if isinstance(module, VideoResBlock)]
+    assert len(blocks) == 4 * 3 + 2
+    for block in blocks:
+        assert block.share.mix.item() == 0.0
+        x = draw(FRAMES, block.spatial.norm1.num_channels, 2, 2)
+        assert torch.equal(block(x, FRAMES), block.spatial(x))
+
+
+def test_levels_have_three_blocks_in_the_decoder_and_two_in_the_encoder() -> None:
+    decoder, encoder = TemporalDecoder(VAE), Encoder(VAE, quant=False)
+    assert [len(level.blocks) for level in decoder.levels if isinstance(level, DecoderLevel)] == [3, 3, 3, 3]
+    assert [len(level.get_submodule("blocks")._modules) for level in encoder.levels] == [2, 2, 2, 2]
+
+
+def test_norms_have_the_published_epsilons() -> None:
+    decoder = TemporalDecoder(VAE)
+    for name, module in [*decoder.named_modules(), *Encoder(VAE, quant=True).named_modules()]:
+        if isinstance(module, nn.GroupNorm):
+            assert module.eps == (1e-5 if ".temporal." in name else 1e-6), name
+
+
+def test_a_posterior_splits_its_moments_clamps_its_spread_and_samples() -> None:
+    moments = torch.tensor([1.0, 2.0, -50.0, 50.0]).reshape(1, 4, 1, 1)
+    posterior = Posterior.of_moments(moments)
+    assert posterior.mean.flatten().tolist() == [1.0, 2.0]
+    assert posterior.log_variance.flatten().tolist() == [-30.0, 20.0]
+    noise = torch.ones(1, 2, 1, 1)
+    expected = torch.tensor([1.0, 2.0]) + torch.exp(torch.tensor([-15.0, 10.0]))
+    assert_close(posterior.sample(noise).flatten(), expected)
+
+
+def test_gradients_reach_every_parameter_of_the_decoder() -> None:
+    decoder = TemporalDecoder(VAEConfig(width=8, multipliers=(1, 2), blocks_per_level=1, norm_groups=4)).train()
+    randomise(decoder)
+    result: Tensor = decoder(draw(FRAMES, 4, 2, 2), FRAMES)
+    result.square().sum().backward()
+    assert all(p.grad is not None and p.grad.any() for p in decoder.parameters())

@@ -1,0 +1,120 @@
+"""A model, a source and an outbox that do what a test tells them."""
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from msgspec.structs import replace as struct_replace
+
+from gcd_model import (
+    FAMILIES,
+    SMALL,
+    Augmentation,
+    Clip,
+    RenderOptions,
+    SourceFeatures,
+    Traits,
+    Trajectory,
+    View,
+)
+from gcd_node.envelope import EndMessage, NoteTopic, ViewMessage
+from gcd_node.frame import Frame, SourceInfo
+from gcd_node.header import OriginHeader
+
+HEIGHT, WIDTH = 64, 96
+
+
+def traits(family: str = "kubric90", *, move_time: int = 13) -> Traits:
+    camera = FAMILIES[family].camera
+    unet = SMALL.unet if camera == "spherical" else struct_replace(SMALL.unet, camera_width=0)
+    config = struct_replace(SMALL, camera=camera, unet=unet, height=HEIGHT, width=WIDTH)
+    return Traits(
+        name="fake",
+        config=config,
+        family=FAMILIES[family],
+        move_time=move_time,
+        sha256_12="0" * 12,
+        precision="float32",
+        device="cpu",
+        trained=False,
+    )
+
+
+class FakeSynthesizer:
+    """Gives the source back, darker by the seed's last bits; `act` is called before every render."""
+
+    def __init__(self, made: Traits, act: Callable[[RenderOptions], None] | None = None) -> None:
+        self.traits = made
+        self.asked: list[tuple[list[Trajectory], RenderOptions]] = []
+        self._act = act
+
+    def encode(
+        self, clip: Clip, augmentation: Augmentation | None = None, extra: torch.Tensor | None = None
+    ) -> SourceFeatures:
+        strength = 0.02 if augmentation is None else augmentation.strength
+        return SourceFeatures(tokens=None, latents=clip.video, extra=extra, fps=clip.fps, augmentation=strength)
+
+    def render(
+        self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
+    ) -> list[View]:
+        options = RenderOptions() if options is None else options
+        self.asked.append((list(trajectories), options))
+        if self._act is not None:
+            self._act(options)
+        video = ((features.latents + 1) / 2 * (1 - (options.seed % 7) / 100)).clamp(0, 1)
+        samples = torch.stack([video * (1 - s / 10) for s in range(options.samples)])
+        return [
+            View(samples=samples, latents=features.latents[None], trajectory=path, motion_bucket=127.0)
+            for path in trajectories
+        ]
+
+
+class FakeSource:
+    """`count` frames, the number of a frame in its pixels; `fails` is raised after the last."""
+
+    def __init__(self, count: int, *, fps: float = 24.0, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
+        self.info = SourceInfo(
+            kind="synthetic", id="fake", width=size[0], height=size[1], fps_nominal=fps, clock="replay"
+        )
+        self._count, self.fails, self.period_s = count, None, 0.0
+        self.closed = False
+
+    fails: Exception | None
+
+    def frames(self) -> Iterator[Frame]:
+        for seq in range(self._count):
+            if self.closed:
+                return
+            time.sleep(self.period_s)
+            image = np.full((self.info.height, self.info.width, 3), 20 + seq % 200, np.uint8)
+            yield Frame(image=image, stamp_ns=round(seq * 1e9 / self.info.fps_nominal), seq=seq)
+        if self.fails is not None:
+            raise self.fails
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@dataclass
+class Box:
+    """An outbox that keeps what it gets."""
+
+    views: list[ViewMessage] = field(default_factory=list)
+    ends: list[EndMessage] = field(default_factory=list)
+    notes: list[tuple[str, Mapping[str, Any]]] = field(default_factory=list)
+
+    def send(self, message: ViewMessage) -> bool:
+        self.views.append(message)
+        return True
+
+    def end(self, message: EndMessage, *, delay_ms: int | None = None) -> None:
+        self.ends.append(message)
+
+    def note(self, topic: NoteTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
+        self.notes.append((topic, fields))
+
+    def of(self, kind: str, view: str = "main") -> list[ViewMessage]:
+        return [message for message in self.views if message.topic == f"view/{view}/{kind}"]

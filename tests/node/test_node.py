@@ -1,0 +1,304 @@
+import threading
+import time
+
+import numpy as np
+import pytest
+from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, traits
+
+from gcd_model import Cancelled, NonFiniteError, RenderOptions, ViewFixedError, ViewRangeError
+from gcd_node.config import NodeConfig, parse_config
+from gcd_node.envelope import images
+from gcd_node.errors import ConfigError, ModelFailedError, SourceError, TooShortError
+from gcd_node.node import Node
+
+
+def config(
+    view: str = "", *, pace: str = "lockstep", source: str = "", window: str = "", more: str = "", model: str = ""
+) -> NodeConfig:
+    text = f"""
+        {more}
+        [source]
+        kind = "synthetic"
+        pace = "{pace}"
+        {source}
+        [window]
+        {window}
+        [model]
+        weights = "fake"
+        {model}
+        [view.main]
+        {view}
+    """
+    return parse_config(text.encode(), "test")
+
+
+def run(settings: NodeConfig, source: FakeSource, model: FakeSynthesizer | None = None) -> tuple[Node, Box]:
+    box = Box()
+    node = Node(settings, model or FakeSynthesizer(traits()), source, box)
+    node.run()
+    return node, box
+
+
+def test_every_whole_window_of_a_replay_is_published_once_and_then_its_end() -> None:
+    _, box = run(config(), FakeSource(50))
+    assert [message.header.window_id for message in box.of("win")] == [0, 1, 2]
+    assert [message.header.src.seq for message in box.of("win")][1] == tuple(range(14, 28))
+    assert {message.topic for message in box.ends} == {"view/main/win", "view/main/frm"}
+    assert all(message.header.window_id == 2 for message in box.ends)
+
+
+def test_the_header_tells_the_whole_story() -> None:
+    _, box = run(config("azimuth_deg = 26.0"), FakeSource(14))
+    header = box.of("win")[0].header
+    assert header.shape == (14, HEIGHT, WIDTH, 3)
+    assert header.t_capture_ns == tuple(round(i * 1e9 / 24) for i in range(14))
+    assert header.clock == "replay"
+    assert header.src.fps_cond == 24.0
+    assert header.pose is not None
+    assert [pose.az_deg for pose in header.pose] == pytest.approx([2.0 * i for i in range(14)])
+    assert header.frame_role == ("in_transit",) * 13 + ("at_goal",)
+    assert header.source_from_view is not None
+    assert header.source_from_view[0] == pytest.approx(np.eye(4).ravel())
+    assert header.model.family == "kubric90"
+    assert header.valid_for_ms == round(2 * 14 / 24 * 1000)
+    assert header.t_infer_start_ns <= header.t_infer_end_ns <= header.t_publish_ns
+    assert header.synthetic
+    assert header.src_pose is not None
+    assert header.src_pose.assumed
+
+
+def test_a_declared_source_pose_is_not_called_assumed() -> None:
+    _, box = run(config(source="pose = {elevation_deg = 10.0, radius = 14.0}"), FakeSource(14))
+    pose = box.of("win")[0].header.src_pose
+    assert pose is not None
+    assert (pose.el_deg, pose.r, pose.assumed) == (10.0, 14.0, False)
+
+
+def test_single_frames_carry_the_goal_pose_only() -> None:
+    _, box = run(config("azimuth_deg = 26.0"), FakeSource(28))
+    frames = box.of("frm")
+    assert len(frames) == 2
+    assert [frame.header.shape for frame in frames] == [(1, HEIGHT, WIDTH, 3)] * 2
+    assert [frame.header.src.seq for frame in frames] == [(13,), (27,)]
+    assert [frame.header.pose[0].az_deg for frame in frames if frame.header.pose] == [26.0, 26.0]
+    assert images(frames[0]).tobytes() == images(box.of("win")[0])[13:].tobytes()
+
+
+def test_every_frame_of_a_direct_view_is_at_its_goal() -> None:
+    _, box = run(config("azimuth_deg = 26.0", model="move_time = 0"), FakeSource(14))
+    assert len(box.of("frm")) == 14
+    assert box.of("win")[0].header.frame_role == ("at_goal",) * 14
+
+
+def test_single_frames_of_a_live_view_leave_at_the_windows_rhythm() -> None:
+    settings = config("azimuth_deg = 20.0", pace="realtime", model="move_time = 0")
+    box = Box()
+    sent_s: list[float] = []
+    keep = box.send
+    box.send = lambda message: (sent_s.append(time.monotonic()), keep(message))[1]  # type: ignore[method-assign]
+    Node(settings, FakeSynthesizer(traits()), FakeSource(14), box).run()
+    frames = [at for at, message in zip(sent_s, box.views, strict=True) if message.topic.endswith("frm")]
+    assert len(frames) == 14
+    assert frames[-1] - frames[0] >= 0.9 * 13 / 24
+    stamps = [message.header.t_publish_ns for message in box.of("frm")]
+    assert stamps == sorted(stamps)
+
+
+def test_several_samples_publish_their_deviation_with_its_scale() -> None:
+    _, box = run(config(model="samples = 3"), FakeSource(14))
+    message = box.of("std")[0]
+    assert message.header.encoding == "mono8"
+    assert message.header.scale is not None
+    values = images(message).astype(float) * message.header.scale
+    level = images(box.of("win")[0])[-1, 0, 0, 0]
+    assert values[-1, 0, 0, 0] == pytest.approx(level * np.std([1.0, 0.9, 0.8]), rel=0.02)
+
+
+def test_an_orbit_goes_on_from_window_to_window_and_turns_at_its_limit() -> None:
+    # 14 frames at 24 FPS are 0.5833 s; 24 deg/s is 14 degrees a window, turning at 30.
+    settings = config('kind = "orbit"\nrate_deg_s = 24.0\namplitude_deg = 30.0')
+    _, box = run(settings, FakeSource(70))
+    goals = [message.header.pose[-1].az_deg for message in box.of("win") if message.header.pose]
+    assert goals == pytest.approx([0.0, 14.0, 28.0, 18.0, 4.0])
+    starts = [message.header.pose[0].az_deg for message in box.of("win") if message.header.pose]
+    assert starts == [0.0] * 5  # a gradual path always leaves from the source camera
+
+
+def test_several_views_share_the_window() -> None:
+    settings = config("azimuth_deg = 10.0\n[view.other]\nazimuth_deg = -10.0")
+    model = FakeSynthesizer(traits())
+    _, box = run(settings, FakeSource(14), model)
+    assert len(box.of("win")) == len(box.of("win", "other")) == 1
+    assert len(model.asked) == 1
+    assert len(model.asked[0][0]) == 2
+    assert {message.topic for message in box.ends} >= {"view/main/win", "view/other/win"}
+
+
+def test_two_lockstep_runs_publish_identical_payloads() -> None:
+    first, second = (run(config("azimuth_deg = 5.0"), FakeSource(42))[1] for _ in range(2))
+    assert [bytes(m.payload) for m in first.views] == [bytes(m.payload) for m in second.views]
+    assert [m.header.quality.seed for m in first.views] == [m.header.quality.seed for m in second.views]
+    assert len({m.header.quality.seed for m in first.of("win")}) == 3
+
+
+def test_jpeg_views_look_like_the_raw_ones() -> None:
+    raw = run(config(), FakeSource(14))[1].of("win")[0]
+    packed = run(config(more="publish = {encoding = 'jpeg'}"), FakeSource(14))[1].of("win")[0]
+    assert packed.header.encoding == "jpeg"
+    assert len(packed.payload) < len(raw.payload) / 4
+    assert np.abs(images(packed).astype(int) - images(raw).astype(int)).mean() < 3
+
+
+def test_a_window_with_nan_is_tried_again_with_another_seed() -> None:
+    seeds: list[int] = []
+
+    def fail_once(options: RenderOptions) -> None:
+        seeds.append(options.seed)
+        if len(seeds) == 1:
+            raise NonFiniteError("NaN")
+
+    _, box = run(config(), FakeSource(28), FakeSynthesizer(traits(), fail_once))
+    assert [message.header.window_id for message in box.of("win")] == [0, 1]
+    assert box.of("win")[0].header.quality.seed == seeds[1] != seeds[0]
+
+
+def test_a_window_that_stays_nan_is_counted_and_not_published() -> None:
+    attempts: list[int] = []
+
+    def fail_twice(options: RenderOptions) -> None:
+        attempts.append(options.seed)
+        if len(attempts) <= 2:
+            raise NonFiniteError("NaN")
+
+    box = Box()
+    summary = Node(config(), FakeSynthesizer(traits(), fail_twice), FakeSource(28), box).run()
+    assert summary.counts.nan_windows == 1
+    assert [message.header.window_id for message in box.of("win")] == [1]
+    assert [fields["window_id"] for topic, fields in box.notes if fields.get("code") == "MODEL_NAN"] == [0]
+
+
+def test_three_nan_windows_in_a_row_fail_the_model_and_still_announce_the_end() -> None:
+    def always(_: RenderOptions) -> None:
+        raise NonFiniteError("NaN")
+
+    box = Box()
+    node = Node(config(), FakeSynthesizer(traits(), always), FakeSource(200), box)
+    with pytest.raises(ModelFailedError, match="3 windows in a row"):
+        node.run()
+    assert box.views == []
+    assert box.ends
+
+
+def test_stop_abandons_the_window_in_work() -> None:
+    started = threading.Event()
+
+    def wait_for_cancel(options: RenderOptions) -> None:
+        started.set()
+        assert options.cancel is not None
+        while not options.cancel.is_set():
+            time.sleep(0.005)
+        raise Cancelled("stopped")
+
+    box = Box()
+    node = Node(config(), FakeSynthesizer(traits(), wait_for_cancel), FakeSource(1000), box)
+    thread = threading.Thread(target=node.run)
+    thread.start()
+    assert started.wait(10)
+    node.stop()
+    thread.join(10)
+    assert not thread.is_alive()
+    assert box.views == []
+    assert all(message.header.window_id == -1 for message in box.ends)
+
+
+def test_a_lost_source_publishes_what_was_whole_and_then_says_so() -> None:
+    source = FakeSource(30)
+    source.fails = SourceError("unplugged")
+    box = Box()
+    with pytest.raises(SourceError, match="unplugged"):
+        Node(config(), FakeSynthesizer(traits()), source, box).run()
+    assert len(box.of("win")) == 2
+    assert box.ends
+
+
+def test_a_source_that_is_too_short_is_an_error() -> None:
+    with pytest.raises(TooShortError, match="13"):
+        run(config(), FakeSource(13))
+
+
+def test_realtime_drops_windows_and_never_frames() -> None:
+    def slow(_: RenderOptions) -> None:
+        time.sleep(0.2)
+
+    box = Box()
+    summary = Node(config(pace="realtime"), FakeSynthesizer(traits(), slow), FakeSource(280), box).run()
+    assert summary.frames == 280
+    assert summary.dropped > 0
+    assert summary.counts.windows + summary.dropped == 20
+    ids = [message.header.window_id for message in box.of("win")]
+    assert ids == sorted(set(ids))
+    assert ids[-1] == 19
+
+
+def test_overlapping_windows_follow_the_stride() -> None:
+    _, box = run(config(window="stride = 7"), FakeSource(28))
+    assert [message.header.src.seq[0] for message in box.of("win")] == [0, 7, 14]
+
+
+@pytest.mark.parametrize(
+    ("family", "view", "error"),
+    [
+        ("kubric90", "azimuth_deg = 91.0", ViewRangeError),
+        ("kubric90", 'kind = "orbit"\nrate_deg_s = 9.0\namplitude_deg = 120.0', ViewRangeError),
+        ("driving", "azimuth_deg = 5.0", ViewFixedError),
+        ("driving", 'kind = "orbit"\nrate_deg_s = 9.0\namplitude_deg = 20.0', ViewFixedError),
+    ],
+)
+def test_a_view_the_checkpoint_cannot_give_is_refused_before_the_first_frame(
+    family: str, view: str, error: type[Exception]
+) -> None:
+    with pytest.raises(error):
+        Node(config(view), FakeSynthesizer(traits(family)), FakeSource(14, fps=10.0), Box())
+
+
+def test_an_untrained_rate_is_flagged_and_refused_when_strict() -> None:
+    _, box = run(config(), FakeSource(14, fps=4.0))
+    assert box.of("win")[0].header.quality.ood[0] == "fps"
+    with pytest.raises(ConfigError, match="strict"):
+        run(config(more="strict = true"), FakeSource(14, fps=4.0))
+
+
+def test_a_foreign_field_of_view_is_flagged_and_the_right_one_is_published() -> None:
+    _, box = run(config(source="hfov_deg = 90.0"), FakeSource(14))
+    header = box.of("win")[0].header
+    assert "hfov" in header.quality.ood
+    assert header.intrinsics is not None
+    assert header.intrinsics[0] == pytest.approx(WIDTH / 2)
+    _, box = run(config(), FakeSource(14))
+    header = box.of("win")[0].header
+    assert header.intrinsics is not None
+    assert header.intrinsics[0] == pytest.approx(WIDTH, rel=1e-3)  # 53.13 degrees
+    assert header.intrinsics[2] == WIDTH / 2 - 0.5
+
+
+def test_a_still_or_black_input_is_published_and_flagged() -> None:
+    class Black(FakeSource):
+        def frames(self):
+            for frame in super().frames():
+                yield type(frame)(image=np.zeros_like(frame.image), stamp_ns=frame.stamp_ns, seq=frame.seq)
+
+    _, box = run(config(), Black(14))
+    assert set(box.of("win")[0].header.quality.ood) == {"exposure", "static"}
+
+
+def test_status_and_meta_describe_the_run() -> None:
+    _, box = run(config(), FakeSource(28))
+    topics = [topic for topic, _ in box.notes]
+    assert topics[0] == "meta"
+    meta = box.notes[0][1]
+    assert meta["weights"]["trained"] is False
+    status = [fields for topic, fields in box.notes if topic == "status"]
+    assert status[-1]["state"] == "inactive"
+    assert status[-1]["window"]["built"] == 2
+    assert [f["heartbeat_seq"] for f in status] == list(range(1, len(status) + 1))
+    assert "SRC_ENDED" in [fields.get("code") for _, fields in box.notes]

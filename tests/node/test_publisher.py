@@ -1,0 +1,352 @@
+"""The publisher, read by a real second process over ipc and tcp, and by plain ZeroMQ sockets."""
+
+import os
+import socket
+import stat
+import subprocess
+import sys
+import threading
+import time
+import zlib
+from pathlib import Path
+
+import pytest
+import zmq
+from wire_messages import OTHER_BOOT, end, lines_of, origin, pixels, start_reader, window
+
+from gcd_node.endpoints import runtime_folder
+from gcd_node.envelope import NoteMessage, decode, topic_key
+from gcd_node.errors import ConfigError, EndpointError, MessageError, NodeError
+from gcd_node.publisher import Publisher, PublisherOptions
+from gcd_node.subscriber import NoteSubscriber, ViewSubscriber
+
+
+def options(tmp_path: Path, *, status: bool = False, lockstep: bool = False, readers: int = 0) -> PublisherOptions:
+    return PublisherOptions(
+        data=f"ipc://{tmp_path}/data",
+        status=f"ipc://{tmp_path}/status" if status else None,
+        lockstep=lockstep,
+        min_subscribers=readers,
+        end_delay_ms=200,
+    )
+
+
+def wait_for_subscribers(publisher: Publisher, count: int) -> None:
+    until = time.monotonic() + 10
+    while publisher.stats.subscribers != count:
+        assert time.monotonic() < until, f"wanted {count} subscribers, got {publisher.stats.subscribers}"
+        time.sleep(0.005)
+
+
+def plain_reader(context: zmq.Context, endpoint: str, *topics: bytes) -> zmq.Socket:
+    reader = context.socket(zmq.SUB)
+    reader.set(zmq.LINGER, 0)
+    for topic in topics:
+        reader.set(zmq.SUBSCRIBE, topic)
+    reader.connect(endpoint)
+    return reader
+
+
+@pytest.fixture
+def context():
+    with zmq.Context() as made:
+        yield made
+        made.destroy(linger=0)
+
+
+# A second process
+
+
+@pytest.mark.parametrize("transport", ["ipc", "tcp"])
+def test_a_second_process_receives_every_window_bit_for_bit(tmp_path, transport) -> None:
+    data = f"ipc://{tmp_path}/data" if transport == "ipc" else "tcp://127.0.0.1:0"
+    with Publisher(PublisherOptions(data=data, status=None, lockstep=True, min_subscribers=1)) as publisher:
+        reader = start_reader(publisher.endpoint, "top", "--all")
+        for i in range(5):
+            assert publisher.send(window(i))
+        publisher.end(end(window_id=4), delay_ms=0)
+    expected = [f"{i} {i} 0 False {zlib.crc32(pixels(i))}" for i in range(5)]
+    assert lines_of(reader) == [*expected, "end"]
+
+
+def test_lockstep_never_skips_for_a_slow_reader(tmp_path) -> None:
+    big = pixels(1, frames=14, height=128, width=192)  # 1 MB: more than the kernel's buffers hold
+    with Publisher(options(tmp_path, lockstep=True, readers=1)) as publisher:
+        reader = start_reader(publisher.endpoint, "top", "--all", "--slow", "0.05")
+        for i in range(30):
+            publisher.send(window(i, images=big))
+        publisher.end(end(window_id=29))
+    rows = [line.split()[:3] for line in lines_of(reader)]
+    assert rows == [[str(i), str(i), "0"] for i in range(30)] + [["end"]]
+
+
+def test_a_conflated_slow_reader_gets_the_newest_window_and_then_the_end(tmp_path) -> None:
+    with Publisher(options(tmp_path)) as publisher:
+        reader = start_reader(publisher.endpoint, "top", "--slow", "0.15")
+        wait_for_subscribers(publisher, 1)
+        for i in range(40):
+            publisher.send(window(i))
+            time.sleep(0.01)
+        publisher.end(end(window_id=39), delay_ms=400)
+    seen = [int(line.split()[0]) for line in lines_of(reader)[:-1]]
+    assert seen[-1] == 39
+    assert seen == sorted(set(seen))
+    assert 2 <= len(seen) <= 12
+
+
+def test_a_reader_of_one_view_gets_nothing_of_a_longer_name(tmp_path) -> None:
+    with Publisher(options(tmp_path, lockstep=True, readers=2)) as publisher:
+        readers = {view: start_reader(publisher.endpoint, view, "--all") for view in ("top", "topdown")}
+        for i in range(3):
+            publisher.send(window(i, view_id="topdown"))
+            publisher.send(window(10 + i, view_id="top"))
+            publisher.send(window(20 + i, view_id="top", kind="frm", images=pixels(frames=1)))
+        for view in readers:
+            publisher.end(end(view_id=view))
+    windows = {view: [line.split()[0] for line in lines_of(reader)] for view, reader in readers.items()}
+    assert windows == {"top": ["10", "11", "12", "end"], "topdown": ["0", "1", "2", "end"]}
+
+
+def test_a_reader_survives_a_restart_and_is_told_once(tmp_path) -> None:
+    with ViewSubscriber(f"ipc://{tmp_path}/data", "top", conflate=False) as views:
+        for boot_id, wanted in ((None, [False, False]), (OTHER_BOOT, [True, False])):
+            with Publisher(options(tmp_path, lockstep=True, readers=1)) as publisher:
+                for i in range(2):
+                    publisher.send(window(i) if boot_id is None else window(i, boot_id=boot_id))
+                received = [views.receive(5000) for _ in range(2)]
+            assert [view.restarted for view in received] == wanted
+            assert [view.message.sequence for view in received] == [0, 1]
+        assert views.stats.restarts == 1
+
+
+# Sockets as the protocol has them
+
+
+def test_a_new_subscriber_is_welcomed_with_zeros(tmp_path, context) -> None:
+    with Publisher(options(tmp_path)) as publisher:
+        reader = plain_reader(context, publisher.endpoint, bytes(32))
+        assert reader.poll(5000)
+        assert reader.recv() == bytes(64)
+        assert publisher.stats.subscribers == 0  # who waits for the welcome alone wants no views
+
+
+def test_subscribers_are_counted_as_they_come_and_go(tmp_path, context) -> None:
+    with Publisher(options(tmp_path)) as publisher:
+        readers = [plain_reader(context, publisher.endpoint, topic_key("view/top/win")) for _ in range(3)]
+        wait_for_subscribers(publisher, 3)
+        readers[0].close()
+        wait_for_subscribers(publisher, 2)
+        readers[1].unsubscribe(topic_key("view/top/win"))
+        wait_for_subscribers(publisher, 1)
+        assert publisher.stats.subscribers == 1
+
+
+def test_sequences_count_each_topic_on_its_own(tmp_path, context) -> None:
+    with Publisher(options(tmp_path, lockstep=True, readers=1)) as publisher:
+        reader = plain_reader(context, publisher.endpoint, b"view/")
+        for view_id in ("a", "b", "a", "a", "b"):
+            publisher.send(window(view_id=view_id))
+        publisher.end(end(view_id="a"))
+        found = [decode(reader.recv()) for _ in range(6)]
+    assert [message.sequence for message in found] == [0, 0, 1, 2, 1, 3]
+
+
+def test_the_end_follows_the_last_window_by_its_delay(tmp_path, context) -> None:
+    with Publisher(options(tmp_path, lockstep=True, readers=1)) as publisher:
+        reader = plain_reader(context, publisher.endpoint, b"view/")
+        publisher.send(window())
+        publisher.end(end(), delay_ms=300)
+        reader.recv()
+        start = time.monotonic()
+        reader.recv()
+        assert time.monotonic() - start > 0.25
+
+
+@pytest.mark.parametrize("topic", ["status", "event", "meta"])
+def test_who_comes_late_gets_the_last_note_of_a_topic(tmp_path, topic) -> None:
+    with Publisher(options(tmp_path, status=True)) as publisher:
+        for level in range(3):
+            publisher.note(topic, origin(), {"level": level})
+        with NoteSubscriber(publisher.status_endpoint, (topic,)) as first:
+            note = until_level(first, 2)
+            assert note.sequence == 2
+            with NoteSubscriber(publisher.status_endpoint, (topic,)) as second:
+                assert until_level(second, 2).sequence == 2
+            assert first.receive(50) is None  # the repeat for the second is no news to the first
+            publisher.note(topic, origin(), {"level": 3})
+            assert until_level(first, 3).sequence == 3
+
+
+def until_level(notes: NoteSubscriber, level: int) -> NoteMessage:
+    while (note := notes.receive(5000)) is not None:
+        if note.fields["level"] == level:
+            return note
+    raise AssertionError(f"no note of level {level} came")
+
+
+# Hand-over
+
+
+def test_realtime_drops_and_counts_instead_of_waiting(tmp_path) -> None:
+    with Publisher(PublisherOptions(data=f"ipc://{tmp_path}/data", status=None, queue_size=2)) as publisher:
+        accepted = sum(publisher.send(window(i)) for i in range(200))
+        stats = publisher.stats
+        assert accepted + stats.dropped == 200
+    assert publisher.stats.sent == accepted
+    assert publisher.stats.bytes > accepted * 144
+
+
+def test_a_full_queue_drops_at_once(tmp_path) -> None:
+    with Publisher(PublisherOptions(data=f"ipc://{tmp_path}/data", status=None, queue_size=1)) as publisher:
+        publisher.end(end(), delay_ms=300)  # holds the thread's attention, not its sockets
+        time.sleep(0.05)
+        assert [publisher.send(window(i)) for i in range(3)] == [True, False, False]
+        assert publisher.stats.dropped == 2
+
+
+def test_lockstep_waits_for_room(tmp_path) -> None:
+    made = PublisherOptions(data=f"ipc://{tmp_path}/data", status=None, lockstep=True, min_subscribers=1, queue_size=1)
+    publisher = Publisher(made)
+    sender = threading.Thread(target=lambda: [publisher.send(window(i)) for i in range(4)], daemon=True)
+    sender.start()
+    sender.join(0.1)
+    assert sender.is_alive()
+    with ViewSubscriber(publisher.endpoint, "top", conflate=False) as views:
+        assert [views.receive(5000).header.window_id for _ in range(4)] == [0, 1, 2, 3]
+        sender.join(5)
+        assert not sender.is_alive()
+        publisher.close()
+
+
+def test_lockstep_that_no_reader_takes_is_an_error_at_the_end(tmp_path) -> None:
+    made = PublisherOptions(data=f"ipc://{tmp_path}/data", status=None, lockstep=True, min_subscribers=1, drain_ms=100)
+    publisher = Publisher(made)
+    publisher.send(window())
+    publisher.send(window())
+    with pytest.raises(EndpointError, match="2 messages were not taken .* 0 subscribers, wanted 1"):
+        publisher.close()
+
+
+def test_closing_twice_is_harmless_and_sending_afterwards_is_an_error(tmp_path) -> None:
+    publisher = Publisher(options(tmp_path))
+    publisher.close()
+    publisher.close()
+    assert not (tmp_path / "data").exists()
+    with pytest.raises(NodeError, match="closed"):
+        publisher.send(window())
+
+
+def test_what_stops_the_thread_reaches_the_caller(tmp_path, monkeypatch) -> None:
+    publisher = Publisher(options(tmp_path))
+    monkeypatch.setattr(publisher._data, "serve", lambda: 1 / 0)
+    publisher._thread.join(5)
+    for call in (publisher.check, lambda: publisher.send(window()), publisher.close):
+        with pytest.raises(NodeError, match="thread stopped: division by zero"):
+            call()
+
+
+def test_an_error_inside_the_block_is_not_hidden_by_the_publisher(tmp_path) -> None:
+    with pytest.raises(KeyError), Publisher(options(tmp_path, lockstep=True, readers=1)) as publisher:
+        publisher.send(window())
+        raise KeyError
+
+
+def test_a_message_that_cannot_be_encoded_takes_no_number(tmp_path, context) -> None:
+    with Publisher(options(tmp_path, lockstep=True, readers=1)) as publisher:
+        reader = plain_reader(context, publisher.endpoint, b"view/")
+        with pytest.raises(MessageError):
+            publisher.send(window(age_ms=float("nan")))
+        publisher.send(window(1))
+        assert decode(reader.recv()).sequence == 0
+
+
+# Endpoints
+
+
+def test_a_live_ipc_endpoint_is_refused_and_stays_alive(tmp_path) -> None:
+    with Publisher(options(tmp_path, lockstep=True, readers=1)) as first:
+        with pytest.raises(EndpointError, match="ipc://.*/data is in use"):
+            Publisher(options(tmp_path))
+        reader = start_reader(first.endpoint, "top", "--all")
+        first.send(window())
+        first.end(end())
+    assert len(lines_of(reader)) == 2
+
+
+def test_a_tcp_port_in_use_is_refused_by_name() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(EndpointError, match=endpoint) as caught:
+            Publisher(PublisherOptions(data=endpoint, status=None))
+    assert caught.value.exit_code == 73
+
+
+def test_the_file_of_a_dead_process_is_replaced(tmp_path) -> None:
+    script = "import os, sys, zmq; s = zmq.Context().socket(zmq.XPUB); s.bind(sys.argv[1]); os._exit(0)"
+    subprocess.run([sys.executable, "-c", script, f"ipc://{tmp_path}/data"], check=True, timeout=20)
+    assert (tmp_path / "data").is_socket()
+    with Publisher(options(tmp_path)) as publisher:
+        assert publisher.stats.sent == 0
+
+
+def test_a_file_that_is_no_socket_is_left_alone(tmp_path) -> None:
+    (tmp_path / "data").write_text("precious")
+    with pytest.raises(EndpointError, match="no socket"):
+        Publisher(options(tmp_path))
+    assert (tmp_path / "data").read_text() == "precious"
+
+
+def test_a_missing_folder_is_named(tmp_path) -> None:
+    with pytest.raises(EndpointError, match="absent, which does not exist"):
+        Publisher(options(tmp_path / "absent"))
+
+
+@pytest.mark.parametrize("endpoint", ["tcp://0.0.0.0:5580", "tcp://*:5580", "tcp://192.168.1.4:1", "tcp://robot:1"])
+def test_tcp_beyond_this_machine_is_refused(endpoint) -> None:
+    with pytest.raises(ConfigError, match="CURVE keys and a list of allowed clients") as caught:
+        Publisher(PublisherOptions(data=endpoint, status=None))
+    assert caught.value.exit_code == 78
+
+
+@pytest.mark.parametrize("endpoint", ["", "data", "udp://1.2.3.4:5", "ipc://", "tcp://127.0.0.1", "inproc://x"])
+def test_what_is_no_endpoint_is_refused(endpoint) -> None:
+    with pytest.raises(ConfigError, match="an endpoint is"):
+        Publisher(PublisherOptions(data=endpoint, status=None))
+
+
+def test_a_failed_status_endpoint_frees_the_data_endpoint(tmp_path) -> None:
+    with pytest.raises(ConfigError):
+        Publisher(PublisherOptions(data=f"ipc://{tmp_path}/data", status="nonsense"))
+    with Publisher(options(tmp_path)) as publisher:
+        assert publisher.endpoint == f"ipc://{tmp_path}/data"
+
+
+def test_the_runtime_folder_is_private_and_shared_by_both_sides(tmp_path, monkeypatch) -> None:
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with Publisher(PublisherOptions(lockstep=True, min_subscribers=1)) as publisher:
+        assert stat.S_IMODE((tmp_path / "gcd").stat().st_mode) == 0o700
+        assert publisher.status_endpoint == f"ipc://{tmp_path}/gcd/status"
+        with ViewSubscriber("ipc", "top", conflate=False) as views:
+            publisher.send(window(7))
+            assert views.receive(5000).header.window_id == 7
+
+
+def test_the_runtime_folder_is_looked_up_in_order(monkeypatch) -> None:
+    monkeypatch.setenv("RUNTIME_DIRECTORY", "/run/gcd:/run/other")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "/run/user/1")
+    assert runtime_folder() == Path("/run/gcd")
+    monkeypatch.delenv("RUNTIME_DIRECTORY")
+    assert runtime_folder() == Path("/run/user/1/gcd")
+    monkeypatch.delenv("XDG_RUNTIME_DIR")
+    assert runtime_folder() == Path(f"/tmp/gcd-{os.getuid()}")
+
+
+def test_a_runtime_folder_anyone_may_write_is_refused(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "open"))
+    (tmp_path / "open").mkdir()
+    (tmp_path / "open").chmod(0o777)
+    with pytest.raises(EndpointError, match="must be ours alone"):
+        Publisher(PublisherOptions())

@@ -1,0 +1,446 @@
+"""One contract for every source, and what each refuses."""
+
+import logging
+import struct
+import threading
+import time
+import zlib
+from collections.abc import Callable
+from itertools import islice
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from media import HEIGHT, WIDTH, flat, ramp, write_pictures, write_video
+
+from gcd_node.config import SourceConfig
+from gcd_node.errors import SourceError
+from gcd_node.frame import Frame, FrameSource
+from gcd_node.sources import (
+    ImageFolder,
+    SyntheticDrive,
+    VideoFile,
+    list_pictures,
+    open_source,
+    packaged_drive,
+    read_picture,
+    resolve_path,
+    write_drive,
+)
+from gcd_node.sources.container import looks_like_video
+from gcd_node.sources.picture_header import read_header
+from gcd_node.sources.street import Street
+from gcd_node.sources.video_file import StampTrack
+
+COUNT = 12
+REAL = Path(__file__).parents[2].parent / "shared" / "real"
+Maker = Callable[[Path, str], FrameSource]
+
+
+def make_video(suffix: str) -> Maker:
+    def make(folder: Path, pace: str) -> FrameSource:
+        path = folder / f"clip.{suffix}"
+        if not path.exists():
+            write_video(path, ramp(COUNT))
+        return VideoFile(path, pace=pace)
+
+    return make
+
+
+def make_folder(folder: Path, pace: str) -> FrameSource:
+    pictures = write_pictures(folder / "pictures", {f"{i}.png": image for i, image in enumerate(ramp(COUNT))})
+    return ImageFolder(pictures, fps=10.0, pace=pace)
+
+
+def make_synthetic(folder: Path, pace: str) -> FrameSource:
+    return SyntheticDrive(width=WIDTH, height=HEIGHT, frames=COUNT, pace=pace)
+
+
+every_source = pytest.mark.parametrize(
+    "make",
+    [*map(make_video, ("mp4", "avi", "mkv", "webm")), make_folder, make_synthetic],
+    ids=["mp4", "avi", "mkv", "webm", "folder", "synthetic"],
+)
+
+
+# --- the contract ------------------------------------------------------------------------------------------------
+
+
+@every_source
+def test_a_source_gives_every_frame_once_and_ends(make: Maker, tmp_path: Path) -> None:
+    frames = list(make(tmp_path, "lockstep").frames())
+    assert [frame.seq for frame in frames] == list(range(COUNT))
+
+
+@every_source
+def test_stamps_rise_at_the_rate_of_the_source(make: Maker, tmp_path: Path) -> None:
+    source = make(tmp_path, "lockstep")
+    steps_s = np.diff([frame.stamp_ns for frame in source.frames()]) / 1e9
+    assert source.info.fps_nominal == pytest.approx(10.0)
+    np.testing.assert_allclose(steps_s, 0.1, atol=2e-3)
+
+
+@every_source
+def test_frames_are_read_only_rgb_of_the_stated_size(make: Maker, tmp_path: Path) -> None:
+    source = make(tmp_path, "lockstep")
+    assert (source.info.width, source.info.height, source.info.clock) == (WIDTH, HEIGHT, "replay")
+    for frame in islice(source.frames(), 3):
+        assert frame.image.shape == (HEIGHT, WIDTH, 3)
+        assert frame.image.dtype == np.uint8
+        with pytest.raises(ValueError, match="read-only"):
+            frame.image[0, 0] = 0
+
+
+@every_source
+def test_a_second_look_sees_the_same(make: Maker, tmp_path: Path) -> None:
+    source = make(tmp_path, "lockstep")
+    first, second, reopened = list(source.frames()), list(source.frames()), list(make(tmp_path, "lockstep").frames())
+    for again in (second, reopened):
+        assert [frame.stamp_ns for frame in again] == [frame.stamp_ns for frame in first]
+        assert all(np.array_equal(a.image, b.image) for a, b in zip(first, again, strict=True))
+
+
+@every_source
+def test_closing_from_another_thread_ends_the_wait_for_a_frame(make: Maker, tmp_path: Path) -> None:
+    source = make(tmp_path, "realtime")
+    seen: list[Frame] = []
+    reader = threading.Thread(target=lambda: seen.extend(source.frames()), daemon=True)
+    reader.start()
+    time.sleep(0.15)
+    source.close()
+    source.close()
+    reader.join(timeout=1.0)
+    assert not reader.is_alive()
+    assert len(seen) < COUNT
+    assert list(source.frames()) == []
+
+
+@every_source
+def test_realtime_takes_as_long_as_the_recording(make: Maker, tmp_path: Path) -> None:
+    begin = time.monotonic()
+    assert len(list(islice(make(tmp_path, "realtime").frames(), 4))) == 4
+    assert time.monotonic() - begin >= 0.29
+
+
+# --- colours -----------------------------------------------------------------------------------------------------
+
+
+def test_red_stays_red_through_a_lossless_video(tmp_path: Path) -> None:
+    colours = [flat(250, 10, 20), flat(10, 240, 30), flat(20, 30, 230)]
+    path = write_video(tmp_path / "colours.mkv", colours)
+    for frame, wanted in zip(VideoFile(path).frames(), colours, strict=True):
+        np.testing.assert_array_equal(frame.image, wanted)
+
+
+@pytest.mark.parametrize("suffix", ["png", "bmp", "tiff", "webp", "jpg"])
+def test_red_stays_red_through_every_picture_format(suffix: str, tmp_path: Path) -> None:
+    folder = write_pictures(tmp_path, {f"red.{suffix}": flat(250, 10, 20)})
+    image = read_picture(folder / f"red.{suffix}")
+    tolerance = 6 if suffix in {"jpg", "webp"} else 0
+    assert np.abs(image.astype(int) - (250, 10, 20)).max() <= tolerance
+
+
+# --- video files -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fps", [24.0, 25.0, 30.0, 30000 / 1001, 24000 / 1001])
+def test_stamps_follow_any_frame_rate(fps: float, tmp_path: Path) -> None:
+    video = VideoFile(write_video(tmp_path / "clip.mp4", ramp(30), fps))
+    stamps_s = np.array([frame.stamp_ns for frame in video.frames()]) / 1e9
+    np.testing.assert_allclose(stamps_s, np.arange(30) / fps, atol=1e-4)
+
+
+def test_a_raw_stream_without_stamps_is_counted_at_its_rate(tmp_path: Path) -> None:
+    coded = write_video(tmp_path / "clip.avi", ramp(8), fps=25.0).read_bytes()
+    pictures = [b"\xff\xd8\xff" + part for part in coded.split(b"\xff\xd8\xff")[1:]]
+    (tmp_path / "raw.mjpeg").write_bytes(b"".join(picture[: picture.rindex(b"\xff\xd9") + 2] for picture in pictures))
+    stamps = [frame.stamp_ns for frame in VideoFile(tmp_path / "raw.mjpeg", fps=20.0).frames()]
+    assert stamps == [50_000_000 * i for i in range(8)]
+
+
+@pytest.mark.parametrize(
+    ("stated_ms", "wanted_ms"),
+    [
+        ([0, 0, 0, 0], [0, 100, 200, 300]),  # a raw stream
+        ([0, 41.7, 166.7, 208.4], [0, 41.7, 166.7, 208.4]),  # a variable rate
+        ([80, 180, 280], [80, 180, 280]),  # begins late
+        ([0, 100, 90, 300], [0, 100, 200, 300]),  # one step back
+        ([0, 100, 9e12, 9e12 + 100], [0, 100, 200, 300]),  # a leap
+        ([float("nan"), -5, 200], [0, 100, 200]),
+        ([-9.2e18, 100, 200], [0, 100, 200]),
+    ],
+)
+def test_stamps_rise_whatever_the_container_says(stated_ms: list[float], wanted_ms: list[float]) -> None:
+    track = StampTrack(fps=10.0)
+    assert [track.next(ms) / 1e6 for ms in stated_ms] == pytest.approx(wanted_ms)
+
+
+def test_a_looped_video_keeps_counting(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "clip.mkv", ramp(5))
+    frames = list(islice(VideoFile(path, loop=True).frames(), 12))
+    assert [frame.seq for frame in frames] == list(range(12))
+    np.testing.assert_allclose(np.diff([frame.stamp_ns for frame in frames]) / 1e6, 100.0, atol=1.0)
+    np.testing.assert_array_equal(frames[7].image, frames[2].image)
+
+
+def test_a_video_cut_short_gives_what_is_left_and_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (30, HEIGHT, WIDTH, 3), np.uint8)
+    path = write_video(tmp_path / "clip.mkv", list(noise))
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with caplog.at_level(logging.WARNING):
+        count = len(list(VideoFile(path).frames()))
+    assert 5 < count < 25
+    assert "truncated" in caplog.text
+
+
+def bad_videos(folder: Path) -> dict[str, tuple[Path, str]]:
+    """What cannot be opened, and a word its message must hold."""
+    whole = write_video(folder / "whole.mp4", ramp(10)).read_bytes()
+    vp9 = write_video(folder / "vp9.webm", ramp(3), codec="VP90").read_bytes()
+    write_video(folder / "good.mkv", ramp(3))
+    contents = {
+        "empty.mp4": b"",
+        "junk.mp4": b"\x07" * 5000,
+        "letters.txt": b"Dear video player,\n" * 400,
+        "playlist.mp4": b"ffconcat version 1.0\nfile 'good.mkv'\n",
+        "playlist.m3u8": b"#EXTM3U\n#EXTINF:1,\ngood.mkv\n",
+        "truncated.mp4": whole[: len(whole) // 2],
+        "head.mkv": b"\x1a\x45\xdf\xa3" + b"\0" * 400,
+        "av1.webm": vp9.replace(b"V_VP9", b"V_AV1"),
+        "still.png": cv2.imencode(".png", flat(1, 2, 3))[1].tobytes(),
+    }
+    for name, content in contents.items():
+        (folder / name).write_bytes(content)
+    words = {
+        "empty.mp4": "is empty",
+        "truncated.mp4": "truncated or damaged",
+        "head.mkv": "truncated or damaged",
+        "av1.webm": r"no frame of it can be decoded \(codec AV01\).*ffmpeg -i",
+        "still.png": "still picture",
+    }
+    cases = {name: (folder / name, words.get(name, "is not a video")) for name in contents}
+    return cases | {"missing": (folder / "none.mp4", "no such video"), "folder": (folder, "is a folder")}
+
+
+BAD_VIDEOS = ["empty.mp4", "junk.mp4", "letters.txt", "playlist.mp4", "playlist.m3u8", "truncated.mp4", "head.mkv"]
+BAD_VIDEOS += ["av1.webm", "still.png", "missing", "folder"]
+
+
+@pytest.mark.parametrize("case", BAD_VIDEOS)
+def test_a_bad_video_is_refused_in_one_line_when_it_is_opened(
+    case: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path, words = bad_videos(tmp_path)[case]
+    capfd.readouterr()
+    with pytest.raises(SourceError, match=f"(?i){words}") as caught:
+        VideoFile(path)
+    message = str(caught.value)
+    assert path.name in message
+    assert "\n" not in message
+    assert caught.value.exit_code == 66
+    assert capfd.readouterr().err == ""
+
+
+def test_a_video_that_vanishes_between_loops_is_lost(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "clip.mkv", ramp(3))
+    frames = VideoFile(path, loop=True).frames()
+    list(islice(frames, 3))
+    path.unlink()
+    with pytest.raises(SourceError, match="no such video"):
+        list(frames)
+
+
+@pytest.mark.parametrize("fps", [0.0, -1.0, float("nan"), float("inf")])
+def test_an_impossible_frame_rate_is_refused_everywhere(fps: float, tmp_path: Path) -> None:
+    folder = write_pictures(tmp_path / "p", {"0.png": flat(0, 0, 0)})
+    makers = [lambda: ImageFolder(folder, fps=fps), lambda: SyntheticDrive(fps=fps), lambda: VideoFile(folder, fps=fps)]
+    for make in makers:
+        with pytest.raises(SourceError, match="fps"):
+            make()
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        *(b"\0\0\0\x1cftypisom", b"\x1a\x45\xdf\xa3", b"RIFF\0\0\0\0AVI LIST", b"\0\0\0\x01\x67", b"OggS", b"FLV\x01"),
+        b"\x47" + b"\0" * 187 + b"\x47",
+    ],
+)
+def test_the_first_bytes_of_videos_are_known(head: bytes) -> None:
+    assert looks_like_video(head)
+
+
+@pytest.mark.parametrize("head", [b"", b"GATTACA", b"RIFF\0\0\0\0WAVEfmt ", b"PK\x03\x04", b"%PDF-1.7", b"#!/bin/sh\n"])
+def test_other_files_are_not_taken_for_videos(head: bytes) -> None:
+    assert not looks_like_video(head)
+
+
+# --- folders and stills ------------------------------------------------------------------------------------------
+
+
+def test_pictures_are_sorted_as_people_count(tmp_path: Path) -> None:
+    names = ["b1.png", "a10.png", "a2.PNG", "a02b.jpg", "A1.png", ".hidden.png"]
+    folder = write_pictures(tmp_path, {name.lower() if "hidden" in name else name: flat(0, 0, 0) for name in names})
+    (folder / "notes.txt").write_text("not a picture")
+    assert [path.name for path in list_pictures(folder)] == ["A1.png", "a2.PNG", "a02b.jpg", "a10.png", "b1.png"]
+
+
+def test_a_picture_of_another_size_is_named(tmp_path: Path) -> None:
+    pictures = {f"{i}.png": flat(0, 0, 0) for i in range(3)}
+    folder = write_pictures(tmp_path, pictures | {"3.png": flat(0, 0, 0, width=60), "4.png": flat(0, 0, 0, width=50)})
+    with pytest.raises(SourceError, match=r"3\.png is 60 x 48.* are 64 x 48"):
+        ImageFolder(folder, fps=10.0)
+
+
+def test_a_turned_picture_is_named_when_it_comes(tmp_path: Path) -> None:
+    folder = write_pictures(tmp_path, {"0.png": flat(0, 0, 0), "1.png": flat(0, 0, 0, width=HEIGHT, height=WIDTH)})
+    with pytest.raises(SourceError, match=r"1\.png is 48 x 64"):
+        list(ImageFolder(folder, fps=10.0).frames())
+
+
+@pytest.mark.parametrize("damage", [lambda data: data[:60], lambda data: data[:20], lambda data: b"x" * 99])
+def test_a_damaged_picture_is_named(damage: Callable[[bytes], bytes], tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
+    folder = write_pictures(tmp_path, {f"{i}.png": noise for i in range(3)})
+    (folder / "1.png").write_bytes(damage((folder / "1.png").read_bytes()))
+    with pytest.raises(SourceError, match=r"1\.png cannot be decoded"):
+        list(ImageFolder(folder, fps=10.0).frames())
+
+
+def test_folders_without_pictures_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="holds no pictures"):
+        ImageFolder(tmp_path, fps=10.0)
+    with pytest.raises(SourceError, match="missing"):
+        ImageFolder(tmp_path / "none", fps=10.0)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SourceError, match="not a folder"):
+        ImageFolder(tmp_path / "file", fps=10.0)
+    with pytest.raises(SourceError, match="cannot read the picture"):
+        read_picture(tmp_path / "none.png")
+
+
+def png_stating(width: int, height: int) -> bytes:
+    """A small PNG whose header states any size."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0")) + chunk(b"IEND", b"")
+
+
+def test_a_picture_that_would_fill_the_memory_is_refused_before_it_is_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
+    (tmp_path / "bomb.png").write_bytes(png_stating(12000, 12000))
+    with pytest.raises(SourceError, match=r"bomb\.png states 12000 x 12000 pixels"):
+        read_picture(tmp_path / "bomb.png")
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg", "bmp", "webp", "tif"])
+def test_the_header_tells_the_size_without_decoding(suffix: str, tmp_path: Path) -> None:
+    folder = write_pictures(tmp_path, {f"a.{suffix}": flat(9, 9, 9, width=37, height=21)})
+    header = read_header(folder / f"a.{suffix}")
+    assert header is not None
+    assert (header.width, header.height) == (37, 21)
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg", "bmp", "webp", "tif"])
+def test_a_header_cut_anywhere_raises_nothing(suffix: str, tmp_path: Path) -> None:
+    whole = (write_pictures(tmp_path, {f"a.{suffix}": flat(9, 9, 9)}) / f"a.{suffix}").read_bytes()
+    cut = tmp_path / "cut"
+    for length in range(0, min(len(whole), 400), 3):
+        cut.write_bytes(whole[:length])
+        header = read_header(cut)
+        assert header is None or (header.width, header.height) == (WIDTH, HEIGHT)
+
+
+def test_a_looped_folder_keeps_counting(tmp_path: Path) -> None:
+    folder = write_pictures(tmp_path, {f"{i}.png": image for i, image in enumerate(ramp(3))})
+    frames = list(islice(ImageFolder(folder, fps=4.0, loop=True).frames(), 7))
+    assert [frame.stamp_ns for frame in frames] == [250_000_000 * i for i in range(7)]
+    np.testing.assert_array_equal(frames[5].image, frames[2].image)
+
+
+# --- the drawn drive ---------------------------------------------------------------------------------------------
+
+
+def test_a_drive_is_the_same_for_the_same_seed_only() -> None:
+    one, same, other = (SyntheticDrive(width=48, height=32, seed=seed).image(7) for seed in (3, 3, 4))
+    np.testing.assert_array_equal(one, same)
+    assert np.abs(one.astype(int) - other).mean() > 5
+
+
+def test_a_drive_has_sky_above_and_grey_road_below() -> None:
+    image = SyntheticDrive(width=96, height=64).image(0).astype(int)
+    sky, road = image[0, 44:52].mean(axis=0), image[-1, 44:52].mean(axis=0)
+    assert sky[2] > sky[0] + 40
+    assert np.ptp(road) < 12
+
+
+def test_the_camera_drives_at_eight_metres_a_second() -> None:
+    places = [Street(seed=0).camera(t) for t in np.arange(0.0, 20.0, 0.1)]
+    speeds = [np.hypot(b.x - a.x, b.y - a.y) / 0.1 for a, b in zip(places, places[1:], strict=False)]
+    assert 7.5 < min(speeds) < max(speeds) < 9.0
+
+
+def test_the_packaged_clip_shows_the_drive() -> None:
+    path = resolve_path("package:drive.mp4")
+    frames, drive = list(VideoFile(path).frames()), packaged_drive()
+    assert path.stat().st_size <= 400_000
+    assert len(frames) >= 42
+    for seq in (0, 41):
+        error = np.mean((frames[seq].image.astype(float) - drive.image(seq)) ** 2)
+        assert 10 * np.log10(255**2 / error) > 25
+
+
+def test_the_packaged_clip_can_be_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    small = SyntheticDrive(width=64, height=48, frames=3)
+    monkeypatch.setattr("gcd_node.sources.synthetic.packaged_drive", lambda: small)
+    write_drive(tmp_path / "again.mp4")
+    assert len(list(VideoFile(tmp_path / "again.mp4").frames())) == 3
+
+
+# --- from a launch file ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["package:none.mp4", "package:../errors.py", "package:"])
+def test_only_packaged_files_are_found_under_package(name: str) -> None:
+    with pytest.raises(SourceError, match=r"it has package:drive\.mp4"):
+        resolve_path(name)
+
+
+def test_a_launch_file_opens_every_kind(tmp_path: Path) -> None:
+    folder = write_pictures(tmp_path / "p", {"0.png": flat(0, 0, 0)})
+    video = write_video(tmp_path / "v.mkv", ramp(2))
+    configs = [
+        SourceConfig(kind="file", path=str(video)),
+        SourceConfig(kind="folder", path=str(folder), fps=5.0),
+        SourceConfig(kind="synthetic", frames=2, seed=1),
+    ]
+    infos = [open_source(config).info for config in configs]
+    assert [(info.kind, info.id) for info in infos] == [("file", "v.mkv"), ("folder", "p"), ("synthetic", "drive-1")]
+
+
+# --- real recordings ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "count", "fps", "size"),
+    [
+        ("kubmv7_scn01992_v11.mp4", 60, 24.0, (576, 384)),
+        ("kubmv7_scn01996_v2.mp4", 60, 24.0, (576, 384)),
+        ("pd_scn00590.mp4", 50, 10.0, (640, 480)),
+        ("pd_scn01969.mp4", 50, 10.0, (640, 480)),
+    ],
+)
+def test_real_recordings_are_read_whole(name: str, count: int, fps: float, size: tuple[int, int]) -> None:
+    path = REAL / name
+    if not path.is_file():
+        pytest.skip(f"{path} is not there")
+    video = VideoFile(path)
+    frames = list(video.frames())
+    assert (video.info.width, video.info.height, video.info.fps_nominal, video.info.codec) == (*size, fps, "h264")
+    assert [frame.stamp_ns for frame in frames] == pytest.approx([i * 1e9 / fps for i in range(count)], abs=1000)
