@@ -8,7 +8,15 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from typer import Argument, Option
 
-from gcd_model import Augmentation, RenderOptions, SphericalDelta, ViewSynthesizer, load_synthesizer
+from gcd_model import (
+    ASSUMED_SOURCE,
+    Augmentation,
+    RenderOptions,
+    Spherical,
+    SphericalDelta,
+    ViewSynthesizer,
+    load_synthesizer,
+)
 from gcd_node.cli_weights import FamilyOption, HeadWidth, ImageHeads
 from gcd_node.errors import UsageError
 from gcd_node.offline_clip import ClipRequest, read_clip
@@ -45,6 +53,12 @@ PathKind: TypeAlias = Annotated[
     str | None, Option(help="gradual or direct; else as the checkpoint was trained.", rich_help_panel=_VIEW)
 ]
 MoveTime: TypeAlias = Annotated[int | None, Option(help="Frame in which the goal is reached.", rich_help_panel=_VIEW)]
+SourceElevation: TypeAlias = Annotated[
+    float | None, Option(help="Where the source camera stands; with --poses. Else 5.", rich_help_panel=_VIEW)
+]
+SourceRadius: TypeAlias = Annotated[
+    float | None, Option(help="Its distance to the scene's centre. Else 15.", rich_help_panel=_VIEW)
+]
 Start: TypeAlias = Annotated[int, Option(help="First frame of the input.", rich_help_panel=_CLIP)]
 Stride: TypeAlias = Annotated[int, Option(help="Take every so-many-th frame.", rich_help_panel=_CLIP)]
 Fps: TypeAlias = Annotated[
@@ -87,6 +101,8 @@ def synthesize(
     poses: Poses = None,
     trajectory: PathKind = None,
     move_time: MoveTime = None,
+    source_elevation_deg: SourceElevation = None,
+    source_radius: SourceRadius = None,
     start: Start = 0,
     stride: Stride = 1,
     fps: Fps = None,
@@ -114,7 +130,11 @@ def synthesize(
         raise UsageError("--save holds one sample; leave out --samples, or save each seed on its own")
     clip = ClipRequest(start=start, stride=stride, fps=fps, height=height, width=width)
     wanted = ViewRequest(
-        delta=_delta(azimuth_deg, elevation_deg, radius), poses=poses, trajectory=trajectory, move_time=move_time
+        delta=_delta(azimuth_deg, elevation_deg, radius),
+        poses=poses,
+        trajectory=trajectory,
+        move_time=move_time,
+        source=_source(source_elevation_deg, source_radius),
     )
     injected = InjectedNoise() if noise is None else read_noise(noise)
     options = RenderOptions(
@@ -163,6 +183,16 @@ def _delta(azimuth_deg: float | None, elevation_deg: float | None, radius: float
     if azimuth_deg is None and elevation_deg is None and radius is None:
         return None
     return SphericalDelta(azimuth_deg=azimuth_deg or 0.0, elevation_deg=elevation_deg or 0.0, radius_m=radius or 0.0)
+
+
+def _source(elevation_deg: float | None, radius: float | None) -> Spherical | None:
+    if elevation_deg is None and radius is None:
+        return None
+    return replace(
+        ASSUMED_SOURCE,
+        elevation_deg=ASSUMED_SOURCE.elevation_deg if elevation_deg is None else elevation_deg,
+        radius_m=ASSUMED_SOURCE.radius_m if radius is None else radius,
+    )
 
 
 def _progress() -> Progress:

@@ -3,16 +3,18 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
 from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+from typer import Argument, Option, Typer
 
-from gcd_model import inspect_weights
+from gcd_model import WeightsReport, convert_weights, inspect_weights
 
-weights = typer.Typer(no_args_is_help=True, help="Look into checkpoints, convert them.")
+weights = Typer(no_args_is_help=True, help="Look into checkpoints, convert them.")
 
 WeightsPath = Annotated[
     Path,
-    typer.Argument(
+    Argument(
         metavar="FILE",
         help="A .ckpt of GCD, svd.safetensors, a diffusers folder, or our own .safetensors.",
         show_default=False,
@@ -20,16 +22,10 @@ WeightsPath = Annotated[
 ]
 FamilyOption = Annotated[
     str | None,
-    typer.Option(
-        help="kubric90, kubric180, driving, driving-semantic or svd; else told from the file.", show_default=False
-    ),
+    Option(help="kubric90, kubric180, driving, driving-semantic or svd; else told from the file."),
 ]
-HeadWidth = Annotated[
-    int | None, typer.Option(help="Width of a U-Net attention head, for unpublished widths.", show_default=False)
-]
-ImageHeads = Annotated[
-    int | None, typer.Option(help="Attention heads of the image tower, for unpublished widths.", show_default=False)
-]
+HeadWidth = Annotated[int | None, Option(help="Width of a U-Net attention head, for unpublished widths.")]
+ImageHeads = Annotated[int | None, Option(help="Attention heads of the image tower, for unpublished widths.")]
 
 
 @weights.command("inspect")
@@ -38,9 +34,103 @@ def inspect(
     family: FamilyOption = None,
     head_width: HeadWidth = None,
     image_heads: ImageHeads = None,
+    full_digest: Annotated[bool, Option(help="Digest every byte, also of large files.")] = False,
 ) -> None:
-    """Say what a checkpoint holds: architecture, family, sizes, and what will be left out. Loads nothing."""
-    report = inspect_weights(file, family=family, head_width=head_width, image_heads=image_heads)
+    """Say what a checkpoint holds: architecture, family, sizes, and what will be left out. Loads no weights."""
     console = Console()
+    with Console(stderr=True).status(f"reading {file}"):
+        report = inspect_weights(
+            file, family=family, head_width=head_width, image_heads=image_heads, full_digest=full_digest
+        )
+    _show(console, report)
+
+
+@weights.command("convert")
+def convert(
+    file: WeightsPath,
+    out: Annotated[Path, Argument(metavar="OUT", help="The .safetensors file to write.")],
+    dtype: Annotated[str | None, Option(help="float32, bfloat16 or float16; else as stored.")] = None,
+    family: FamilyOption = None,
+    head_width: HeadWidth = None,
+    image_heads: ImageHeads = None,
+    overwrite: Annotated[bool, Option("--overwrite", help="Replace OUT if it is there.")] = False,
+) -> None:
+    """Strip a checkpoint to what inference needs, with its configuration inside. OUT appears whole or not at all."""
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("converting", total=None)
+
+        def advance(done: int, total: int) -> None:
+            progress.update(task, completed=done, total=total)
+
+        report = convert_weights(
+            file,
+            out,
+            dtype=dtype,
+            family=family,
+            head_width=head_width,
+            image_heads=image_heads,
+            overwrite=overwrite,
+            progress=advance,
+        )
+    console = Console()
+    _show(console, report)
+    console.print(f"wrote {out}", soft_wrap=True)
+
+
+def _show(console: Console, report: WeightsReport) -> None:
     console.print(_facts(report))
-    console.print(_networks(report))
+    networks = Table(title="Used")
+    for column in ("network", "parameters", "tensors", "stored as", "MB"):
+        networks.add_column(column, justify="left" if column in ("network", "stored as") else "right")
+    for network in report.networks:
+        stored = ", ".join(network.dtypes)
+        networks.add_row(network.name, f"{network.parameters:,}", str(network.tensors), stored, _mb(network.size))
+    console.print(networks)
+    if report.leftovers or report.optimizer_size:
+        console.print(_left_out(report))
+
+
+def _facts(report: WeightsReport) -> Table:
+    config, facts = report.config, Table(title=report.path, show_header=False)
+    family = "unknown: no limits are checked, --motion-bucket must be given"
+    if report.family is not None:
+        family = f"{report.family} (told by {report.told_by})"
+    path = "direct" if report.move_time == 0 else f"the goal is reached in frame {report.move_time}"
+    rows = (
+        ("layout", report.layout),
+        ("family", family),
+        ("camera control", config.camera),
+        ("trajectory", path),
+        ("frames, trained size", f"{config.frames}, {config.width}x{config.height}"),
+        ("U-Net widths", ", ".join(map(str, config.unet.widths))),
+        ("head width, image heads", f"{config.unet.head_width}, {_heads(report)}"),
+        ("parameters used", f"{report.parameters:,}"),
+        ("size on disk", f"{_mb(report.size)} MB"),
+        ("digest", report.digest),
+        ("trained", "yes" if report.trained else "no: random weights"),
+    )
+    for row in rows:
+        facts.add_row(*row)
+    return facts
+
+
+def _heads(report: WeightsReport) -> str:
+    tower = report.config.image_encoder
+    return "no image tower" if tower is None else str(tower.heads)
+
+
+def _left_out(report: WeightsReport) -> Table:
+    table = Table(title="Left out")
+    for column in ("what", "tensors", "MB"):
+        table.add_column(column, justify="left" if column == "what" else "right")
+    for leftover in report.leftovers:
+        table.add_row(leftover.kind, str(leftover.tensors), _mb(leftover.size))
+    if report.optimizer_size:
+        table.add_row("optimizer state, never read", "", _mb(report.optimizer_size))
+    if report.other_entries:
+        table.add_row(f"other entries: {', '.join(report.other_entries)}", "", "")
+    return table
+
+
+def _mb(size: int) -> str:
+    return f"{size / 1e6:,.1f}"

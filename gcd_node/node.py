@@ -165,11 +165,20 @@ class Node:
 
     def _watch(self, model: threading.Thread) -> None:
         next_s = 0.0
+        told: dict[str, int] = {}
         while model.is_alive():
             if time.monotonic() >= next_s:
                 next_s = time.monotonic() + _STATUS_PERIOD_S
                 self._note("status", self._status("active", "streaming"))
+            self._note_new_reasons(told)
             model.join(_TICK_S)
+
+    def _note_new_reasons(self, told: dict[str, int]) -> None:
+        """An event for every kind of trouble that has happened since the last look."""
+        for reason, count in self._builder.counts.reasons.items():
+            if count > told.get(reason, 0):
+                self._note("event", {"code": reason, "level": 1, "count": count})
+                told[reason] = count
 
     def _announce_end(self) -> None:
         code = "SRC_ENDED" if self._failure is None else type(self._failure).__name__

@@ -39,7 +39,8 @@ class PublisherOptions:
     data, status: endpoints, or "ipc" for the runtime folder; status None opens no status socket.
     lockstep: wait for slow readers instead of skipping, and for min_subscribers before the first message.
     end_delay_ms: how long an end-of-stream message follows the last window, so that a conflated reader gets both.
-    linger_ms: how long an orderly close waits for readers; drain_ms: the same in lockstep, without any progress.
+    linger_ms: how long an orderly close waits for readers to take the end and leave; drain_ms: the same in lockstep,
+        and there also how long a queued message may wait for a reader.
     queue_size: messages between the callers and the thread.
     """
 
@@ -49,7 +50,7 @@ class PublisherOptions:
     min_subscribers: int = 0
     end_delay_ms: int = 500
     linger_ms: int = 1000
-    drain_ms: int = 10_000
+    drain_ms: int = 5000
     queue_size: int = 8
 
 
@@ -162,13 +163,15 @@ class Publisher:
         return None if self._status is None else self._status.endpoint
 
     def close(self, *, orderly: bool = True) -> None:
-        """Send what is queued, give readers `linger_ms`, close. Not orderly: close at once. A second call does nothing.
+        """Send what is queued, give readers `linger_ms`, close. Not orderly: close at once. A second call does
+        nothing, but one that is not orderly cuts the first one short.
 
         Raises:
             EndpointError: lockstep messages that no reader took. Else whatever stopped the thread.
         """
-        if not self._closed.is_set():
-            self._shut(orderly)
+        first = not self._closed.is_set()
+        self._shut(orderly)
+        if first:
             self._raise_failure()
 
     def __enter__(self) -> "Publisher":
@@ -202,11 +205,11 @@ class Publisher:
             raise NodeError(f"the publisher thread stopped: {self._failure}") from self._failure
 
     def _shut(self, orderly: bool) -> None:
+        if not orderly:
+            self._abandoned.set()  # also cuts short an orderly close that another thread is in
         if self._closed.is_set():
             return
         self._closed.set()
-        if not orderly:
-            self._abandoned.set()
         self._closing.set()
         self._thread.join()
         self._context.term()
@@ -218,7 +221,8 @@ class Publisher:
         try:
             self._run()
             if not self._abandoned.is_set():
-                linger_ms = self._options.drain_ms if self._options.lockstep else self._options.linger_ms
+                linger_ms = self._patience_ms
+                self._see_off()
         except Exception as error:
             self._failure = error
         finally:
@@ -237,10 +241,27 @@ class Publisher:
                 return
             if parcel is None or self._data.send(parcel):
                 parcel, progress = None, time.monotonic()
-            elif closing and time.monotonic() - progress > self._options.drain_ms / 1000:
+            elif not closing:
+                progress = time.monotonic()
+                self._data.wait(_RETRY_MS)
+            elif time.monotonic() - progress > self._options.drain_ms / 1000:
                 raise EndpointError(self._undelivered())
             else:
                 self._data.wait(_RETRY_MS)
+
+    def _see_off(self) -> None:
+        """Wait until readers have left. ZeroMQ's linger ends when its last batch of bytes is on its way, and loses it
+        to a reader too slow to take it at once; who leaves has the end-of-stream message."""
+        until = time.monotonic() + self._patience_ms / 1000
+        while self._data.ended and self._data.subscribers > 0 and time.monotonic() < until:
+            self._serve_sockets()
+            self._data.wait(_RETRY_MS)
+            if self._abandoned.is_set():
+                return
+
+    @property
+    def _patience_ms(self) -> int:
+        return self._options.drain_ms if self._options.lockstep else self._options.linger_ms
 
     def _serve_sockets(self) -> None:
         self._data.serve()
@@ -272,6 +293,7 @@ class _DataSocket:
         self._socket = _bound(context, _own_endpoint(options.data, "data"), _DATA_HWM, no_drop=options.lockstep)
         self.endpoint = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
         self.sent = self.bytes = self.subscribers = 0
+        self.ended = False
         self._last_sent = time.monotonic()
 
     def serve(self) -> None:
@@ -292,7 +314,8 @@ class _DataSocket:
             return False
         self.sent += 1
         self.bytes += len(parcel.part)
-        if parcel.follow_s is None:
+        self.ended = parcel.follow_s is not None
+        if not self.ended:
             self._last_sent = time.monotonic()
         return True
 
@@ -301,7 +324,7 @@ class _DataSocket:
         self._socket.poll(timeout_ms)
 
     def close(self, linger_ms: int) -> None:
-        self._socket.close(linger_ms)
+        _unbind(self._socket, self.endpoint, linger_ms)
 
 
 class _StatusSocket:
@@ -323,7 +346,7 @@ class _StatusSocket:
         self._socket.send(part)
 
     def close(self, linger_ms: int) -> None:
-        self._socket.close(linger_ms)
+        _unbind(self._socket, self.endpoint, linger_ms)
 
 
 def _events(socket: "zmq.Socket[bytes]") -> list[bytes]:
@@ -334,6 +357,13 @@ def _events(socket: "zmq.Socket[bytes]") -> list[bytes]:
         if event[:1] in (b"\0", b"\1"):
             found.append(event)
     return found
+
+
+def _unbind(socket: "zmq.Socket[bytes]", endpoint: str, linger_ms: int) -> None:
+    """Close; an ipc file goes first, while it is still ours: ZeroMQ leaves it behind."""
+    if endpoint.startswith("ipc://"):
+        Path(endpoint.removeprefix("ipc://")).unlink(missing_ok=True)
+    socket.close(linger_ms)
 
 
 def _own_endpoint(endpoint: str, channel: Channel) -> str:

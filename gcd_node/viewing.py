@@ -106,8 +106,13 @@ class ViewSaver:
     def add(self, view: ReceivedView) -> None:
         """Write one message's frames."""
         header, frames = view.header, _colour(view.images)
+        folder = self._folder / header.view_id
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"cannot create {folder}: {error.strerror}; name another folder") from error
         for index, frame in enumerate(frames):
-            write_png(self._folder / header.view_id / f"{header.window_id:06d}_{index:02d}.png", frame)
+            write_png(folder / f"{header.window_id:06d}_{index:02d}.png", frame)
         self.files += len(frames)
         video = self._video(header)
         for frame in frames:

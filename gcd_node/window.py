@@ -78,7 +78,7 @@ def choose_fps(source_fps: float, trained: Sequence[float]) -> tuple[float, bool
     if not trained:
         return source_fps, False
     reachable = [fps for fps in trained if fps <= source_fps * (1 + RATE_TOLERANCE)]
-    return (max(reachable), False) if reachable else (source_fps, True)
+    return (float(max(reachable)), False) if reachable else (source_fps, True)
 
 
 class WindowBuilder:

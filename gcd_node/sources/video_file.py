@@ -185,8 +185,8 @@ def _describe(path: Path, decoder: _Decoder, stated_fps: float | None) -> Source
     first = decoder.read()
     if first is None:
         raise SourceError(
-            f"{path} opens, but no frame of it can be decoded (codec {decoder.codec}); "
-            "convert it: ffmpeg -i INPUT -c:v libx264 OUTPUT.mp4"
+            f"{path} opens, but no frame of it can be decoded: codec {decoder.codec} is damaged or unknown to this "
+            "OpenCV; convert it: ffmpeg -i INPUT -c:v libx264 OUTPUT.mp4"
         )
     fps = stated_fps or decoder.fps
     if fps is None:

@@ -7,6 +7,7 @@
 The node imports from here only. Source: Van Hoorick et al., "Generative Camera Dolly", ECCV 2024.
 """
 
+from gcd_model.checkpoints import WeightsReport, convert_weights, inspect_weights
 from gcd_model.clip import Augmentation, Clip, RenderOptions, View
 from gcd_model.conditioning import SourceFeatures
 from gcd_model.config import SMALL, SVD_14, ModelConfig
@@ -36,6 +37,7 @@ from gcd_model.geometry import (
     pose_trajectory,
     spherical_trajectory,
 )
+from gcd_model.loading import load_synthesizer
 from gcd_model.synthesizer import Synthesizer, ViewSynthesizer, synthesize
 
 __all__ = [
@@ -69,9 +71,13 @@ __all__ = [
     "ViewLimits",
     "ViewRangeError",
     "ViewSynthesizer",
+    "WeightsReport",
     "center_crop_box",
+    "convert_weights",
     "driving_trajectory",
     "fitted_trajectory",
+    "inspect_weights",
+    "load_synthesizer",
     "nearest_delta",
     "pose_trajectory",
     "spherical_trajectory",

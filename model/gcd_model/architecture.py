@@ -33,11 +33,12 @@ PUBLISHED_FRAMES = 14
 class Hints:
     """What neither names nor shapes tell; None means as published.
 
-    head_width: channels of an attention head of the U-Net. image_heads: attention heads of the image tower.
-    frames: T. latent_scale: see `VAEConfig.scale`.
+    head_width: channels of an attention head of the U-Net; or heads: their number, one for all levels or one each.
+    image_heads: attention heads of the image tower. frames: T. latent_scale: see `VAEConfig.scale`.
     """
 
     head_width: int | None = None
+    heads: int | tuple[int, ...] | None = None
     image_heads: int | None = None
     frames: int | None = None
     latent_scale: float | None = None
@@ -166,7 +167,7 @@ def _unet(probe: _Probe, hints: Hints) -> UNetConfig:
         attention=attention,
         blocks_per_level=probe.levels.unet_blocks,
         embedding_width=probe.size("unet.embed_noise.0", 0),
-        head_width=_head_width([w for w, attends in zip(widths, attention, strict=True) if attends], widths, hints),
+        head_width=_head_width(attention, widths, hints),
         context_width=_context_width(probe),
         vector_width=probe.size("unet.embed_vector.0", 1),
         camera_width=_camera_width(probe),
@@ -174,16 +175,32 @@ def _unet(probe: _Probe, hints: Hints) -> UNetConfig:
     )
 
 
-def _head_width(attending: list[int], widths: tuple[int, ...], hints: Hints) -> int:
+def _head_width(attends: tuple[bool, ...], widths: tuple[int, ...], hints: Hints) -> int:
     """The given head width, or the published one. The middle, as wide as the deepest level, always attends."""
-    head_width = hints.head_width or PUBLISHED_HEAD_WIDTH
-    for width in (*attending, *widths[-1:]):
+    attending = [width for width, there in zip(widths, (*attends[:-1], True), strict=True) if there]
+    head_width = hints.head_width or _width_of_heads(attends, widths, hints.heads) or PUBLISHED_HEAD_WIDTH
+    for width in attending:
         if width % head_width:
             raise CheckpointError(
                 f"an attention level is {width} wide, no multiple of the head width {head_width}, which the weights "
                 "do not tell; give --head-width"
             )
     return head_width
+
+
+def _width_of_heads(
+    attends: tuple[bool, ...], widths: tuple[int, ...], heads: int | tuple[int, ...] | None
+) -> int | None:
+    """Head width from numbers of heads; None without them."""
+    if heads is None:
+        return None
+    counts = (heads,) * len(widths) if isinstance(heads, int) else heads
+    if len(counts) != len(widths) or min(counts) < 1:
+        raise CheckpointError(f"config.json gives heads {counts} for {len(widths)} levels")
+    found = {width / count for width, count, there in zip(widths, counts, (*attends[:-1], True), strict=True) if there}
+    if len(found) > 1 or not all(width.is_integer() for width in found):
+        raise CheckpointError(f"heads {counts} over widths {widths} are not all of one width; give --head-width")
+    return int(found.pop())
 
 
 def _context_width(probe: _Probe) -> int | None:

@@ -3,7 +3,8 @@
 A family is how a checkpoint was trained; `Traits` is one loaded checkpoint: its family and its own facts.
 """
 
-from dataclasses import dataclass
+import logging
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor
 from gcd_model.config import CameraControl, ModelConfig
 from gcd_model.errors import OptionError, PoseError, ViewFixedError, ViewRangeError
 from gcd_model.geometry import (
+    DeltaFit,
     Interpolation,
     Spherical,
     SphericalDelta,
@@ -22,6 +24,9 @@ from gcd_model.geometry import (
     pose_trajectory,
     spherical_trajectory,
 )
+
+_LOG = logging.getLogger(__name__)
+_TOLERATED_M, _TOLERATED_DEG = 1e-3, 0.05
 
 FamilyName = Literal["kubric90", "kubric180", "driving", "driving-semantic", "svd"]
 
@@ -63,7 +68,8 @@ def _within(relative: tuple[float, float], absolute: tuple[float, float], at: fl
 class Family:
     """How a group of checkpoints was trained.
 
-    camera: control the checkpoint must have. rates: trained frames per second, empty if any. fps: the default label.
+    camera: control the checkpoints have; relative poses may stand in for angles and radius.
+    rates: trained frames per second, empty if any. fps: the default label.
     hfov_deg: trained horizontal field of view. height, width: trained size in pixels.
     motion_bucket: the constant the network was told, None where the formula gives it.
     """
@@ -225,18 +231,16 @@ class Traits:
             raise ViewFixedError(f"{self.name} has one fixed view and takes no poses; leave the poses out")
         if source_from_target.shape[:1] != (self.config.frames,):
             raise PoseError(f"poses must be [{self.config.frames}, 4, 4], got {list(source_from_target.shape)}")
-        fitted, _ = fitted_trajectory(source_from_target, source or ASSUMED_SOURCE)
+        if self.config.camera == "relative_pose" and (self.family is None or self.family.limits is None):
+            return pose_trajectory(source_from_target)
+        fitted, fits = fitted_trajectory(source_from_target, source or ASSUMED_SOURCE)
         assert fitted.delta is not None
         for azimuth, elevation, radius in fitted.delta.tolist():
             self._check_limits(SphericalDelta(azimuth_deg=azimuth, elevation_deg=elevation, radius_m=radius), source)
         if self.config.camera == "spherical":
+            _warn_of_residual(fits)
             return fitted
-        return Trajectory(
-            source_from_target=source_from_target.double(),
-            delta=fitted.delta,
-            at_goal=fitted.at_goal,
-            source=fitted.source,
-        )
+        return replace(fitted, source_from_target=source_from_target.double())
 
     def _fixed_view(self, delta: SphericalDelta | None, move_time: int) -> Trajectory:
         if delta is not None and delta != SphericalDelta():
@@ -259,3 +263,15 @@ class Traits:
                     "choose a view inside, or another checkpoint",
                     allowed,
                 )
+
+
+def _warn_of_residual(fits: list[DeltaFit]) -> None:
+    position_m = max(fit.position_error_m for fit in fits)
+    rotation_deg = max(fit.rotation_error_deg for fit in fits)
+    if position_m > _TOLERATED_M or rotation_deg > _TOLERATED_DEG:
+        _LOG.warning(
+            "the network is steered by angles and radius: the nearest path misses the asked poses by up to %.3g m "
+            "and %.3g degrees",
+            position_m,
+            rotation_deg,
+        )

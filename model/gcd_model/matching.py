@@ -1,7 +1,7 @@
 """Strict matching of a file's weights to a network's parameters: nothing missing, nothing unknown, all of one shape."""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from gcd_model.architecture import Naming, Shapes

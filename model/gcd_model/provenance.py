@@ -53,7 +53,7 @@ def told_by_yaml(text: str) -> Provenance:
 
     Only `key: value` lines with numbers are looked at, lists on one line or one item a line; nothing is executed.
     """
-    move_time = re.search(r"^[\s-]*move_time\s*:\s*(\d{1,4})\s*(#.*)?$", text, re.MULTILINE)
+    move_time = re.search(r"^[ \t-]*move_time\s*:\s*(\d{1,4})\s*(#.*)?$", text, re.MULTILINE)
     family = _family_of_ranges(text) or _family_of_views(text)
     return Provenance(
         family=family,
@@ -78,7 +78,7 @@ def _largest_difference(text: str, angle: str) -> float | None:
     inline = rf"\[\s*{number}\s*,\s*{number}\s*\]"
     block = rf"(?:#.*)?\n\s*-\s*{number}\s*\n\s*-\s*{number}\s*(?:\n|$)"
     for found in re.finditer(
-        rf"^[\s-]*[\w.]*{angle}\w*\s*:\s*(?:{inline}|{block})", text, re.MULTILINE | re.IGNORECASE
+        rf"^[ \t-]*[\w.]*{angle}\w*\s*:\s*(?:{inline}|{block})", text, re.MULTILINE | re.IGNORECASE
     ):
         low, high = (float(value) for value in found.groups() if value is not None)
         if low == -high and high > 0:
@@ -90,7 +90,7 @@ def _family_of_views(text: str) -> FamilyName | None:
     """The driving checkpoints look from above the road; their target is colour or classes."""
     if re.search(r"pardom|parallel_?domain|ego_forward|topdown", text, re.IGNORECASE) is None:
         return None
-    semantic = re.search(r"^[\s-]*\w*modality\w*\s*:\s*[\['\"\s]*segm", text, re.MULTILINE | re.IGNORECASE)
+    semantic = re.search(r"^[ \t-]*\w*modality\w*\s*:\s*[\['\"\s]*segm", text, re.MULTILINE | re.IGNORECASE)
     return "driving" if semantic is None else "driving-semantic"
 
 
@@ -105,14 +105,15 @@ def combined(*told: Provenance) -> Provenance:
 
 
 def checked_family(told: Provenance, config: ModelConfig) -> Family | None:
-    """The family, if it can be: its camera control must be the weights'.
+    """The family, if it can be: steered weights need a steered family, fixed ones a fixed one.
 
+    Relative poses may stand in for angles and radius.
     Raises: CheckpointError on a contradiction, OptionError for an unknown name.
     """
     if told.family is None:
         return None
     family = family_named(told.family)
-    if family.camera != config.camera:
+    if (family.camera == "none") != (config.camera == "none"):
         raise CheckpointError(
             f"family {family.name} (told by: {told.told_by}) wants camera control {family.camera!r}, "
             f"the weights have {config.camera!r}; name another with --family"

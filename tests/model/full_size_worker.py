@@ -15,12 +15,13 @@ from pathlib import Path
 
 import msgspec
 import torch
-from diffusers import UNetSpatioTemporalConditionModel
+from diffusers.models.unets.unet_spatio_temporal_condition import UNetSpatioTemporalConditionModel
 from naming import from_diffusers_unet
 from safetensors.torch import load_file, save_file
-from small_models import draw, randomise
-from torch import Tensor, nn
+from small_models import draw, give_published_epsilon, randomise
+from torch import Tensor
 
+from gcd_model.conditioning import micro_conditioning
 from gcd_model.config import SVD_14
 from gcd_model.layers import prepare
 from gcd_model.unet import VideoUNet
@@ -34,23 +35,16 @@ def _diffusers_unet() -> UNetSpatioTemporalConditionModel:
     """On the meta device, with the published epsilon in the blocks where diffusers has another."""
     with torch.device("meta"):
         unet = UNetSpatioTemporalConditionModel(num_frames=FRAMES)
-    for block in unet.down_blocks:
-        for module in block.resnets.modules():
-            if isinstance(module, nn.GroupNorm):
-                module.eps = 1e-5
+    give_published_epsilon(unet)
     return unet.eval()
 
 
 def _write(folder: Path) -> None:
     unet = _diffusers_unet().to_empty(device="cpu")
     with torch.no_grad():
-        for parameter in unet.parameters():
-            parameter.zero_()
-    randomise(unet)
-    with torch.no_grad():
         for name, parameter in unet.named_parameters():
-            if "norm" in name and name.endswith(".weight"):
-                parameter.add_(1.0)
+            parameter.fill_(1.0 if "norm" in name and name.endswith(".weight") else 0.0)
+    randomise(unet)
     save_file(unet.state_dict(), folder / "unet.safetensors")
 
 
@@ -62,17 +56,11 @@ def _ours(weights: dict[str, Tensor]) -> Callable[[Tensor, Tensor], Tensor]:
     prepare(unet)
 
     def forward(latents: Tensor, token: Tensor) -> Tensor:
-        vector = torch.cat([_sinusoid(value) for value in MICRO]).expand(FRAMES, -1)
+        vector = micro_conditioning(*MICRO, config.vector_width).expand(FRAMES, -1)
         plan = unet.plan(torch.tensor([NOISE_LABEL]), vector, None, token.expand(FRAMES, -1))
         return unet(latents[:, :4], latents[:, 4:], plan.step(0))
 
     return forward
-
-
-def _sinusoid(value: float) -> Tensor:
-    from gcd_model.layers import sinusoid
-
-    return sinusoid(torch.tensor(value), 256)
 
 
 def _diffusers(weights: dict[str, Tensor]) -> Callable[[Tensor, Tensor], Tensor]:

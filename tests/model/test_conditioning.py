@@ -18,6 +18,7 @@ from gcd_model.conditioning import (
     relative_pose_features,
     spherical_features,
 )
+from gcd_model.config import CameraControl
 from gcd_model.errors import ShapeError
 from gcd_model.geometry import Spherical, SphericalDelta, pose_trajectory, spherical_trajectory
 
@@ -58,13 +59,15 @@ def test_relative_poses_become_their_top_three_rows_row_by_row() -> None:
 
 def test_the_camera_embedder_is_one_linear_map_of_the_features_of_each_frame() -> None:
     path = spherical_trajectory(SOURCE, SphericalDelta(azimuth_deg=40.0, radius_m=1.0), frames=4, move_time=3)
-    for control, features in (
-        ("spherical", spherical_features(path.delta)),  # pyright: ignore[reportArgumentType]
-        ("relative_pose", relative_pose_features(path.source_from_target)),
-    ):
-        embedder = CameraEmbedder(control, 5)  # pyright: ignore[reportArgumentType]
+    assert path.delta is not None
+    features: dict[CameraControl, Tensor] = {
+        "spherical": spherical_features(path.delta),
+        "relative_pose": relative_pose_features(path.source_from_target),
+    }
+    for control, expected in features.items():
+        embedder = CameraEmbedder(control, 5)
         randomise(embedder)
-        assert_close(embedder(path), features @ embedder.proj.weight.T + embedder.proj.bias)
+        assert_close(embedder(path), expected @ embedder.proj.weight.T + embedder.proj.bias)
 
 
 def test_a_free_path_is_refused_by_spherical_control_with_the_way_out() -> None:

@@ -375,3 +375,22 @@ def test_planner_files_keep_to_python_3_10(name) -> None:
     source = (Path(gcd_node.__file__).parent / f"{name}.py").read_text()
     assert ast.parse(source, feature_version=(3, 10)).body
     assert not {"Self", "StrEnum", "assert_never", "tomllib", "ExceptionGroup"} & set(source.replace(",", " ").split())
+
+
+# The page other languages are written from
+
+PAGE = (Path(gcd_node.__file__).parent.parent / "docs" / "protocol.md").read_text()
+
+
+def test_the_protocol_page_names_every_header_key() -> None:
+    header = json.loads(header_text(jpeg_message()))
+    nested = [*header["src"], *header["quality"], *header["model"], *header["pose"][0], *header["src_pose"]]
+    assert [key for key in (*header, *nested, "scale") if f"`{key}`" not in PAGE] == []
+
+
+def test_the_example_on_the_protocol_page_is_a_message() -> None:
+    part = bytes.fromhex(PAGE.split("```hex")[1].split("```")[0])
+    message = decode(part)
+    assert isinstance(message, EndMessage)
+    assert (message.topic, message.sequence, message.header.window_id) == ("view/top/win", 3, 2)
+    assert encode(message) == part

@@ -1,5 +1,6 @@
 """Small messages for the tests of the wire side, and a real second process that reads them."""
 
+import os
 import subprocess
 import sys
 import time
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+import gcd_node
 from gcd_node.envelope import EndMessage, ViewKind, ViewMessage, payload_of, view_topic
 from gcd_node.header import (
     EndHeader,
@@ -115,7 +117,8 @@ def origin(boot_id: str = BOOT) -> OriginHeader:
 def start_reader(endpoint: str, view: str, *options: str) -> "subprocess.Popen[str]":
     """A second Python that prints one JSON line for each view it receives, and one when the stream ends."""
     command = [sys.executable, str(READER), endpoint, view, *options]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    environment = os.environ | {"PYTHONPATH": str(Path(gcd_node.__file__).parent.parent)}
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
 
 
 def lines_of(reader: "subprocess.Popen[str]") -> list[str]:

@@ -1,0 +1,139 @@
+"""From the name of a checkpoint to a synthesizer on a device."""
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import torch
+
+from gcd_model.checkpoints import LoadedWeights, load_weights
+from gcd_model.config import SMALL
+from gcd_model.errors import CheckpointError, OptionError
+from gcd_model.families import Traits, family_named
+from gcd_model.networks import Networks, random_networks
+from gcd_model.own_format import precision
+from gcd_model.synthesizer import Synthesizer
+
+PACKAGED = Path(__file__).parent / "weights"
+"""Where the weights that ship with the package lie."""
+
+
+def load_synthesizer(
+    source: str | Path,
+    *,
+    family: str | None = None,
+    device: str = "auto",
+    dtype: str | None = None,
+    head_width: int | None = None,
+    image_heads: int | None = None,
+    frames: int | None = None,
+) -> Synthesizer:
+    """A checkpoint, ready to run.
+
+    Args:
+        source: a path; `package:NAME`, weights that ship with the package; or `random:FAMILY`, small random networks
+            whose views are noise.
+        family: see `load_weights`. device: "auto" (CUDA where there is one), "cpu", "cuda" or "cuda:N".
+        dtype: "float32", "bfloat16" or "float16"; else float32 on the CPU, bfloat16 on CUDA. The VAE decoder
+            computes in float32 always.
+        head_width, image_heads, frames: see `load_weights`.
+    Raises:
+        CheckpointError: see `load_weights`. OptionError: an option is unknown or contradicts the checkpoint.
+    """
+    place = _place(device, dtype)
+    kind, _, name = str(source).partition(":")
+    if isinstance(source, str) and kind == "random":
+        _require_no_overrides(source, family, head_width, image_heads)
+        loaded = random_weights(name, frames=frames)
+    else:
+        path = packaged_weights(name) if isinstance(source, str) and kind == "package" else Path(source)
+        loaded = load_weights(path, family=family, head_width=head_width, image_heads=image_heads, frames=frames)
+    return Synthesizer(_moved(loaded.networks, place), _traits(loaded, place))
+
+
+def packaged_weights(name: str) -> Path:
+    """File of weights that ship with the package. Raises CheckpointError, listing what there is."""
+    path = PACKAGED / f"{name}.safetensors"
+    if Path(name).name == name and path.is_file():
+        return path
+    there = ", ".join(sorted(file.stem for file in PACKAGED.glob("*.safetensors")))
+    raise CheckpointError(
+        f"no weights called {name!r} ship with the package; there are: {there or 'none yet'}. "
+        "Give a path, or random:kubric90 to try things out with random weights"
+    )
+
+
+def random_weights(family: str, *, frames: int | None = None) -> LoadedWeights:
+    """Small random networks with the camera control of a family; always the same ones."""
+    chosen = family_named(family)
+    unet = SMALL.unet if chosen.camera != "none" else msgspec.structs.replace(SMALL.unet, camera_width=0)
+    config = msgspec.structs.replace(SMALL, camera=chosen.camera, unet=unet, frames=frames or SMALL.frames)
+    networks = random_networks(config, seed=0)
+    return LoadedWeights(
+        name=f"random-{family}",
+        networks=networks,
+        family=chosen,
+        move_time=config.frames - 1,
+        trained=False,
+        sha256_12=_state_digest(networks)[:12],
+    )
+
+
+def _state_digest(networks: Networks) -> str:
+    total = hashlib.sha256()
+    for name, tensor in sorted(networks.state_dict().items()):
+        total.update(name.encode())
+        total.update(tensor.detach().contiguous().flatten().view(torch.uint8).numpy().data)
+    return total.hexdigest()
+
+
+def _require_no_overrides(source: str, *given: object) -> None:
+    if any(option is not None for option in given):
+        raise OptionError(f"{source} takes neither family, head width nor image heads; leave them out")
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where the networks compute, and in which precision."""
+
+    device: torch.device
+    dtype: torch.dtype
+    precision: str
+
+
+def _place(device: str, dtype: str | None) -> _Place:
+    chosen = _device(device)
+    name = dtype or ("bfloat16" if chosen.type == "cuda" else "float32")
+    return _Place(chosen, precision(name), name)
+
+
+def _device(name: str) -> torch.device:
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    kind, _, index = name.partition(":")
+    if kind not in ("cpu", "cuda") or (index and not index.isdecimal()) or (kind == "cpu" and index):
+        raise OptionError(f"device must be auto, cpu, cuda or cuda:N, got {name!r}")
+    if kind == "cuda" and int(index or 0) >= torch.cuda.device_count():
+        raise OptionError(f"device {name} was asked for, this machine has {torch.cuda.device_count()} CUDA devices")
+    return torch.device(name)
+
+
+def _moved(networks: Networks, place: _Place) -> Networks:
+    """Everything to its device and precision; what has both already stays in the mapped file."""
+    for name, module in networks.named_children():
+        module.to(place.device, torch.float32 if name == "decoder" else place.dtype)
+    return networks
+
+
+def _traits(loaded: LoadedWeights, place: _Place) -> Traits:
+    return Traits(
+        name=loaded.name,
+        config=loaded.networks.config,
+        family=loaded.family,
+        move_time=loaded.move_time,
+        sha256_12=loaded.sha256_12,
+        precision=place.precision,
+        device=str(place.device),
+        trained=loaded.trained,
+    )

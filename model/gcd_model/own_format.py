@@ -1,0 +1,114 @@
+"""Our weight files: safetensors with the config in the metadata. Pure: text and bytes in, text and bytes out."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Self
+
+import msgspec
+import torch
+
+from gcd_model.config import ModelConfig
+from gcd_model.errors import CheckpointError, OptionError
+
+FORMAT = "1"
+CONFIG_KEY = "gcd.config"
+
+PRECISIONS: dict[str, torch.dtype] = {
+    "float32": torch.float32,
+    "bfloat16": torch.bfloat16,
+    "float16": torch.float16,
+}
+"""What --dtype takes."""
+
+_DTYPES = {torch.float64: "F64", torch.float32: "F32", torch.bfloat16: "BF16", torch.float16: "F16"}
+
+
+def precision(name: str) -> torch.dtype:
+    """The dtype of that name. Raises OptionError for another."""
+    if name not in PRECISIONS:
+        raise OptionError(f"dtype must be one of {', '.join(PRECISIONS)}, got {name!r}")
+    return PRECISIONS[name]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Card:
+    """What our files say about themselves besides the weights.
+
+    family: a name of FAMILIES or None. move_time: frame in which the goal pose is reached.
+    trained: False for random weights. origin: digest of the file this one was converted from, or "".
+    """
+
+    name: str
+    config: ModelConfig
+    family: str | None
+    move_time: int
+    trained: bool = True
+    origin: str = ""
+
+    def to_metadata(self) -> dict[str, str]:
+        """As safetensors metadata: text to text."""
+        return {
+            "gcd.format": FORMAT,
+            CONFIG_KEY: msgspec.json.encode(self.config).decode(),
+            "gcd.name": self.name,
+            "gcd.family": self.family or "",
+            "gcd.move_time": str(self.move_time),
+            "gcd.trained": "true" if self.trained else "false",
+            "gcd.origin": self.origin,
+        }
+
+    @classmethod
+    def from_metadata(cls, metadata: Mapping[str, str]) -> Self:
+        """Raises CheckpointError for another format or a damaged config."""
+        if metadata.get("gcd.format", FORMAT) != FORMAT:
+            raise CheckpointError(
+                f"its format is {metadata['gcd.format']!r}, this version reads {FORMAT!r}; install a newer gcd-node"
+            )
+        try:
+            return cls(
+                name=metadata.get("gcd.name", ""),
+                config=msgspec.json.decode(metadata[CONFIG_KEY], type=ModelConfig),
+                family=metadata.get("gcd.family") or None,
+                move_time=int(metadata["gcd.move_time"]),
+                trained=metadata.get("gcd.trained", "true") != "false",
+                origin=metadata.get("gcd.origin", ""),
+            )
+        except (msgspec.DecodeError, KeyError, ValueError, ArithmeticError) as error:
+            raise CheckpointError(f"its metadata cannot be used ({error}); convert the weights again") from error
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One tensor to be written."""
+
+    shape: tuple[int, ...]
+    dtype: torch.dtype
+
+    @property
+    def size(self) -> int:
+        """Bytes."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+
+def file_order(entries: Mapping[str, Entry]) -> list[str]:
+    """Names as their tensors follow each other: widest type first, so that each is aligned; then by name."""
+    return sorted(entries, key=lambda name: (-entries[name].dtype.itemsize, name))
+
+
+def header(entries: Mapping[str, Entry], metadata: Mapping[str, str]) -> bytes:
+    """The head of a safetensors file whose tensors follow in `file_order`.
+
+    Eight bytes of length, then JSON padded with spaces to a multiple of eight. Source: the safetensors format.
+    """
+    content: dict[str, object] = {"__metadata__": dict(metadata)}
+    start = 0
+    for name in file_order(entries):
+        entry = entries[name]
+        offsets = [start, start + entry.size]
+        content[name] = {"dtype": _DTYPES[entry.dtype], "shape": list(entry.shape), "data_offsets": offsets}
+        start = offsets[1]
+    text = json.dumps(content, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text

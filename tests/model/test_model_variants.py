@@ -1,0 +1,142 @@
+"""One config scales every part of the model."""
+
+import msgspec
+import pytest
+import torch
+from small_models import TINY, draw, random_clip, relative_error, tiny_synthesizer
+
+from gcd_model.clip import Clip, RenderOptions
+from gcd_model.config import SMALL, SVD_14, ModelConfig, SamplingConfig
+from gcd_model.errors import OptionError, ShapeError
+from gcd_model.geometry import SphericalDelta, Trajectory, pose_trajectory
+from gcd_model.synthesizer import Synthesizer, synthesize
+
+LATENTS = (TINY.frames, 4, TINY.height // 4, TINY.width // 4)
+
+
+@pytest.fixture(scope="module")
+def synthesizer() -> Synthesizer:
+    return tiny_synthesizer()
+
+
+def path(synthesizer: Synthesizer) -> Trajectory:
+    return synthesizer.traits.plan_view(SphericalDelta(azimuth_deg=30.0))
+
+
+def with_unet(**changes: object) -> ModelConfig:
+    """TINY with other fields in its U-Net."""
+    return msgspec.structs.replace(TINY, unet=msgspec.structs.replace(TINY.unet, **changes))
+
+
+@pytest.mark.parametrize("channels", [0, 3])
+def test_a_checkpoint_with_extra_condition_channels_wants_exactly_those(channels: int) -> None:
+    synthesizer = tiny_synthesizer(with_unet(condition_channels=6))
+    extra = draw(3, channels, *LATENTS[2:]) if channels else None
+    with pytest.raises(ShapeError, match=f"2 extra condition channels, got {channels}"):
+        synthesizer.encode(random_clip(), extra=extra)
+    features = synthesizer.encode(random_clip(), extra=draw(3, 2, *LATENTS[2:]))
+    assert synthesizer.render(features, [path(synthesizer)])[0].samples.isfinite().all()
+
+
+def test_one_autoencoder_may_serve_both_source_and_target_frames() -> None:
+    shared = msgspec.structs.replace(TINY, vae=msgspec.structs.replace(TINY.vae, shared=True))
+    synthesizer = tiny_synthesizer(shared)
+    assert synthesizer.networks.condition_encoder is synthesizer.networks.target_encoder
+    assert synthesize(synthesizer, random_clip(), path(synthesizer)).samples.isfinite().all()
+
+
+def test_a_model_without_image_tower_has_no_tokens_and_still_renders() -> None:
+    unet = msgspec.structs.replace(TINY.unet, context_width=None)
+    synthesizer = tiny_synthesizer(msgspec.structs.replace(TINY, unet=unet, image_encoder=None))
+    assert synthesizer.encode(random_clip()).tokens is None
+    assert synthesize(synthesizer, random_clip(), path(synthesizer)).samples.isfinite().all()
+
+
+@pytest.mark.parametrize("control", ["relative_pose", "none"])
+def test_the_other_camera_controls_render_too(control: str) -> None:
+    unet = msgspec.structs.replace(TINY.unet, camera_width=0 if control == "none" else TINY.unet.camera_width)
+    synthesizer = tiny_synthesizer(msgspec.structs.replace(TINY, unet=unet, camera=control), family_known=False)
+    options = RenderOptions(motion_bucket=127.0)
+    angle = torch.tensor([0.0, 0.1, 0.2], dtype=torch.float64)
+    poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    poses[:, 0, 0], poses[:, 0, 2], poses[:, 2, 0], poses[:, 2, 2] = angle.cos(), angle.sin(), -angle.sin(), angle.cos()
+    features = synthesizer.encode(random_clip())
+    still, moving = synthesizer.render(
+        features, [pose_trajectory(poses[:1].repeat(3, 1, 1)), pose_trajectory(poses)], options
+    )
+    assert (relative_error(still.latents, moving.latents) > 1e-3) == (control == "relative_pose")
+
+
+def test_networks_in_bfloat16_give_float32_views_near_those_of_float32(synthesizer: Synthesizer) -> None:
+    half = tiny_synthesizer()
+    for name, network in half.networks.named_children():
+        if name != "decoder":
+            network.bfloat16()
+    exact = synthesize(synthesizer, random_clip(), path(synthesizer))
+    rounded = synthesize(half, random_clip(), path(half))
+    assert rounded.samples.dtype == rounded.latents.dtype == torch.float32
+    assert 0 < relative_error(rounded.latents, exact.latents) < 0.05
+
+
+def test_a_render_at_another_number_of_frames_levels_and_latent_channels_has_the_shapes_the_config_says() -> None:
+    config = ModelConfig(
+        frames=5,
+        height=16,
+        width=32,
+        unet=msgspec.structs.replace(
+            TINY.unet, latent_channels=8, condition_channels=8, multipliers=(1, 1, 2), attention=(True, False, True)
+        ),
+        vae=msgspec.structs.replace(TINY.vae, latent_channels=8, multipliers=(1, 2)),
+        image_encoder=TINY.image_encoder,
+        sampling=SamplingConfig(steps=2),
+    )
+    assert (config.vae.down_factor, config.unet.size_factor, config.size_factor) == (2, 4, 8)
+    synthesizer = tiny_synthesizer(config)
+    features = synthesizer.encode(random_clip(config))
+    (view,) = synthesizer.render(features, [path(synthesizer)])
+    assert view.video.shape == (5, 3, 16, 32)
+    assert view.latents.shape == (1, 5, 8, 8, 16)
+
+
+def test_the_two_named_configs_are_the_published_one_and_one_that_renders_on_a_cpu() -> None:
+    assert (SVD_14.frames, SVD_14.height, SVD_14.width, SVD_14.size_factor) == (14, 256, 384, 64)
+    assert SVD_14.unet.widths == (320, 640, 1280, 1280)
+    assert SVD_14.vae.widths == (128, 256, 512, 512)
+    assert SVD_14.sampling == SamplingConfig(steps=25, sigma_max=700.0, sigma_min=0.002, rho=7.0, guidance=(1.0, 1.5))
+    assert SMALL.frames == 14
+    synthesizer = tiny_synthesizer(SMALL)
+    clip = Clip(video=random_clip(SMALL).video[..., :64, :64].contiguous(), fps=12.0)
+    (view,) = synthesizer.render(synthesizer.encode(clip), [path(synthesizer)], RenderOptions(steps=1))
+    assert view.video.shape == (14, 3, 64, 64)
+
+
+@pytest.mark.parametrize("config", [SVD_14, SMALL, TINY])
+def test_a_config_survives_json(config: ModelConfig) -> None:
+    assert msgspec.json.decode(msgspec.json.encode(config), type=ModelConfig) == config
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"camera": "none"}, "contradicts camera_width 8"),
+        ({"image_encoder": None}, "image tower gives width None, the U-Net wants 24"),
+        ({"vae": msgspec.structs.replace(TINY.vae, latent_channels=8)}, "latent channels: U-Net 4, VAE 8"),
+    ],
+)
+def test_parts_that_do_not_fit_together_are_refused(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(OptionError, match=message):
+        msgspec.structs.replace(TINY, **changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"attention": (True,)}, "attention names 1 levels, multipliers 2"),
+        ({"vector_width": 25}, "25 is no multiple of 3"),
+        ({"width": 12}, "norm_groups = 8"),
+        ({"head_width": 24}, "head_width = 24"),
+    ],
+)
+def test_a_u_net_that_cannot_be_built_is_refused(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(OptionError, match=message):
+        with_unet(**changes)

@@ -1,0 +1,224 @@
+"""The slot between reader and model thread, with real threads."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+from media import frames_at
+
+from gcd_node.capture import Newest, read
+from gcd_node.errors import SourceError, TooShortError
+from gcd_node.frame import Frame, SourceInfo
+from gcd_node.window import FrameWindow, WindowBuilder
+
+GUARD_S = 5.0
+
+
+class ScriptedSource:
+    """Gives the frames it was given, then fails or waits as told."""
+
+    def __init__(self, frames: list[Frame], *, failure: Exception | None = None, stays: bool = False) -> None:
+        self._frames, self._failure, self._stays = frames, failure, stays
+        self._closed = threading.Event()
+        self.given = 0
+
+    @property
+    def info(self) -> SourceInfo:
+        return SourceInfo(kind="synthetic", id="script", width=4, height=2, fps_nominal=10.0, clock="replay")
+
+    def frames(self) -> Iterator[Frame]:
+        for frame in self._frames:
+            self.given += 1
+            yield frame
+        if self._stays:
+            self._closed.wait(GUARD_S)
+        if self._failure is not None:
+            raise self._failure
+
+    def close(self) -> None:
+        self._closed.set()
+
+
+def started(target: Callable[[], object]) -> threading.Thread:
+    thread = threading.Thread(target=target, daemon=True)
+    thread.start()
+    return thread
+
+
+def joined(thread: threading.Thread) -> None:
+    thread.join(GUARD_S)
+    assert not thread.is_alive(), "a thread hangs"
+
+
+def taken(slot: Newest[FrameWindow]) -> list[FrameWindow]:
+    windows: list[FrameWindow] = []
+    while (window := slot.take()) is not None:
+        windows.append(window)
+    return windows
+
+
+def ten_fps(count: int) -> list[Frame]:
+    return frames_at(i * 100.0 for i in range(count))
+
+
+def builder() -> WindowBuilder:
+    return WindowBuilder(frames=4, fps=10.0, source_fps=10.0)
+
+
+# --- the slot ----------------------------------------------------------------------------------------------------
+
+
+def test_the_newest_item_wins_and_the_rest_is_counted() -> None:
+    slot = Newest[int]()
+    assert [slot.put(i) for i in range(5)] == [True] * 5
+    assert slot.take() == 4
+    assert slot.dropped == 4
+
+
+def test_a_lossless_slot_hands_over_everything_in_order() -> None:
+    slot = Newest[int](lossless=True)
+    giver = started(lambda: ([slot.put(i) for i in range(200)], slot.finish()))
+    got: list[int] = []
+    while (item := slot.take()) is not None:
+        got.append(item)
+    joined(giver)
+    assert got == list(range(200))
+    assert slot.dropped == 0
+
+
+def test_what_was_left_can_be_taken_after_the_end() -> None:
+    slot = Newest[int]()
+    slot.put(7)
+    slot.finish()
+    assert [slot.take(), slot.take(), slot.take()] == [7, None, None]
+
+
+def test_an_error_reaches_the_taker_after_the_last_item() -> None:
+    slot = Newest[int]()
+    slot.put(7)
+    slot.finish(SourceError("unplugged"))
+    assert slot.take() == 7
+    with pytest.raises(SourceError, match="unplugged"):
+        slot.take()
+    assert slot.take() is None
+
+
+@pytest.mark.parametrize("ending", ["close", "finish"])
+def test_a_taker_who_waits_is_let_go(ending: str) -> None:
+    slot = Newest[int]()
+    got: list[int | None] = []
+    taker = started(lambda: got.append(slot.take()))
+    time.sleep(0.05)
+    getattr(slot, ending)()
+    joined(taker)
+    assert got == [None]
+
+
+def test_a_giver_who_waits_is_let_go_when_the_taker_closes() -> None:
+    slot = Newest[int](lossless=True)
+    answers: list[bool] = []
+    giver = started(lambda: answers.extend([slot.put(1), slot.put(2)]))
+    time.sleep(0.05)
+    assert answers == []
+    slot.close()
+    joined(giver)
+    assert answers == [True, False]
+    assert slot.closed
+    assert slot.take() is None
+
+
+def test_nothing_is_lost_or_doubled_between_busy_threads() -> None:
+    slot = Newest[int]()
+    giver = started(lambda: ([slot.put(i) for i in range(3000)], slot.finish()))
+    got: list[int] = []
+    while (item := slot.take()) is not None:
+        got.append(item)
+    joined(giver)
+    assert got == sorted(set(got))
+    assert got[-1] == 2999
+    assert len(got) + slot.dropped == 3000
+
+
+# --- the reader --------------------------------------------------------------------------------------------------
+
+
+def test_a_patient_taker_gets_every_window() -> None:
+    slot = Newest[FrameWindow](lossless=True)
+    reader = started(lambda: read(ScriptedSource(ten_fps(20)), builder(), slot))
+    windows = taken(slot)
+    joined(reader)
+    assert [window.seqs[0] for window in windows] == [0, 4, 8, 12, 16]
+
+
+def test_a_slow_taker_gets_the_newest_window_and_every_frame_was_read() -> None:
+    slot = Newest[FrameWindow]()
+    source = ScriptedSource(ten_fps(20))
+    read(source, builder(), slot)
+    windows = taken(slot)
+    assert [window.window_id for window in windows] == [4]
+    assert (source.given, slot.dropped) == (20, 4)
+
+
+def test_arrivals_are_stamped_by_the_given_clock() -> None:
+    slot = Newest[FrameWindow]()
+    ticks = iter(range(1000, 2000))
+    read(ScriptedSource(ten_fps(4)), builder(), slot, clock_ns=lambda: next(ticks))
+    assert [window.arrival_ns for window in taken(slot)] == [1003]
+
+
+def test_the_last_window_is_not_forgotten_at_the_end() -> None:
+    slot = Newest[FrameWindow]()
+    read(ScriptedSource(frames_at([0, 100, 200, 270])), WindowBuilder(frames=4, fps=10.0), slot)
+    assert len(taken(slot)) == 1
+
+
+def test_a_lost_source_is_reported_after_its_last_window() -> None:
+    slot = Newest[FrameWindow](lossless=True)
+    source = ScriptedSource(ten_fps(6), failure=SourceError("camera unplugged"))
+    reader = started(lambda: read(source, builder(), slot))
+    assert slot.take() is not None
+    with pytest.raises(SourceError, match="camera unplugged"):
+        slot.take()
+    joined(reader)
+
+
+def test_a_fault_in_the_source_is_not_swallowed() -> None:
+    slot = Newest[FrameWindow]()
+    read(ScriptedSource([], failure=ZeroDivisionError("bug")), builder(), slot)
+    with pytest.raises(ZeroDivisionError, match="bug"):
+        slot.take()
+
+
+def test_too_few_frames_are_an_error_that_counts_them() -> None:
+    slot = Newest[FrameWindow]()
+    read(ScriptedSource(ten_fps(3)), builder(), slot)
+    with pytest.raises(TooShortError, match=r"TOO_SHORT n=3: script .* takes 4 in a row at 10 FPS") as caught:
+        slot.take()
+    assert caught.value.exit_code == 65
+
+
+def test_frames_with_too_many_holes_are_an_error_that_says_so() -> None:
+    slot = Newest[FrameWindow]()
+    read(ScriptedSource(frames_at(i * 250.0 for i in range(20))), builder(), slot)
+    with pytest.raises(TooShortError, match=r"n=20: .* x WIN_GAP"):
+        slot.take()
+
+
+def test_closing_slot_and_source_stops_the_reader_without_an_error() -> None:
+    slot = Newest[FrameWindow]()
+    source = ScriptedSource(ten_fps(2), stays=True)
+    reader = started(lambda: read(source, builder(), slot))
+    time.sleep(0.05)
+    slot.close()
+    source.close()
+    joined(reader)
+    assert slot.take() is None
+
+
+def test_windows_leave_the_reader_with_fitted_pictures() -> None:
+    slot = Newest[FrameWindow]()
+    fitting = WindowBuilder(frames=4, fps=10.0, source_fps=10.0, fit=lambda image: np.ascontiguousarray(image[:1]))
+    read(ScriptedSource(ten_fps(4)), fitting, slot)
+    assert [window.images.shape for window in taken(slot)] == [(4, 1, 4, 3)]

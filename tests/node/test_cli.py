@@ -1,0 +1,265 @@
+"""The command line as a user meets it: real arguments in, exit code and one line out."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gcd_node.cli import run_app
+from gcd_node.pictures import write_png, write_video
+from gcd_node.publisher import Publisher, PublisherOptions
+
+SIZE = (128, 192)  # of the small random model
+KUBRIC = ["--weights", "random:kubric90"]
+DRIVING = ["--weights", "random:driving"]
+QUICK = ["--steps", "1"]
+
+
+@pytest.fixture(autouse=True)
+def _runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "runtime"))
+
+
+@pytest.fixture
+def clip(tmp_path: Path) -> Path:
+    frames = np.random.default_rng(0).random((14, *SIZE, 3), np.float32)
+    np.save(tmp_path / "clip.npy", frames)
+    return tmp_path / "clip.npy"
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    frames = [np.full((2 * SIZE[0], 2 * SIZE[1], 3), 5 * i, np.uint8) for i in range(16)]
+    write_video(tmp_path / "v.mkv", frames, 10.0)
+    return tmp_path / "v.mkv"
+
+
+def failed(arguments: list[str | Path], code: int, capsys: pytest.CaptureFixture[str]) -> str:
+    """Run, expect this exit code and one line that starts with `error:`; gives the line."""
+    assert run_app([str(argument) for argument in arguments]) == code
+    lines = [line for line in capsys.readouterr().err.strip().splitlines() if "noise" not in line]
+    assert lines[-1].startswith("error: ")
+    assert "Traceback" not in "".join(lines)
+    return lines[-1]
+
+
+def synthesize(source: Path, out: Path, *options: str | Path) -> list[str | Path]:
+    return ["synthesize", source, "--out", out, *QUICK, *options]
+
+
+def launch_file(folder: Path, source: Path | str, **changes: str) -> Path:
+    text = f"""
+        [source]
+        path = "{source}"
+        pace = "lockstep"
+        allow_upscale = true
+        {changes.get("source", "")}
+        [model]
+        weights = "{changes.get("weights", "random:driving")}"
+        steps = 1
+        [view.main]
+        {changes.get("view", "")}
+        [publish]
+        data = "ipc://{folder}/data"
+        status = "ipc://{folder}/status"
+        end_delay_ms = 10
+        {changes.get("publish", "")}
+    """
+    path = folder / "launch.toml"
+    path.write_text(text)
+    return path
+
+
+def test_synthesize_writes_frames_video_strip_and_arrays(clip: Path, tmp_path: Path) -> None:
+    out, saved = tmp_path / "out", tmp_path / "run.npz"
+    options = ["--azimuth-deg", "20", "--elevation-deg", "-5", "--radius", "1", "--save", saved, *KUBRIC]
+    assert run_app([str(a) for a in synthesize(clip, out, *options)]) == 0
+    assert len(list((out / "frames").glob("*.png"))) == 14
+    assert (out / "view.mp4").stat().st_size > 1000
+    assert (out / "strip.png").stat().st_size > 1000
+    arrays = np.load(saved)
+    assert arrays["latents"].shape == (14, 4, 16, 24)
+    assert arrays["frames"].shape == (14, *SIZE, 3)
+    assert arrays["latents"].dtype == arrays["frames"].dtype == np.float32
+    assert 0.0 <= arrays["frames"].min() <= arrays["frames"].max() <= 1.0
+
+
+def test_injected_noise_replaces_every_random_draw(clip: Path, tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    np.savez(
+        tmp_path / "n.npz",
+        initial=rng.standard_normal((14, 4, 16, 24), np.float32),
+        augmentation=rng.standard_normal((14, 3, *SIZE), np.float32),
+    )
+    results = []
+    for seed in ("1", "2"):
+        saved = tmp_path / f"{seed}.npz"
+        options = [*KUBRIC, "--noise", tmp_path / "n.npz", "--seed", seed, "--save", saved]
+        assert run_app([str(a) for a in synthesize(clip, tmp_path / "out", *options)]) == 0
+        results.append(np.load(saved)["latents"])
+    assert np.array_equal(*results)
+
+
+def test_several_samples_come_with_a_picture_of_where_they_differ(clip: Path, tmp_path: Path) -> None:
+    arguments = synthesize(clip, tmp_path / "out", *KUBRIC, "--samples", "2")
+    assert run_app([str(a) for a in arguments]) == 0
+    assert (tmp_path / "out" / "uncertainty.png").exists()
+    assert len(list((tmp_path / "out" / "frames_s1").glob("*.png"))) == 14
+
+
+def test_poses_near_the_sphere_are_taken(clip: Path, tmp_path: Path) -> None:
+    from gcd_model import ASSUMED_SOURCE, SphericalDelta, spherical_trajectory
+
+    path = spherical_trajectory(ASSUMED_SOURCE, SphericalDelta(azimuth_deg=20.0), frames=14, move_time=13)
+    np.save(tmp_path / "poses.npy", path.source_from_target.numpy())
+    saved = [tmp_path / "angles.npz", tmp_path / "poses.npz"]
+    for file, options in zip(saved, (["--azimuth-deg", "20"], ["--poses", str(tmp_path / "poses.npy")]), strict=True):
+        assert run_app([str(a) for a in synthesize(clip, tmp_path / "o", *KUBRIC, *options, "--save", file)]) == 0
+    angles, poses = (np.load(file)["latents"] for file in saved)
+    assert np.abs(angles - poses).max() < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "reason"),
+    [
+        ([*KUBRIC, "--azimuth-deg", "91"], 64, "[-90, 90]"),
+        ([*KUBRIC, "--elevation-deg", "31"], 64, "[-30, 30]"),
+        ([*KUBRIC, "--radius", "3.5"], 64, "[-3, 3]"),
+        ([*DRIVING, "--azimuth-deg", "5"], 64, "fixed view"),
+        ([*KUBRIC, "--trajectory", "sideways"], 64, "gradual or direct"),
+        ([*KUBRIC, "--move-time", "14"], 64, "move_time"),
+        ([*KUBRIC, "--samples", "2", "--save", "x.npz"], 64, "one sample"),
+        ([*KUBRIC, "--poses", "none.npy"], 66, "none.npy"),
+        ([*KUBRIC, "--noise", "none.npz"], 66, "none.npz"),
+        ([*KUBRIC, "--height", "64", "--width", "64"], 64, "own size"),
+        ([*KUBRIC, "--device", "abacus"], 64, "abacus"),
+        ([*KUBRIC, "--dtype", "float3"], 64, "float3"),
+        (["--weights", "random:kubric91"], 64, "kubric91"),
+        (["--weights", "package:none"], 65, "none"),
+        (["--weights", "nowhere.ckpt"], 65, "nowhere.ckpt"),
+        ([*KUBRIC, "--family", "driving"], 64, "camera"),
+    ],
+)
+def test_bad_options_are_one_line_with_cause_and_remedy(
+    options: list[str], code: int, reason: str, clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert reason in failed(synthesize(clip, tmp_path / "out", *options), code, capsys)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["missing.mp4", "empty.mp4", "junk.mp4", "truncated.mp4", "text.png", "empty_folder"])
+@pytest.mark.parametrize("command", ["synthesize", "run"])
+def test_an_input_that_cannot_be_decoded_is_exit_66(
+    command: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / name
+    if name == "empty.mp4":
+        path.touch()
+    elif name == "empty_folder":
+        path.mkdir()
+    elif name == "truncated.mp4":
+        write_video(tmp_path / "whole.mp4", [np.zeros((128, 192, 3), np.uint8)] * 20, 10.0)
+        path.write_bytes((tmp_path / "whole.mp4").read_bytes()[:900])
+    elif name != "missing.mp4":
+        path.write_bytes(b"this is no picture" * 100)
+    arguments = synthesize(path, tmp_path / "out", *DRIVING)
+    if command == "run":
+        arguments = ["run", launch_file(tmp_path, path)]
+    assert name in failed(arguments, 66, capsys)
+
+
+def test_too_few_frames_is_exit_65(video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "n=6" in failed(synthesize(video, tmp_path / "out", *DRIVING, "--start", "10"), 65, capsys)
+    short = tmp_path / "short.mkv"
+    write_video(short, [np.zeros((128, 192, 3), np.uint8)] * 9, 10.0)
+    assert "TOO_SHORT n=9" in failed(["run", launch_file(tmp_path, short)], 65, capsys)
+
+
+def test_a_wrong_checkpoint_is_exit_65(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, content in (("empty.ckpt", b""), ("html.ckpt", b"<html>not found</html>"), ("x.safetensors", b"\0" * 64)):
+        (tmp_path / name).write_bytes(content)
+        line = failed(synthesize(clip, tmp_path / "out", "--weights", tmp_path / name), 65, capsys)
+        assert name in line
+    assert "x.safetensors" in failed(["weights", "inspect", tmp_path / "x.safetensors"], 65, capsys)
+
+
+def test_run_publishes_and_ends_with_0(video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(["run", str(launch_file(tmp_path, video))]) == 0
+    told = capsys.readouterr().err
+    assert "window 0" in told
+    assert "noise" in told
+
+
+@pytest.mark.parametrize(
+    ("changes", "code", "reason"),
+    [
+        ({"view": "azimuth_deg = 10.0"}, 64, "fixed view"),
+        ({"view": "azimuth_deg = 100.0", "weights": "random:kubric90"}, 64, "[-90, 90]"),
+        ({"view": "azimut_deg = 10.0"}, 78, "azimuth_deg"),
+        ({"publish": "encodng = 'jpeg'"}, 78, "encoding"),
+        ({"source": "fps = -1.0"}, 78, "> 0"),
+        ({"weights": "random:unheard"}, 78, "unheard"),
+    ],
+)
+def test_a_launch_file_that_asks_for_the_impossible_is_refused(
+    changes: dict[str, str], code: int, reason: str, video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert reason in failed(["run", launch_file(tmp_path, video, **changes)], code, capsys)
+
+
+def test_a_missing_launch_file_is_exit_78(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "no.toml" in failed(["run", "no.toml"], 78, capsys)
+
+
+def test_an_endpoint_in_use_is_exit_73(video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with Publisher(PublisherOptions(data=f"ipc://{tmp_path}/data", status=None, linger_ms=0)):
+        assert f"{tmp_path}/data" in failed(["run", launch_file(tmp_path, video)], 73, capsys)
+
+
+def test_usage_errors_are_exit_64(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(["synthesize"]) == 64
+    assert run_app(["no-such-command"]) == 64
+    assert "no-such-command" in capsys.readouterr().err
+
+
+def test_every_command_has_help() -> None:
+    for command in ([], ["run"], ["view"], ["demo"], ["synthesize"], ["weights"], ["weights", "inspect"]):
+        assert run_app([*command, "--help"]) == 0
+
+
+def test_the_demo_ends_with_pictures_of_what_arrived_in_the_other_process(tmp_path: Path) -> None:
+    environment = {**os.environ, "OMP_NUM_THREADS": "2"}
+    done = subprocess.run(
+        [sys.executable, "-m", "gcd_node", "demo"],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=110,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "noise" in done.stdout
+    assert "windows in the other process" in done.stdout
+    for name in ("side_by_side.mp4", "strip.png"):
+        assert (tmp_path / "gcd-demo" / name).stat().st_size > 10_000
+
+
+def test_view_saves_what_a_running_node_publishes(video: Path, tmp_path: Path) -> None:
+    settings = launch_file(tmp_path, video, publish="min_subscribers = 1")
+    node = subprocess.Popen([sys.executable, "-m", "gcd_node", "run", str(settings)], stderr=subprocess.DEVNULL)
+    try:
+        assert run_app(["view", f"ipc://{tmp_path}/data", "--save", str(tmp_path / "s"), "--timeout", "60"]) == 0
+        assert node.wait(30) == 0
+    finally:
+        node.kill()
+    assert len(list((tmp_path / "s" / "main").glob("*.png"))) == 14
+    assert (tmp_path / "s" / "main.mkv").exists()
+
+
+def test_a_still_is_seen_as_a_clip(tmp_path: Path) -> None:
+    write_png(tmp_path / "still.png", np.full((*SIZE, 3), 90, np.uint8))
+    assert run_app([str(a) for a in synthesize(tmp_path / "still.png", tmp_path / "out", *DRIVING)]) == 0
+    assert len(list((tmp_path / "out" / "frames").glob("*.png"))) == 14

@@ -1,0 +1,119 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fakes import HEIGHT, WIDTH, traits
+
+from gcd_model import OptionError
+from gcd_node.errors import SourceError, TooShortError, UsageError
+from gcd_node.offline_clip import ClipRequest, OfflineClip, read_clip
+from gcd_node.pictures import write_png, write_video
+
+
+def numbered(count: int, height: int = 2 * HEIGHT, width: int = 2 * WIDTH) -> list[np.ndarray]:
+    return [np.full((height, width, 3), 10 * i % 250, np.uint8) for i in range(count)]
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    write_video(tmp_path / "v.mkv", numbered(24), 24.0)
+    return tmp_path / "v.mkv"
+
+
+def read(path: Path, family: str = "kubric90", **request: object) -> OfflineClip:
+    return read_clip(path, ClipRequest(**request), traits(family))  # type: ignore[arg-type]
+
+
+def levels(clip: OfflineClip) -> list[int]:
+    return [int(picture[0, 0, 0]) for picture in clip.pictures]
+
+
+def test_a_video_goes_to_the_trained_size_and_the_range_of_the_model(video: Path) -> None:
+    clip = read(video)
+    assert clip.clip.video.shape == (14, 3, HEIGHT, WIDTH)
+    assert levels(clip) == [10 * i for i in range(14)]
+    assert clip.clip.video[1].unique().tolist() == pytest.approx([10 / 127.5 - 1])
+    assert clip.clip.fps == 24.0
+
+
+def test_start_and_stride_count_frames_of_the_input(video: Path) -> None:
+    assert levels(read(video, start=5)) == [10 * i for i in range(5, 19)]
+    write_video(video, numbered(41), 24.0)
+    clip = read(video, start=1, stride=3)
+    assert levels(clip) == [10 * i % 250 for i in range(1, 41, 3)]
+    assert clip.clip.fps == 8.0
+
+
+def test_the_label_is_what_the_user_says(video: Path) -> None:
+    assert read(video, fps=7.5).clip.fps == 7.5
+
+
+def test_a_foreign_rate_is_kept_and_said(video: Path, caplog: pytest.LogCaptureFixture) -> None:
+    assert read(video, "driving").clip.fps == 24.0
+    assert "24 frames per second" in caplog.text
+
+
+def test_another_size_may_be_asked_for(video: Path) -> None:
+    assert read(video, height=2 * HEIGHT, width=2 * WIDTH).clip.video.shape == (14, 3, 2 * HEIGHT, 2 * WIDTH)
+    with pytest.raises(OptionError, match="multiples of"):
+        read(video, height=HEIGHT + 1, width=WIDTH)
+    with pytest.raises(UsageError, match="go together"):
+        read(video, height=HEIGHT)
+
+
+def test_too_few_frames_is_an_error_with_the_count(video: Path) -> None:
+    with pytest.raises(TooShortError, match="n=4"):
+        read(video, start=20)
+    with pytest.raises(TooShortError, match="n=12"):
+        read(video, stride=2)
+    with pytest.raises(TooShortError, match="n=0"):
+        read(video, start=500)
+
+
+def test_a_still_is_repeated(tmp_path: Path) -> None:
+    write_png(tmp_path / "s.png", numbered(5)[4])
+    clip = read(tmp_path / "s.png")
+    assert levels(clip) == [40] * 14
+    assert clip.clip.fps == 12.0
+
+
+def test_a_folder_of_pictures_is_read_in_order(tmp_path: Path) -> None:
+    for index, picture in enumerate(numbered(15)):
+        write_png(tmp_path / f"{index}.png", picture)
+    assert levels(read(tmp_path, start=1)) == [10 * i for i in range(1, 15)]
+
+
+def test_an_array_is_taken_as_it_is(tmp_path: Path) -> None:
+    array = np.random.default_rng(0).random((16, 32 * 3, 32 * 2, 3), np.float32)
+    np.save(tmp_path / "a.npy", array)
+    clip = read(tmp_path / "a.npy", start=2)
+    assert np.allclose(clip.clip.video.numpy(), array[2:].transpose(0, 3, 1, 2) * 2 - 1, atol=1e-7)
+    with pytest.raises(UsageError, match="own size"):
+        read(tmp_path / "a.npy", height=64, width=64)
+
+
+@pytest.mark.parametrize(
+    ("array", "error", "reason"),
+    [
+        (np.zeros((14, 64, 96, 3)), SourceError, "float64"),
+        (np.zeros((14, 64, 96), np.float32), SourceError, r"\[14, 64, 96\]"),
+        (np.full((14, 64, 96, 3), 2.0, np.float32), SourceError, r"\[0, 1\]"),
+        (np.full((14, 64, 96, 3), np.nan, np.float32), SourceError, "finite"),
+        (np.zeros((14, 65, 96, 3), np.float32), OptionError, "multiples of"),
+        (np.zeros((13, 64, 96, 3), np.float32), TooShortError, "n=13"),
+        (np.array([{"a": 1}]), SourceError, "cannot read"),
+    ],
+)
+def test_an_array_of_another_kind_is_refused(
+    tmp_path: Path, array: np.ndarray, error: type[Exception], reason: str
+) -> None:
+    np.save(tmp_path / "a.npy", array, allow_pickle=True)
+    with pytest.raises(error, match=reason):
+        read(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize("content", [b"", b"junk", b"\\x93NUMPY\\x01\\x00"])
+def test_a_damaged_array_is_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "a.npy").write_bytes(content)
+    with pytest.raises(SourceError, match=r"a\.npy"):
+        read(tmp_path / "a.npy")

@@ -1,0 +1,140 @@
+"""Watching a node: the table's rows, the pictures, and how a watch ends."""
+
+import io
+import threading
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from rich.console import Console
+from wire_messages import end, pixels, view_header, window
+
+from gcd_node.envelope import ViewMessage
+from gcd_node.errors import OutputError
+from gcd_node.publisher import Publisher, PublisherOptions
+from gcd_node.subscriber import ReceivedView
+from gcd_node.viewing import ViewSaver, ViewTable, WatchReport, WatchRequest, render, watch
+
+pytestmark = pytest.mark.timeout(30)
+
+
+def received(message: ViewMessage, *, skipped: int = 0, expired: bool = False) -> ReceivedView:
+    return ReceivedView(message=message, age_ms=40.0, expired=expired, skipped=skipped, restarted=False)
+
+
+def read_video(path: Path) -> np.ndarray:
+    video = cv2.VideoCapture(str(path))
+    frames = []
+    while (frame := video.read()[1]) is not None:
+        frames.append(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB))
+    return np.stack(frames)
+
+
+def watched(tmp_path: Path, request: WatchRequest, windows: int, *, ending: bool) -> WatchReport:
+    """A watch of a publisher that sends `windows` of view top and one of view side."""
+    options = PublisherOptions(
+        data=request.endpoint, status=None, lockstep=True, min_subscribers=1, end_delay_ms=0, drain_ms=3000
+    )
+    reports: list[WatchReport] = []
+    rows = []
+    with Publisher(options) as publisher:
+        thread = threading.Thread(target=lambda: reports.append(watch(request, rows.append)), daemon=True)
+        thread.start()
+        publisher.send(window(0, view_id="side", images=pixels(100, height=16, width=16)))
+        for i in range(windows):
+            publisher.send(window(i, images=pixels(i, height=16, width=16)))
+        for view_id in ("side", "top") if ending else ():
+            publisher.end(end(view_id=view_id))
+        thread.join(15)
+    assert reports, "the watch did not end"
+    assert rows
+    return reports[0]
+
+
+def test_rows_hold_what_arrived() -> None:
+    table = ViewTable()
+    for i in range(5):
+        table.add(received(window(i), skipped=2 if i == 3 else 0), now_s=10.0 + 0.5 * i)
+    table.add(received(window(7, view_id="alt")), now_s=12.0)
+    alt, top = table.rows(now_s=12.25)
+    assert (alt.topic, alt.window_id, alt.rate_hz) == ("view/alt/win", 7, 0.0)
+    assert (top.topic, top.window_id, top.shape) == ("view/top/win", 4, (2, 4, 6, 3))
+    assert (top.rate_hz, top.missed, top.bytes, top.state) == (2.0, 2, 5 * 144, "live")
+    assert top.age_ms == 40.0 + 250.0
+
+
+def test_a_row_expires_and_ends() -> None:
+    table = ViewTable()
+    table.add(received(window()), now_s=0.0)
+    assert table.rows(now_s=60.1)[0].state == "expired"
+    assert table.rows(now_s=1.0)[0].state == "live"
+    assert table.rows(now_s=1.0, ended=True)[0].state == "ended"
+
+
+def test_a_rendered_table_shows_each_row_and_the_warning() -> None:
+    table = ViewTable()
+    table.add(received(window(31)), now_s=0.0)
+    console = Console(width=120, record=True, file=io.StringIO())
+    console.print(render(table.rows(now_s=0.0)))
+    shown = console.export_text()
+    for word in ("never evidence of free space", "view/top/win", "31", "2x4x6x3", "live"):
+        assert word in shown
+
+
+def test_a_watch_sees_all_views_until_the_stream_ends(tmp_path) -> None:
+    request = WatchRequest(endpoint=f"ipc://{tmp_path}/data", timeout_s=10)
+    report = watched(tmp_path, request, 3, ending=True)
+    assert report.ended
+    assert (report.received, report.damaged, report.restarts, report.files) == (4, 0, 0, 0)
+    assert [(row.topic, row.window_id, row.state) for row in report.rows] == [
+        ("view/side/win", 0, "ended"),
+        ("view/top/win", 2, "ended"),
+    ]
+
+
+def test_a_watch_stops_at_its_limit(tmp_path) -> None:
+    report = watched(tmp_path, WatchRequest(endpoint=f"ipc://{tmp_path}/data", view="top", limit=2), 4, ending=False)
+    assert (report.received, report.ended) == (2, False)
+
+
+def test_a_watch_stops_when_nothing_comes(tmp_path) -> None:
+    report = watch(WatchRequest(endpoint=f"ipc://{tmp_path}/nobody", timeout_s=0.05), lambda rows: None)
+    assert (report.received, report.ended, report.rows) == (0, False, ())
+
+
+def test_saved_pictures_and_video_are_the_published_pixels(tmp_path) -> None:
+    request = WatchRequest(endpoint=f"ipc://{tmp_path}/data", save=tmp_path / "out", timeout_s=10)
+    report = watched(tmp_path, request, 2, ending=True)
+    out = tmp_path / "out"
+    names = sorted(str(path.relative_to(out)) for path in out.rglob("*.*"))
+    assert names == [
+        *("side.mkv", "side/000000_00.png", "side/000000_01.png", "top.mkv"),
+        *("top/000000_00.png", "top/000000_01.png", "top/000001_00.png", "top/000001_01.png"),
+    ]
+    assert report.files == len(names)
+    sent = np.concatenate([pixels(i, height=16, width=16) for i in range(2)])
+    assert np.array_equal(read_video(out / "top.mkv"), sent)
+    last = cv2.cvtColor(cv2.imread(str(out / "top" / "000001_01.png")), cv2.COLOR_BGR2RGB)
+    assert np.array_equal(last, sent[3])
+
+
+def test_grey_views_are_saved_as_grey(tmp_path) -> None:
+    grey = pixels(3, height=16, width=16, channels=1)
+    header = view_header(shape=grey.shape)
+    with ViewSaver(tmp_path) as saver:
+        saver.add(received(ViewMessage(topic="view/top/win", header=header, payload=grey.tobytes())))
+    assert np.array_equal(read_video(tmp_path / "top.mkv"), np.broadcast_to(grey, (2, 16, 16, 3)))
+
+
+def test_a_view_that_changes_its_size_is_an_error(tmp_path) -> None:
+    with ViewSaver(tmp_path) as saver:
+        saver.add(received(window(images=pixels(height=16, width=16))))
+        with pytest.raises(OutputError, match=r"was \(16, 16\) .* now \(16, 32\)"):
+            saver.add(received(window(images=pixels(height=16, width=32))))
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path) -> None:
+    (tmp_path / "file").write_text("")
+    with ViewSaver(tmp_path / "file") as saver, pytest.raises(OutputError, match="file"):
+        saver.add(received(window(images=pixels(height=16, width=16))))

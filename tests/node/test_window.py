@@ -1,0 +1,252 @@
+"""Frames become windows: the grid, its holes, restarts and the end of a stream."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from media import frames_at
+
+from gcd_node.errors import ConfigError, SourceError
+from gcd_node.frame import Frame
+from gcd_node.window import FrameWindow, WindowBuilder, choose_fps
+
+
+def run(builder: WindowBuilder, frames: Sequence[Frame], *, flush: bool = True) -> list[FrameWindow]:
+    windows = [window for frame in frames for window in builder.push(frame, frame.stamp_ns + 5)]
+    return windows + (builder.flush() if flush else [])
+
+
+def even(count: int, fps: float, first_ms: float = 0.0) -> list[Frame]:
+    return frames_at(first_ms + i * 1000 / fps for i in range(count))
+
+
+def jittered(count: int, fps: float, spread: float, seed: int = 0) -> list[Frame]:
+    noise = np.random.default_rng(seed).uniform(-spread, spread, count)
+    return frames_at((np.arange(count) + noise) * 1000 / fps + 1000)
+
+
+def seqs(windows: Sequence[FrameWindow]) -> list[int]:
+    return [seq for window in windows for seq in window.seqs]
+
+
+# --- laws --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fps", [5.0, 6.0, 8.0, 10.0, 12.0, 24.0, 30000 / 1001])
+def test_at_the_trained_rate_every_frame_is_used_once(fps: float) -> None:
+    windows = run(WindowBuilder(frames=14, fps=fps, source_fps=fps), even(42, fps))
+    assert seqs(windows) == list(range(42))
+    assert [window.window_id for window in windows] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("source_fps", [24000 / 1001, 24.1, 23.9])
+def test_nearly_the_trained_rate_uses_every_frame_once_however_long_the_stream(source_fps: float) -> None:
+    builder = WindowBuilder(frames=14, fps=24.0, source_fps=source_fps)
+    windows = run(builder, even(14 * 300, source_fps))
+    assert seqs(windows) == list(range(14 * 300))
+    assert builder.counts.reasons == {}
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_jitter_loses_no_frame(seed: int) -> None:
+    builder = WindowBuilder(frames=14, fps=10.0, source_fps=10.0)
+    windows = run(builder, jittered(140, 10.0, spread=0.2, seed=seed))
+    assert seqs(windows) == list(range(140))
+
+
+@pytest.mark.parametrize("source_fps", [24.0, 25.0, 30000 / 1001, 30.0, 50.0, 60.0])
+@pytest.mark.parametrize("fps", [6.0, 12.0, 24.0])
+def test_each_place_in_time_gets_the_nearest_frame(source_fps: float, fps: float) -> None:
+    frames = even(400, source_fps, first_ms=123.0)
+    stamps = np.array([frame.stamp_ns for frame in frames])
+    windows = run(WindowBuilder(frames=14, fps=fps, source_fps=source_fps), frames)
+    assert len(windows) >= int(400 / source_fps * fps) // 14 - 1
+    for place, seq in enumerate(seqs(windows)):
+        wanted_ns = stamps[0] + round(place * 1e9 / fps)
+        assert abs(stamps[seq] - wanted_ns) <= np.abs(stamps - wanted_ns).min() + 1e6
+
+
+@pytest.mark.parametrize("source_fps", [7.0, 24.0, 25.0, 29.97, 60.0])
+@pytest.mark.parametrize("stride", [1, 5, 14, 20])
+def test_no_frame_is_repeated_and_time_never_runs_back(source_fps: float, stride: int) -> None:
+    fps, _ = choose_fps(source_fps, (6.0, 24.0))
+    builder = WindowBuilder(frames=14, fps=fps, stride=stride, source_fps=source_fps)
+    windows = run(builder, jittered(300, source_fps, spread=0.15))
+    assert windows
+    for window in windows:
+        assert (np.diff(window.seqs) > 0).all()
+        assert (np.diff(window.stamps_ns) > 0).all()
+        skew = np.diff(window.stamps_ns) * window.fps / 1e9 - 1
+        assert np.abs(skew).max() <= 1.0
+
+
+@pytest.mark.parametrize("stride", [1, 3, 4, 6, 9])
+def test_windows_begin_one_stride_apart(stride: int) -> None:
+    windows = run(WindowBuilder(frames=4, fps=10.0, stride=stride), even(40, 10.0))
+    assert [window.seqs for window in windows] == [tuple(range(s, s + 4)) for s in range(0, 37, stride)]
+
+
+def test_a_variable_rate_is_resampled_by_its_stamps() -> None:
+    stamps = [*np.arange(24) * 1000 / 24, *(1000 + np.arange(16) * 125), *(3000 + np.arange(24) * 1000 / 24)]
+    frames = frames_at(stamps)
+    windows = run(WindowBuilder(frames=8, fps=8.0), frames)
+    used_ms = [frames[seq].stamp_ns / 1e6 for seq in seqs(windows)]
+    np.testing.assert_allclose(used_ms, np.arange(32) * 125, atol=0.01)
+
+
+# --- a window ----------------------------------------------------------------------------------------------------
+
+
+def test_a_window_carries_pictures_stamps_and_arrival() -> None:
+    frames = even(8, 10.0, first_ms=50.0)
+    window = run(WindowBuilder(frames=4, fps=10.0), frames)[1]
+    assert window.images.shape == (4, 2, 4, 3)
+    assert window.images[:, 0, 0, 0].tolist() == [4, 5, 6, 7]
+    assert not window.images.flags.writeable
+    assert window.stamps_ns == tuple(frame.stamp_ns for frame in frames[4:])
+    assert (window.arrival_ns, window.fps, window.epoch, window.dropped) == (frames[7].stamp_ns + 5, 10.0, 0, 0)
+
+
+def test_only_frames_of_a_window_are_fitted_and_each_once() -> None:
+    fitted: list[int] = []
+
+    def fit(image: np.ndarray) -> np.ndarray:
+        fitted.append(int(image[0, 0, 0]))
+        return np.zeros((3, 5, 3), np.uint8)
+
+    windows = run(WindowBuilder(frames=4, fps=10.0, fit=fit), even(24, 30.0), flush=False)
+    assert windows[0].images.shape == (4, 3, 5, 3)
+    assert fitted == [0, 3, 6, 9, 12, 15, 18, 21]
+
+
+def test_a_frame_a_little_early_does_not_wait_for_the_next() -> None:
+    builder = WindowBuilder(frames=4, fps=24.0)
+    stamps_ms = [0.0, 42.0, 83.0, 124.9]  # a container that rounds
+    assert len(run(builder, frames_at(stamps_ms), flush=False)) == 1
+
+
+# --- holes, steps, the end ---------------------------------------------------------------------------------------
+
+
+def test_a_missing_frame_rejects_its_window_and_nothing_else() -> None:
+    frames = even(42, 10.0)
+    del frames[20]
+    builder = WindowBuilder(frames=14, fps=10.0, source_fps=10.0)
+    windows = run(builder, frames)
+    assert [window.seqs for window in windows] == [tuple(range(14)), tuple(range(21, 35))]
+    assert builder.counts.reasons == {"WIN_GAP": 1}
+
+
+def test_a_longer_hole_is_counted_once() -> None:
+    frames = even(42, 10.0)
+    del frames[16:22]
+    builder = WindowBuilder(frames=14, fps=10.0, source_fps=10.0)
+    assert [window.seqs[0] for window in run(builder, frames)] == [0, 22]
+    assert builder.counts.reasons == {"WIN_GAP": 1}
+
+
+def test_the_skew_that_is_allowed_decides_what_a_hole_is() -> None:
+    frames = frames_at([0, 100, 230, 300])
+    assert len(run(WindowBuilder(frames=4, fps=10.0, max_skew=0.5), frames)) == 1
+    strict = WindowBuilder(frames=4, fps=10.0, max_skew=0.2)
+    assert run(strict, frames) == []
+    assert strict.counts.reasons == {"WIN_GAP": 1}
+
+
+def test_duplicate_and_backward_stamps_are_dropped_and_counted() -> None:
+    builder = WindowBuilder(frames=4, fps=10.0, source_fps=10.0)
+    windows = run(builder, frames_at([0, 100, 100, 50, 200, 300, 300, 400, 500, 600, 700]))
+    assert [window.seqs for window in windows] == [(0, 1, 4, 5), (7, 8, 9, 10)]
+    assert [window.dropped for window in windows] == [2, 3]
+    assert builder.counts.dropped == 3
+
+
+@pytest.mark.parametrize("step_ms", [-5000.0, 60_000.0, 1e12])
+def test_a_step_of_the_clock_begins_a_new_epoch(step_ms: float) -> None:
+    builder = WindowBuilder(frames=4, fps=10.0, source_fps=10.0)
+    early = 10_000 + np.arange(6) * 100.0
+    windows = run(builder, frames_at([*early, *(early + step_ms)]))
+    assert [(window.epoch, window.seqs) for window in windows] == [(0, (0, 1, 2, 3)), (1, (6, 7, 8, 9))]
+    assert builder.counts.reasons == {"CLOCK_STEP": 1}
+
+
+def test_another_picture_size_begins_a_new_epoch() -> None:
+    small, large = frames_at(range(0, 600, 100)), frames_at(range(600, 1200, 100), width=8)
+    builder = WindowBuilder(frames=4, fps=10.0)
+    windows = run(builder, [*small, *large])
+    assert [(window.epoch, window.images.shape[2]) for window in windows] == [(0, 4), (1, 8)]
+    assert builder.counts.reasons == {"SRC_FORMAT": 1}
+
+
+def test_the_end_completes_a_window_that_only_waits_for_a_nearer_frame() -> None:
+    frames = frames_at([0, 100, 200, 280])
+    builder = WindowBuilder(frames=4, fps=10.0)
+    assert run(builder, frames, flush=False) == []
+    assert [window.seqs for window in builder.flush()] == [(0, 1, 2, 3)]
+    assert builder.flush() == []
+
+
+def test_the_end_completes_nothing_that_lacks_frames() -> None:
+    builder = WindowBuilder(frames=4, fps=10.0)
+    assert run(builder, even(3, 10.0)) == []
+    assert (builder.counts.frames, builder.counts.built) == (3, 0)
+
+
+def test_a_nearer_frame_takes_the_place_of_one_that_waits() -> None:
+    windows = run(WindowBuilder(frames=3, fps=10.0), frames_at([0, 70, 102, 130, 200]))
+    assert [window.seqs for window in windows] == [(0, 2, 4)]
+
+
+def test_realtime_stamps_lose_no_precision() -> None:
+    start_ns = 1_790_000_000_123_456_789
+    image = np.zeros((2, 4, 3), np.uint8)
+    frames = [Frame(image=image, stamp_ns=start_ns + i * 100_000_000, seq=i) for i in range(8)]
+    windows = run(WindowBuilder(frames=4, fps=10.0, source_fps=10.0), frames)
+    assert [window.stamps_ns[0] for window in windows] == [start_ns, start_ns + 400_000_000]
+
+
+# --- rates and refusals ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("source_fps", "trained", "wanted"),
+    [
+        (30.0, (6, 8, 12, 24), (24, False)),
+        (24.0, (6, 8, 12, 24), (24, False)),
+        (24000 / 1001, (6, 8, 12, 24), (24, False)),
+        (23.0, (6, 8, 12, 24), (12, False)),
+        (9.99, (5, 10), (10, False)),
+        (60.0, (5, 10), (10, False)),
+        (4.0, (5, 10), (4.0, True)),
+        (17.0, (), (17.0, False)),
+    ],
+)
+def test_the_highest_trained_rate_the_source_can_give_is_chosen(
+    source_fps: float, trained: tuple[float, ...], wanted: tuple[float, bool]
+) -> None:
+    assert choose_fps(source_fps, trained) == wanted
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"frames": 0},
+        {"fps": 0.0},
+        {"fps": float("inf")},
+        {"fps": float("nan")},
+        {"stride": 0},
+        {"max_skew": 0.6},
+        {"max_skew": 0.0},
+    ],
+)
+def test_numbers_out_of_range_are_refused(settings: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match="a window needs"):
+        WindowBuilder(**({"frames": 14, "fps": 10.0} | settings))
+
+
+@pytest.mark.parametrize(
+    "image", [np.zeros((4, 4, 3), np.float32), np.zeros((4, 4), np.uint8), np.zeros((4, 4, 4), np.uint8)]
+)
+def test_a_frame_refuses_what_is_no_rgb_picture(image: np.ndarray) -> None:
+    with pytest.raises(SourceError, match=r"frame 7 must be u8 \[H, W, 3\]"):
+        Frame(image=image, stamp_ns=0, seq=7)
