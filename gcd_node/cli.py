@@ -2,9 +2,8 @@
 
 import logging
 import sys
-from typing import Annotated
+from typing import Annotated, cast
 
-import click
 import typer
 from rich.console import Console
 from rich.logging import RichHandler
@@ -47,6 +46,8 @@ EXIT_CODES: tuple[tuple[type[ModelError], int], ...] = (
 )
 """sysexits of the model's errors; the node's own carry theirs."""
 
+_UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__mro__[1])  # wherever this typer keeps it
+
 
 @app.callback()
 def setup(
@@ -70,14 +71,22 @@ def run_app(arguments: list[str]) -> int:
         return _failed(str(error), error.exit_code)
     except ModelError as error:
         return _failed(str(error), next(code for kind, code in EXIT_CODES if isinstance(error, kind)))
-    except click.UsageError as error:
+    except _UsageError as error:
+        return _bad_command_line(error)
+    except (KeyboardInterrupt, typer.Abort):
+        return _failed("interrupted", 130)
+
+
+def _bad_command_line(error: typer.BadParameter) -> int:
+    """A command without arguments shows its help, anything else is one line."""
+    message = str(error.format_message()).strip().rstrip(".")
+    if not message:
         error.show()
         return 64
-    except (KeyboardInterrupt, click.Abort):
-        return _failed("interrupted", 130)
+    return _failed(f"{message}; see --help", 64)
 
 
 def _failed(message: str, code: int) -> int:
     line = " ".join(message.split())
-    click.echo(click.style("error: ", fg="red", bold=True) + line, err=True)
+    typer.echo(typer.style("error: ", fg="red", bold=True) + line, err=True)
     return code

@@ -1,6 +1,7 @@
 """Published names: a bijection, at full size and at others, and the facts the manifest's shapes cannot tell."""
 
 from dataclasses import replace
+from functools import lru_cache
 
 import msgspec
 import pytest
@@ -12,7 +13,7 @@ from gcd_model.config import SVD_14, ModelConfig, UNetConfig
 from gcd_model.errors import CheckpointError
 from gcd_model.matching import Match, match_weights
 from gcd_model.networks import empty_networks
-from gcd_model.weight_names import Levels, Source, assembled, diffusers_source, gcd_source
+from gcd_model.weight_names import Form, Levels, Source, assembled, diffusers_source, gcd_source
 
 UNET = "model.diffusion_model"
 SVD_FIXED = fixed_view(SVD_14)
@@ -33,6 +34,7 @@ DEEP = msgspec.structs.replace(
 """Other numbers of levels and blocks than published, and a level without attention between two with."""
 
 
+@lru_cache
 def own_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
     return {name: tuple(tensor.shape) for name, tensor in empty_networks(config).state_dict().items()}
 
@@ -79,9 +81,9 @@ def test_a_tensor_taken_apart_and_assembled_is_itself(shape: tuple[int, ...], so
 
 
 @pytest.mark.parametrize("form", ["same", "transposed", "pixelwise"])
-def test_conversions_but_stacking_stay_in_the_mapped_file(form: str) -> None:
+def test_conversions_but_stacking_stay_in_the_mapped_file(form: Form) -> None:
     tensor = torch.randn(4, 3)
-    assert assembled([tensor], form).untyped_storage().data_ptr() == tensor.untyped_storage().data_ptr()  # type: ignore[arg-type]
+    assert assembled([tensor], form).untyped_storage().data_ptr() == tensor.untyped_storage().data_ptr()
 
 
 @pytest.mark.parametrize("config", [SMALL_GCD, DEEP], ids=["small", "deep"])
@@ -146,17 +148,37 @@ def test_the_diffusers_folder_fits_at_full_size() -> None:
 @pytest.mark.parametrize(
     ("own", "gcd", "diffusers"),
     [
-        ("unet.down.1.stages.0.res.spatial.conv1.bias", "input_blocks.4.0.in_layers.2.bias", "down_blocks.1.resnets.0.spatial_res_block.conv1.bias"),
+        (
+            "unet.down.1.stages.0.res.spatial.conv1.bias",
+            "input_blocks.4.0.in_layers.2.bias",
+            "down_blocks.1.resnets.0.spatial_res_block.conv1.bias",
+        ),
         ("unet.down.2.down.conv.weight", "input_blocks.9.0.op.weight", "down_blocks.2.downsamplers.0.conv.weight"),
-        ("unet.middle.1.res.share.mix", "middle_block.2.time_mixer.mix_factor", "mid_block.resnets.1.time_mixer.mix_factor"),
+        (
+            "unet.middle.1.res.share.mix",
+            "middle_block.2.time_mixer.mix_factor",
+            "mid_block.resnets.1.time_mixer.mix_factor",
+        ),
         ("unet.up.0.up.conv.weight", "output_blocks.2.1.conv.weight", "up_blocks.0.upsamplers.0.conv.weight"),
         ("unet.up.1.up.conv.weight", "output_blocks.5.2.conv.weight", "up_blocks.1.upsamplers.0.conv.weight"),
-        ("unet.up.3.stages.2.attention.spatial.norm_feed.weight", "output_blocks.11.1.transformer_blocks.0.norm3.weight", "up_blocks.3.attentions.2.transformer_blocks.0.norm3.weight"),
-        ("unet.middle.0.attention.temporal.token.dormant.norm_bias", "middle_block.1.time_stack.0.norm2.bias", "mid_block.attentions.0.temporal_transformer_blocks.0.norm2.bias"),
-        ("unet.middle.0.attention.positions.mlp.2.bias", "middle_block.1.time_pos_embed.2.bias", "mid_block.attentions.0.time_pos_embed.linear_2.bias"),
+        (
+            "unet.up.3.stages.2.attention.spatial.norm_feed.weight",
+            "output_blocks.11.1.transformer_blocks.0.norm3.weight",
+            "up_blocks.3.attentions.2.transformer_blocks.0.norm3.weight",
+        ),
+        (
+            "unet.middle.0.attention.temporal.token.dormant.norm_bias",
+            "middle_block.1.time_stack.0.norm2.bias",
+            "mid_block.attentions.0.temporal_transformer_blocks.0.norm2.bias",
+        ),
+        (
+            "unet.middle.0.attention.positions.mlp.2.bias",
+            "middle_block.1.time_pos_embed.2.bias",
+            "mid_block.attentions.0.time_pos_embed.linear_2.bias",
+        ),
         ("unet.embed_vector.2.bias", "label_emb.0.2.bias", "add_embedding.linear_2.bias"),
     ],
-)  # fmt: skip
+)
 def test_unet_names_of_equal_shape_are_told_apart(own: str, gcd: str, diffusers: str) -> None:
     levels = Levels.of(SVD_14)
     assert gcd_source(own, levels) == Source((f"{UNET}.{gcd}",))
@@ -166,13 +188,33 @@ def test_unet_names_of_equal_shape_are_told_apart(own: str, gcd: str, diffusers:
 @pytest.mark.parametrize(
     ("own", "gcd", "diffusers"),
     [
-        ("decoder.levels.0.blocks.1.temporal.norm2.bias", "decoder.up.3.block.1.time_stack.out_layers.0.bias", "decoder.up_blocks.0.resnets.1.temporal_res_block.norm2.bias"),
-        ("decoder.levels.2.up.conv.bias", "decoder.up.1.upsample.conv.bias", "decoder.up_blocks.2.upsamplers.0.conv.bias"),
-        ("decoder.middle_out.share.mix", "decoder.mid.block_2.mix_factor", "decoder.mid_block.resnets.1.time_mixer.mix_factor"),
-        ("decoder.middle_attention.value.bias", "decoder.mid.attn_1.v.bias", "decoder.mid_block.attentions.0.to_v.bias"),
-        ("target_encoder.levels.1.blocks.0.skip.bias", "encoder.down.1.block.0.nin_shortcut.bias", "encoder.down_blocks.1.resnets.0.conv_shortcut.bias"),
+        (
+            "decoder.levels.0.blocks.1.temporal.norm2.bias",
+            "decoder.up.3.block.1.time_stack.out_layers.0.bias",
+            "decoder.up_blocks.0.resnets.1.temporal_res_block.norm2.bias",
+        ),
+        (
+            "decoder.levels.2.up.conv.bias",
+            "decoder.up.1.upsample.conv.bias",
+            "decoder.up_blocks.2.upsamplers.0.conv.bias",
+        ),
+        (
+            "decoder.middle_out.share.mix",
+            "decoder.mid.block_2.mix_factor",
+            "decoder.mid_block.resnets.1.time_mixer.mix_factor",
+        ),
+        (
+            "decoder.middle_attention.value.bias",
+            "decoder.mid.attn_1.v.bias",
+            "decoder.mid_block.attentions.0.to_v.bias",
+        ),
+        (
+            "target_encoder.levels.1.blocks.0.skip.bias",
+            "encoder.down.1.block.0.nin_shortcut.bias",
+            "encoder.down_blocks.1.resnets.0.conv_shortcut.bias",
+        ),
     ],
-)  # fmt: skip
+)
 def test_autoencoder_names_of_equal_shape_are_told_apart(own: str, gcd: str, diffusers: str) -> None:
     levels = Levels.of(SVD_14)
     assert gcd_source(own, levels) == Source((f"first_stage_model.{gcd}",))

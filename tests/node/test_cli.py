@@ -40,7 +40,7 @@ def video(tmp_path: Path) -> Path:
 def failed(arguments: list[str | Path], code: int, capsys: pytest.CaptureFixture[str]) -> str:
     """Run, expect this exit code and one line that starts with `error:`; gives the line."""
     assert run_app([str(argument) for argument in arguments]) == code
-    lines = [line for line in capsys.readouterr().err.strip().splitlines() if "noise" not in line]
+    lines = [line for line in capsys.readouterr().err.strip().splitlines() if "weights are random" not in line]
     assert lines[-1].startswith("error: ")
     assert "Traceback" not in "".join(lines)
     return lines[-1]
@@ -50,10 +50,10 @@ def synthesize(source: Path, out: Path, *options: str | Path) -> list[str | Path
     return ["synthesize", source, "--out", out, *QUICK, *options]
 
 
-def launch_file(folder: Path, source: Path | str, **changes: str) -> Path:
+def launch_file(folder: Path, video_path: Path, **changes: str) -> Path:
     text = f"""
         [source]
-        path = "{source}"
+        path = "{video_path}"
         pace = "lockstep"
         allow_upscale = true
         {changes.get("source", "")}
@@ -140,7 +140,7 @@ def test_poses_near_the_sphere_are_taken(clip: Path, tmp_path: Path) -> None:
         (["--weights", "random:kubric91"], 64, "kubric91"),
         (["--weights", "package:none"], 65, "none"),
         (["--weights", "nowhere.ckpt"], 65, "nowhere.ckpt"),
-        ([*KUBRIC, "--family", "driving"], 64, "camera"),
+        ([*KUBRIC, "--family", "driving"], 64, "family"),
     ],
 )
 def test_bad_options_are_one_line_with_cause_and_remedy(
@@ -200,7 +200,7 @@ def test_run_publishes_and_ends_with_0(video: Path, tmp_path: Path, capsys: pyte
         ({"view": "azimuth_deg = 100.0", "weights": "random:kubric90"}, 64, "[-90, 90]"),
         ({"view": "azimut_deg = 10.0"}, 78, "azimuth_deg"),
         ({"publish": "encodng = 'jpeg'"}, 78, "encoding"),
-        ({"source": "fps = -1.0"}, 78, "> 0"),
+        ({"source": "hfov_deg = -1.0"}, 78, "> 0"),
         ({"weights": "random:unheard"}, 78, "unheard"),
     ],
 )
