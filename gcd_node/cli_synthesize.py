@@ -146,9 +146,10 @@ def synthesize(
         motion_bucket=motion_bucket,
     )
     require_input(input_path)
-    model = load_synthesizer(
-        weights, family=family, device=device, dtype=dtype, head_width=head_width, image_heads=image_heads
-    )
+    with Console(stderr=True).status(f"loading {weights}"):
+        model = load_synthesizer(
+            weights, family=family, device=device, dtype=dtype, head_width=head_width, image_heads=image_heads
+        )
     augmentation = Augmentation(strength=cond_aug, seed=seed, noise=injected.augmentation)
     _run(_Order(model, input_path, clip, wanted, options, augmentation), out, save)
 

@@ -10,6 +10,7 @@ import torch
 from gcd_model.checkpoints import LoadedWeights, load_weights
 from gcd_model.config import SMALL
 from gcd_model.errors import CheckpointError, OptionError
+from gcd_model.examination import Options
 from gcd_model.families import Traits, family_named
 from gcd_model.networks import Networks, random_networks
 from gcd_model.own_format import precision
@@ -66,6 +67,7 @@ def packaged_weights(name: str) -> Path:
 
 def random_weights(family: str, *, frames: int | None = None) -> LoadedWeights:
     """Small random networks with the camera control of a family; always the same ones."""
+    Options(frames=frames)  # checks it
     chosen = family_named(family)
     unet = SMALL.unet if chosen.camera != "none" else msgspec.structs.replace(SMALL.unet, camera_width=0)
     config = msgspec.structs.replace(SMALL, camera=chosen.camera, unet=unet, frames=frames or SMALL.frames)

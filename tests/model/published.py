@@ -3,6 +3,7 @@
 import gzip
 import json
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,9 @@ from small_models import randomise
 from torch import Tensor
 
 from gcd_model.architecture import Naming
+from gcd_model.checkpoints import load_weights
 from gcd_model.config import ImageEncoderConfig, ModelConfig, UNetConfig, VAEConfig
+from gcd_model.errors import CheckpointError
 from gcd_model.networks import Networks
 from gcd_model.weight_names import Levels, Source, diffusers_source, gcd_source
 
@@ -52,8 +55,9 @@ def shared_vae(config: ModelConfig) -> ModelConfig:
     return fixed_view(msgspec.structs.replace(config, vae=msgspec.structs.replace(config.vae, shared=True)))
 
 
+@lru_cache
 def filled(config: ModelConfig = SMALL_GCD, seed: int = 0) -> Networks:
-    """Networks whose every parameter is random."""
+    """Networks whose every parameter is random. They are shared: copy them before changing them."""
     networks = Networks(config)
     randomise(networks, seed)
     return networks
@@ -161,3 +165,20 @@ def diffusers_manifest() -> dict[str, tuple[int, ...]]:
         for part in ("unet", "vae", "image_encoder")
         for name, shape in manifest(f"diffusers_{part}").items()
     }
+
+
+def assert_same_weights(ours: Networks, theirs: Networks) -> None:
+    state, wanted = ours.state_dict(), theirs.state_dict()
+    assert list(state) == list(wanted)
+    for name, tensor in wanted.items():
+        torch.testing.assert_close(state[name], tensor, rtol=0, atol=0, msg=name)
+
+
+def refused(path: Path) -> str:
+    """The one line a file is refused with; it begins with the file's name."""
+    with pytest.raises(CheckpointError) as caught:
+        load_weights(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+    return message.removeprefix(f"{path}: ")

@@ -1,8 +1,10 @@
 """The command line as a user meets it: real arguments in, exit code and one line out."""
 
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -257,6 +259,22 @@ def test_view_saves_what_a_running_node_publishes(video: Path, tmp_path: Path) -
         node.kill()
     assert len(list((tmp_path / "s" / "main").glob("*.png"))) == 14
     assert (tmp_path / "s" / "main.mkv").exists()
+
+
+def test_sigterm_ends_a_running_node_in_order(video: Path, tmp_path: Path) -> None:
+    settings = launch_file(tmp_path, video, source="loop = true")
+    settings.write_text(settings.read_text().replace("lockstep", "realtime"))
+    node = subprocess.Popen([sys.executable, "-m", "gcd_node", "run", str(settings)], stderr=subprocess.PIPE, text=True)
+    try:
+        assert node.stderr is not None
+        while "window 0" not in (line := node.stderr.readline()):
+            assert line, "the node ended before its first window"
+        node.send_signal(signal.SIGTERM)
+        started_s = time.monotonic()
+        assert node.wait(30) == 0
+        assert time.monotonic() - started_s < 15  # five seconds on a machine that does nothing else
+    finally:
+        node.kill()
 
 
 def test_a_still_is_seen_as_a_clip(tmp_path: Path) -> None:

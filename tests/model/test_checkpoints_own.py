@@ -1,0 +1,232 @@
+"""Families, our own files and what is told about a checkpoint."""
+
+import json
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import pytest
+import torch
+from published import (
+    SMALL_GCD,
+    assert_same_weights,
+    filled,
+    fixed_view,
+    refused,
+    write_diffusers,
+    write_gcd,
+    write_svd,
+)
+from safetensors.torch import load_file, save_file
+
+from gcd_model.checkpoints import convert_weights, digest, inspect_weights, load_weights, save_weights
+from gcd_model.config import SMALL, ModelConfig
+from gcd_model.errors import CheckpointError, OptionError
+from gcd_model.own_format import Card
+
+UNET = "model.diffusion_model"
+CONV = f"{UNET}.input_blocks.1.0.in_layers.2.weight"
+
+
+# --- the family ------------------------------------------------------------------------------------------------------
+
+
+def test_the_family_follows_option_metadata_name_and_yaml_in_that_order(tmp_path: Path) -> None:
+    path = write_gcd(tmp_path, "kubric_direct_max180.ckpt")
+    path.with_suffix(".yaml").write_text("move_time: 13\ndelta_azimuth_range: [-90, 90]\n")
+    report = inspect_weights(path)
+    assert (report.family, report.told_by, report.move_time) == ("kubric180", "file name", 0)
+    report = inspect_weights(path, family="kubric90")
+    assert (report.family, report.told_by, report.move_time) == ("kubric90", "option", 0)
+    other = path.rename(tmp_path / "mine.ckpt")
+    other.with_suffix(".yaml").write_text("move_time: 5\ndelta_azimuth_range: [-90, 90]\n")
+    report = inspect_weights(other)
+    assert (report.family, report.told_by, report.move_time) == ("kubric90", "yaml", 5)
+    card = Card(name="small", config=SMALL_GCD, family="kubric180", move_time=7)
+    save_weights(filled(), tmp_path / "kubric_gradual_max90.safetensors", card)
+    report = inspect_weights(tmp_path / "kubric_gradual_max90.safetensors")
+    assert (report.family, report.told_by, report.move_time) == ("kubric180", "metadata", 7)
+
+
+def test_an_unknown_family_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = write_gcd(tmp_path, "mine.ckpt")
+    with caplog.at_level(logging.WARNING):
+        loaded = load_weights(path)
+    assert loaded.family is None
+    assert loaded.move_time == 13
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert "--motion-bucket" in caplog.text
+    caplog.clear()
+    load_weights(path, family="kubric90")
+    assert caplog.records == []
+
+
+@pytest.mark.parametrize("family", ["driving", "svd"])
+def test_a_family_against_the_camera_of_the_weights_is_refused(tmp_path: Path, family: str) -> None:
+    with pytest.raises(CheckpointError, match=f"family {family} .*the weights have 'spherical'; name another"):
+        load_weights(write_gcd(tmp_path), family=family)
+
+
+def test_a_published_name_against_the_camera_of_the_weights_is_refused(tmp_path: Path) -> None:
+    assert "told by: file name" in refused(write_svd(tmp_path, "kubric_gradual_max90.safetensors"))
+
+
+def test_an_unknown_family_name_lists_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="kubric90, kubric180, driving, driving-semantic, svd"):
+        load_weights(tmp_path / "a.ckpt", family="kubric")
+
+
+def test_an_early_goal_stays_within_the_frames(tmp_path: Path) -> None:
+    assert inspect_weights(write_gcd(tmp_path), frames=5).move_time == 4
+    with pytest.raises(OptionError, match="frames must be at least 2"):
+        inspect_weights(write_gcd(tmp_path), frames=1)
+
+
+# --- our own files ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("write", [write_gcd, write_svd, lambda folder: write_diffusers(folder / "m")])
+def test_conversion_keeps_every_weight_and_every_fact(tmp_path: Path, write: Callable[[Path], Path]) -> None:
+    path, steps = write(tmp_path), list[tuple[int, int]]()
+    report = convert_weights(path, tmp_path / "ours.safetensors", progress=lambda *step: steps.append(step))
+    before, after = load_weights(path), load_weights(tmp_path / "ours.safetensors")
+    assert_same_weights(after.networks, before.networks)
+    assert after.networks.config == before.networks.config
+    assert (after.family, after.move_time, after.name) == (before.family, before.move_time, before.name)
+    assert (report.layout, report.leftovers, report.optimizer_size) == ("gcd-node", (), 0)
+    assert steps[-1] == (steps[-1][1],) * 2
+    assert [done for done, _ in steps] == sorted(done for done, _ in steps)
+
+
+def test_our_files_are_safetensors_anybody_can_read(tmp_path: Path) -> None:
+    convert_weights(write_gcd(tmp_path), tmp_path / "ours.safetensors", dtype="bfloat16")
+    state, wanted = load_file(tmp_path / "ours.safetensors"), filled().state_dict()
+    assert set(state) == set(wanted)
+    for name, tensor in state.items():
+        kept = torch.float32 if name.startswith("decoder.") else torch.bfloat16
+        torch.testing.assert_close(tensor, wanted[name].to(kept), rtol=0, atol=0, msg=name)
+
+
+def test_a_stored_precision_is_kept_unless_asked(tmp_path: Path) -> None:
+    report = convert_weights(write_diffusers(tmp_path / "m", half=True), tmp_path / "ours.safetensors")
+    assert {network.dtypes for network in report.networks} == {("float16",)}
+    report = convert_weights(tmp_path / "ours.safetensors", tmp_path / "wide.safetensors", dtype="float32")
+    assert {network.dtypes for network in report.networks} == {("float32",)}
+
+
+def test_nothing_is_overwritten_unasked_and_nothing_half_written_stays(tmp_path: Path) -> None:
+    source, out = write_gcd(tmp_path), tmp_path / "ours.safetensors"
+    out.write_bytes(b"precious")
+    with pytest.raises(OptionError, match="exists; give another name"):
+        convert_weights(source, out)
+    assert out.read_bytes() == b"precious"
+
+    def fail(_done: int, _total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        convert_weights(source, out, overwrite=True, progress=fail)
+    assert out.read_bytes() == b"precious"
+    assert sorted(file.name for file in tmp_path.iterdir()) == [source.name, out.name]
+    assert convert_weights(source, out, overwrite=True).layout == "gcd-node"
+
+
+def test_a_file_can_be_converted_onto_itself(tmp_path: Path) -> None:
+    out = tmp_path / "ours.safetensors"
+    convert_weights(write_gcd(tmp_path), out)
+    convert_weights(out, out, overwrite=True)
+    assert_same_weights(load_weights(out).networks, filled())
+
+
+@pytest.mark.parametrize(("out", "said"), [("ours.ckpt", "ends so"), ("absent/ours.safetensors", "there is no folder")])
+def test_an_impossible_output_is_said(tmp_path: Path, out: str, said: str) -> None:
+    with pytest.raises(OptionError, match=said):
+        convert_weights(write_gcd(tmp_path), tmp_path / out)
+
+
+def test_random_networks_survive_saving(tmp_path: Path) -> None:
+    networks = filled(SMALL)
+    card = Card(name="small", config=SMALL, family=None, move_time=3, trained=False)
+    save_weights(networks, tmp_path / "a.safetensors", card)
+    loaded = load_weights(tmp_path / "a.safetensors", family="kubric90")
+    assert_same_weights(loaded.networks, networks)
+    assert (loaded.name, loaded.trained, loaded.move_time) == ("small", False, 3)
+    assert loaded.networks.config == SMALL
+
+
+def own_file(tmp_path: Path, **metadata: str) -> Path:
+    card = Card(name="small", config=SMALL_GCD, family="kubric90", move_time=13).to_metadata()
+    path = tmp_path / "ours.safetensors"
+    save_file({k: v.contiguous() for k, v in filled().state_dict().items()}, path, metadata=card | metadata)
+    return path
+
+
+def tampered(**changes: object) -> str:
+    fields = msgspec.to_builtins(SMALL_GCD)
+    return json.dumps(fields | changes)
+
+
+@pytest.mark.parametrize(
+    ("metadata", "said"),
+    [
+        ({"gcd.format": "2"}, "this version reads '1'; install a newer"),
+        ({"gcd.config": "{"}, "its metadata cannot be used"),
+        ({"gcd.config": tampered(shiny=1)}, "unknown field `shiny`"),
+        ({"gcd.config": tampered(camera="none")}, "contradicts camera_width"),
+        ({"gcd.move_time": "soon"}, "its metadata cannot be used"),
+    ],
+)
+def test_damaged_metadata_is_refused(tmp_path: Path, metadata: dict[str, str], said: str) -> None:
+    assert said in refused(own_file(tmp_path, **metadata))
+
+
+def test_a_config_out_of_proportion_is_refused_before_it_is_built(tmp_path: Path) -> None:
+    tower = msgspec.to_builtins(SMALL_GCD.image_encoder) | {"layers": 10**9}
+    path = own_file(tmp_path, **{"gcd.config": tampered(image_encoder=tower)})
+    assert "describes 1000000004 blocks" in refused(path)
+
+
+def test_our_files_state_their_heads(tmp_path: Path) -> None:
+    assert inspect_weights(own_file(tmp_path), head_width=64, image_heads=16).config == SMALL_GCD
+    with pytest.raises(OptionError, match="head_width is 64 in this file"):
+        load_weights(own_file(tmp_path), head_width=32)
+    assert load_weights(own_file(tmp_path), frames=25).networks.config.frames == 25
+
+
+# --- digests and reports ---------------------------------------------------------------------------------------------
+
+
+def test_the_digest_of_a_file_is_its_sha256(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"abc")
+    assert digest((tmp_path / "a",)) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+
+
+def test_a_large_file_is_digested_by_samples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gcd_model.checkpoints._SAMPLED_ABOVE", 1 << 20)
+    path = tmp_path / "a"
+    content = bytearray(8 << 20)
+    path.write_bytes(content)
+    sampled, full = digest((path,)), digest((path,), full=True)
+    assert sampled != full
+    for at in (0, (8 << 20) - 1, 4 << 20):
+        path.write_bytes(content[:at] + b"\x01" + content[at + 1 :])
+        assert digest((path,)) != sampled
+    path.write_bytes(content + b"\x00")
+    assert digest((path,)) != sampled
+
+
+def test_a_report_counts_what_the_networks_hold(tmp_path: Path) -> None:
+    report, networks = inspect_weights(write_gcd(tmp_path)), filled()
+    by_name = {network.name: network.parameters for network in report.networks}
+    for name, module in networks.named_children():
+        assert by_name[name] == sum(tensor.numel() for tensor in module.state_dict().values())
+    assert report.parameters == sum(tensor.numel() for tensor in networks.state_dict().values())
+    assert report.sha256_12 == load_weights(write_gcd(tmp_path)).sha256_12
+    assert report.size == (tmp_path / "kubric_gradual_max90.ckpt").stat().st_size
+
+
+@pytest.mark.parametrize("config", [SMALL_GCD, fixed_view(SMALL_GCD)], ids=["steered", "fixed"])
+def test_camera_control_follows_the_weights(tmp_path: Path, config: ModelConfig) -> None:
+    path = write_gcd(tmp_path, "mine.ckpt", config)
+    assert inspect_weights(path).config == config

@@ -1,0 +1,144 @@
+"""A checkpoint's name becomes a synthesizer on a device, in a precision."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from published import SMALL_GCD, filled, write_diffusers, write_gcd
+from torch import Tensor
+
+from gcd_model import loading
+from gcd_model.checkpoints import convert_weights, save_weights
+from gcd_model.clip import Clip, RenderOptions, View
+from gcd_model.config import SMALL
+from gcd_model.errors import CheckpointError, OptionError, ViewFixedError
+from gcd_model.families import FAMILIES
+from gcd_model.geometry import SphericalDelta
+from gcd_model.loading import load_synthesizer
+from gcd_model.own_format import Card
+from gcd_model.synthesizer import Synthesizer, synthesize
+
+
+def view(synthesizer: Synthesizer, height: int = 16, width: int = 24) -> View:
+    """One step over a small random clip."""
+    video = torch.rand(14, 3, height, width, generator=torch.Generator().manual_seed(3)) * 2 - 1
+    clip = Clip(video=video, fps=12.0)
+    trajectory = synthesizer.traits.plan_view(SphericalDelta(azimuth_deg=20.0))
+    return synthesize(synthesizer, clip, trajectory, RenderOptions(steps=1, seed=1))
+
+
+def dtypes(synthesizer: Synthesizer) -> dict[str, set[torch.dtype]]:
+    """Precisions of each network; what never leaves the host keeps its own."""
+    return {
+        name: {p.dtype for key, p in module.named_parameters() if ".dormant." not in key}
+        for name, module in synthesizer.networks.named_children()
+    }
+
+
+def test_a_converted_checkpoint_gives_the_same_view(tmp_path: Path) -> None:
+    published = write_gcd(tmp_path)
+    convert_weights(published, tmp_path / "ours.safetensors")
+    first, second = (view(load_synthesizer(path, device="cpu")) for path in (published, tmp_path / "ours.safetensors"))
+    assert first.video.std() > 0.01, "a constant picture would show nothing"
+    torch.testing.assert_close(first.latents, second.latents, rtol=0, atol=0)
+    torch.testing.assert_close(first.video, second.video, rtol=0, atol=0)
+
+
+def test_float32_on_the_cpu_stays_in_the_mapped_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept: dict[str, int] = {}
+
+    def remembered(*arguments: object, **options: object) -> object:
+        loaded = real(*arguments, **options)  # type: ignore[arg-type]
+        kept.update({name: tensor.data_ptr() for name, tensor in loaded.networks.state_dict().items()})
+        return loaded
+
+    real = loading.load_weights
+    monkeypatch.setattr(loading, "load_weights", remembered)
+    synthesizer = load_synthesizer(write_gcd(tmp_path), device="cpu")
+    assert {name: tensor.data_ptr() for name, tensor in synthesizer.networks.state_dict().items()} == kept
+
+
+def test_traits_say_what_was_loaded(tmp_path: Path) -> None:
+    path = write_gcd(tmp_path)
+    traits = load_synthesizer(path, device="cpu").traits
+    assert (traits.name, traits.move_time, traits.precision, traits.device, traits.trained) == (
+        *("kubric_gradual_max90", 13, "float32", "cpu"),
+        True,
+    )
+    assert traits.family == FAMILIES["kubric90"]
+    assert traits.config == SMALL_GCD
+    assert traits.sha256_12 == loading.load_weights(path).sha256_12
+
+
+def test_a_precision_is_for_all_but_the_decoder() -> None:
+    found = dtypes(load_synthesizer("random:kubric90", device="cpu", dtype="bfloat16"))
+    assert found.pop("decoder") == {torch.float32}
+    assert set(map(tuple, found.values())) == {(torch.bfloat16,)}
+
+
+def test_a_float16_folder_computes_in_float32_on_the_cpu(tmp_path: Path) -> None:
+    synthesizer = load_synthesizer(write_diffusers(tmp_path / "m", half=True), device="cpu", family="driving")
+    assert set(map(tuple, dtypes(synthesizer).values())) == {(torch.float32,)}
+    assert synthesizer.traits.family == FAMILIES["driving"]
+
+
+@pytest.mark.parametrize("family", list(FAMILIES))
+def test_random_networks_have_their_familys_control(family: str) -> None:
+    traits = load_synthesizer(f"random:{family}", device="cpu").traits
+    assert (traits.name, traits.trained, traits.move_time) == (f"random-{family}", False, 13)
+    assert traits.config.camera == FAMILIES[family].camera
+    assert (traits.config.height, traits.config.width) == (SMALL.height, SMALL.width)
+    if traits.config.camera == "none":
+        with pytest.raises(ViewFixedError):
+            traits.plan_view(SphericalDelta(azimuth_deg=10.0))
+
+
+def test_random_networks_are_the_same_every_time() -> None:
+    first, second = (load_synthesizer("random:kubric90", device="cpu") for _ in range(2))
+    assert first.traits.sha256_12 == second.traits.sha256_12
+    state: dict[str, Tensor] = second.networks.state_dict()
+    for name, tensor in first.networks.state_dict().items():
+        torch.testing.assert_close(tensor, state[name], rtol=0, atol=0)
+    assert first.traits.sha256_12 != load_synthesizer("random:driving", device="cpu").traits.sha256_12
+
+
+def test_packaged_weights_are_found_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loading, "PACKAGED", tmp_path)
+    with pytest.raises(CheckpointError, match=r"no weights called 'small' ship .* none yet"):
+        load_synthesizer("package:small")
+    card = Card(name="small", config=SMALL_GCD, family="kubric90", move_time=13)
+    save_weights(filled(), tmp_path / "small.safetensors", card)
+    assert load_synthesizer("package:small", device="cpu").traits.name == "small"
+    with pytest.raises(CheckpointError, match="there are: small"):
+        load_synthesizer("package:large")
+    with pytest.raises(CheckpointError, match="no weights called"):
+        load_synthesizer(f"package:../{tmp_path.name}/small")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"device": "gpu"}, "device must be auto, cpu, cuda or cuda:N, got 'gpu'"),
+        ({"device": "cuda:x"}, "got 'cuda:x'"),
+        ({"device": "cpu:1"}, "got 'cpu:1'"),
+        ({"device": "cuda:99"}, "device cuda:99 was asked for, this machine has"),
+        ({"dtype": "int8"}, "dtype must be one of float32, bfloat16, float16, got 'int8'"),
+        ({"family": "driving"}, "random:kubric90 takes neither family"),
+        ({"frames": 1}, "frames must be at least 2"),
+    ],
+)
+def test_impossible_options_are_said(options: dict[str, str], said: str) -> None:
+    with pytest.raises(OptionError, match=said):
+        load_synthesizer("random:kubric90", **options)  # type: ignore[arg-type]
+
+
+def test_an_unknown_random_family_lists_the_known_ones() -> None:
+    with pytest.raises(OptionError, match="there are kubric90"):
+        load_synthesizer("random:")
+
+
+def test_a_path_object_is_always_a_path(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="there is no such file"):
+        load_synthesizer(tmp_path / "random:kubric90")
+    with pytest.raises(CheckpointError, match="there is no such file"):
+        load_synthesizer(Path("random:kubric90"))

@@ -1,0 +1,50 @@
+import subprocess
+import sys
+
+import pytest
+from typer.testing import CliRunner
+
+from gcd_train.cli import app
+
+
+def test_families_lists_every_family_with_its_limits() -> None:
+    result = CliRunner().invoke(app, ["families"], env={"COLUMNS": "200"})
+    assert result.exit_code == 0
+    for text in ("kubric90", "kubric180", "driving-semantic", "svd", "±180°", "53.13°"):
+        assert text in result.stdout
+
+
+def test_one_family_can_be_asked_for() -> None:
+    result = CliRunner().invoke(app, ["families", "driving"], env={"COLUMNS": "200"})
+    assert "85°" in result.stdout
+    assert "kubric" not in result.stdout
+
+
+def test_an_unknown_family_is_refused_with_the_known_ones() -> None:
+    result = CliRunner().invoke(app, ["families", "cubric"])
+    assert result.exit_code != 0
+    assert "kubric90" in result.output
+
+
+def test_architectures_lists_both_set_ups() -> None:
+    result = CliRunner().invoke(app, ["architectures"], env={"COLUMNS": "200"})
+    assert "320, 640, 1280, 1280" in result.stdout
+    assert "SMALL" in result.stdout
+
+
+@pytest.mark.parametrize("module", ["gcd_model", "gcd_node", "gcd_node.cli", "gcd_train.cli"])
+def test_the_core_imports_without_cameras_gpu_ros_and_onnx(module: str) -> None:
+    blocked = (
+        "depthai",
+        "onnxruntime",
+        "onnx",
+        "rclpy",
+        "mcap",
+        "moderngl",
+        "diffusers",
+        "transformers",
+        "torchvision",
+    )
+    code = f"import sys; sys.modules.update(dict.fromkeys({blocked!r})); import {module}; print('imported')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == "imported", done.stderr
