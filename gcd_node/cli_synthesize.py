@@ -146,10 +146,9 @@ def synthesize(
         motion_bucket=motion_bucket,
     )
     require_input(input_path)
+    heads = {"head_width": head_width, "image_heads": image_heads}
     with Console(stderr=True).status(f"loading {weights}"):
-        model = load_synthesizer(
-            weights, family=family, device=device, dtype=dtype, head_width=head_width, image_heads=image_heads
-        )
+        model = load_synthesizer(weights, family=family, device=device, dtype=dtype, **heads)
     augmentation = Augmentation(strength=cond_aug, seed=seed, noise=injected.augmentation)
     _run(_Order(model, input_path, clip, wanted, options, augmentation), out, save)
 

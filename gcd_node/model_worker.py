@@ -4,6 +4,7 @@ import hashlib
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -17,12 +18,14 @@ from gcd_node.errors import ModelFailedError
 from gcd_node.frame_pacer import FramePacer
 from gcd_node.header import OriginHeader
 from gcd_node.preprocess import to_clip_tensor
+from gcd_node.publisher import PublisherStats
 from gcd_node.view_message import Rendered, Run, messages, origin
 from gcd_node.virtual_view import VirtualView
 from gcd_node.window import FrameWindow
 
 _LOG = logging.getLogger(__name__)
 _BAD_WINDOWS_IN_A_ROW = 3
+_KEPT = 1000  # a node runs for weeks
 
 
 class Outbox(Protocol):
@@ -40,16 +43,21 @@ class Outbox(Protocol):
         """Hand over a status, event or meta note."""
         ...
 
+    @property
+    def stats(self) -> PublisherStats:
+        """What has left."""
+        ...
+
 
 @dataclass(slots=True)
 class WorkCounts:
-    """What the model thread has done. render_s: inference time of each window. age_ms: of each, at publish."""
+    """What the model thread has done. render_s: inference times of the latest windows. age_ms: theirs, at publish."""
 
     windows: int = 0
     nan_windows: int = 0
     last_window_id: int = -1
-    render_s: list[float] = field(default_factory=list[float])
-    age_ms: list[float] = field(default_factory=list[float])
+    render_s: deque[float] = field(default_factory=lambda: deque[float](maxlen=_KEPT))
+    age_ms: deque[float] = field(default_factory=lambda: deque[float](maxlen=_KEPT))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)

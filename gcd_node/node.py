@@ -1,6 +1,7 @@
 """The node: source, reader thread, model thread and publisher, started and stopped together."""
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -205,7 +206,7 @@ class Node:
     def _status(self, state: str, source: str) -> dict[str, object]:
         """As wire protocol, section 4, as far as this node knows it."""
         self._beats += 1
-        built, counts = self._builder.counts, self._worker.counts
+        built, sent = self._builder.counts, self._outbox.stats
         return {
             "state": state,
             "level": 1 if self._info.ood else 0,
@@ -217,9 +218,19 @@ class Node:
                 "reason_counts": dict(built.reasons),
                 "skipped": self._newest.dropped,
             },
-            "model": {"state": "busy" if source == "streaming" else "ready", "nan_windows": counts.nan_windows},
+            "model": self._model_status(busy=source == "streaming"),
+            "publish": {"sent": sent.sent, "subs": sent.subscribers, "bytes": sent.bytes, "dropped": sent.dropped},
             "heartbeat_seq": self._beats,
         }
+
+    def _model_status(self, *, busy: bool) -> dict[str, object]:
+        counts = self._worker.counts
+        recent_ms = sorted(1000.0 * seconds for seconds in tuple(counts.render_s))
+        status: dict[str, object] = {"state": "busy" if busy else "ready", "nan_windows": counts.nan_windows}
+        if recent_ms:
+            status["ms_p50"] = round(recent_ms[len(recent_ms) // 2], 1)
+            status["ms_p99"] = round(recent_ms[math.ceil(0.99 * len(recent_ms)) - 1], 1)
+        return status
 
     def _meta(self) -> dict[str, object]:
         """What does not change during a run: weights, views, camera."""

@@ -53,7 +53,7 @@ def _safetensors(length: int, size: int) -> FileKind:
 def check_archive(entries: Sequence[zipfile.ZipInfo]) -> None:
     """Whether a zip is a checkpoint torch can map. Raises CheckpointError if not."""
     inner = {entry.filename.partition("/")[2] for entry in entries}
-    if "constants.pkl" in inner:
+    if any(entry.filename.endswith("constants.pkl") for entry in entries):
         raise CheckpointError("is a TorchScript program, which would be executed; wanted are weights only")
     if "data.pkl" not in inner:
         raise CheckpointError("is a zip without data.pkl, not a torch checkpoint; unpack it if it only wraps one")

@@ -1,7 +1,6 @@
 """Checkpoints of every layout load mapped and strictly, weight by weight."""
 
 import gc
-import json
 from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
@@ -18,6 +17,7 @@ from published import (
     gcd_state,
     refused,
     shared_vae,
+    split_in_shards,
     stem_of,
     write_diffusers,
     write_gcd,
@@ -76,21 +76,8 @@ def test_full_precision_is_preferred_to_its_float16_variant(tmp_path: Path) -> N
 
 
 def test_a_sharded_part_is_put_together(tmp_path: Path) -> None:
-    folder = shard(write_diffusers(tmp_path / "model") / "unet")
+    folder = split_in_shards(write_diffusers(tmp_path / "model") / "unet")
     assert_same_weights(load_weights(folder.parent).networks, filled(shared_vae(SMALL_GCD)))
-
-
-def shard(part: Path) -> Path:
-    """Split a part's weights in two files with an index, as diffusers does."""
-    whole = part / f"{stem_of(part.name)}.safetensors"
-    state = load_file(whole)
-    whole.unlink()
-    files = [f"{whole.stem}-0000{i}-of-00002.safetensors" for i in (1, 2)]
-    index = {name: files[i % 2] for i, name in enumerate(state)}
-    for file in files:
-        save_file({name: state[name] for name in state if index[name] == file}, part / file)
-    (part / f"{whole.name}.index.json").write_text(json.dumps({"metadata": {}, "weight_map": index}))
-    return part
 
 
 def test_a_part_written_as_a_pickle_loads_too(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from published import (
     filled,
     gcd_state,
     refused,
+    split_in_shards,
     write_diffusers,
     write_gcd,
     write_lightning,
@@ -56,7 +57,7 @@ class Listed(list[int]):
 def test_foreign_objects_beside_the_weights_do_not_matter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     callback = foreign_class(monkeypatch)(monitor="loss")
     listed = Listed([1, 2, 3])
-    listed.note = "kept in the instance's dictionary"  # type: ignore[attr-defined]
+    listed.note = "kept in the instance's dictionary"
     entries = {"callbacks": {"best": callback}, "loops": [listed, {1, 2}, Path("a/b")], "hyper_parameters": callback}
     path = write_lightning(tmp_path / "a.ckpt", gcd_state(filled()), **entries)
     monkeypatch.undo()
@@ -207,7 +208,7 @@ def test_weights_of_another_model_are_named(tmp_path: Path) -> None:
 
 
 def test_an_index_cannot_lead_out_of_its_folder(tmp_path: Path) -> None:
-    part = shard(write_diffusers(tmp_path / "model") / "unet")
+    part = split_in_shards(write_diffusers(tmp_path / "model") / "unet")
     index = part / "diffusion_pytorch_model.safetensors.index.json"
     index.write_text(json.dumps({"weight_map": {"a": "../../secret.safetensors"}}))
     assert "plain file names" in refused(part.parent)

@@ -48,7 +48,7 @@ def test_float32_on_the_cpu_stays_in_the_mapped_file(tmp_path: Path, monkeypatch
     kept: dict[str, int] = {}
 
     def remembered(*arguments: object, **options: object) -> object:
-        loaded = real(*arguments, **options)  # type: ignore[arg-type]
+        loaded = real(*arguments, **options)
         kept.update({name: tensor.data_ptr() for name, tensor in loaded.networks.state_dict().items()})
         return loaded
 
@@ -129,7 +129,7 @@ def test_packaged_weights_are_found_by_name(tmp_path: Path, monkeypatch: pytest.
 )
 def test_impossible_options_are_said(options: dict[str, str], said: str) -> None:
     with pytest.raises(OptionError, match=said):
-        load_synthesizer("random:kubric90", **options)  # type: ignore[arg-type]
+        load_synthesizer("random:kubric90", **options)
 
 
 def test_an_unknown_random_family_lists_the_known_ones() -> None:

@@ -63,7 +63,7 @@ def test_angle_ranges_of_a_yaml_tell_the_family(
     style: tuple[str, str], azimuth: int, elevation: int, family: str
 ) -> None:
     text = YAML.format(azimuth=style[0].format(azimuth), elevation=style[1].format(elevation), move_time=13)
-    assert told_by_yaml(text) == Provenance(family=family, move_time=13, told_by="yaml")  # type: ignore[arg-type]
+    assert told_by_yaml(text) == Provenance(family=family, move_time=13, told_by="yaml")
 
 
 def test_ranges_that_contradict_each_other_or_no_family_tell_none() -> None:

@@ -23,6 +23,7 @@ from gcd_model import (
 from gcd_node.envelope import EndMessage, NoteTopic, ViewMessage
 from gcd_node.frame import Frame, SourceInfo
 from gcd_node.header import OriginHeader
+from gcd_node.publisher import PublisherStats
 
 HEIGHT, WIDTH = 64, 96
 
@@ -115,6 +116,10 @@ class Box:
 
     def note(self, topic: NoteTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
         self.notes.append((topic, fields))
+
+    @property
+    def stats(self) -> PublisherStats:
+        return PublisherStats(sent=len(self.views), dropped=0, subscribers=0, bytes=0)
 
     def of(self, kind: str, view: str = "main") -> list[ViewMessage]:
         return [message for message in self.views if message.topic == f"view/{view}/{kind}"]

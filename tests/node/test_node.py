@@ -300,5 +300,7 @@ def test_status_and_meta_describe_the_run() -> None:
     status = [fields for topic, fields in box.notes if topic == "status"]
     assert status[-1]["state"] == "inactive"
     assert status[-1]["window"]["built"] == 2
+    assert status[-1]["publish"]["sent"] == len(box.views)
+    assert status[-1]["model"]["ms_p50"] <= status[-1]["model"]["ms_p99"]
     assert [f["heartbeat_seq"] for f in status] == list(range(1, len(status) + 1))
     assert "SRC_ENDED" in [fields.get("code") for _, fields in box.notes]
