@@ -25,14 +25,19 @@ def write_png(path: Path, image: Image) -> None:
         raise OutputError(f"cannot write {path}; is there space, and may this user write there?")
 
 
-def write_video(path: Path, frames: Sequence[Image], fps: float) -> None:
-    """Write a video: .mp4 is small and lossy, .mkv is lossless (FFV1). Raises OutputError."""
+def video_writer(path: Path, width: int, height: int, fps: float) -> cv2.VideoWriter:
+    """An open video: .mp4 is small and lossy, .mkv is lossless (FFV1). It takes BGR. Raises OutputError."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    height, width = frames[0].shape[:2]
     code = cv2.VideoWriter.fourcc(*("FFV1" if path.suffix == ".mkv" else "mp4v"))
     writer = cv2.VideoWriter(str(path), code, max(fps, 1.0), (width, height))
     if not writer.isOpened():
         raise OutputError(f"cannot write {path}; is there space, and may this user write there?")
+    return writer
+
+
+def write_video(path: Path, frames: Sequence[Image], fps: float) -> None:
+    """Write a whole video, see video_writer(). Raises OutputError."""
+    writer = video_writer(path, frames[0].shape[1], frames[0].shape[0], fps)
     for frame in frames:
         writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
     writer.release()

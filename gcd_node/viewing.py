@@ -16,7 +16,7 @@ from rich.table import Table
 from gcd_node.envelope import ViewKind
 from gcd_node.errors import MessageError, OutputError
 from gcd_node.header import ViewHeader
-from gcd_node.pictures import write_png
+from gcd_node.pictures import video_writer, write_png
 from gcd_node.subscriber import ReceivedView, ViewSubscriber
 
 _REFRESH_MS = 250
@@ -133,19 +133,12 @@ class ViewSaver:
     def _video(self, header: ViewHeader) -> cv2.VideoWriter:
         size = header.shape[1:3]
         if header.view_id not in self._videos:
-            self._videos[header.view_id] = (self._new_video(header), size)
+            path, fps = self._folder / f"{header.view_id}.mkv", header.src.fps_cond
+            self._videos[header.view_id] = (video_writer(path, size[1], size[0], fps), size)
             self.files += 1
         video, first = self._videos[header.view_id]
         if first != size:
             raise OutputError(f"view {header.view_id} was {first} (height, width), now {size}; save to a new folder")
-        return video
-
-    def _new_video(self, header: ViewHeader) -> cv2.VideoWriter:
-        path = self._folder / f"{header.view_id}.mkv"
-        code = cv2.VideoWriter.fourcc(*"FFV1")
-        video = cv2.VideoWriter(str(path), code, max(header.src.fps_cond, 1.0), (header.shape[2], header.shape[1]))
-        if not video.isOpened():
-            raise OutputError(f"cannot write {path}; is there space, and may this user write there?")
         return video
 
 

@@ -7,8 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gcd_node.errors import OutputError, SourceError
+from gcd_node.errors import SourceError
 from gcd_node.frame import MAX_FPS, Frame, Image, SourceInfo
+from gcd_node.pictures import write_video
 from gcd_node.sources.pace import Pace, Pacer
 from gcd_node.sources.ray_cast import draw_street
 from gcd_node.sources.street import Street
@@ -105,10 +106,4 @@ def write_drive(path: Path) -> None:
         OutputError: the file cannot be written.
     """
     drive = packaged_drive()
-    info = drive.info
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), info.fps_nominal, (info.width, info.height))
-    if not writer.isOpened():
-        raise OutputError(f"cannot write {path}; is there space, and may this user write there?")
-    for frame in drive.frames():
-        writer.write(cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR))
-    writer.release()
+    write_video(path, [frame.image for frame in drive.frames()], drive.info.fps_nominal)

@@ -96,14 +96,7 @@ KUBRIC90 = Family(
     fps=12.0,
     hfov_deg=53.13,
 )
-KUBRIC180 = Family(
-    name="kubric180",
-    camera="spherical",
-    limits=ViewLimits(azimuth_deg=180.0, elevation_deg=60.0),
-    rates=(6.0, 8.0, 12.0, 24.0),
-    fps=12.0,
-    hfov_deg=53.13,
-)
+KUBRIC180 = replace(KUBRIC90, name="kubric180", limits=ViewLimits(azimuth_deg=180.0, elevation_deg=60.0))
 DRIVING = Family(
     name="driving",
     camera="none",
@@ -114,17 +107,7 @@ DRIVING = Family(
     motion_bucket=127.0,
     pose_units="m",
 )
-DRIVING_SEMANTIC = Family(
-    name="driving-semantic",
-    camera="none",
-    rates=(5.0, 10.0),
-    fps=10.0,
-    hfov_deg=85.0,
-    interpolation="sine",
-    motion_bucket=127.0,
-    pose_units="m",
-    output="semantic",
-)
+DRIVING_SEMANTIC = replace(DRIVING, name="driving-semantic", output="semantic")
 SVD = Family(name="svd", camera="none", rates=(), fps=7.0, hfov_deg=None, height=576, width=1024, motion_bucket=127.0)
 
 FAMILIES: dict[str, Family] = {family.name: family for family in (KUBRIC90, KUBRIC180, DRIVING, DRIVING_SEMANTIC, SVD)}
