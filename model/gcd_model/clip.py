@@ -1,5 +1,6 @@
 """The types that cross the door: a Clip goes in, a View comes out."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -27,8 +28,8 @@ class Clip:
             raise ShapeError(f"video must be [T, 3, H, W], got {list(self.video.shape)}")
         if self.video.dtype != torch.float32:
             raise ShapeError(f"video must be float32 in [-1, 1], got {self.video.dtype}")
-        if not self.fps > 0:
-            raise OptionError(f"fps must be positive, got {self.fps}")
+        if not (self.fps > 0 and math.isfinite(self.fps)):
+            raise OptionError(f"fps must be a positive number, got {self.fps}")
 
     @property
     def frames(self) -> int:

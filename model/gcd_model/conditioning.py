@@ -34,6 +34,9 @@ class SourceFeatures:
         """T."""
         return self.latents.shape[0]
 
+    def _kind(self) -> tuple[float, float, bool, bool]:
+        return self.fps, self.augmentation, self.tokens is None, self.extra is None
+
     def rows(self, start: int, stop: int) -> Self:
         """The features of frames start..stop-1."""
         return replace(
@@ -44,9 +47,11 @@ class SourceFeatures:
         )
 
     def followed_by(self, later: Self) -> Self:
-        """These frames and then the later ones; both must have been encoded alike."""
-        if (later.fps, later.augmentation) != (self.fps, self.augmentation):
-            raise ShapeError("features of different frame rate or augmentation cannot be joined; encode them alike")
+        """These frames and then the later ones. Raises ShapeError unless both were encoded alike."""
+        if self._kind() != later._kind():
+            raise ShapeError(
+                "features of another frame rate, augmentation or model cannot be joined; encode them alike"
+            )
         return replace(
             self,
             tokens=_joined(self.tokens, later.tokens),

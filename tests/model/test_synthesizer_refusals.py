@@ -1,6 +1,7 @@
 """What `encode` and `render` refuse, and that the message says what to do."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,6 +9,7 @@ from small_models import TINY, draw, random_clip, tiny_synthesizer
 from torch import nn
 
 from gcd_model.clip import Augmentation, Clip, RenderOptions
+from gcd_model.conditioning import SourceFeatures
 from gcd_model.errors import NonFiniteError, OptionError, ShapeError
 from gcd_model.geometry import SphericalDelta, Trajectory, pose_trajectory
 from gcd_model.synthesizer import Synthesizer, synthesize
@@ -54,7 +56,7 @@ def test_a_clip_in_another_type_or_without_frame_rate_is_refused() -> None:
     with pytest.raises(ShapeError, match="float32"):
         Clip(video=torch.zeros(3, 3, 8, 8, dtype=torch.uint8), fps=12.0)
     for fps in (0.0, -1.0, float("nan")):
-        with pytest.raises(OptionError, match="fps must be positive"):
+        with pytest.raises(OptionError, match="fps must be a positive"):
             Clip(video=torch.zeros(3, 3, 8, 8), fps=fps)
 
 
@@ -102,3 +104,17 @@ def test_without_a_family_the_motion_number_must_be_given() -> None:
         unknown.render(features, [path(unknown)])
     (view,) = unknown.render(features, [path(unknown)], RenderOptions(motion_bucket=127.0))
     assert view.motion_bucket == 127.0
+
+
+@pytest.mark.parametrize("fps", [0.0, -1.0, float("inf"), float("nan")])
+def test_a_clip_needs_a_positive_finite_frame_rate(fps: float) -> None:
+    with pytest.raises(OptionError, match="positive number"):
+        Clip(video=torch.zeros(2, 3, 8, 8), fps=fps)
+
+
+def test_features_of_another_kind_are_not_joined() -> None:
+    latents = torch.zeros(2, 4, 1, 1)
+    plain = SourceFeatures(tokens=None, latents=latents, extra=None, fps=12.0, augmentation=0.02)
+    for other in (replace(plain, tokens=torch.zeros(2, 5)), replace(plain, extra=latents), replace(plain, fps=6.0)):
+        with pytest.raises(ShapeError, match="encode them alike"):
+            plain.followed_by(other)
