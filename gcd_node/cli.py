@@ -11,6 +11,7 @@ from rich.logging import RichHandler
 from gcd_model import (
     Cancelled,
     CheckpointError,
+    DeviceMemoryError,
     ModelError,
     NonFiniteError,
     OptionError,
@@ -40,6 +41,7 @@ EXIT_CODES: tuple[tuple[type[ModelError], int], ...] = (
     (OptionError, 64),
     (PoseError, 64),
     (ShapeError, 65),
+    (DeviceMemoryError, 70),
     (NonFiniteError, 70),
     (Cancelled, 130),
     (ModelError, 70),

@@ -144,8 +144,11 @@ class NodeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     @property
     def digest(self) -> str:
-        """12 hex digits that name this configuration: what is rendered, not where it is sent."""
-        rendered = msgspec.json.encode((self.source, self.model, self.view, self.window), order="deterministic")
+        """12 hex digits that name this configuration: how views are rendered; not from which recording, on which
+        device or at what pace, nor where they are sent. Seeds follow from it."""
+        source = msgspec.structs.replace(self.source, path=None, kind="synthetic", pace="lockstep", loop=False)
+        model = msgspec.structs.replace(self.model, device="auto", threads=None)
+        rendered = msgspec.json.encode((source, model, self.view, self.window), order="deterministic")
         return hashlib.sha256(rendered).hexdigest()[:12]
 
 

@@ -14,7 +14,7 @@ from gcd_node.errors import NodeError
 from gcd_node.frame import Image
 from gcd_node.model_worker import WindowReport
 from gcd_node.node import Summary
-from gcd_node.pictures import side_by_side, spread, strip, write_png, write_video
+from gcd_node.pictures import make_folder, side_by_side, spread, strip, write_png, write_video
 from gcd_node.publisher import Publisher
 from gcd_node.session import open_session, run_until_signal
 from gcd_node.sources import read_picture
@@ -52,6 +52,7 @@ def run_demo(out: Path, on_window: Callable[[WindowReport], None]) -> DemoReport
     Raises:
         NodeError: the second process did not come up, or nothing arrived in it.
     """
+    make_folder(out)  # to know at once
     inputs: dict[int, Image] = {}
 
     def remember(report: WindowReport) -> None:

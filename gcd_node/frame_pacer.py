@@ -40,7 +40,7 @@ class FramePacer:
             self._thread.start()
 
     def finish(self, *, abandon: bool = False) -> None:
-        """Wait until all messages have left, or forget those that wait."""
+        """Wait until all messages have left, or forget those that wait. Raises what a send failed with."""
         with self._changed:
             self._finishing = True
             if abandon:
@@ -48,6 +48,8 @@ class FramePacer:
             self._changed.notify()
         if self._thread is not None:
             self._thread.join()
+        if self._failure is not None and not abandon:
+            raise self._failure
 
     def _serve(self) -> None:
         try:

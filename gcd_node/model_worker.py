@@ -11,14 +11,23 @@ from typing import Any, Protocol
 
 import torch
 
-from gcd_model import Augmentation, Cancelled, Clip, NonFiniteError, RenderOptions, View, ViewSynthesizer
+from gcd_model import (
+    Augmentation,
+    Cancelled,
+    Clip,
+    DeviceMemoryError,
+    NonFiniteError,
+    RenderOptions,
+    View,
+    ViewSynthesizer,
+)
 from gcd_node.capture import Newest
 from gcd_node.envelope import EndMessage, NoteTopic, ViewMessage
 from gcd_node.errors import ModelFailedError
 from gcd_node.frame_pacer import FramePacer
 from gcd_node.header import OriginHeader
 from gcd_node.preprocess import to_clip_tensor
-from gcd_node.publisher import PublisherStats
+from gcd_node.publisher_options import PublisherStats
 from gcd_node.view_message import Rendered, Run, messages, origin
 from gcd_node.virtual_view import VirtualView
 from gcd_node.window import FrameWindow
@@ -41,6 +50,10 @@ class Outbox(Protocol):
 
     def note(self, topic: NoteTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
         """Hand over a status, event or meta note."""
+        ...
+
+    def hurry(self) -> None:
+        """Stop waiting for readers."""
         ...
 
     @property
@@ -84,6 +97,7 @@ class ModelWorker:
         self._run, self._synthesizer, self._views, self._outbox = run, synthesizer, views, outbox
         self._on_window = on_window
         self._pacer = FramePacer(outbox.send)
+        self._newest_goal_ns: dict[str, int] = {}
         self._cancel = threading.Event()
         self._bad_in_a_row = 0
 
@@ -91,30 +105,16 @@ class ModelWorker:
         """Abandon the window in work at its next denoising step; from any thread."""
         self._cancel.set()
 
-    def warm_up(self) -> bool:
-        """Render a grey clip in one step, so that the first window does not pay for what happens only once.
-
-        Returns:
-            False if it was cancelled.
-        """
-        traits = self._run.traits
-        video = torch.zeros(traits.config.frames, 3, traits.config.height, traits.config.width)
-        features = self._synthesizer.encode(Clip(video=video, fps=traits.fps))
-        options = RenderOptions(steps=1, motion_bucket=0.0, cancel=self._cancel)
-        try:
-            self._synthesizer.render(features, [view.planned() for view in self._views], options)
-        except (Cancelled, NonFiniteError):
-            return not self._cancel.is_set()  # a model that gives NaN is dealt with window by window
-        return True
-
     def work(self, newest: Newest[FrameWindow]) -> None:
         """Take windows and publish their views.
 
         Raises:
-            ModelFailedError: three windows in a row came out with NaN or Inf, twice each.
+            ModelFailedError: three windows in a row could not be used.
             whatever the source failed with, once its last window is done.
         """
         try:
+            if self._run.config.source.pace == "realtime":
+                self._warm_up()
             while (window := newest.take()) is not None:
                 self._render_or_count(window)
         except Cancelled:
@@ -122,24 +122,51 @@ class ModelWorker:
         finally:
             self._pacer.finish(abandon=self._cancel.is_set())
 
+    def _warm_up(self) -> None:
+        """Render a grey clip in one step, so that the first window does not pay for what happens only once."""
+        config = self._run.traits.config
+        grey = Clip(video=torch.zeros(config.frames, 3, config.height, config.width), fps=self._run.traits.fps)
+        try:
+            features = self._synthesizer.encode(grey)
+            self._synthesizer.render(features, [view.planned() for view in self._views], self._options(0, steps=1))
+        except (NonFiniteError, DeviceMemoryError) as error:
+            _LOG.warning("the warm-up came to nothing: %s", error)  # windows are dealt with one by one
+
+    def _options(self, seed: int, *, steps: int | None) -> RenderOptions:
+        model = self._run.config.model
+        return RenderOptions(
+            steps=steps,
+            guidance=model.guidance,
+            samples=model.samples,
+            seed=seed,
+            motion_bucket=model.motion_bucket,
+            cancel=self._cancel,
+        )
+
     def _render_or_count(self, window: FrameWindow) -> None:
         """One retry with another seed; a window that fails again is counted and not published."""
+        failure: Exception | None = None
         for attempt in (0, 1):
             try:
                 self._publish(window, window_seed(self._run.config.digest, window.window_id, attempt))
-            except NonFiniteError as error:
+            except (NonFiniteError, DeviceMemoryError) as error:
+                failure = error
                 _LOG.warning("window %d, attempt %d: %s", window.window_id, attempt + 1, error)
             else:
                 self._bad_in_a_row = 0
                 return
-        self.counts.nan_windows += 1
+        self._count_bad(window, failure)
+
+    def _count_bad(self, window: FrameWindow, failure: Exception | None) -> None:
+        is_nan = isinstance(failure, NonFiniteError)
+        self.counts.nan_windows += is_nan
         self._bad_in_a_row += 1
-        fields = {"code": "MODEL_NAN", "level": 2, "window_id": window.window_id}
+        fields = {"code": "MODEL_NAN" if is_nan else "GPU_OOM", "level": 2, "window_id": window.window_id}
         self._outbox.note("event", origin(self._run), fields)
         if self._bad_in_a_row >= _BAD_WINDOWS_IN_A_ROW:
             raise ModelFailedError(
-                f"{self._bad_in_a_row} windows in a row came out with NaN or Inf; nothing of them was published. "
-                'Try dtype = "float32" in [model], and look at the weights with `gcd-node weights inspect`'
+                f"{self._bad_in_a_row} windows in a row came out with NaN or found no memory; none was published. "
+                'Try dtype = "float32", fewer views and samples, and `gcd-node weights inspect`'
             )
 
     def _publish(self, window: FrameWindow, seed: int) -> None:
@@ -158,8 +185,20 @@ class ModelWorker:
                 steps=steps,
                 seed=seed,
             )
-            self._send(messages(self._run, described), window.fps)
+            self._send(self._unsent(messages(self._run, described)), window.fps)
         self._count(window, (ended_ns - started_ns) / 1e9)
+
+    def _unsent(self, made: Sequence[ViewMessage]) -> list[ViewMessage]:
+        """Without single frames of moments that an overlapping window has sent before."""
+        kept: list[ViewMessage] = []
+        for message in made:
+            if message.topic.endswith("/frm"):
+                stamp_ns = message.header.t_capture_ns[0]
+                if stamp_ns <= self._newest_goal_ns.get(message.topic, stamp_ns - 1):
+                    continue
+                self._newest_goal_ns[message.topic] = stamp_ns
+            kept.append(message)
+        return kept
 
     def _send(self, made: Sequence[ViewMessage], fps: float) -> None:
         """Single frames leave at the rhythm they were taken in, unless nobody waits for the clock."""
@@ -174,16 +213,8 @@ class ModelWorker:
         model = self._run.config.model
         clip = Clip(video=torch.from_numpy(to_clip_tensor(window.images)), fps=window.fps)
         features = self._synthesizer.encode(clip, Augmentation(strength=model.cond_aug, seed=seed))
-        options = RenderOptions(
-            steps=model.steps,
-            guidance=model.guidance,
-            samples=model.samples,
-            seed=seed,
-            motion_bucket=model.motion_bucket,
-            cancel=self._cancel,
-        )
-        paths = [view.trajectory(window.stamps_ns[-1]) for view in self._views]
-        return self._synthesizer.render(features, paths, options)
+        paths = [view.trajectory(window.stamps_ns[-1], window.epoch) for view in self._views]
+        return self._synthesizer.render(features, paths, self._options(seed, steps=model.steps))
 
     def _count(self, window: FrameWindow, seconds: float) -> None:
         self.counts.windows += 1

@@ -11,13 +11,13 @@ from gcd_model import Intrinsics, Traits, ViewSynthesizer
 from gcd_node.capture import Newest, read
 from gcd_node.config import NodeConfig
 from gcd_node.envelope import NoteTopic, new_boot_id
-from gcd_node.errors import ConfigError
+from gcd_node.errors import ConfigError, SourceError, TooShortError
 from gcd_node.frame import FrameSource, SourceInfo
 from gcd_node.model_worker import ModelWorker, Outbox, WindowReport, WorkCounts
 from gcd_node.preprocess import Fit
 from gcd_node.view_message import Run, camera_matrix, end_messages, origin
 from gcd_node.virtual_view import virtual_views
-from gcd_node.window import FrameWindow, WindowBuilder, choose_fps
+from gcd_node.window import RATE_TOLERANCE, FrameWindow, WindowBuilder, choose_fps
 
 _LOG = logging.getLogger(__name__)
 _HFOV_TOLERANCE_DEG = 2.0
@@ -42,11 +42,14 @@ def prepare_run(config: NodeConfig, traits: Traits, source: SourceInfo) -> tuple
     """Everything that can be said before the first frame, and the frame rate windows will have.
 
     Raises:
-        ConfigError: in strict mode, a frame rate or field of view the model was not trained for.
+        ConfigError: a frame rate the source cannot give; in strict mode, a rate or field of view the model was not
+            trained for.
     """
     fps, foreign_rate = config.window.fps, False
     if fps is None:
         fps, foreign_rate = choose_fps(source.fps_nominal, traits.rates)
+    elif fps > source.fps_nominal * (1 + RATE_TOLERANCE):
+        raise ConfigError(f"[window] fps {fps:g} is more than the {source.fps_nominal:g} the source gives; lower it")
     elif traits.rates:
         foreign_rate = fps not in traits.rates
     intrinsics, foreign_field = _intrinsics(config, traits, source)
@@ -97,10 +100,14 @@ class Node:
 
         Raises:
             ConfigError, ViewRangeError, ViewFixedError: see prepare_run() and virtual_views().
+            OptionError: the motion number cannot be worked out and was not given.
         """
         self._info, fps = prepare_run(config, synthesizer.traits, source.info)
         self._source, self._outbox = source, outbox
         self._views = virtual_views(config, synthesizer.traits)
+        if config.model.motion_bucket is None:
+            for view in self._views:
+                synthesizer.traits.motion_bucket(view.planned())
         fit = _fit(config, synthesizer.traits)
         fit.crop_box(source.info.width, source.info.height)
         self._builder = WindowBuilder(
@@ -131,18 +138,16 @@ class Node:
         """
         self._note("meta", self._meta())
         self._note("status", self._status("activating", "connecting"))
-        if self._info.config.source.pace == "realtime" and not self._worker.warm_up():
-            return self._ended()
         reader = threading.Thread(target=read, args=(self._source, self._builder, self._newest), name="reader")
         model = threading.Thread(target=self._work, name="model")
         reader.start()
         model.start()
-        self._watch(model)
-        self._close()
-        reader.join()
-        return self._ended()
-
-    def _ended(self) -> Summary:
+        try:
+            self._watch(model)
+        finally:
+            self._close()
+            model.join()
+            reader.join()
         self._announce_end()
         if self._failure is not None:
             raise self._failure
@@ -152,6 +157,7 @@ class Node:
         """End soon: no new window begins, the one in work is abandoned at its next step."""
         self._stopped = True
         self._worker.cancel()
+        self._outbox.hurry()
         self._close()
 
     def _close(self) -> None:
@@ -182,12 +188,26 @@ class Node:
                 told[reason] = count
 
     def _announce_end(self) -> None:
-        code = "SRC_ENDED" if self._failure is None else type(self._failure).__name__
+        code, source, model = self._end_reason()
         self._note("event", {"code": code, "level": 0 if self._failure is None else 2})
-        self._note("status", self._status("inactive", "ended"))
+        status = self._status("inactive", source)
+        if self._failure is not None:
+            status |= {"level": 2, "reasons": [*self._info.ood, code]}
+        self._note("status", status | {"model": {**self._model_status(), "state": model}})
+        delay_ms = _STOP_DELAY_MS if self._stopped else None
         for view in self._views:
             for message in end_messages(self._info, view.view_id, view.rev, self._worker.counts.last_window_id):
-                self._outbox.end(message, delay_ms=_STOP_DELAY_MS if self._stopped else None)
+                self._outbox.end(message, delay_ms=delay_ms)
+
+    def _end_reason(self) -> tuple[str, str, str]:
+        """Event code, and the states of source and model at the end."""
+        if isinstance(self._failure, TooShortError):
+            return "TOO_SHORT", "ended", "ready"
+        if isinstance(self._failure, SourceError):
+            return "SRC_LOST", "lost", "ready"
+        if self._failure is not None:
+            return "MODEL_FAILED", "closed", "failed"
+        return ("STOPPED", "closed", "ready") if self._stopped else ("SRC_ENDED", "ended", "ready")
 
     def _note(self, topic: NoteTopic, fields: dict[str, object]) -> None:
         self._outbox.note(topic, origin(self._info), fields)
@@ -218,15 +238,15 @@ class Node:
                 "reason_counts": dict(built.reasons),
                 "skipped": self._newest.dropped,
             },
-            "model": self._model_status(busy=source == "streaming"),
+            "model": self._model_status(),
             "publish": {"sent": sent.sent, "subs": sent.subscribers, "bytes": sent.bytes, "dropped": sent.dropped},
             "heartbeat_seq": self._beats,
         }
 
-    def _model_status(self, *, busy: bool) -> dict[str, object]:
+    def _model_status(self) -> dict[str, object]:
         counts = self._worker.counts
         recent_ms = sorted(1000.0 * seconds for seconds in tuple(counts.render_s))
-        status: dict[str, object] = {"state": "busy" if busy else "ready", "nan_windows": counts.nan_windows}
+        status: dict[str, object] = {"state": "busy", "nan_windows": counts.nan_windows}
         if recent_ms:
             status["ms_p50"] = round(recent_ms[len(recent_ms) // 2], 1)
             status["ms_p99"] = round(recent_ms[math.ceil(0.99 * len(recent_ms)) - 1], 1)

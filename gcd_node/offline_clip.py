@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from gcd_model import Clip, Traits
+from gcd_node.array_file import read_npy
 from gcd_node.errors import SourceError, TooShortError, UsageError
 from gcd_node.frame import Image
 from gcd_node.preprocess import Fit, to_clip_tensor
@@ -125,13 +126,9 @@ def _from_array(path: Path, request: ClipRequest, traits: Traits) -> OfflineClip
 
 
 def _load_array(path: Path) -> NDArray[np.float32]:
-    try:
-        array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error).splitlines()[0]
-        raise SourceError(f"cannot read {path}: {reason}; give float32 [T, H, W, 3] in [0, 1] as .npy") from error
-    if not isinstance(array, np.ndarray) or array.dtype != np.float32 or array.ndim != 4 or array.shape[3] != 3:
-        found = f"{array.dtype} {list(array.shape)}" if isinstance(array, np.ndarray) else "an archive"
+    array = read_npy(path, "float32 [T, H, W, 3] in [0, 1] as .npy")
+    if array.dtype != np.float32 or array.ndim != 4 or array.shape[3] != 3:
+        found = f"{array.dtype} {list(array.shape)}"
         raise SourceError(f"{path} must hold float32 [T, H, W, 3] in [0, 1], got {found}")
     if array.size == 0 or not np.isfinite(array).all() or array.min() < 0.0 or array.max() > 1.0:
         raise SourceError(f"{path} must hold finite numbers in [0, 1]; scale them first")

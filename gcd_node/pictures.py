@@ -18,16 +18,24 @@ def to_u8(video: NDArray[np.float32]) -> Image:
     return np.ascontiguousarray(np.rint(video.transpose(0, 2, 3, 1) * 255.0).clip(0, 255).astype(np.uint8))
 
 
+def make_folder(folder: Path) -> None:
+    """Create a folder and those above it. Raises OutputError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot create {folder}: {error.strerror}; name another folder") from error
+
+
 def write_png(path: Path, image: Image) -> None:
     """Write one picture. Raises OutputError."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     if not cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
         raise OutputError(f"cannot write {path}; is there space, and may this user write there?")
 
 
 def video_writer(path: Path, width: int, height: int, fps: float) -> cv2.VideoWriter:
     """An open video: .mp4 is small and lossy, .mkv is lossless (FFV1). It takes BGR. Raises OutputError."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     code = cv2.VideoWriter.fourcc(*("FFV1" if path.suffix == ".mkv" else "mp4v"))
     writer = cv2.VideoWriter(str(path), code, max(fps, 1.0), (width, height))
     if not writer.isOpened():

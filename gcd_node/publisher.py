@@ -23,6 +23,7 @@ from gcd_node.endpoints import Channel, check_bindable, free_ipc_path, is_ipv6, 
 from gcd_node.envelope import TOPIC_BYTES, WELCOME, EndMessage, NoteMessage, NoteTopic, ViewMessage, encode
 from gcd_node.errors import EndpointError, NodeError
 from gcd_node.header import OriginHeader
+from gcd_node.publisher_options import PublisherOptions, PublisherStats
 
 _LOG = logging.getLogger(__name__)
 _IDLE_S = 0.01
@@ -30,40 +31,6 @@ _RETRY_MS = 3
 _DATA_HWM = 4
 _STATUS_HWM = 100
 _MAX_SUBSCRIPTION = 4096
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PublisherOptions:
-    """Where and how to send.
-
-    data, status: endpoints, or "ipc" for the runtime folder; status None opens no status socket.
-    lockstep: wait for slow readers instead of skipping, and for min_subscribers before the first message.
-    end_delay_ms: how long an end-of-stream message follows the last window, so that a conflated reader gets both.
-    linger_ms: how long an orderly close waits for readers to take the end and leave; drain_ms: the same in lockstep,
-        and there also how long a queued message may wait for a reader.
-    queue_size: messages between the callers and the thread.
-    """
-
-    data: str = "ipc"
-    status: str | None = "ipc"
-    lockstep: bool = False
-    min_subscribers: int = 0
-    end_delay_ms: int = 500
-    linger_ms: int = 1000
-    drain_ms: int = 5000
-    queue_size: int = 8
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PublisherStats:
-    """sent, bytes: handed to ZeroMQ on the data socket. dropped: refused because the queue was full.
-    subscribers: subscriptions on the data socket now. What ZeroMQ drops for a slow reader shows in no counter here:
-    that reader sees a gap in the sequence."""
-
-    sent: int
-    dropped: int
-    subscribers: int
-    bytes: int
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -89,7 +56,8 @@ class Publisher:
         self._queue: queue.Queue[_Parcel] = queue.Queue(options.queue_size)
         self._notes: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._sequences: Counter[tuple[str, str]] = Counter()
-        self._hand_over = threading.Lock()
+        self._hand_over, self._note_order = threading.Lock(), threading.Lock()
+        self._hurried = threading.Event()
         self._closing, self._abandoned, self._closed = threading.Event(), threading.Event(), threading.Event()
         self._failure: Exception | None = None
         self._dropped = 0
@@ -136,9 +104,13 @@ class Publisher:
 
         Raises: as send().
         """
-        with self._hand_over:
+        with self._note_order:
             self.check()
             self._notes.put(self._encoded(NoteMessage(topic=topic, header=header, fields=fields)))
+
+    def hurry(self) -> None:
+        """Stop waiting for readers, for a node that was told to stop: what does not leave in `linger_ms` is lost."""
+        self._hurried.set()
 
     def check(self) -> None:
         """Raises what stopped the thread, or NodeError if the publisher is closed."""
@@ -192,11 +164,15 @@ class Publisher:
         return part
 
     def _put(self, parcel: _Parcel) -> None:
-        while True:
+        while not self._hurried.is_set():
             try:
                 return self._queue.put(parcel, timeout=0.05)
             except queue.Full:
                 self.check()
+        try:
+            self._queue.put_nowait(parcel)
+        except queue.Full:
+            self._dropped += 1
 
     def _raise_failure(self) -> None:
         if isinstance(self._failure, NodeError):
@@ -244,7 +220,9 @@ class Publisher:
             elif not closing:
                 progress = time.monotonic()
                 self._data.wait(_RETRY_MS)
-            elif time.monotonic() - progress > self._options.drain_ms / 1000:
+            elif time.monotonic() - progress > self._patience_ms / 1000:
+                if self._hurried.is_set():
+                    return
                 raise EndpointError(self._undelivered())
             else:
                 self._data.wait(_RETRY_MS)
@@ -261,7 +239,8 @@ class Publisher:
 
     @property
     def _patience_ms(self) -> int:
-        return self._options.drain_ms if self._options.lockstep else self._options.linger_ms
+        waits = self._options.lockstep and not self._hurried.is_set()
+        return self._options.drain_ms if waits else self._options.linger_ms
 
     def _serve_sockets(self) -> None:
         self._data.serve()

@@ -8,12 +8,13 @@ from types import FrameType
 
 import torch
 
-from gcd_model import ModelError, OptionError, ViewSynthesizer, load_synthesizer
+from gcd_model import OptionError, ViewSynthesizer, load_synthesizer
 from gcd_node.config import ModelSection, NodeConfig, PublishConfig
-from gcd_node.errors import ConfigError, NodeError
+from gcd_node.errors import ConfigError
 from gcd_node.model_worker import WindowReport
 from gcd_node.node import Node, Summary
-from gcd_node.publisher import Publisher, PublisherOptions
+from gcd_node.publisher import Publisher
+from gcd_node.publisher_options import PublisherOptions
 from gcd_node.sources import open_source
 
 _LOG = logging.getLogger(__name__)
@@ -88,8 +89,8 @@ def run_until_signal(node: Node, publisher: Publisher) -> Summary:
         signal.signal(number, stop)
     try:
         return node.run()
-    except (NodeError, ModelError):
-        publisher.close()
+    except Exception:
+        publisher.close()  # in order: what was announced, the end of every view included, still leaves
         raise
     finally:
         for number, handler in previous.items():

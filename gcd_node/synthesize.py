@@ -16,6 +16,7 @@ from gcd_model import (
     View,
     ViewSynthesizer,
 )
+from gcd_node.array_file import read_npy, read_npz
 from gcd_node.errors import OutputError, SourceError, UsageError
 from gcd_node.offline_clip import OfflineClip
 from gcd_node.pictures import Image, heat, side_by_side, spread, strip, to_u8, write_frames, write_png, write_video
@@ -67,27 +68,15 @@ def plan(synthesizer: ViewSynthesizer, request: ViewRequest) -> Trajectory:
 
 def read_poses(path: Path) -> NDArray[np.float64]:
     """[T, 4, 4] from a .npy file. Raises SourceError."""
-    try:
-        poses = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise SourceError(f"cannot read poses from {path}: {_reason(error)}; give a .npy file of [T, 4, 4]") from error
-    if (
-        not isinstance(poses, np.ndarray)
-        or poses.ndim != 3
-        or poses.shape[1:] != (4, 4)
-        or poses.dtype.kind not in "fiu"
-    ):
-        raise SourceError(f"poses in {path} must be numbers [T, 4, 4], got {getattr(poses, 'shape', 'an archive')}")
+    poses = read_npy(path, "a .npy file of [T, 4, 4]")
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or poses.dtype.kind not in "fiu":
+        raise SourceError(f"poses in {path} must be numbers [T, 4, 4], got {poses.dtype} {list(poses.shape)}")
     return poses.astype(np.float64)
 
 
 def read_noise(path: Path) -> InjectedNoise:
     """Noise from an .npz file with `initial` and `augmentation`, either may be missing. Raises SourceError."""
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError, AttributeError, TypeError) as error:
-        raise SourceError(f"cannot read noise from {path}: {_reason(error)}; give an .npz file") from error
+    arrays = read_npz(path, "an .npz file with `initial` and `augmentation`")
     unknown = sorted(set(arrays) - {"initial", "augmentation"})
     if unknown or not arrays:
         raise SourceError(f"{path} must hold `initial` and `augmentation`, got {unknown or 'nothing'}")
@@ -163,7 +152,3 @@ def uncertainty_picture(std: NDArray[np.float32]) -> Image:
     """Per-pixel deviation over samples at a few moments, [T, H, W]; bright is uncertain."""
     top = max(float(std.max()), 1e-6)
     return side_by_side(*(heat(std[i], top) for i in spread(len(std), _STRIP_FRAMES)))
-
-
-def _reason(error: Exception) -> str:
-    return error.strerror or str(error) if isinstance(error, OSError) else str(error).splitlines()[0]

@@ -65,7 +65,8 @@ def messages(run: Run, rendered: Rendered) -> list[ViewMessage]:
     pixels = to_u8(rendered.view.video.numpy())
     header = _header(run, rendered)
     window = _message(run, header, pixels, "win")
-    goal = [_message(run, _one_frame(header, i), pixels[i : i + 1], "frm") for i in _at_goal(rendered.view.trajectory)]
+    at_goal = _at_goal(rendered.view.trajectory) if run.traits.knows_camera else []
+    goal = [_message(run, _one_frame(header, i), pixels[i : i + 1], "frm") for i in at_goal]
     std = rendered.view.std
     return [window, *goal, *([] if std is None else [_deviation(header, std.numpy())])]
 
@@ -128,7 +129,7 @@ def _header(run: Run, rendered: Rendered) -> ViewHeader:
         src=_source(run, window),
         frame_id=f"{rendered.view_id}_optical",
         src_frame_id=f"{run.source.kind}_optical",
-        frame_role=tuple(_role(at_goal) for at_goal in path.at_goal),
+        frame_role=tuple(_role(at_goal and run.traits.knows_camera) for at_goal in path.at_goal),
         shape=(path.frames, *rendered.view.video.shape[-2:], 3),
         encoding="rgb8",
         quality=QualityRecord(
@@ -137,7 +138,7 @@ def _header(run: Run, rendered: Rendered) -> ViewHeader:
         model=_model(run.traits),
         cfg_digest=run.config.digest,
         pose=_deltas(path),
-        source_from_view=tuple(tuple(row) for row in path.source_from_target.flatten(1).tolist()),
+        source_from_view=_matrices(path) if run.traits.knows_camera else None,
         pose_units="scene" if run.traits.family is None else run.traits.family.pose_units,
         src_pose=_source_pose(run),
         intrinsics=None if run.intrinsics is None else camera_matrix(run.intrinsics),
@@ -151,16 +152,18 @@ def camera_matrix(intrinsics: Intrinsics) -> tuple[float, ...]:
 
 
 def _one_frame(header: ViewHeader, index: int) -> ViewHeader:
-    """The header of one frame of a window."""
-    assert header.source_from_view is not None
+    """The header of one frame of a window; it is older than the newest by the time between them."""
+    older_ms = (header.t_capture_ns[-1] - header.t_capture_ns[index]) / 1e6
+    matrices = header.source_from_view
     return replace(
         header,
+        age_ms=header.age_ms + older_ms,
         t_capture_ns=header.t_capture_ns[index : index + 1],
         src=replace(header.src, seq=header.src.seq[index : index + 1]),
         frame_role=header.frame_role[index : index + 1],
         shape=(1, *header.shape[1:]),
         pose=None if header.pose is None else header.pose[index : index + 1],
-        source_from_view=header.source_from_view[index : index + 1],
+        source_from_view=None if matrices is None else matrices[index : index + 1],
     )
 
 
@@ -202,6 +205,10 @@ def _deltas(path: Trajectory) -> tuple[PoseDelta, ...] | None:
     return tuple(
         PoseDelta(az_deg=azimuth, el_deg=elevation, r=radius) for azimuth, elevation, radius in path.delta.tolist()
     )
+
+
+def _matrices(path: Trajectory) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(row) for row in path.source_from_target.flatten(1).tolist())
 
 
 def _role(at_goal: bool) -> FrameRole:

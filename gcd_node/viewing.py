@@ -92,7 +92,9 @@ class ViewTable:
 
 
 class ViewSaver:
-    """Writes each window's frames as `<view>/<window>_<frame>.png` and all of a view as lossless `<view>.mkv`.
+    """Writes each window's frames as `<view>/<window>_<frame>.png`, and all of a view as lossless `<view>.mkv`.
+
+    Single frames, of which a window may give many, are numbered as the source did.
 
     Raises:
         OutputError: a file cannot be written, or a view changes its size.
@@ -107,12 +109,10 @@ class ViewSaver:
         """Write one message's frames."""
         header, frames = view.header, _colour(view.images)
         folder = self._folder / header.view_id
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"cannot create {folder}: {error.strerror}; name another folder") from error
+        single = view.message.topic.endswith("/frm")  # many of these share a window
         for index, frame in enumerate(frames):
-            write_png(folder / f"{header.window_id:06d}_{index:02d}.png", frame)
+            number = f"{header.src.seq[0]:06d}" if single else f"{index:02d}"
+            write_png(folder / f"{header.window_id:06d}_{number}.png", frame)
         self.files += len(frames)
         video = self._video(header)
         for frame in frames:

@@ -23,17 +23,18 @@ class VirtualView:
             azimuth_deg=config.azimuth_deg, elevation_deg=config.elevation_deg, radius_m=config.radius
         )
         self._orbit = _orbit(config)
-        self._stamp_ns: int | None = None
+        self._newest: tuple[int, int] | None = None  # epoch and stamp of the last window
         self._check_reach()
 
-    def trajectory(self, stamp_ns: int) -> Trajectory:
+    def trajectory(self, stamp_ns: int, epoch: int) -> Trajectory:
         """The camera path for a window whose newest frame was captured at `stamp_ns`.
 
-        An orbit's destination goes on from the last window's by the time between them, and turns at its limit.
+        An orbit's destination goes on from the last window's by the time between them, and turns at its limit. Stamps
+        of different epochs cannot be compared: there it waits for one window. The same window may be asked for again.
         """
-        if self._orbit is not None and self._stamp_ns is not None:
-            self._orbit = self._orbit.advanced((stamp_ns - self._stamp_ns) / NANOSECONDS)
-        self._stamp_ns = stamp_ns
+        if self._orbit is not None and self._newest is not None and self._newest[0] == epoch:
+            self._orbit = self._orbit.advanced((stamp_ns - self._newest[1]) / NANOSECONDS)
+        self._newest = (epoch, stamp_ns)
         return self.planned()
 
     def planned(self) -> Trajectory:

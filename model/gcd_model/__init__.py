@@ -14,6 +14,7 @@ from gcd_model.config import SMALL, SVD_14, ModelConfig
 from gcd_model.errors import (
     Cancelled,
     CheckpointError,
+    DeviceMemoryError,
     ModelError,
     NonFiniteError,
     OptionError,
@@ -50,6 +51,7 @@ __all__ = [
     "CheckpointError",
     "Clip",
     "DeltaFit",
+    "DeviceMemoryError",
     "Family",
     "Intrinsics",
     "ModelConfig",

@@ -7,6 +7,7 @@
     │   └── ViewFixedError    the checkpoint has one fixed view and takes no camera command
     ├── CheckpointError   a file is missing, damaged, hostile or of another architecture
     ├── OptionError       a setting is missing, unknown or contradicts the checkpoint; also a ValueError
+    ├── DeviceMemoryError the device ran out of memory; what it held for the call is free again
     ├── NonFiniteError    the network produced NaN or Inf
     └── Cancelled         the caller asked to stop; noticed between two denoising steps
 
@@ -47,6 +48,10 @@ class CheckpointError(ModelError):
 
 class OptionError(ModelError, ValueError):
     """A setting is missing, unknown or contradicts the checkpoint."""
+
+
+class DeviceMemoryError(ModelError):
+    """The device ran out of memory; what it held for the call is free again."""
 
 
 class NonFiniteError(ModelError):

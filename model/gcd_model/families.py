@@ -126,7 +126,7 @@ class Traits:
 
     family: None if nobody could tell; then no limits are checked.
     move_time: frame in which the goal pose is reached; 0 for a direct checkpoint.
-    sha256_12: first 12 hex digits of the digest of the weights file.
+    sha256_12: 12 hex digits that name the weights: of SHA-256 over the file, over samples of it above 512 MiB.
     trained: False for random weights, whose pictures are noise.
     """
 
@@ -148,6 +148,11 @@ class Traits:
     def rates(self) -> tuple[float, ...]:
         """Trained frame rates; empty if any will do."""
         return () if self.family is None else self.family.rates
+
+    @property
+    def knows_camera(self) -> bool:
+        """Whether anybody knows where the views' camera stands: not for checkpoints that nobody steers."""
+        return self.config.camera != "none" or (self.family is not None and self.family.name.startswith("driving"))
 
     def check_size(self, height: int, width: int) -> None:
         """Raises OptionError if the network cannot take frames of this size."""
@@ -223,14 +228,15 @@ class Traits:
         if self.config.camera == "spherical":
             _warn_of_residual(fits)
             return fitted
-        return replace(fitted, source_from_target=source_from_target.double())
+        asked = pose_trajectory(source_from_target)
+        return replace(fitted, source_from_target=asked.source_from_target, at_goal=asked.at_goal)
 
     def _fixed_view(self, delta: SphericalDelta | None, move_time: int) -> Trajectory:
         if delta is not None and delta != SphericalDelta():
             raise ViewFixedError(
                 f"{self.name} has one fixed view and takes no camera command; leave azimuth, elevation and radius out"
             )
-        if self.family is not None and self.family.name.startswith("driving"):
+        if self.knows_camera:
             return driving_trajectory(frames=self.config.frames, move_time=move_time)
         return pose_trajectory(torch.eye(4, dtype=torch.float64).repeat(self.config.frames, 1, 1))
 

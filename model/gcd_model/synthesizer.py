@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from functools import wraps
+from typing import ParamSpec, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -15,7 +16,7 @@ from gcd_model.conditioning import (
     condition_tokens,
     micro_conditioning,
 )
-from gcd_model.errors import NonFiniteError, OptionError, ShapeError
+from gcd_model.errors import DeviceMemoryError, NonFiniteError, OptionError, ShapeError
 from gcd_model.families import Traits
 from gcd_model.geometry import Trajectory
 from gcd_model.image_encoder import clip_pixels
@@ -24,6 +25,9 @@ from gcd_model.networks import Networks
 from gcd_model.noise import edm_sigmas, guidance_scale, preconditioning, unit_noise
 from gcd_model.sampler import euler, guided
 from gcd_model.vae import to_pixels
+
+Given = ParamSpec("Given")
+Made = TypeVar("Made")
 
 _ENCODE_FRAMES = 2  # frames per encoder call: the largest activations are per frame, so this bounds memory
 
@@ -50,7 +54,7 @@ class ViewSynthesizer(Protocol):
         Raises:
             ShapeError: a trajectory and the clip differ in length.
             Cancelled: `options.cancel` was set; noticed between two denoising steps.
-            NonFiniteError: the result holds NaN or Inf.
+            NonFiniteError: the result holds NaN or Inf. DeviceMemoryError: the device ran out of memory.
         """
         ...
 
@@ -60,6 +64,21 @@ def synthesize(
 ) -> View:
     """One clip, one view: `encode`, then `render`."""
     return synthesizer.render(synthesizer.encode(clip), [trajectory], options)[0]
+
+
+def _out_of_memory_is_our_error(method: Callable[Given, Made]) -> Callable[Given, Made]:
+    """The method, with torch's out-of-memory error as DeviceMemoryError and the device's cache given back."""
+
+    @wraps(method)
+    def guarded(*args: Given.args, **kwargs: Given.kwargs) -> Made:
+        try:
+            return method(*args, **kwargs)
+        except torch.OutOfMemoryError as error:
+            reason = str(error).splitlines()[0]
+        torch.cuda.empty_cache()  # outside the handler: its traceback would keep tensors alive
+        raise DeviceMemoryError(f"{reason} Render fewer views and samples at once, smaller frames, or use bfloat16")
+
+    return guarded
 
 
 class Synthesizer:
@@ -83,6 +102,7 @@ class Synthesizer:
         """The networks themselves, for measuring and exporting."""
         return self._networks
 
+    @_out_of_memory_is_our_error
     @torch.inference_mode()
     def encode(
         self, clip: Clip, augmentation: Augmentation | None = None, extra: Tensor | None = None
@@ -99,7 +119,7 @@ class Synthesizer:
             noise = unit_noise(tuple(clip.video.shape), augmentation.seed)
         if noise.shape != clip.video.shape:
             raise ShapeError(f"augmentation noise must be {list(clip.video.shape)}, got {list(noise.shape)}")
-        noisy = clip.video + augmentation.strength * noise
+        noisy = clip.video + augmentation.strength * noise.to(clip.video.device)
         return SourceFeatures(
             tokens=self._tokens(clip.video),
             latents=_in_chunks(self._condition_mean, noisy),
@@ -108,6 +128,7 @@ class Synthesizer:
             augmentation=augmentation.strength,
         )
 
+    @_out_of_memory_is_our_error
     @torch.inference_mode()
     def render(
         self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None

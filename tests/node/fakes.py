@@ -106,6 +106,7 @@ class Box:
     views: list[ViewMessage] = field(default_factory=list)
     ends: list[EndMessage] = field(default_factory=list)
     notes: list[tuple[str, Mapping[str, Any]]] = field(default_factory=list)
+    hurried: bool = False
 
     def send(self, message: ViewMessage) -> bool:
         self.views.append(message)
@@ -116,6 +117,9 @@ class Box:
 
     def note(self, topic: NoteTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
         self.notes.append((topic, fields))
+
+    def hurry(self) -> None:
+        self.hurried = True
 
     @property
     def stats(self) -> PublisherStats:

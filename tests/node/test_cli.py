@@ -11,8 +11,11 @@ import numpy as np
 import pytest
 
 from gcd_node.cli import run_app
+from gcd_node.config import load_config
 from gcd_node.pictures import write_png, write_video
-from gcd_node.publisher import Publisher, PublisherOptions
+from gcd_node.publisher import Publisher
+from gcd_node.publisher_options import PublisherOptions
+from gcd_node.session import open_session
 
 SIZE = (128, 192)  # of the small random model
 KUBRIC = ["--weights", "random:kubric90"]
@@ -281,3 +284,41 @@ def test_a_still_is_seen_as_a_clip(tmp_path: Path) -> None:
     write_png(tmp_path / "still.png", np.full((*SIZE, 3), 90, np.uint8))
     assert run_app([str(a) for a in synthesize(tmp_path / "still.png", tmp_path / "out", *DRIVING)]) == 0
     assert len(list((tmp_path / "out" / "frames").glob("*.png"))) == 14
+
+
+REAL = Path(__file__).parents[2].parent / "shared" / "real"
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="needs the four real clips in ../shared/real")
+@pytest.mark.parametrize("name", ["kubmv7_scn01992_v11", "kubmv7_scn01996_v2", "pd_scn00590", "pd_scn01969"])
+def test_real_recordings_go_through_both_programs(name: str, tmp_path: Path) -> None:
+    source, windows = REAL / f"{name}.mp4", 4 if name.startswith("kub") else 3
+    weights = KUBRIC if name.startswith("kub") else DRIVING
+    assert run_app([str(a) for a in synthesize(source, tmp_path / "out", *weights)]) == 0
+    assert len(list((tmp_path / "out" / "frames").glob("*.png"))) == 14
+    settings = load_config(launch_file(tmp_path, source, weights=weights[1]))
+    with open_session(settings) as (node, _):
+        assert node.run().counts.windows == windows
+
+
+@pytest.mark.parametrize("kind", ["clip.npy", "poses.npy", "noise.npz"])
+@pytest.mark.parametrize("damage", ["cut", "huge"])
+def test_damaged_arrays_are_one_line(
+    kind: str, damage: str, clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = tmp_path / "whole.npz"
+    np.savez(whole, initial=np.zeros((14, 4, 16, 24), np.float32))
+    path = tmp_path / f"bad_{kind}"
+    if damage == "cut":
+        path.write_bytes(whole.read_bytes()[:3000])
+    else:
+        header = "{'descr': '<f4', 'fortran_order': False, 'shape': (1048576, 1048576, 2, 3), }".ljust(117) + "\n"
+        path.write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode())
+    options = {"clip.npy": [], "poses.npy": ["--poses", path], "noise.npz": ["--noise", path]}[kind]
+    source = path if kind == "clip.npy" else clip
+    assert path.name in failed(synthesize(source, tmp_path / "out", *KUBRIC, *options), 66, capsys)
+
+
+def test_a_demo_that_cannot_write_says_so_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").touch()
+    assert str(tmp_path / "file") in failed(["demo", "--out", tmp_path / "file" / "x"], 73, capsys)

@@ -1,15 +1,34 @@
 import threading
 import time
+from collections.abc import Iterator, Mapping
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, traits
 
-from gcd_model import Cancelled, NonFiniteError, RenderOptions, ViewFixedError, ViewRangeError
+from gcd_model import (
+    Cancelled,
+    DeviceMemoryError,
+    NonFiniteError,
+    OptionError,
+    RenderOptions,
+    ViewFixedError,
+    ViewRangeError,
+)
 from gcd_node.config import NodeConfig, parse_config
-from gcd_node.envelope import images
-from gcd_node.errors import ConfigError, ModelFailedError, SourceError, TooShortError
+from gcd_node.envelope import NoteTopic, images
+from gcd_node.errors import ConfigError, ModelFailedError, NodeError, SourceError, TooShortError
+from gcd_node.frame import Frame
+from gcd_node.header import OriginHeader
 from gcd_node.node import Node
+from gcd_node.publisher import Publisher
+from gcd_node.publisher_options import PublisherOptions
+from gcd_node.session import load_model
+from gcd_node.sources import open_source
 
 
 def config(
@@ -304,3 +323,155 @@ def test_status_and_meta_describe_the_run() -> None:
     assert status[-1]["model"]["ms_p50"] <= status[-1]["model"]["ms_p99"]
     assert [f["heartbeat_seq"] for f in status] == list(range(1, len(status) + 1))
     assert "SRC_ENDED" in [fields.get("code") for _, fields in box.notes]
+
+
+def test_a_single_frame_is_as_old_as_its_own_capture() -> None:
+    _, box = run(config("azimuth_deg = 26.0", model="move_time = 0"), FakeSource(14))
+    ages = [frame.header.age_ms for frame in box.of("frm")]
+    assert ages[0] - ages[-1] == pytest.approx(13 / 24 * 1000, abs=1e-3)
+    assert ages[-1] == box.of("win")[0].header.age_ms
+
+
+def test_overlapping_windows_send_a_moment_at_the_goal_once() -> None:
+    _, box = run(config("azimuth_deg = 26.0", window="stride = 4", model="move_time = 0"), FakeSource(56))
+    seqs = [frame.header.src.seq[0] for frame in box.of("frm")]
+    assert seqs == list(range(54))
+
+
+def test_nobody_claims_to_know_where_an_unsteered_camera_stands() -> None:
+    _, box = run(config(), FakeSource(14), FakeSynthesizer(traits("svd")))
+    header = box.of("win")[0].header
+    assert header.source_from_view is None
+    assert header.pose is None
+    assert set(header.frame_role) == {"in_transit"}
+    assert box.of("frm") == []
+
+
+def test_the_driving_path_is_stated_as_rigid_transforms() -> None:
+    _, box = run(config(), FakeSource(14, fps=10.0), FakeSynthesizer(traits("driving")))
+    header = box.of("win")[0].header
+    assert header.pose is None
+    assert header.pose_units == "m"
+    assert header.source_from_view is not None
+    ahead = np.array(header.source_from_view[-1]).reshape(4, 4)[:3, 3]
+    assert ahead == pytest.approx([0.0, 1.55 - 8.0, -8.0 - 1.6])  # above and behind, in the source camera's axes
+
+
+@pytest.mark.parametrize(
+    ("act", "fails", "code", "source", "model"),
+    [
+        (None, None, "SRC_ENDED", "ended", "ready"),
+        (None, SourceError("unplugged"), "SRC_LOST", "lost", "ready"),
+        (NonFiniteError("NaN"), None, "MODEL_FAILED", "closed", "failed"),
+        (DeviceMemoryError("full"), None, "MODEL_FAILED", "closed", "failed"),
+    ],
+)
+def test_the_last_status_says_how_it_ended(
+    act: Exception | None, fails: Exception | None, code: str, source: str, model: str
+) -> None:
+    def do(_: RenderOptions) -> None:
+        if act is not None:
+            raise act
+
+    camera, box = FakeSource(60), Box()
+    camera.fails = fails
+    node = Node(config(), FakeSynthesizer(traits(), do), camera, box)
+    with nullcontext() if fails is act is None else pytest.raises((SourceError, ModelFailedError)):
+        node.run()
+    events = [fields["code"] for topic, fields in box.notes if topic == "event"]
+    assert events[-1] == code
+    last = [fields for topic, fields in box.notes if topic == "status"][-1]
+    assert (last["source"]["state"], last["model"]["state"]) == (source, model)
+    assert last["level"] == (0 if code == "SRC_ENDED" else 2)
+
+
+def test_a_full_device_drops_the_window_and_says_so() -> None:
+    tries: list[int] = []
+
+    def full_at_first(_: RenderOptions) -> None:
+        tries.append(1)
+        if len(tries) <= 2:
+            raise DeviceMemoryError("out of memory")
+
+    _, box = run(config(), FakeSource(28), FakeSynthesizer(traits(), full_at_first))
+    assert [message.header.window_id for message in box.of("win")] == [1]
+    assert "GPU_OOM" in [fields.get("code") for _, fields in box.notes]
+
+
+def test_a_window_rate_above_the_sources_is_refused() -> None:
+    with pytest.raises(ConfigError, match="more than the 10"):
+        run(config(window="fps = 24.0"), FakeSource(50, fps=10.0))
+
+
+def test_a_motion_number_that_nobody_can_know_is_asked_for_before_the_first_frame() -> None:
+    unknown = replace(traits(), family=None)
+    with pytest.raises(OptionError, match="motion"):
+        Node(config(), FakeSynthesizer(unknown), FakeSource(14), Box())
+    assert Node(config(model="motion_bucket = 100.0"), FakeSynthesizer(unknown), FakeSource(14), Box())
+
+
+def test_an_orbit_waits_where_stamps_cannot_be_compared() -> None:
+    class Jumps(FakeSource):
+        def frames(self) -> Iterator[Frame]:
+            for frame in super().frames():
+                back = 3_600_000_000_000 if frame.seq >= 28 else 0
+                yield replace(frame, stamp_ns=frame.stamp_ns - back)
+
+    settings = config('kind = "orbit"\nrate_deg_s = 24.0\namplitude_deg = 60.0')
+    _, box = run(settings, Jumps(56))
+    goals = [message.header.pose[-1].az_deg for message in box.of("win") if message.header.pose]
+    assert goals == pytest.approx([0.0, 14.0, 14.0, 28.0])
+
+
+def test_an_outbox_that_fails_ends_the_run_and_every_thread() -> None:
+    class Broken(Box):
+        def note(self, topic: NoteTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
+            if len(self.notes) >= 3:
+                raise NodeError("the publisher stopped")
+            super().note(topic, header, fields)
+
+    slow = FakeSource(100_000)
+    slow.period_s = 0.001
+    before = threading.active_count()
+    with pytest.raises(NodeError, match="publisher stopped"):
+        Node(config(), FakeSynthesizer(traits(), lambda _: time.sleep(0.05)), slow, Broken()).run()
+    assert threading.active_count() == before
+
+
+def test_a_lockstep_node_that_nobody_reads_still_stops(tmp_path: Path) -> None:
+    options = PublisherOptions(
+        data=f"ipc://{tmp_path}/d", status=f"ipc://{tmp_path}/s", lockstep=True, min_subscribers=1, queue_size=2
+    )
+    with Publisher(options) as publisher:
+        node = Node(config(), FakeSynthesizer(traits()), FakeSource(10_000), publisher)
+        thread = threading.Thread(target=node.run)
+        thread.start()
+        time.sleep(1.5)
+        notes_before = publisher.stats
+        started_s = time.monotonic()
+        node.stop()
+        thread.join(10)
+        assert not thread.is_alive()
+    assert notes_before.sent == 0
+    assert time.monotonic() - started_s < 10
+
+
+def test_two_lockstep_runs_of_a_real_network_publish_identical_payloads() -> None:
+    text = """
+        [source]
+        kind = "synthetic"
+        pace = "lockstep"
+        frames = 28
+        [model]
+        weights = "random:driving"
+        steps = 1
+        [view.main]
+    """
+    parsed = parse_config(text.encode(), "test")
+    payloads: list[list[bytes]] = []
+    for _ in range(2):
+        box = Box()
+        Node(parsed, load_model(parsed.model), open_source(parsed.source), box).run()
+        payloads.append([bytes(message.payload) for message in box.of("win")])
+    assert payloads[0] == payloads[1]
+    assert len(payloads[0]) == 2

@@ -1,0 +1,45 @@
+"""NumPy files of strangers: opened without pickles, checked, every failure a SourceError."""
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcd_node.errors import SourceError
+
+_FAILURES = (OSError, ValueError, EOFError, KeyError, TypeError, MemoryError, OverflowError, zipfile.BadZipFile)
+
+
+def read_npy(path: Path, wanted: str) -> NDArray[Any]:
+    """The array of a .npy file. `wanted` says for the message what it should hold. Raises SourceError."""
+    loaded = _load(path, wanted)
+    if isinstance(loaded, np.ndarray):
+        return loaded
+    loaded.close()
+    raise SourceError(f"{path} is an archive of arrays; give {wanted}")
+
+
+def read_npz(path: Path, wanted: str) -> dict[str, NDArray[Any]]:
+    """All arrays of an .npz file by name. Raises SourceError."""
+    loaded = _load(path, wanted)
+    if isinstance(loaded, np.ndarray):
+        raise SourceError(f"{path} is a single array; give {wanted}")
+    try:
+        with loaded:
+            return {name: loaded[name] for name in loaded.files}
+    except _FAILURES as error:
+        raise _unreadable(path, wanted, error) from error
+
+
+def _load(path: Path, wanted: str) -> Any:
+    try:
+        return np.load(path, allow_pickle=False)
+    except _FAILURES as error:
+        raise _unreadable(path, wanted, error) from error
+
+
+def _unreadable(path: Path, wanted: str, error: Exception) -> SourceError:
+    reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error).split("\n")[0]
+    return SourceError(f"cannot read {path}: {reason or type(error).__name__}; give {wanted}")
