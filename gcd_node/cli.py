@@ -5,8 +5,6 @@ import sys
 from typing import Annotated, cast
 
 import typer
-from rich.console import Console
-from rich.logging import RichHandler
 
 from gcd_model import (
     Cancelled,
@@ -56,8 +54,8 @@ def setup(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log what happens, with times.")] = False,
 ) -> None:
     """Log to stderr, so that stdout stays for results."""
-    handler = RichHandler(console=Console(stderr=True), show_time=verbose, show_path=False, show_level=True)
-    logging.basicConfig(level="INFO" if verbose else "WARNING", format="%(message)s", handlers=[handler], force=True)
+    line = "%(asctime)s %(levelname)s %(name)s: %(message)s" if verbose else "%(levelname)s: %(message)s"
+    logging.basicConfig(level="INFO" if verbose else "WARNING", format=line, stream=sys.stderr, force=True)
 
 
 def main() -> None:

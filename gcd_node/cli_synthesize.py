@@ -127,7 +127,7 @@ def synthesize(
     Writes frames, a video and an input-above-view strip; with several samples also where they differ.
     """
     if save is not None and samples != 1:
-        raise UsageError("--save holds one sample; leave out --samples, or save each seed on its own")
+        raise UsageError("--save holds one sample; leave out --samples")
     clip = ClipRequest(start=start, stride=stride, fps=fps, height=height, width=width)
     wanted = ViewRequest(
         delta=_delta(azimuth_deg, elevation_deg, radius),
@@ -197,7 +197,8 @@ def _source(elevation_deg: float | None, radius: float | None) -> Spherical | No
 
 def _progress() -> Progress:
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
-    return Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True), transient=True)
+    console = Console(stderr=True)
+    return Progress(*columns, TimeElapsedColumn(), console=console, transient=True, disable=not console.is_terminal)
 
 
 class _Steps:

@@ -56,7 +56,8 @@ def convert(
     overwrite: Annotated[bool, Option("--overwrite", help="Replace OUT if it is there.")] = False,
 ) -> None:
     """Strip a checkpoint to what inference needs, with its configuration inside. OUT appears whole or not at all."""
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    errors = Console(stderr=True)
+    with Progress(console=errors, transient=True, disable=not errors.is_terminal) as progress:
         task = progress.add_task("converting", total=None)
 
         def advance(done: int, total: int) -> None:

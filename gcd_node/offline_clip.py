@@ -98,16 +98,16 @@ def _too_short(path: Path, request: ClipRequest, wanted: int, found: int) -> Too
 
 def _label(request: ClipRequest, source_fps: float | None, traits: Traits) -> float:
     """The frame rate the network is told: as asked, else the clip's own (the trained one it stands for)."""
-    if request.fps is not None:
-        return request.fps
-    if source_fps is None:
+    if request.fps is None and source_fps is None:
         return traits.fps
-    own = source_fps / request.stride
+    own = request.fps or (source_fps or 0.0) / request.stride
     near = [rate for rate in traits.rates if abs(own / rate - 1) <= _RATE_TOLERANCE]
     if not near and traits.rates:
         rates = ", ".join(f"{rate:g}" for rate in traits.rates)
         _LOG.warning("the clip runs at %g frames per second; %s was trained at %s", own, traits.name, rates)
-    return min(near, key=lambda rate: abs(own - rate)) if near else own
+    if request.fps is not None or not near:
+        return own
+    return min(near, key=lambda rate: abs(own - rate))
 
 
 def _from_array(path: Path, request: ClipRequest, traits: Traits) -> OfflineClip:
@@ -120,9 +120,8 @@ def _from_array(path: Path, request: ClipRequest, traits: Traits) -> OfflineClip
     if len(chosen) < frames:
         raise _too_short(path, request, frames, len(chosen))
     video = torch.from_numpy(np.ascontiguousarray(chosen.transpose(0, 3, 1, 2))) * 2.0 - 1.0
-    fps = traits.fps if request.fps is None else request.fps
     pictures = np.rint(chosen * 255.0).astype(np.uint8)
-    return OfflineClip(clip=Clip(video=video, fps=fps), pictures=pictures)
+    return OfflineClip(clip=Clip(video=video, fps=_label(request, None, traits)), pictures=pictures)
 
 
 def _load_array(path: Path) -> NDArray[np.float32]:
@@ -130,6 +129,6 @@ def _load_array(path: Path) -> NDArray[np.float32]:
     if array.dtype != np.float32 or array.ndim != 4 or array.shape[3] != 3:
         found = f"{array.dtype} {list(array.shape)}"
         raise SourceError(f"{path} must hold float32 [T, H, W, 3] in [0, 1], got {found}")
-    if array.size == 0 or not np.isfinite(array).all() or array.min() < 0.0 or array.max() > 1.0:
+    if array.size and not (np.isfinite(array).all() and array.min() >= 0.0 and array.max() <= 1.0):
         raise SourceError(f"{path} must hold finite numbers in [0, 1]; scale them first")
     return array

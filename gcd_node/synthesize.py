@@ -29,7 +29,7 @@ class ViewRequest:
     """The wanted camera path, in the words of the command line.
 
     delta: destination minus source; None if no angle was named. poses: a .npy file of [T, 4, 4] source-from-target.
-    trajectory: "gradual" or "direct"; move_time, if given, wins. source: where the source camera stands, if known.
+    trajectory: "gradual" or "direct", or else move_time. source: where the source camera stands, if known.
     """
 
     delta: SphericalDelta | None = None
@@ -51,7 +51,7 @@ def plan(synthesizer: ViewSynthesizer, request: ViewRequest) -> Trajectory:
     """The camera path for a request.
 
     Raises:
-        UsageError: angles and poses at once, or an unknown kind of trajectory.
+        UsageError: options that contradict each other, or an unknown kind of trajectory.
         PoseError and its kind: see Traits.plan_view and Traits.plan_poses.
     """
     traits = synthesizer.traits
@@ -59,6 +59,8 @@ def plan(synthesizer: ViewSynthesizer, request: ViewRequest) -> Trajectory:
         if request.delta is not None or request.trajectory is not None or request.move_time is not None:
             raise UsageError("--poses states the whole path; leave out the angles, --trajectory and --move-time")
         return traits.plan_poses(torch.from_numpy(read_poses(request.poses)), source=request.source)
+    if request.trajectory is not None and request.move_time is not None:
+        raise UsageError("--trajectory and --move-time say the same thing twice; give one of them")
     times = {None: None, "gradual": traits.config.frames - 1, "direct": 0}
     if request.trajectory not in times:
         raise UsageError(f"--trajectory is gradual or direct, got {request.trajectory!r}")

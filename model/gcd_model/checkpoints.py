@@ -37,7 +37,7 @@ from gcd_model.file_kind import FETCH_AGAIN, HEAD, FileKind, check_archive, file
 from gcd_model.lightning import Contents, contents
 from gcd_model.networks import Networks
 from gcd_model.own_format import Card, Entry, file_order, header, precision
-from gcd_model.restricted_pickle import RestrictedPickle
+from gcd_model.restricted_pickle import RestrictedPickle, check_storages
 from gcd_model.weights_report import WeightsReport
 
 _log = logging.getLogger(__name__)
@@ -318,13 +318,13 @@ def _read_zip(path: Path) -> Contents:
     try:
         with zipfile.ZipFile(path) as archive:
             check_archive(archive.infolist())
-    except zipfile.BadZipFile as error:
-        raise CheckpointError(f"is a truncated or damaged torch zip ({error}); {FETCH_AGAIN}") from error
-    try:
+            check_storages(archive)
         reader = cast("Any", RestrictedPickle)
         return contents(torch.load(str(path), map_location="cpu", mmap=True, weights_only=False, pickle_module=reader))
     except CheckpointError:
         raise
+    except zipfile.BadZipFile as error:
+        raise CheckpointError(f"is a truncated or damaged torch zip ({error}); {FETCH_AGAIN}") from error
     except Exception as error:  # a damaged or hostile pickle can raise anything at all
         raise CheckpointError(f"cannot be unpickled ({type(error).__name__}: {error}); {FETCH_AGAIN}") from error
 

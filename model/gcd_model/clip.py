@@ -78,6 +78,10 @@ class Augmentation:
     seed: int = 0
     noise: Tensor | None = None
 
+    def __post_init__(self) -> None:
+        if not 0 <= self.strength < math.inf:
+            raise OptionError(f"the augmentation strength must be 0 or more, got {self.strength}")
+
 
 class CancelSignal(Protocol):
     """Whatever can be asked to stop: a threading.Event."""
@@ -110,3 +114,6 @@ class RenderOptions:
     def __post_init__(self) -> None:
         if self.samples < 1 or (self.steps is not None and self.steps < 1):
             raise OptionError(f"samples and steps must be at least 1, got {self.samples} and {self.steps}")
+        numbers = (*(self.guidance or ()), 0.0 if self.motion_bucket is None else self.motion_bucket)
+        if not all(map(math.isfinite, numbers)):
+            raise OptionError(f"guidance and motion bucket must be finite, got {self.guidance}, {self.motion_bucket}")

@@ -5,11 +5,15 @@ rebuilding is real; every other name becomes an inert placeholder, which takes w
 keeps none of it. So foreign classes (a trainer's callbacks, an option container) do not stop us, and nothing runs.
 """
 
+import io
 import pickle
+import zipfile
 from collections import OrderedDict
 from collections.abc import Callable
 
 import torch
+
+from gcd_model.errors import CheckpointError
 
 
 class Placeholder:
@@ -104,6 +108,57 @@ class RestrictedPickle:
     """What `torch.load` takes as its pickle module."""
 
     Unpickler = RestrictedUnpickler
+
+
+class _Census(pickle.Unpickler):
+    """Reads a pickle for nothing but the storages it refers to; every name is a placeholder."""
+
+    def __init__(self, pickled: bytes) -> None:
+        super().__init__(io.BytesIO(pickled))
+        self.claims: dict[str, int] = {}
+
+    def find_class(self, module_name: str, global_name: str, /) -> object:
+        """A placeholder."""
+        return _placeholder_class(global_name)
+
+    def persistent_load(self, pid: object) -> object:
+        """Takes down a storage: kind, class, key, place, number of elements."""
+        if isinstance(pid, tuple) and len(pid) == 5 and isinstance(pid[4], int):
+            width = _STORAGE_BYTES.get(getattr(pid[1], "origin", ""), 1)
+            self.claims[str(pid[2])] = max(self.claims.get(str(pid[2]), 0), width * pid[4])
+        return Placeholder()
+
+
+def claimed_storages(pickled: bytes) -> dict[str, int]:
+    """Bytes a checkpoint's pickle says its storages have, by key. Raises whatever a damaged pickle raises."""
+    census = _Census(pickled)
+    census.load()
+    return census.claims
+
+
+def check_storages(archive: zipfile.ZipFile) -> None:
+    """Whether every record of an open torch zip holds what its pickle claims: a short one would be read past its end.
+
+    Raises:
+        CheckpointError: a record is missing or too short.
+    """
+    entries = {entry.filename: entry.file_size for entry in archive.infolist()}
+    pickled = next(name for name in entries if name.endswith("/data.pkl"))
+    for key, claimed in claimed_storages(archive.read(pickled)).items():
+        there = entries.get(f"{pickled.removesuffix('data.pkl')}data/{key}", 0)
+        if there < claimed:
+            raise CheckpointError(
+                f"tensor record {key} should hold {claimed} bytes and holds {there}: damaged, refused"
+            )
+
+
+_STORAGE_BYTES = {
+    **dict.fromkeys(("DoubleStorage", "LongStorage", "ComplexFloatStorage"), 8),
+    **dict.fromkeys(("FloatStorage", "IntStorage"), 4),
+    **dict.fromkeys(("HalfStorage", "BFloat16Storage", "ShortStorage"), 2),
+    "ComplexDoubleStorage": 16,
+}
+"""Bytes per element of torch's typed storages; 1 for all others."""
 
 
 def _placeholder_class(origin: str) -> type[Placeholder]:

@@ -222,3 +222,14 @@ def test_an_image_tower_with_another_activation_is_refused(tmp_path: Path) -> No
     folder = write_diffusers(tmp_path / "model")
     (folder / "image_encoder" / "config.json").write_text('{"hidden_act": "quick_gelu"}')
     assert "activation 'quick_gelu'" in refused(folder)
+
+
+def test_a_record_shorter_than_its_tensor_is_refused_rather_than_read_past_its_end(tmp_path: Path) -> None:
+    whole, short = write_gcd(tmp_path), tmp_path / "short.ckpt"
+    with zipfile.ZipFile(whole) as source, zipfile.ZipFile(short, "w") as target:
+        records = [entry for entry in source.infolist() if "/data/" in entry.filename]
+        largest = max(records, key=lambda entry: entry.file_size).filename
+        for entry in source.infolist():
+            content = source.read(entry)
+            target.writestr(entry.filename, content[: len(content) // 2] if entry.filename == largest else content)
+    assert "should hold" in refused(short)

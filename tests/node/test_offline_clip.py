@@ -101,6 +101,7 @@ def test_an_array_is_taken_as_it_is(tmp_path: Path) -> None:
         (np.full((14, 64, 96, 3), np.nan, np.float32), SourceError, "finite"),
         (np.zeros((14, 65, 96, 3), np.float32), OptionError, "multiples of"),
         (np.zeros((13, 64, 96, 3), np.float32), TooShortError, "n=13"),
+        (np.zeros((0, 64, 96, 3), np.float32), TooShortError, "n=0"),
         (np.array([{"a": 1}]), SourceError, "cannot read"),
     ],
 )
