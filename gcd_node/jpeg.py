@@ -1,15 +1,13 @@
 """Frames as JPEG, one after another with a table of offsets (wire protocol, section 4). Images are u8 RGB."""
 
-import struct
+import io
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gcd_node.errors import MessageError
-
-_FRAME_HEADERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-"""Markers that state height and width (JPEG standard, table B.1)."""
+from gcd_node.picture_header import parse_header
 
 _COLOUR = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
@@ -53,11 +51,5 @@ def _decode(coded: bytes, index: int, size: tuple[int, int]) -> NDArray[np.uint8
 
 def _stated_size(coded: bytes) -> tuple[int, int] | None:
     """Height and width by the frame header, None if there is none."""
-    position = 2 if coded[:2] == b"\xff\xd8" else len(coded)
-    while position + 9 <= len(coded) and coded[position] == 0xFF:
-        marker, length = struct.unpack_from(">BH", coded, position + 1)
-        if marker in _FRAME_HEADERS:
-            height, width = struct.unpack_from(">HH", coded, position + 5)
-            return height, width
-        position += 2 + length
-    return None
+    header = parse_header(io.BytesIO(coded))
+    return None if header is None or header.kind != "jpeg" else (header.height, header.width)

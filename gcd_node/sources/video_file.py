@@ -13,9 +13,9 @@ from cv2.utils import logging as cv2_logging
 
 from gcd_node.errors import SourceError
 from gcd_node.frame import MAX_FPS, Frame, Image, SourceInfo
+from gcd_node.picture_header import MAX_PIXELS
 from gcd_node.sources.container import check_video
 from gcd_node.sources.pace import Pace, Pacer
-from gcd_node.sources.picture_header import MAX_PIXELS
 
 _LOG = logging.getLogger(__name__)
 _LOWEST_FPS = 0.1

@@ -37,7 +37,7 @@ def load_synthesizer(
             whose views are noise.
         family: see `load_weights`. device: "auto" (CUDA where there is one), "cpu", "cuda" or "cuda:N".
         dtype: "float32", "bfloat16" or "float16"; else float32 on the CPU, bfloat16 on CUDA. The VAE decoder
-            computes in float32 always.
+            stays float32 (on CUDA torch may use TF32 in its convolutions, see torch.backends.cudnn).
         head_width, image_heads, frames: see `load_weights`.
     Raises:
         CheckpointError: see `load_weights`. OptionError: an option is unknown or contradicts the checkpoint.

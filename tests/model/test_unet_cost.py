@@ -156,7 +156,7 @@ def test_what_the_weights_determine_is_not_derived_again_in_a_prepared_network(
     assert synthesizer.render(synthesizer.encode(random_clip()), [path])[0].samples.isfinite().all()
 
 
-def test_a_step_never_waits_for_the_device_or_builds_anything_on_the_host() -> None:
+def test_a_network_evaluation_never_waits_for_the_device_or_builds_anything_on_the_host() -> None:
     """On the meta device there are no values to wait for: reading one, or mixing in a host tensor, would raise."""
     with torch.device("meta"):
         unet = VideoUNet(UNET, 3)

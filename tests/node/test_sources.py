@@ -20,6 +20,7 @@ from media import HEIGHT, WIDTH, flat, ramp, write_pictures, write_video
 from gcd_node.config import SourceConfig
 from gcd_node.errors import SourceError
 from gcd_node.frame import Frame, FrameSource
+from gcd_node.picture_header import read_header
 from gcd_node.sources import (
     ImageFolder,
     SyntheticDrive,
@@ -32,7 +33,6 @@ from gcd_node.sources import (
     write_drive,
 )
 from gcd_node.sources.container import looks_like_video
-from gcd_node.sources.picture_header import read_header
 from gcd_node.sources.street import Street
 from gcd_node.sources.video_file import StampTrack
 

@@ -26,12 +26,17 @@ class PictureHeader:
 def read_header(path: Path) -> PictureHeader | None:
     """What a picture's header states; None if it is damaged or of another kind. Raises OSError."""
     with path.open("rb") as file:
-        head = file.read(32)
-        file.seek(0)
-        try:
-            return _parse(head, file)
-        except (struct.error, IndexError):  # ends within its header
-            return None
+        return parse_header(file)
+
+
+def parse_header(file: BinaryIO) -> PictureHeader | None:
+    """The same of an open file, from its beginning."""
+    head = file.read(32)
+    file.seek(0)
+    try:
+        return _parse(head, file)
+    except (struct.error, IndexError):  # ends within its header
+        return None
 
 
 def _parse(head: bytes, file: BinaryIO) -> PictureHeader | None:
