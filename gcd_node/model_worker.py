@@ -96,6 +96,7 @@ class ModelWorker:
         self.counts = WorkCounts()
         self._run, self._synthesizer, self._views, self._outbox = run, synthesizer, views, outbox
         self._on_window = on_window
+        self.warm = threading.Event()  # the first window may come
         self._pacer = FramePacer(outbox.send)
         self._newest_goal_ns: dict[str, int] = {}
         self._cancel = threading.Event()
@@ -115,11 +116,13 @@ class ModelWorker:
         try:
             if self._run.config.source.pace == "realtime":
                 self._warm_up()
+            self.warm.set()
             while (window := newest.take()) is not None:
                 self._render_or_count(window)
         except Cancelled:
             _LOG.info("the window in work was abandoned")
         finally:
+            self.warm.set()
             self._pacer.finish(abandon=self._cancel.is_set())
 
     def _warm_up(self) -> None:

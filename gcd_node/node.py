@@ -140,14 +140,16 @@ class Node:
         self._note("status", self._status("activating", "connecting"))
         reader = threading.Thread(target=read, args=(self._source, self._builder, self._newest), name="reader")
         model = threading.Thread(target=self._work, name="model")
-        reader.start()
         model.start()
         try:
+            self._worker.warm.wait()
+            reader.start()
             self._watch(model)
         finally:
             self._close()
             model.join()
-            reader.join()
+            if reader.ident is not None:
+                reader.join()
         self._announce_end()
         if self._failure is not None:
             raise self._failure

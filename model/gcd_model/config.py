@@ -186,6 +186,6 @@ SMALL = ModelConfig(
     image_encoder=ImageEncoderConfig(
         image_size=56, patch=14, width=64, layers=2, heads=2, hidden_width=128, output_width=64
     ),
-    sampling=SamplingConfig(steps=4),
+    sampling=SamplingConfig(steps=2),
 )
 """The same model at widths a CPU runs in a second: for the demo until trained weights ship, and for tests."""
