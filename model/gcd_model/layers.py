@@ -233,7 +233,9 @@ class Upsample(Derived[Tensor]):
 
     def derive(self) -> Tensor:
         """Kernels by output phase: [2, 2, C, C, 2, 2]."""
-        return phase_kernels(self.conv.weight.float()).to(self.conv.weight.dtype)  # sums of taps in full precision
+        weight = self.conv.weight
+        precise = torch.promote_types(weight.dtype, torch.float32)  # taps are added up before they are rounded
+        return phase_kernels(weight.to(precise)).to(weight.dtype)
 
     def forward(self, x: Tensor) -> Tensor:
         """x: [N, C, H, W] -> [N, C, 2H, 2W]."""
