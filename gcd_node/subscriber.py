@@ -1,6 +1,6 @@
 """Receives views, for planners: checked, read-only, newest first.
 
-    with ViewSubscriber("ipc", "topdown", max_age_ms=2000) as views:
+    with ViewSubscriber("ipc", "topdown", max_age_ms=10_000) as views:
         for view in views:
             plan(view.images, view.header)
 
