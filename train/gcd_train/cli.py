@@ -3,6 +3,7 @@
 from typing import Annotated
 
 import typer
+from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
@@ -28,9 +29,9 @@ def families(
     """List the model families: how each was trained, and what a finetuned checkpoint will accept."""
     if name is not None and name not in FAMILIES:
         raise typer.BadParameter(f"no family is called {name!r}; there are {', '.join(FAMILIES)}")
-    table = Table(title="Model families")
-    for column in ("family", "camera", "azimuth", "elevation", "radius", "rates", "hfov", "size", "output"):
-        table.add_column(column)
+    table = Table(title="Model families", box=SIMPLE, pad_edge=False)
+    for column in ("family", "camera", "az / el / r", "rates", "hfov", "size", "output"):
+        table.add_column(column, no_wrap=column != "rates")
     for family in FAMILIES.values():
         if name in (None, family.name):
             table.add_row(*_family_row(family))
@@ -50,12 +51,12 @@ def architectures() -> None:
 
 def _family_row(family: Family) -> tuple[str, ...]:
     limits = family.limits
-    span = ("fixed", "fixed", "fixed")
+    span = "fixed"
     if limits is not None:
-        span = (f"±{limits.azimuth_deg:g}°", f"±{limits.elevation_deg:g}°", f"±{limits.radius_m:g}")
+        span = f"±{limits.azimuth_deg:g}° ±{limits.elevation_deg:g}° ±{limits.radius_m:g}"
     rates = ", ".join(f"{rate:g}" for rate in family.rates) or "any"
     hfov = "any" if family.hfov_deg is None else f"{family.hfov_deg:g}°"
-    return family.name, family.camera, *span, rates, hfov, f"{family.width}x{family.height}", family.output
+    return family.name, family.camera, span, rates, hfov, f"{family.width}x{family.height}", family.output
 
 
 def _config_row(config: ModelConfig) -> tuple[str, ...]:
