@@ -1,13 +1,14 @@
-"""NumPy files of strangers: opened without pickles, checked, every failure a SourceError."""
+"""NumPy files: those of strangers are opened without pickles and checked, ours appear whole or not at all."""
 
 import zipfile
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_node.errors import SourceError
+from gcd_node.errors import OutputError, SourceError
 
 _FAILURES = (OSError, ValueError, EOFError, KeyError, TypeError, MemoryError, OverflowError, zipfile.BadZipFile)
 
@@ -31,6 +32,27 @@ def read_npz(path: Path, wanted: str) -> dict[str, NDArray[Any]]:
             return {name: loaded[name] for name in loaded.files}
     except _FAILURES as error:
         raise _unreadable(path, wanted, error) from error
+
+
+def write_npy(path: Path, array: NDArray[Any]) -> None:
+    """Write one array. Raises OutputError."""
+    _write(path, lambda file: np.save(file, array, allow_pickle=False))
+
+
+def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays by name. Raises OutputError."""
+    _write(path, lambda file: np.savez(file, allow_pickle=False, **arrays))
+
+
+def _write(path: Path, save: Callable[[BinaryIO], None]) -> None:
+    part = path.with_name(path.name + ".part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with part.open("wb") as file:
+            save(file)
+        part.replace(path)
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}; name another file or folder") from error
 
 
 def _load(path: Path, wanted: str) -> Any:

@@ -8,18 +8,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from typer import Argument, Option
 
-from gcd_model import (
-    ASSUMED_SOURCE,
-    Augmentation,
-    RenderOptions,
-    Spherical,
-    SphericalDelta,
-    ViewSynthesizer,
-    load_synthesizer,
-)
+from gcd_model import Augmentation, RenderOptions, SphericalDelta, ViewSynthesizer, load_synthesizer
 from gcd_node.cli_weights import FamilyOption, HeadWidth, ImageHeads
+from gcd_node.config import SourcePose
 from gcd_node.errors import UsageError
 from gcd_node.offline_clip import ClipRequest, read_clip
+from gcd_node.source_pose import require_usable, stated_mount
 from gcd_node.synthesize import (
     InjectedNoise,
     ViewRequest,
@@ -30,8 +24,10 @@ from gcd_node.synthesize import (
     save_arrays,
     write_view,
 )
+from gcd_node.view_message import ontology
 
 _VIEW, _CLIP, _SAMPLING, _MODEL = "The view", "The clip", "Sampling", "The model"
+_MOUNT = "The camera's mount; what is left out is as the model was trained"
 
 Input: TypeAlias = Annotated[
     Path,
@@ -59,6 +55,20 @@ SourceElevation: TypeAlias = Annotated[
 SourceRadius: TypeAlias = Annotated[
     float | None, Option(help="Its distance to the scene's centre. Else 15.", rich_help_panel=_VIEW)
 ]
+MountHeight: TypeAlias = Annotated[
+    float | None,
+    Option(help="Camera above the ground, metres, for models that use its mount.", rich_help_panel=_MOUNT),
+]
+MountForward: TypeAlias = Annotated[
+    float | None, Option(help="Camera ahead of the vehicle's origin, metres.", rich_help_panel=_MOUNT)
+]
+MountLeft: TypeAlias = Annotated[float | None, Option(help="And to its left, metres.", rich_help_panel=_MOUNT)]
+MountTilt: TypeAlias = Annotated[
+    float | None, Option(help="How far the camera looks down, degrees.", rich_help_panel=_MOUNT)
+]
+FieldOfView: TypeAlias = Annotated[
+    float | None, Option(help="Horizontal field of view of the input, degrees.", rich_help_panel=_MOUNT)
+]
 Start: TypeAlias = Annotated[int, Option(help="First frame of the input.", rich_help_panel=_CLIP)]
 Stride: TypeAlias = Annotated[int, Option(help="Take every so-many-th frame.", rich_help_panel=_CLIP)]
 Fps: TypeAlias = Annotated[
@@ -79,7 +89,8 @@ MotionBucket: TypeAlias = Annotated[
     float | None, Option(help="The motion number; else by the formula.", rich_help_panel=_SAMPLING)
 ]
 CondAug: TypeAlias = Annotated[
-    float, Option(help="Strength of the noise on the conditioning frames.", rich_help_panel=_SAMPLING)
+    float | None,
+    Option(help="Strength of the noise on the conditioning frames; else the model's.", rich_help_panel=_SAMPLING),
 ]
 Noise: TypeAlias = Annotated[
     Path | None, Option(help=".npz with `initial` and `augmentation` instead of draws.", rich_help_panel=_SAMPLING)
@@ -103,6 +114,11 @@ def synthesize(
     move_time: MoveTime = None,
     source_elevation_deg: SourceElevation = None,
     source_radius: SourceRadius = None,
+    mount_height: MountHeight = None,
+    mount_forward: MountForward = None,
+    mount_left: MountLeft = None,
+    mount_tilt: MountTilt = None,
+    hfov_deg: FieldOfView = None,
     start: Start = 0,
     stride: Stride = 1,
     fps: Fps = None,
@@ -113,7 +129,7 @@ def synthesize(
     seed: Seed = 0,
     samples: Samples = 1,
     motion_bucket: MotionBucket = None,
-    cond_aug: CondAug = 0.02,
+    cond_aug: CondAug = None,
     noise: Noise = None,
     save: Save = None,
     family: FamilyOption = None,
@@ -124,33 +140,29 @@ def synthesize(
 ) -> None:
     """See one clip from another camera, offline.
 
-    Writes frames, a video and an input-above-view strip; with several samples also where they differ.
+    Writes frames, a video, an input-above-view strip and, if the model makes one, the class map; with several samples
+    also where they differ.
     """
-    if save is not None and samples != 1:
-        raise UsageError("--save holds one sample; leave out --samples")
-    clip = ClipRequest(start=start, stride=stride, fps=fps, height=height, width=width)
-    wanted = ViewRequest(
-        delta=_delta(azimuth_deg, elevation_deg, radius),
-        poses=poses,
-        trajectory=trajectory,
-        move_time=move_time,
-        source=_source(source_elevation_deg, source_radius),
-    )
+    clip = ClipRequest(start=start, stride=stride, fps=fps, height=height, width=width, hfov_deg=hfov_deg)
+    source = _pose((source_elevation_deg, source_radius), (mount_height, mount_forward, mount_left, mount_tilt))
+    delta = _delta(azimuth_deg, elevation_deg, radius)
+    wanted = ViewRequest(delta=delta, poses=poses, trajectory=trajectory, move_time=move_time, source=source)
     injected = InjectedNoise() if noise is None else read_noise(noise)
-    options = RenderOptions(
-        steps=steps,
-        guidance=guidance,
-        samples=samples,
-        seed=seed,
-        initial_noise=injected.initial,
-        motion_bucket=motion_bucket,
-    )
-    require_input(input_path)
+    options = RenderOptions(steps=steps, guidance=guidance, samples=samples, seed=seed, motion_bucket=motion_bucket)
+    options = replace(options, initial_noise=injected.initial)
+    _require_possible(input_path, save, samples)
     heads = {"head_width": head_width, "image_heads": image_heads}
     with Console(stderr=True).status(f"loading {weights}"):
         model = load_synthesizer(weights, family=family, device=device, dtype=dtype, **heads)
     augmentation = Augmentation(strength=cond_aug, seed=seed, noise=injected.augmentation)
     _run(_Order(model, input_path, clip, wanted, options, augmentation), out, save)
+
+
+def _require_possible(input_path: Path, save: Path | None, samples: int) -> None:
+    """What is cheaper to know before the weights are loaded."""
+    if save is not None and samples != 1:
+        raise UsageError("--save holds one sample; leave out --samples")
+    require_input(input_path)
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,15 +176,21 @@ class _Order:
 
 
 def _run(order: _Order, out: Path, save: Path | None) -> None:
-    path = plan(order.model, order.view)
-    source = read_clip(order.input_path, order.clip, order.model.traits)
+    traits = order.model.traits
+    require_usable(order.view.source, traits)
+    if order.clip.hfov_deg is not None and traits.mount is None:
+        raise UsageError(f"{traits.name} has no use for --hfov-deg; leave it out")
+    source = read_clip(order.input_path, order.clip, traits)
+    mount = stated_mount(order.view.source, source.hfov_deg, traits)
+    source = replace(source, clip=replace(source.clip, mount=mount))
+    path = plan(order.model, order.view, mount)
     with _progress() as progress:
         options = replace(order.options, progress=_Steps(progress))
         view = render(order.model, source, path, options, order.augmentation)
     console = Console()
-    if not order.model.traits.trained:
-        console.print(f"{order.model.traits.name}: these weights are random, so the picture is noise.")
-    for written in write_view(out, source, view, source.clip.fps):
+    if not traits.trained:
+        console.print(f"{traits.name}: these weights are random, so the picture is noise.")
+    for written in write_view(out, source, view, ontology(traits)):
         console.print(f"wrote {written}", soft_wrap=True)
     if save is not None:
         save_arrays(save, view)
@@ -185,14 +203,22 @@ def _delta(azimuth_deg: float | None, elevation_deg: float | None, radius: float
     return SphericalDelta(azimuth_deg=azimuth_deg or 0.0, elevation_deg=elevation_deg or 0.0, radius_m=radius or 0.0)
 
 
-def _source(elevation_deg: float | None, radius: float | None) -> Spherical | None:
-    if elevation_deg is None and radius is None:
+def _pose(sphere: tuple[float | None, ...], mount: tuple[float | None, ...]) -> SourcePose | None:
+    if all(number is None for number in (*sphere, *mount)):
         return None
-    return replace(
-        ASSUMED_SOURCE,
-        elevation_deg=ASSUMED_SOURCE.elevation_deg if elevation_deg is None else elevation_deg,
-        radius_m=ASSUMED_SOURCE.radius_m if radius is None else radius,
-    )
+    elevation_deg, radius = sphere
+    height_m, forward_m, left_m, tilt_deg = mount
+    try:
+        return SourcePose(
+            elevation_deg=elevation_deg,
+            radius=radius,
+            height_m=height_m,
+            forward_m=forward_m,
+            left_m=left_m,
+            tilt_deg=tilt_deg,
+        )
+    except ValueError as error:
+        raise UsageError(str(error)) from error
 
 
 def _progress() -> Progress:

@@ -17,13 +17,37 @@ ViewId: TypeAlias = Annotated[str, Meta(pattern="^[a-z0-9_]{1,16}$")]
 
 
 class SourcePose(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where the source camera stands. Views are differences, so this is needed for rigid transforms only.
+    """Where the source camera stands: on a sphere around the scene, or on its vehicle; not both.
 
-    elevation_deg: above the ground plane. radius: distance to the scene's centre, metres or scene units.
+    elevation_deg, radius: for models steered by angles: above the ground plane (left out, 5), and distance to the
+        scene's centre, metres or scene units (left out, 15). Views are differences, so rigid transforms alone need it.
+    height_m, forward_m, left_m, tilt_deg: for models that warp by known planes: above the ground, ahead and to the
+        left of the vehicle's origin, and how far the camera looks down. What is left out is as the model was trained.
     """
 
-    elevation_deg: Annotated[float, Meta(gt=-90, lt=90)] = 5.0
-    radius: Positive = 15.0
+    elevation_deg: Annotated[float, Meta(gt=-90, lt=90)] | None = None
+    radius: Positive | None = None
+    height_m: Annotated[float, Meta(gt=0, le=100)] | None = None
+    forward_m: Annotated[float, Meta(ge=-100, le=100)] | None = None
+    left_m: Annotated[float, Meta(ge=-100, le=100)] | None = None
+    tilt_deg: Annotated[float, Meta(gt=-90, lt=90)] | None = None
+
+    def __post_init__(self) -> None:
+        if self.on_sphere and self.on_vehicle:
+            raise ValueError(
+                "a camera stands on a sphere (elevation, radius) or on its vehicle (height, forward, left, tilt): "
+                "state one of the two"
+            )
+
+    @property
+    def on_sphere(self) -> bool:
+        """Whether elevation or radius is stated."""
+        return (self.elevation_deg, self.radius) != (None, None)
+
+    @property
+    def on_vehicle(self) -> bool:
+        """Whether anything of the mount is stated."""
+        return (self.height_m, self.forward_m, self.left_m, self.tilt_deg) != (None,) * 4
 
 
 class SourceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -32,7 +56,8 @@ class SourceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     path: a video file or a folder of images; `package:drive.mp4` is the clip that ships. Not for `synthetic`.
     pace: "realtime" plays at the recorded speed; "lockstep" waits for the model and skips nothing.
     fps: of an image folder, which cannot say; otherwise leave it out.
-    hfov_deg: horizontal field of view of the source picture, if known; published as intrinsics.
+    hfov_deg: horizontal field of view of the source picture, if known; published as intrinsics, and part of the
+        mount for models that warp by known planes.
     resize: "released" is the bilinear resize the checkpoints were trained with, "area" averages (less aliasing).
     frames: stop a synthetic source after this many.
     """
@@ -75,6 +100,7 @@ class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     weights: a checkpoint, a diffusers folder, `package:NAME`, or `random:FAMILY` (noise, for trying the plumbing).
     threads: CPU threads for the model; leave the rest of the robot its cores.
     guidance: scale of the first and of the last frame.
+    cond_aug: strength of the noise on the conditioning frames.
     """
 
     weights: str
@@ -88,7 +114,7 @@ class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     seed: int = 0
     motion_bucket: float | None = None
     move_time: Annotated[int, Meta(ge=0)] | None = None
-    cond_aug: Annotated[float, Meta(ge=0)] = 0.02
+    cond_aug: Annotated[float, Meta(ge=0)] | None = None
     head_width: Count | None = None
     image_heads: Count | None = None
 

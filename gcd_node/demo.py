@@ -4,42 +4,58 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 
+from gcd_node.comparison import Moment, comparison
 from gcd_node.config import ModelSection, NodeConfig, PublishConfig, SourceConfig, ViewConfig
 from gcd_node.errors import NodeError
 from gcd_node.frame import Image
+from gcd_node.header import ClassRecord
 from gcd_node.model_worker import WindowReport
 from gcd_node.node import Summary
-from gcd_node.pictures import make_folder, side_by_side, spread, strip, write_png, write_video
+from gcd_node.pictures import make_folder, spread, write_png, write_video
 from gcd_node.publisher import Publisher
 from gcd_node.session import open_session, run_until_signal
 from gcd_node.sources import read_picture
+from gcd_node.view_message import ontology
 
 VIEW_ID = "topdown"
+HEADINGS = ("input: the packaged drive", "generated view from above", "generated class map")
+"""Columns of the demo's pictures."""
+
+_TRAINED = "driving-small"
 _RECEIVER_TIMEOUT_S = 60.0
-_STRIP_FRAMES = 7
+_ROWS = 4
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class DemoReport:
-    """How the demo went. received: windows that arrived in the other process. noise: the weights are random."""
+    """How the demo went. model: its name. received: windows that arrived in the other process. noise: the weights are
+    random. columns: what the pictures show, from left to right. files: the pictures."""
 
     summary: Summary
+    model: str
     received: int
     noise: bool
-    video: Path
-    strip: Path
+    columns: tuple[str, ...]
+    files: tuple[Path, ...]
+
+
+def demo_weights() -> str:
+    """The trained weights that ship with the package; where they are missing, random ones whose picture is noise."""
+    shipped = files("gcd_model").joinpath("weights", f"{_TRAINED}.safetensors")
+    return f"package:{_TRAINED}" if shipped.is_file() else "random:driving"
 
 
 def demo_config(folder: Path) -> NodeConfig:
     """The demo's launch file, with sockets in a folder of its own so that it never meets a running node."""
     return NodeConfig(
         source=SourceConfig(kind="file", path="package:drive.mp4", pace="realtime", hfov_deg=85.0),
-        model=ModelSection(weights="random:driving"),
+        model=ModelSection(weights=demo_weights()),
         view={VIEW_ID: ViewConfig(kind="fixed")},
         publish=PublishConfig(data=f"ipc://{folder}/data", status=f"ipc://{folder}/status"),
         node_id="demo",
@@ -47,7 +63,7 @@ def demo_config(folder: Path) -> NodeConfig:
 
 
 def run_demo(out: Path, on_window: Callable[[WindowReport], None]) -> DemoReport:
-    """Run it all; writes side_by_side.mp4 and strip.png into `out`.
+    """Run it all; writes side_by_side.mp4 and side_by_side.png into `out`.
 
     Raises:
         NodeError: the second process did not come up, or nothing arrived in it.
@@ -63,20 +79,27 @@ def run_demo(out: Path, on_window: Callable[[WindowReport], None]) -> DemoReport
         folder = Path(name)
         config = demo_config(folder)
         with open_session(config, remember) as (node, publisher), _receiver(publisher, folder / "received") as receiver:
-            noise = not node.traits.trained
-            summary = run_until_signal(node, publisher)
+            traits, summary = node.traits, run_until_signal(node, publisher)
             publisher.close()
             receiver.wait(_RECEIVER_TIMEOUT_S)
-        arrived = _arrived(folder / "received" / VIEW_ID)
-    video, still = _write_pictures(out, inputs, arrived, summary.fps)
-    return DemoReport(summary=summary, received=len(arrived), noise=noise, video=video, strip=still)
+        views, maps = (_arrived(folder / "received" / VIEW_ID / kind) for kind in (".", "cls"))
+    shown = moments(inputs, views, maps)
+    return DemoReport(
+        summary=summary,
+        model=traits.name,
+        received=len(views),
+        noise=not traits.trained,
+        columns=HEADINGS[: len(shown[0][0].columns)],
+        files=tuple(_write_pictures(out, shown, ontology(traits), summary.fps)),
+    )
 
 
 @contextmanager
 def _receiver(publisher: Publisher, folder: Path) -> Generator[subprocess.Popen[bytes]]:
     """`gcd-node view` in a process of its own, subscribed before this returns."""
-    command = [sys.executable, "-m", "gcd_node", "view", publisher.endpoint, "--view", VIEW_ID, "--save", str(folder)]
-    process = subprocess.Popen([*command, "--timeout", str(_RECEIVER_TIMEOUT_S)], stdout=subprocess.DEVNULL)  # noqa: S603
+    command = [sys.executable, "-m", "gcd_node", "view", publisher.endpoint, "--view", VIEW_ID, "--kind", "all"]
+    command += ["--save", str(folder), "--timeout", str(_RECEIVER_TIMEOUT_S)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)  # noqa: S603
     try:
         deadline = time.monotonic() + _RECEIVER_TIMEOUT_S
         while publisher.stats.subscribers == 0:
@@ -90,23 +113,40 @@ def _receiver(publisher: Publisher, folder: Path) -> Generator[subprocess.Popen[
 
 
 def _arrived(folder: Path) -> dict[int, list[Image]]:
-    """Frames by window, from the pictures the receiver saved as WINDOW_FRAME.png."""
+    """Frames by window, from the pictures the receiver saved as WINDOW_FRAME.png; empty if it saved none."""
     windows: dict[int, list[Image]] = {}
     for path in sorted(folder.glob("*_*.png")):
         windows.setdefault(int(path.stem.split("_")[0]), []).append(read_picture(path))
-    if not windows:
-        raise NodeError("no window arrived in the receiving process; run `gcd-node -v demo` to see why")
     return windows
 
 
-def _write_pictures(
-    out: Path, inputs: dict[int, Image], arrived: dict[int, list[Image]], fps: float
-) -> tuple[Path, Path]:
-    """The video of all windows, and a strip of the last one."""
-    video, still = out / "side_by_side.mp4", out / "strip.png"
-    pairs = [pair for window in sorted(arrived) for pair in zip(inputs[window], arrived[window], strict=True)]
-    write_video(video, [side_by_side(source, view) for source, view in pairs], fps)
-    last = pairs[-len(inputs[max(arrived)]) :]
-    chosen = [last[i] for i in spread(len(last), _STRIP_FRAMES)]
-    write_png(still, strip([[source for source, _ in chosen], [view for _, view in chosen]]))
-    return video, still
+def moments(
+    inputs: Mapping[int, Iterable[Image]], views: Mapping[int, Sequence[Image]], maps: Mapping[int, Sequence[Image]]
+) -> list[list[Moment]]:
+    """Frames by window put together, in the order of the windows; if some have a class map, those without are left out.
+
+    Raises:
+        NodeError: there is nothing to put together.
+    """
+    windows = sorted(views.keys() & maps.keys() if maps else views.keys())
+    if not windows:
+        raise NodeError("no whole window arrived in the receiving process; run `gcd-node -v demo` to see why")
+    return [
+        [
+            Moment(source=source, view=view, classes=painted)
+            for source, view, painted in zip(
+                inputs[window], views[window], maps.get(window) or [None] * len(views[window]), strict=True
+            )
+        ]
+        for window in windows
+    ]
+
+
+def _write_pictures(out: Path, shown: list[list[Moment]], classes: Sequence[ClassRecord], fps: float) -> list[Path]:
+    """The video of all windows, and a picture of a few moments of the last one."""
+    video, still = out / "side_by_side.mp4", out / "side_by_side.png"
+    headings = HEADINGS[: len(shown[0][0].columns)]
+    write_video(video, [comparison([moment], classes, headings) for window in shown for moment in window], fps)
+    last = shown[-1]
+    write_png(still, comparison([last[i] for i in spread(len(last), _ROWS)], classes, headings))
+    return [video, still]

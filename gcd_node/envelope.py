@@ -17,6 +17,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from gcd_node.class_colours import paint
 from gcd_node.errors import ConfigError, MessageError
 from gcd_node.header import EndHeader, OriginHeader, ViewHeader, check_version
 from gcd_node.record_json import dump, from_json, parse, to_json
@@ -31,12 +32,12 @@ MAX_PAYLOAD = 64 * 1024 * 1024
 WELCOME = bytes(PREFIX.size)
 """What a publisher sends to each new subscriber; not a message."""
 
-ViewKind: TypeAlias = Literal["win", "frm", "std"]
+ViewKind: TypeAlias = Literal["win", "frm", "std", "cls"]
 NoteTopic: TypeAlias = Literal["status", "event", "meta"]
 Buffer: TypeAlias = bytes | memoryview
 
 _VIEW_ID = re.compile(r"[a-z0-9_]{1,16}")
-_VIEW_TOPIC = re.compile(r"view/([a-z0-9_]{1,16})/(?:win|frm|std)|(src)/frm")
+_VIEW_TOPIC = re.compile(r"view/([a-z0-9_]{1,16})/(?:win|frm|std|cls)|(src)/frm")
 _NOTES = ("status", "event", "meta")
 
 
@@ -53,9 +54,9 @@ _KNOWN_FLAGS = 7
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ViewMessage:
-    """Pixels of one view: a window of frames, single frames, or their standard deviation.
+    """Pixels of one view: a window of frames, single frames, their standard deviation, or the window's class map.
 
-    topic: `view/<id>/win`, `/frm` or `/std`, or `src/frm`. payload: the bytes `header` describes.
+    topic: `view/<id>/win`, `/frm`, `/std` or `/cls`, or `src/frm`. payload: the bytes `header` describes.
     sequence: number on this topic, counted by the publisher.
 
     Raises:
@@ -71,6 +72,8 @@ class ViewMessage:
         _check_view_topic(self.topic, self.header.view_id)
         if self.topic.endswith("/std") and self.header.scale is None:
             raise MessageError("a std message needs `scale` in its header")
+        if self.topic.endswith("/cls") and self.header.classes is None:
+            raise MessageError("a cls message needs encoding class8 and `classes` in its header")
         if self.header.offsets is not None:
             _check_offsets(self.header.offsets, self.header.shape[0])
         wanted, got = self.header.payload_bytes, len(self.payload)
@@ -172,7 +175,8 @@ def decode(part: Buffer, max_payload: int = MAX_PAYLOAD) -> Message:
 
 
 def images(message: ViewMessage) -> NDArray[np.uint8]:
-    """The pixels, u8 [T, H, W, C], read-only; RGB for rgb8 and jpeg. Raw encodings are not copied.
+    """The pixels, u8 [T, H, W, C], read-only; RGB for rgb8 and jpeg, class numbers for class8. Raw encodings are not
+    copied.
 
     Raises:
         MessageError: a JPEG frame is damaged or has another size.
@@ -187,6 +191,18 @@ def images(message: ViewMessage) -> NDArray[np.uint8]:
         remedy = 'install opencv-python-headless here, or let the node publish encoding = "rgb8"'
         raise ConfigError(f"this view is JPEG and cv2 cannot be imported ({error}); {remedy}") from error
     return decode_frames(message.payload, header.offsets, header.shape)
+
+
+def colours(message: ViewMessage) -> NDArray[np.uint8]:
+    """The pixels to look at, u8 RGB [T, H, W, 3], read-only: a class map in its colours, grey levels as grey.
+
+    Raises:
+        MessageError: a pixel holds a number that the header's `classes` do not name. Else as images().
+    """
+    pixels = images(message)
+    if message.header.classes is not None:
+        return paint(pixels[..., 0], message.header.classes)
+    return np.broadcast_to(pixels, (*pixels.shape[:3], 3))
 
 
 def payload_of(pixels: NDArray[np.uint8]) -> memoryview:
@@ -204,7 +220,7 @@ def view_topic(view_id: str, kind: ViewKind) -> str:
 def topic_key(topic: str) -> bytes:
     """What to subscribe to for this topic alone: 32 bytes, NUL-padded, so no topic is a prefix of another."""
     if _VIEW_TOPIC.fullmatch(topic) is None and topic not in _NOTES:
-        raise MessageError(f"a topic is view/<id>/win|frm|std, src/frm or {', '.join(_NOTES)}, got {topic[:40]!r}")
+        raise MessageError(f"a topic is view/<id>/win|frm|std|cls, src/frm or {', '.join(_NOTES)}, got {topic[:40]!r}")
     return topic.encode("ascii").ljust(TOPIC_BYTES, b"\0")
 
 
@@ -259,7 +275,7 @@ _ORIGIN_KEYS = frozenset({"proto", "node_id", "boot_id", "t_publish"})
 def _check_view_topic(topic: str, view_id: str) -> None:
     match = _VIEW_TOPIC.fullmatch(topic)
     if match is None:
-        raise MessageError(f"a view's topic is view/<id>/win|frm|std or src/frm, got {topic[:40]!r}")
+        raise MessageError(f"a view's topic is view/<id>/win|frm|std|cls or src/frm, got {topic[:40]!r}")
     if view_id not in match.groups():
         raise MessageError(f"topic {topic} must carry view_id {match.group(1) or 'src'}, got {view_id[:40]!r}")
 

@@ -87,6 +87,25 @@ class ModelRecord:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class ClassRecord:
+    """One class of a class map: the number a pixel holds, a name, and the colour to show it in, RGB 0 to 255.
+
+    Raises:
+        MessageError: a number or a colour that fits no byte.
+    """
+
+    id: int
+    name: str
+    colour: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.colour) != 3 or not all(0 <= value <= 255 for value in (self.id, *self.colour)):
+            raise MessageError(
+                f"a class has an id and three colour levels of 0 to 255, got {self.id}, {short(self.colour)}"
+            )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class OriginHeader:
     """Who speaks, and when; the head of every message.
 
@@ -124,7 +143,8 @@ class ViewHeader(OriginHeader):
     pose: T differences; source_from_view (wire name T_src_dst): T row-major 4x4 matrices; both in pose_units, None if
         the model cannot say. intrinsics (wire name K): 9 numbers, pixels of the generated image; None if unknown.
     shape: [T, H, W, C] with C by `encoding`; offsets: T+1 byte positions in a JPEG payload; scale: of `std`,
-        value = u8 * scale. range: lowest and highest level.
+        value = u8 * scale. range: lowest and highest level, of a class map the lowest and highest class number.
+    classes: of a class map (class8) and there alone: what the numbers mean. None elsewhere.
     synthetic: the pixels are generated; never evidence of free space.
     cfg_digest: 12 hex digits naming the node's configuration.
 
@@ -162,6 +182,7 @@ class ViewHeader(OriginHeader):
     range: tuple[int, ...] = (0, 255)
     offsets: tuple[int, ...] | None = None
     scale: float | None = None
+    classes: tuple[ClassRecord, ...] | None = None
     synthetic: bool = True
 
     def __post_init__(self) -> None:
@@ -185,6 +206,15 @@ class ViewHeader(OriginHeader):
             raise MessageError(f"shape of {self.encoding} must be [T, H, W, {channels}], got {list(self.shape)}")
         if (self.offsets is not None) != (self.encoding == "jpeg"):
             raise MessageError(f"offsets belong to jpeg and to jpeg alone, got encoding {self.encoding}")
+        if self.classes is not None:
+            self._check_classes(self.classes)
+
+    def _check_classes(self, classes: tuple[ClassRecord, ...]) -> None:
+        if self.encoding != "class8":
+            raise MessageError(f"classes belong to class8 alone, got encoding {self.encoding}")
+        numbers = [each.id for each in classes]
+        if not numbers or len(set(numbers)) < len(numbers):
+            raise MessageError(f"classes must name each number once, got {short(numbers)}")
 
     @property
     def payload_bytes(self) -> int:

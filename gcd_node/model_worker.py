@@ -128,7 +128,8 @@ class ModelWorker:
     def _warm_up(self) -> None:
         """Render a grey clip in one step, so that the first window does not pay for what happens only once."""
         config = self._run.traits.config
-        grey = Clip(video=torch.zeros(config.frames, 3, config.height, config.width), fps=self._run.traits.fps)
+        video = torch.zeros(config.frames, 3, config.height, config.width)
+        grey = Clip(video=video, fps=self._run.traits.fps, mount=self._run.mount)
         try:
             features = self._synthesizer.encode(grey)
             self._synthesizer.render(features, [view.planned() for view in self._views], self._options(0, steps=1))
@@ -214,7 +215,8 @@ class ModelWorker:
 
     def _render(self, window: FrameWindow, seed: int) -> list[View]:
         model = self._run.config.model
-        clip = Clip(video=torch.from_numpy(to_clip_tensor(window.images)), fps=window.fps)
+        video = torch.from_numpy(to_clip_tensor(window.images))
+        clip = Clip(video=video, fps=window.fps, mount=self._run.mount)
         features = self._synthesizer.encode(clip, Augmentation(strength=model.cond_aug, seed=seed))
         paths = [view.trajectory(window.stamps_ns[-1], window.epoch) for view in self._views]
         return self._synthesizer.render(features, paths, self._options(seed, steps=model.steps))

@@ -1,26 +1,24 @@
 """The node: source, reader thread, model thread and publisher, started and stopped together."""
 
-import logging
 import math
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
-from gcd_model import Intrinsics, Traits, ViewSynthesizer
+from gcd_model import Traits, ViewSynthesizer
 from gcd_node.capture import Newest, read
 from gcd_node.config import NodeConfig
-from gcd_node.envelope import NoteTopic, new_boot_id
-from gcd_node.errors import ConfigError, SourceError, TooShortError
-from gcd_node.frame import FrameSource, SourceInfo
+from gcd_node.envelope import NoteTopic
+from gcd_node.errors import SourceError, TooShortError
+from gcd_node.frame import FrameSource
 from gcd_node.model_worker import ModelWorker, Outbox, WindowReport, WorkCounts
-from gcd_node.preprocess import Fit
-from gcd_node.view_message import Run, camera_matrix, end_messages, origin
+from gcd_node.preparation import fit_of, prepare_run
+from gcd_node.record_json import to_json
+from gcd_node.view_message import camera_matrix, end_messages, origin
 from gcd_node.virtual_view import virtual_views
-from gcd_node.window import RATE_TOLERANCE, FrameWindow, WindowBuilder, choose_fps
+from gcd_node.window import FrameWindow, WindowBuilder
 
-_LOG = logging.getLogger(__name__)
-_HFOV_TOLERANCE_DEG = 2.0
 _TICK_S = 0.1
 _STATUS_PERIOD_S = 1.0
 _STOP_DELAY_MS = 100
@@ -36,53 +34,6 @@ class Summary:
     frames: int
     rejected: dict[str, int] = field(default_factory=dict[str, int])
     window_s: float
-
-
-def prepare_run(config: NodeConfig, traits: Traits, source: SourceInfo) -> tuple[Run, float]:
-    """Everything that can be said before the first frame, and the frame rate windows will have.
-
-    Raises:
-        ConfigError: a frame rate the source cannot give; in strict mode, a rate or field of view the model was not
-            trained for.
-    """
-    fps, foreign_rate = config.window.fps, False
-    if fps is None:
-        fps, foreign_rate = choose_fps(source.fps_nominal, traits.rates)
-    elif fps > source.fps_nominal * (1 + RATE_TOLERANCE):
-        raise ConfigError(f"[window] fps {fps:g} is more than the {source.fps_nominal:g} the source gives; lower it")
-    elif traits.rates:
-        foreign_rate = fps not in traits.rates
-    intrinsics, foreign_field = _intrinsics(config, traits, source)
-    ood = tuple(name for name, is_foreign in (("fps", foreign_rate), ("hfov", foreign_field)) if is_foreign)
-    if ood and config.strict:
-        raise ConfigError(
-            f"strict: {' and '.join(ood)} of the source ({fps:g} FPS) lie outside what {traits.name} was trained "
-            "with; use another source or [window] fps, or leave strict out to have views flagged"
-        )
-    for name in ood:
-        _LOG.warning("%s of the source lies outside what %s was trained with: views are flagged", name, traits.name)
-    run = Run(config=config, traits=traits, source=source, boot_id=new_boot_id(), intrinsics=intrinsics, ood=ood)
-    return run, fps
-
-
-def _intrinsics(config: NodeConfig, traits: Traits, source: SourceInfo) -> tuple[Intrinsics | None, bool]:
-    """The generated picture's camera, and whether the source's field of view is not the trained one."""
-    trained = None if traits.family is None else traits.family.hfov_deg
-    stated = config.source.hfov_deg or source.hfov_deg
-    if stated is None:
-        size = traits.config.width, traits.config.height
-        return (None if trained is None else Intrinsics.from_hfov(trained, *size)), False
-    fitted = _fit(config, traits).intrinsics(Intrinsics.from_hfov(stated, source.width, source.height))
-    return fitted, trained is not None and abs(fitted.hfov_deg - trained) > _HFOV_TOLERANCE_DEG
-
-
-def _fit(config: NodeConfig, traits: Traits) -> Fit:
-    return Fit(
-        width=traits.config.width,
-        height=traits.config.height,
-        resize=config.source.resize,
-        allow_upscale=config.source.allow_upscale,
-    )
 
 
 class Node:
@@ -104,11 +55,11 @@ class Node:
         """
         self._info, fps = prepare_run(config, synthesizer.traits, source.info)
         self._source, self._outbox = source, outbox
-        self._views = virtual_views(config, synthesizer.traits)
+        self._views = virtual_views(config, synthesizer.traits, self._info.mount)
         if config.model.motion_bucket is None:
             for view in self._views:
                 synthesizer.traits.motion_bucket(view.planned())
-        fit = _fit(config, synthesizer.traits)
+        fit = fit_of(config, synthesizer.traits)
         fit.crop_box(source.info.width, source.info.height)
         self._builder = WindowBuilder(
             frames=synthesizer.traits.config.frames,
@@ -255,8 +206,10 @@ class Node:
         return status
 
     def _meta(self) -> dict[str, object]:
-        """What does not change during a run: weights, views, camera."""
+        """What does not change during a run: weights, views, cameras, classes."""
         traits, camera = self._info.traits, self._info.intrinsics
+        mount, pose = self._info.mount or traits.mount, self._info.config.source.pose
+        assumed = pose is None or not pose.on_vehicle
         return {
             "weights": {
                 "name": traits.name,
@@ -266,6 +219,8 @@ class Node:
             },
             "views": [view.view_id for view in self._views],
             "K": None if camera is None else list(camera_matrix(camera)),
+            "mount": None if mount is None else {**asdict(mount), "assumed": assumed},
+            "classes": [to_json(each) for each in self._info.classes],
             "size": [traits.config.width, traits.config.height],
             "fps": self._builder.fps,
             "cfg_digest": self._info.config.digest,

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gcd_model import Clip, Traits
+from gcd_model import Clip, Intrinsics, Traits
 from gcd_node.array_file import read_npy
 from gcd_node.errors import SourceError, TooShortError, UsageError
 from gcd_node.frame import Image
@@ -28,6 +28,7 @@ class ClipRequest:
 
     start, stride: in frames of the input. fps: what the network is told; else worked out.
     height, width: else the trained size. An array keeps its own size.
+    hfov_deg: horizontal field of view of the input's pictures, if known.
     """
 
     start: int = 0
@@ -35,6 +36,7 @@ class ClipRequest:
     fps: float | None = None
     height: int | None = None
     width: int | None = None
+    hfov_deg: float | None = None
 
     def __post_init__(self) -> None:
         if self.start < 0 or self.stride < 1:
@@ -45,10 +47,14 @@ class ClipRequest:
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class OfflineClip:
-    """The clip as the model takes it, and its pictures, u8 [T, H, W, 3], for showing."""
+    """The clip as the model takes it, and its pictures, u8 [T, H, W, 3], for showing.
+
+    hfov_deg: horizontal field of view of these, None if nobody knows.
+    """
 
     clip: Clip
     pictures: Image
+    hfov_deg: float | None = None
 
 
 def read_clip(path: Path, request: ClipRequest, traits: Traits) -> OfflineClip:
@@ -66,8 +72,11 @@ def read_clip(path: Path, request: ClipRequest, traits: Traits) -> OfflineClip:
     images, source_fps = _pictures(path, request, traits.config.frames)
     fit = Fit(width=width, height=height, allow_upscale=True)
     fitted = np.stack([fit.image(image) for image in images])
-    video = torch.from_numpy(to_clip_tensor(fitted))
-    return OfflineClip(clip=Clip(video=video, fps=_label(request, source_fps, traits)), pictures=fitted)
+    clip = Clip(video=torch.from_numpy(to_clip_tensor(fitted)), fps=_label(request, source_fps, traits))
+    hfov_deg = request.hfov_deg
+    if hfov_deg is not None:
+        hfov_deg = fit.intrinsics(Intrinsics.from_hfov(hfov_deg, images[0].shape[1], images[0].shape[0])).hfov_deg
+    return OfflineClip(clip=clip, pictures=fitted, hfov_deg=hfov_deg)
 
 
 def _pictures(path: Path, request: ClipRequest, frames: int) -> tuple[list[Image], float | None]:
@@ -121,7 +130,8 @@ def _from_array(path: Path, request: ClipRequest, traits: Traits) -> OfflineClip
         raise _too_short(path, request, frames, len(chosen))
     video = torch.from_numpy(np.ascontiguousarray(chosen.transpose(0, 3, 1, 2))) * 2.0 - 1.0
     pictures = np.rint(chosen * 255.0).astype(np.uint8)
-    return OfflineClip(clip=Clip(video=video, fps=_label(request, None, traits)), pictures=pictures)
+    clip = Clip(video=video, fps=_label(request, None, traits))
+    return OfflineClip(clip=clip, pictures=pictures, hfov_deg=request.hfov_deg)
 
 
 def _load_array(path: Path) -> NDArray[np.float32]:

@@ -28,6 +28,7 @@ from gcd_node.envelope import (
     NoteTopic,
     ViewKind,
     ViewMessage,
+    colours,
     decode,
     images,
     topic_key,
@@ -65,6 +66,11 @@ class ReceivedView:
         """The pixels, u8 [T, H, W, C], read-only; see envelope.images()."""
         return images(self.message)
 
+    @property
+    def colours(self) -> NDArray[np.uint8]:
+        """The pixels to look at, u8 RGB [T, H, W, 3], read-only; see envelope.colours()."""
+        return colours(self.message)
+
 
 @dataclass(kw_only=True, slots=True)
 class SubscriberStats:
@@ -83,13 +89,14 @@ class ViewSubscriber:
 
     endpoint: "ipc" for the node on this machine, or ipc://PATH, tcp://HOST:PORT.
     view: the view's id; None for all views, which needs conflate=False.
-    kind: "win" for windows, "frm" for frames at the goal pose, "std" for standard deviations.
+    kind: "win" for windows, "frm" for frames at the goal pose, "std" for standard deviations, "cls" for class maps;
+        None for all kinds, which needs conflate=False.
     conflate: keep only the newest message, so that a slow reader never works on old ones.
     max_age_ms: what is older raises StaleError; None for no limit.
     max_payload: largest payload accepted, bytes.
 
     Raises:
-        ConfigError: the endpoint is none, or all views are to be conflated.
+        ConfigError: the endpoint is none, or all views or kinds are to be conflated.
         MessageError: the view id is none.
     """
 
@@ -97,17 +104,18 @@ class ViewSubscriber:
         self,
         endpoint: str = "ipc",
         view: str | None = None,
-        kind: ViewKind = "win",
+        kind: ViewKind | None = "win",
         *,
         conflate: bool = True,
         max_age_ms: float | None = None,
         max_payload: int = MAX_PAYLOAD,
     ) -> None:
-        if view is None and conflate:
-            raise ConfigError("a conflated socket keeps one message of all topics: name a view, or set conflate=False")
-        key = b"view/" if view is None else topic_key(view_topic(view, kind))
-        self._link = _Link(resolve_endpoint(endpoint, "data"), (key,), conflate, max_payload)
-        self._suffix = f"/{kind}"
+        if conflate and (view is None or kind is None):
+            raise ConfigError(
+                "a conflated socket keeps one message of all topics: name a view and a kind, or set conflate=False"
+            )
+        self._link = _Link(resolve_endpoint(endpoint, "data"), (_key(view, kind),), conflate, max_payload)
+        self._suffix = "" if kind is None else f"/{kind}"
         self._max_age_ms = max_age_ms
         self._streams: dict[str, _Stream] = {}
         self._boot_id: str | None = None
@@ -264,6 +272,14 @@ class _Link:
 
     def close(self) -> None:
         self._context.destroy(linger=0)
+
+
+def _key(view: str | None, kind: ViewKind | None) -> bytes:
+    """What to subscribe to: one topic, all topics of a view, or all views; the rest is left out on arrival."""
+    if view is None:
+        return b"view/"
+    topic = view_topic(view, kind or "win")
+    return topic.removesuffix("win").encode() if kind is None else topic_key(topic)
 
 
 def _deadline(timeout_ms: float | None) -> float | None:

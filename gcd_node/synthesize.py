@@ -1,5 +1,6 @@
 """One clip, one view, offline: what `gcd-node synthesize` does between reading its input and writing its output."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,17 +10,22 @@ from numpy.typing import NDArray
 
 from gcd_model import (
     Augmentation,
+    CameraMount,
     RenderOptions,
-    Spherical,
     SphericalDelta,
     Trajectory,
     View,
     ViewSynthesizer,
 )
-from gcd_node.array_file import read_npy, read_npz
+from gcd_node.array_file import read_npy, read_npz, write_npz
+from gcd_node.class_colours import paint
+from gcd_node.comparison import legend
+from gcd_node.config import SourcePose
 from gcd_node.errors import OutputError, SourceError, UsageError
+from gcd_node.header import ClassRecord
 from gcd_node.offline_clip import OfflineClip
 from gcd_node.pictures import Image, heat, side_by_side, spread, strip, to_u8, write_frames, write_png, write_video
+from gcd_node.source_pose import stated_sphere
 
 _STRIP_FRAMES = 7
 
@@ -29,14 +35,14 @@ class ViewRequest:
     """The wanted camera path, in the words of the command line.
 
     delta: destination minus source; None if no angle was named. poses: a .npy file of [T, 4, 4] source-from-target.
-    trajectory: "gradual" or "direct", or else move_time. source: where the source camera stands, if known.
+    trajectory: "gradual" or "direct", or else move_time. source: where the source camera stands, if stated.
     """
 
     delta: SphericalDelta | None = None
     poses: Path | None = None
     trajectory: str | None = None
     move_time: int | None = None
-    source: Spherical | None = None
+    source: SourcePose | None = None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -47,25 +53,25 @@ class InjectedNoise:
     augmentation: torch.Tensor | None = None
 
 
-def plan(synthesizer: ViewSynthesizer, request: ViewRequest) -> Trajectory:
-    """The camera path for a request.
+def plan(synthesizer: ViewSynthesizer, request: ViewRequest, mount: CameraMount | None = None) -> Trajectory:
+    """The camera path for a request. mount: of the source camera, None for the trained one.
 
     Raises:
         UsageError: options that contradict each other, or an unknown kind of trajectory.
         PoseError and its kind: see Traits.plan_view and Traits.plan_poses.
     """
-    traits = synthesizer.traits
+    traits, source = synthesizer.traits, stated_sphere(request.source)
     if request.poses is not None:
         if request.delta is not None or request.trajectory is not None or request.move_time is not None:
             raise UsageError("--poses states the whole path; leave out the angles, --trajectory and --move-time")
-        return traits.plan_poses(torch.from_numpy(read_poses(request.poses)), source=request.source)
+        return traits.plan_poses(torch.from_numpy(read_poses(request.poses)), source=source)
     if request.trajectory is not None and request.move_time is not None:
         raise UsageError("--trajectory and --move-time say the same thing twice; give one of them")
     times = {None: None, "gradual": traits.config.frames - 1, "direct": 0}
     if request.trajectory not in times:
         raise UsageError(f"--trajectory is gradual or direct, got {request.trajectory!r}")
     move_time = times[request.trajectory] if request.move_time is None else request.move_time
-    return traits.plan_view(request.delta, source=request.source, move_time=move_time)
+    return traits.plan_view(request.delta, source=source, move_time=move_time, mount=mount)
 
 
 def read_poses(path: Path) -> NDArray[np.float64]:
@@ -106,9 +112,10 @@ def render(
     return synthesizer.render(synthesizer.encode(source.clip, augmentation), [trajectory], options)[0]
 
 
-def write_view(out: Path, source: OfflineClip, view: View, fps: float) -> list[Path]:
-    """Write frames, videos and pictures; gives the paths worth telling. Raises OutputError.
+def write_view(out: Path, source: OfflineClip, view: View, classes: Sequence[ClassRecord]) -> list[Path]:
+    """Write frames, videos, pictures and class numbers; gives the paths worth telling. Raises OutputError.
 
+    classes: the ontology of the view's class map, empty if the model makes none.
     The first sample goes to frames/ and view.mp4, further ones to frames_s1/, view_s1.mp4, and so on.
     """
     written: list[Path] = []
@@ -117,9 +124,14 @@ def write_view(out: Path, source: OfflineClip, view: View, fps: float) -> list[P
             ending = f"_s{number}" if number else ""
             frames = to_u8(sample.numpy())
             write_frames(out / f"frames{ending}", frames)
-            write_video(out / f"view{ending}.mp4", list(frames), fps)
+            write_video(out / f"view{ending}.mp4", list(frames), source.clip.fps)
             written += [out / f"frames{ending}", out / f"view{ending}.mp4"]
-        write_png(out / "strip.png", input_and_view(source.pictures, to_u8(view.video.numpy())))
+        class_map = None
+        if view.classes is not None:
+            class_map = paint(view.classes[0].numpy(), classes)
+            save_classes(out / "classes.npz", view.classes.numpy(), classes)
+            written.append(out / "classes.npz")
+        write_png(out / "strip.png", strip_picture(source.pictures, to_u8(view.video.numpy()), class_map, classes))
         written.append(out / "strip.png")
         if view.std is not None:
             write_png(out / "uncertainty.png", uncertainty_picture(view.std.numpy()))
@@ -134,20 +146,29 @@ def save_arrays(path: Path, view: View) -> None:
 
     The file appears whole or not at all. Raises OutputError.
     """
-    part = path.with_name(path.name + ".part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("wb") as file:
-            np.savez(file, latents=view.latents[0].numpy(), frames=view.video.permute(0, 2, 3, 1).contiguous().numpy())
-        part.replace(path)
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}; name another file with --save") from error
+    frames = view.video.permute(0, 2, 3, 1).contiguous()
+    write_npz(path, {"latents": view.latents[0].numpy(), "frames": frames.numpy()})
 
 
-def input_and_view(inputs: Image, views: Image) -> Image:
-    """Input above view, at a few moments from the first to the last."""
+def save_classes(path: Path, numbers: NDArray[np.uint8], classes: Sequence[ClassRecord]) -> None:
+    """Write `classes` u8 [S, T, H, W], and what its numbers mean: `ids` [K], `names` [K] and RGB `colours` [K, 3].
+
+    The file appears whole or not at all. Raises OutputError.
+    """
+    ontology = {
+        "ids": np.array([each.id for each in classes], np.uint8),
+        "names": np.array([each.name for each in classes]),
+        "colours": np.array([each.colour for each in classes], np.uint8),
+    }
+    write_npz(path, {"classes": numbers, **ontology})
+
+
+def strip_picture(inputs: Image, views: Image, class_map: Image | None, classes: Sequence[ClassRecord]) -> Image:
+    """Input above view, and if there is one the class map (in colours) and its legend, at a few moments."""
     chosen = spread(len(views), _STRIP_FRAMES)
-    return strip([[inputs[i] for i in chosen], [views[i] for i in chosen]])
+    rows = [inputs, views] if class_map is None else [inputs, views, class_map]
+    picture = strip([[row[i] for i in chosen] for row in rows])
+    return np.concatenate([picture, legend(classes, picture.shape[1])]) if classes else picture
 
 
 def uncertainty_picture(std: NDArray[np.float32]) -> Image:

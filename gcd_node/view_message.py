@@ -1,17 +1,18 @@
 """From a rendered view to the messages that leave the node."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_model import ASSUMED_SOURCE, Intrinsics, Traits, Trajectory, View
+from gcd_model import ASSUMED_SOURCE, CameraMount, Intrinsics, Traits, Trajectory, View
 from gcd_node.config import NodeConfig
-from gcd_node.envelope import EndMessage, ViewMessage, payload_of, view_topic
+from gcd_node.envelope import EndMessage, ViewKind, ViewMessage, payload_of, view_topic
 from gcd_node.frame import Image, SourceInfo
 from gcd_node.header import (
+    ClassRecord,
     EndHeader,
     FrameRole,
     ModelRecord,
@@ -24,6 +25,7 @@ from gcd_node.header import (
 )
 from gcd_node.jpeg import encode_frames
 from gcd_node.pictures import to_u8
+from gcd_node.source_pose import stated_sphere
 from gcd_node.window import FrameWindow
 
 _STAMP_UNCERTAINTY_US = 500  # containers round stamps to a millisecond
@@ -35,7 +37,8 @@ class Run:
     """What stays the same in every message of a run.
 
     intrinsics: of the generated picture, None if nobody knows the field of view.
-    ood: what lies outside the trained domain from the start: "fps", "hfov".
+    mount: of the source camera, for a model that uses it; None if nothing was stated.
+    ood: what lies outside the trained domain from the start: "fps", "hfov", "view".
     """
 
     config: NodeConfig
@@ -43,7 +46,13 @@ class Run:
     source: SourceInfo
     boot_id: str
     intrinsics: Intrinsics | None
+    mount: CameraMount | None
     ood: tuple[str, ...]
+
+    @property
+    def classes(self) -> tuple[ClassRecord, ...]:
+        """The ontology of the class maps; empty for a model that makes none."""
+        return ontology(self.traits)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -61,14 +70,20 @@ class Rendered:
 
 
 def messages(run: Run, rendered: Rendered) -> list[ViewMessage]:
-    """The window, its frames at the goal pose, and with several samples their deviation."""
+    """The window, its class map if the model makes one, its frames at the goal pose, and with several samples their
+    deviation."""
     pixels = to_u8(rendered.view.video.numpy())
     header = _header(run, rendered)
     window = _message(run, header, pixels, "win")
     at_goal = _at_goal(rendered.view.trajectory) if run.traits.knows_camera else []
     goal = [_message(run, _one_frame(header, i), pixels[i : i + 1], "frm") for i in at_goal]
-    std = rendered.view.std
-    return [window, *goal, *([] if std is None else [_deviation(header, std.numpy())])]
+    classes, std = rendered.view.classes, rendered.view.std
+    return [
+        window,
+        *([] if classes is None else [_class_map(header, classes[0].numpy(), run.classes)]),
+        *goal,
+        *([] if std is None else [_deviation(header, std.numpy())]),
+    ]
 
 
 def end_messages(run: Run, view_id: str, view_rev: int, last_window_id: int) -> list[EndMessage]:
@@ -82,8 +97,16 @@ def end_messages(run: Run, view_id: str, view_rev: int, last_window_id: int) -> 
         window_id=last_window_id,
         clock=run.source.clock,
     )
-    kinds = ("win", "frm", "std") if run.config.model.samples > 1 else ("win", "frm")
-    return [EndMessage(topic=view_topic(view_id, kind), header=header) for kind in kinds]
+    return [EndMessage(topic=view_topic(view_id, kind), header=header) for kind in _kinds(run)]
+
+
+def _kinds(run: Run) -> Iterator[ViewKind]:
+    """What is published of each view."""
+    yield from ("win", "frm")
+    if run.classes:
+        yield "cls"
+    if run.config.model.samples > 1:
+        yield "std"
 
 
 def origin(run: Run) -> OriginHeader:
@@ -105,6 +128,14 @@ def _deviation(header: ViewHeader, std: NDArray[np.float32]) -> ViewMessage:
     pixels = np.rint(levels / scale).clip(0, 255).astype(np.uint8)[..., None]
     described = replace(header, shape=pixels.shape, encoding="mono8", scale=scale)
     return ViewMessage(topic=view_topic(header.view_id, "std"), header=described, payload=payload_of(pixels))
+
+
+def _class_map(header: ViewHeader, numbers: NDArray[np.uint8], classes: tuple[ClassRecord, ...]) -> ViewMessage:
+    pixels = numbers[..., None]  # [T, H, W, 1]
+    described = replace(
+        header, shape=pixels.shape, encoding="class8", classes=classes, range=(0, max(each.id for each in classes))
+    )
+    return ViewMessage(topic=view_topic(header.view_id, "cls"), header=described, payload=payload_of(pixels))
 
 
 def _header(run: Run, rendered: Rendered) -> ViewHeader:
@@ -145,6 +176,11 @@ def _header(run: Run, rendered: Rendered) -> ViewHeader:
     )
 
 
+def ontology(traits: Traits) -> tuple[ClassRecord, ...]:
+    """What the numbers of a model's class maps mean; empty for a model that makes none."""
+    return tuple(ClassRecord(id=i, name=each.name, colour=each.colour) for i, each in enumerate(traits.classes))
+
+
 def camera_matrix(intrinsics: Intrinsics) -> tuple[float, ...]:
     """The 9 numbers of K, row by row, with pixel centres at whole numbers as in OpenCV and ROS."""
     cx, cy = intrinsics.cx - _HALF_PIXEL, intrinsics.cy - _HALF_PIXEL
@@ -183,10 +219,9 @@ def _source(run: Run, window: FrameWindow) -> SourceRecord:
 def _source_pose(run: Run) -> SourcePoseRecord | None:
     if run.traits.config.camera == "none":
         return None  # a fixed path states its rigid transforms itself
-    declared = run.config.source.pose
-    if declared is None:
-        return SourcePoseRecord(el_deg=ASSUMED_SOURCE.elevation_deg, r=ASSUMED_SOURCE.radius_m, assumed=True)
-    return SourcePoseRecord(el_deg=declared.elevation_deg, r=declared.radius, assumed=False)
+    stated = stated_sphere(run.config.source.pose)
+    source = stated or ASSUMED_SOURCE
+    return SourcePoseRecord(el_deg=source.elevation_deg, r=source.radius_m, assumed=stated is None)
 
 
 def _model(traits: Traits) -> ModelRecord:

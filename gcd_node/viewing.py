@@ -9,18 +9,19 @@ from pathlib import Path
 from types import TracebackType
 
 import cv2
-import numpy as np
-from numpy.typing import NDArray
 from rich.table import Table
 
+from gcd_node.array_file import write_npy
+from gcd_node.comparison import legend
 from gcd_node.envelope import ViewKind
 from gcd_node.errors import MessageError, OutputError
-from gcd_node.header import ViewHeader
+from gcd_node.header import ClassRecord, ViewHeader
 from gcd_node.pictures import video_writer, write_png
 from gcd_node.subscriber import ReceivedView, ViewSubscriber
 
 _REFRESH_MS = 250
 _RATE_SPAN = 10
+_LEGEND_WIDTH = 384
 
 _STYLES = {"live": "green", "expired": "yellow", "ended": "dim"}
 
@@ -47,13 +48,13 @@ class ViewRow:
 class WatchRequest:
     """What to watch.
 
-    view: one view's id, None for all. kind: as in ViewSubscriber. save: folder for pictures, None for none.
+    view: one view's id, None for all. kind: as in ViewSubscriber, None for all. save: folder for pictures, or None.
     limit: stop after this many messages. timeout_s: stop when nothing came for so long. None for no bound.
     """
 
     endpoint: str = "ipc"
     view: str | None = None
-    kind: ViewKind = "win"
+    kind: ViewKind | None = "win"
     save: Path | None = None
     limit: int | None = None
     timeout_s: float | None = None
@@ -94,7 +95,9 @@ class ViewTable:
 class ViewSaver:
     """Writes each window's frames as `<view>/<window>_<frame>.png`, and all of a view as lossless `<view>.mkv`.
 
-    Single frames, of which a window may give many, are numbered as the source did.
+    What is no window goes to a folder of its kind: `<view>/<kind>/<window>_<frame>.png`, `<view>/<kind>.mkv`. Single
+    frames, of which a window may give many, are numbered as the source did. Class maps are shown in the colours of
+    their ontology, with a `legend.png`; the class numbers themselves are in `<window>.npy`, u8 [T, H, W].
 
     Raises:
         OutputError: a file cannot be written, or a view changes its size.
@@ -102,19 +105,24 @@ class ViewSaver:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._videos: dict[str, tuple[cv2.VideoWriter, tuple[int, ...]]] = {}
+        self._videos: dict[Path, tuple[cv2.VideoWriter, tuple[int, ...]]] = {}
+        self._legends: set[Path] = set()
         self.files = 0
 
     def add(self, view: ReceivedView) -> None:
         """Write one message's frames."""
-        header, frames = view.header, _colour(view.images)
+        header, frames = view.header, view.colours
+        kind = view.message.topic.rpartition("/")[2]
         folder = self._folder / header.view_id
-        single = view.message.topic.endswith("/frm")  # many of these share a window
+        folder = folder if kind == "win" else folder / kind
+        single = kind == "frm"  # many of these share a window
         for index, frame in enumerate(frames):
             number = f"{header.src.seq[0]:06d}" if single else f"{index:02d}"
             write_png(folder / f"{header.window_id:06d}_{number}.png", frame)
         self.files += len(frames)
-        video = self._video(header)
+        if header.classes is not None:
+            self._keep_classes(folder, view, header.classes)
+        video = self._video(folder.with_suffix(".mkv"), header)
         for frame in frames:
             video.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
 
@@ -130,13 +138,21 @@ class ViewSaver:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         self.close()
 
-    def _video(self, header: ViewHeader) -> cv2.VideoWriter:
-        size = header.shape[1:3]
-        if header.view_id not in self._videos:
-            path, fps = self._folder / f"{header.view_id}.mkv", header.src.fps_cond
-            self._videos[header.view_id] = (video_writer(path, size[1], size[0], fps), size)
+    def _keep_classes(self, folder: Path, view: ReceivedView, classes: Sequence[ClassRecord]) -> None:
+        write_npy(folder / f"{view.header.window_id:06d}.npy", view.images[..., 0])
+        self.files += 1
+        path = folder / "legend.png"
+        if path not in self._legends:
+            write_png(path, legend(classes, _LEGEND_WIDTH))
+            self._legends.add(path)
             self.files += 1
-        video, first = self._videos[header.view_id]
+
+    def _video(self, path: Path, header: ViewHeader) -> cv2.VideoWriter:
+        size = header.shape[1:3]
+        if path not in self._videos:
+            self._videos[path] = (video_writer(path, size[1], size[0], header.src.fps_cond), size)
+            self.files += 1
+        video, first = self._videos[path]
         if first != size:
             raise OutputError(f"view {header.view_id} was {first} (height, width), now {size}; save to a new folder")
         return video
@@ -241,8 +257,3 @@ class _Track:
     def _rate_hz(self) -> float:
         span = self.arrivals[-1] - self.arrivals[0]
         return (len(self.arrivals) - 1) / span if span > 0 else 0.0
-
-
-def _colour(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """[T, H, W, 1 or 3] as [T, H, W, 3]."""
-    return np.broadcast_to(frames, (*frames.shape[:3], 3))

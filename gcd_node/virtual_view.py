@@ -2,8 +2,9 @@
 
 from dataclasses import replace
 
-from gcd_model import Orbit, Spherical, SphericalDelta, Traits, Trajectory
+from gcd_model import CameraMount, Orbit, SphericalDelta, Traits, Trajectory
 from gcd_node.config import NodeConfig, ViewConfig
+from gcd_node.source_pose import stated_sphere
 
 NANOSECONDS = 1_000_000_000
 
@@ -14,15 +15,15 @@ class VirtualView:
     rev: counts changes of the view; receivers drop older ones.
     """
 
-    def __init__(
-        self, view_id: str, config: ViewConfig, traits: Traits, source: Spherical | None, move_time: int
-    ) -> None:
+    def __init__(self, view_id: str, config: NodeConfig, traits: Traits, mount: CameraMount | None) -> None:
         self.view_id, self.rev = view_id, 1
-        self._traits, self._source, self._move_time = traits, source, move_time
+        self._traits, self._mount, self._source = traits, mount, stated_sphere(config.source.pose)
+        self._move_time = traits.move_time if config.model.move_time is None else config.model.move_time
+        wanted = config.view[view_id]
         self._goal = SphericalDelta(
-            azimuth_deg=config.azimuth_deg, elevation_deg=config.elevation_deg, radius_m=config.radius
+            azimuth_deg=wanted.azimuth_deg, elevation_deg=wanted.elevation_deg, radius_m=wanted.radius
         )
-        self._orbit = _orbit(config)
+        self._orbit = _orbit(wanted)
         self._newest: tuple[int, int] | None = None  # epoch and stamp of the last window
         self._check_reach()
 
@@ -45,7 +46,7 @@ class VirtualView:
         return self._goal if orbit is None else replace(self._goal, azimuth_deg=orbit.azimuth_deg)
 
     def _plan(self, goal: SphericalDelta) -> Trajectory:
-        return self._traits.plan_view(goal, source=self._source, move_time=self._move_time)
+        return self._traits.plan_view(goal, source=self._source, move_time=self._move_time, mount=self._mount)
 
     def _check_reach(self) -> None:
         """Raises ViewRangeError or ViewFixedError before the first window rather than in the middle of a run."""
@@ -61,16 +62,10 @@ def _orbit(config: ViewConfig) -> Orbit | None:
     return Orbit(rate_deg_s=config.rate_deg_s, amplitude_deg=config.amplitude_deg, azimuth_deg=config.azimuth_deg)
 
 
-def virtual_views(config: NodeConfig, traits: Traits) -> list[VirtualView]:
-    """The views a launch file configures.
+def virtual_views(config: NodeConfig, traits: Traits, mount: CameraMount | None = None) -> list[VirtualView]:
+    """The views a launch file configures. mount: of the source camera, None for the trained one.
 
     Raises:
         ViewRangeError, ViewFixedError: the checkpoint cannot give one of them. OptionError: an impossible orbit.
     """
-    pose, move_time = config.source.pose, config.model.move_time
-    source = None
-    if pose is not None:
-        source = Spherical(azimuth_deg=0.0, elevation_deg=pose.elevation_deg, radius_m=pose.radius)
-    if move_time is None:
-        move_time = traits.move_time
-    return [VirtualView(name, view, traits, source, move_time) for name, view in config.view.items()]
+    return [VirtualView(view_id, config, traits, mount) for view_id in config.view]

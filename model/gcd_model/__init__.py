@@ -8,9 +8,10 @@ The node imports from here only. Source: Van Hoorick et al., "Generative Camera 
 """
 
 from gcd_model.checkpoints import WeightsReport, convert_weights, inspect_weights
+from gcd_model.class_head import palette
 from gcd_model.clip import Augmentation, Clip, RenderOptions, View
 from gcd_model.conditioning import SourceFeatures
-from gcd_model.config import SMALL, SVD_14, ModelConfig
+from gcd_model.config import DRIVING_CLASSES, DRIVING_SMALL, SMALL, SVD_14, ModelConfig, SemanticClass
 from gcd_model.errors import (
     Cancelled,
     CheckpointError,
@@ -25,6 +26,7 @@ from gcd_model.errors import (
 )
 from gcd_model.families import ASSUMED_SOURCE, FAMILIES, Family, Traits, ViewLimits
 from gcd_model.geometry import (
+    CameraMount,
     DeltaFit,
     Intrinsics,
     Orbit,
@@ -43,10 +45,13 @@ from gcd_model.synthesizer import Synthesizer, ViewSynthesizer, synthesize
 
 __all__ = [
     "ASSUMED_SOURCE",
+    "DRIVING_CLASSES",
+    "DRIVING_SMALL",
     "FAMILIES",
     "SMALL",
     "SVD_14",
     "Augmentation",
+    "CameraMount",
     "Cancelled",
     "CheckpointError",
     "Clip",
@@ -61,6 +66,7 @@ __all__ = [
     "Orbit",
     "PoseError",
     "RenderOptions",
+    "SemanticClass",
     "ShapeError",
     "SourceFeatures",
     "Spherical",
@@ -81,6 +87,7 @@ __all__ = [
     "inspect_weights",
     "load_synthesizer",
     "nearest_delta",
+    "palette",
     "pose_trajectory",
     "spherical_trajectory",
     "synthesize",

@@ -36,7 +36,7 @@ from gcd_model.families import FAMILIES, Family
 from gcd_model.file_kind import FETCH_AGAIN, HEAD, FileKind, check_archive, file_kind
 from gcd_model.lightning import Contents, contents
 from gcd_model.networks import Networks
-from gcd_model.own_format import Card, Entry, file_order, header, precision
+from gcd_model.own_format import FULL_PRECISION, Card, Entry, file_order, header, precision
 from gcd_model.restricted_pickle import RestrictedPickle, check_storages
 from gcd_model.weights_report import WeightsReport
 
@@ -351,8 +351,8 @@ class _Content:
 
 
 def _written_dtype(name: str, stored: torch.dtype, wanted: torch.dtype | None) -> torch.dtype:
-    """The precision asked for; the decoder is only ever widened."""
-    if wanted is None or (name.startswith("decoder.") and wanted.itemsize < stored.itemsize):
+    """The precision asked for; what computes in float32 is only ever widened."""
+    if wanted is None or (name.partition(".")[0] in FULL_PRECISION and wanted.itemsize < stored.itemsize):
         return stored
     return wanted
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gcd_model.errors import OptionError, ShapeError
-from gcd_model.geometry import Trajectory
+from gcd_model.geometry import CameraMount, Trajectory
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -18,10 +18,12 @@ class Clip:
 
     video: float32 [T, 3, H, W], RGB in [-1, 1].
     fps: frames per second of the clip itself, not of the camera; the network is told this number.
+    mount: how the camera sits on its vehicle, for models that warp by planes; None for the mount of their training.
     """
 
     video: Tensor
     fps: float
+    mount: CameraMount | None = None
 
     def __post_init__(self) -> None:
         if self.video.ndim != 4 or self.video.shape[1] != 3:
@@ -45,12 +47,14 @@ class View:
     latents: float32 [S, T, C, h, w], what was decoded, in the scaled space the network works in.
     trajectory: the camera path that was asked for.
     motion_bucket: the motion number the network was told.
+    classes: uint8 [S, T, H, W], class ids of `Traits.classes`, on the CPU; None for models without class head.
     """
 
     samples: Tensor
     latents: Tensor
     trajectory: Trajectory
     motion_bucket: float
+    classes: Tensor | None = None
 
     @property
     def video(self) -> Tensor:
@@ -69,17 +73,18 @@ class View:
 class Augmentation:
     """The noise added in pixel space to the conditioning frames the VAE sees (CLIP sees them clean).
 
-    strength: its standard deviation on frames in [-1, 1]; the network is told this number.
+    strength: its standard deviation on frames in [-1, 1]; the network is told this number. None means: as the
+        checkpoint was made for.
     seed: where the noise is drawn from.
     noise: float32 [T, 3, H, W], unit variance, used instead of a draw.
     """
 
-    strength: float = 0.02
+    strength: float | None = None
     seed: int = 0
     noise: Tensor | None = None
 
     def __post_init__(self) -> None:
-        if not 0 <= self.strength < math.inf:
+        if self.strength is not None and not 0 <= self.strength < math.inf:
             raise OptionError(f"the augmentation strength must be 0 or more, got {self.strength}")
 
 

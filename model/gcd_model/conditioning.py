@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from gcd_model.config import CAMERA_FEATURES, CameraControl
 from gcd_model.errors import ShapeError
-from gcd_model.geometry import Trajectory
+from gcd_model.geometry import CameraMount, Trajectory
 from gcd_model.layers import sinusoid
 
 
@@ -21,6 +21,7 @@ class SourceFeatures:
     tokens: [T, D] from the image tower, or None without one. latents: [T, C, h, w], not scaled.
     extra: [T, C', h, w], further condition channels, or None. fps: what the network is told.
     augmentation: strength of the noise the VAE saw.
+    video: float32 [T, 3, H, W] in [-1, 1] and mount: what plane warps are made of; None for models without.
     """
 
     tokens: Tensor | None
@@ -28,14 +29,17 @@ class SourceFeatures:
     extra: Tensor | None
     fps: float
     augmentation: float
+    video: Tensor | None = None
+    mount: CameraMount | None = None
 
     @property
     def frames(self) -> int:
         """T."""
         return self.latents.shape[0]
 
-    def _kind(self) -> tuple[float, float, bool, bool]:
-        return self.fps, self.augmentation, self.tokens is None, self.extra is None
+    def _kind(self) -> tuple[float, float, bool, bool, bool, CameraMount | None]:
+        absent = (self.tokens is None, self.extra is None, self.video is None)
+        return self.fps, self.augmentation, *absent, self.mount
 
     def rows(self, start: int, stop: int) -> Self:
         """The features of frames start..stop-1."""
@@ -44,19 +48,21 @@ class SourceFeatures:
             tokens=None if self.tokens is None else self.tokens[start:stop],
             latents=self.latents[start:stop],
             extra=None if self.extra is None else self.extra[start:stop],
+            video=None if self.video is None else self.video[start:stop],
         )
 
     def followed_by(self, later: Self) -> Self:
         """These frames and then the later ones. Raises ShapeError unless both were encoded alike."""
         if self._kind() != later._kind():
             raise ShapeError(
-                "features of another frame rate, augmentation or model cannot be joined; encode them alike"
+                "features of another frame rate, augmentation, mount or model cannot be joined; encode them alike"
             )
         return replace(
             self,
             tokens=_joined(self.tokens, later.tokens),
             latents=torch.cat([self.latents, later.latents]),
             extra=_joined(self.extra, later.extra),
+            video=_joined(self.video, later.video),
         )
 
 
@@ -128,10 +134,17 @@ class CameraEmbedder(nn.Module):
         return self.proj(features.to(self.proj.weight))
 
 
-def condition_latents(features: SourceFeatures, views: int, *, unconditional: bool) -> Tensor:
-    """Condition channels of K views, [R*K*T, C', h, w]; the unconditional branch sees zeros, as released."""
+def condition_latents(
+    features: SourceFeatures, views: int, warped: Tensor | None = None, *, unconditional: bool
+) -> Tensor:
+    """Condition channels of K views, [R*K*T, C', h, w]; the unconditional branch sees zeros, as released.
+
+    warped: [K*T, C'', h, w], channels that differ between the views, or None.
+    """
     rows = features.latents if features.extra is None else torch.cat([features.latents, features.extra], dim=1)
-    return _with_unconditional(rows, views, unconditional)
+    if warped is None:
+        return _with_unconditional(rows, views, unconditional)
+    return _with_unconditional(torch.cat([rows.repeat(views, 1, 1, 1), warped.to(rows)], dim=1), 1, unconditional)
 
 
 def condition_tokens(features: SourceFeatures, views: int, *, unconditional: bool) -> Tensor | None:

@@ -10,9 +10,10 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from gcd_model.config import CameraControl, ModelConfig
+from gcd_model.config import CameraControl, ModelConfig, SemanticClass
 from gcd_model.errors import OptionError, PoseError, ViewFixedError, ViewRangeError
 from gcd_model.geometry import (
+    CameraMount,
     DeltaFit,
     Interpolation,
     Spherical,
@@ -24,6 +25,7 @@ from gcd_model.geometry import (
     pose_trajectory,
     spherical_trajectory,
 )
+from gcd_model.plane_warp import trained_mount
 
 _LOG = logging.getLogger(__name__)
 _TOLERATED_M, _TOLERATED_DEG = 1e-3, 0.05
@@ -154,6 +156,16 @@ class Traits:
         """Whether anybody knows where the views' camera stands: not for checkpoints that nobody steers."""
         return self.config.camera != "none" or (self.family is not None and self.family.name.startswith("driving"))
 
+    @property
+    def classes(self) -> tuple[SemanticClass, ...]:
+        """Ontology of the views' class maps, by id; empty for a model that makes none."""
+        return () if self.config.class_head is None else self.config.class_head.classes
+
+    @property
+    def mount(self) -> CameraMount | None:
+        """The camera mount a model that warps by planes was trained with; None for others."""
+        return None if self.config.plane_warp is None else trained_mount(self.config.plane_warp)
+
     def check_size(self, height: int, width: int) -> None:
         """Raises OptionError if the network cannot take frames of this size."""
         factor = self.config.size_factor
@@ -187,6 +199,7 @@ class Traits:
         source: Spherical | None = None,
         move_time: int | None = None,
         interpolation: Interpolation | None = None,
+        mount: CameraMount | None = None,
     ) -> Trajectory:
         """The camera path to a goal given as differences of angles and radius.
 
@@ -194,13 +207,18 @@ class Traits:
             delta: destination minus source; None for the checkpoint's own fixed view.
             source: where the source camera stands, if known; absolute limits are checked only then.
             move_time: frame in which the goal is reached, instead of the checkpoint's.
+            mount: how the source camera sits on its vehicle, for the fixed driving view; None as trained. The clip
+                must name the same.
         Raises:
             ViewFixedError: the checkpoint takes no camera command.
             ViewRangeError: the goal lies outside the family's limits.
+            OptionError: a mount was given to a checkpoint whose view hangs on no vehicle.
         """
         frames, move_time = self.config.frames, self.move_time if move_time is None else move_time
+        if mount is not None and not (self.config.camera == "none" and self.knows_camera):
+            raise OptionError(f"{self.name} has no vehicle's view to place a camera mount in; leave the mount out")
         if self.config.camera == "none":
-            return self._fixed_view(delta, move_time)
+            return self._fixed_view(delta, move_time, mount)
         delta = SphericalDelta() if delta is None else delta
         self._check_limits(delta, source)
         if interpolation is None:
@@ -231,13 +249,13 @@ class Traits:
         asked = pose_trajectory(source_from_target)
         return replace(fitted, source_from_target=asked.source_from_target, at_goal=asked.at_goal)
 
-    def _fixed_view(self, delta: SphericalDelta | None, move_time: int) -> Trajectory:
+    def _fixed_view(self, delta: SphericalDelta | None, move_time: int, mount: CameraMount | None) -> Trajectory:
         if delta is not None and delta != SphericalDelta():
             raise ViewFixedError(
                 f"{self.name} has one fixed view and takes no camera command; leave azimuth, elevation and radius out"
             )
         if self.knows_camera:
-            return driving_trajectory(frames=self.config.frames, move_time=move_time)
+            return driving_trajectory(frames=self.config.frames, move_time=move_time, mount=mount or self.mount)
         return pose_trajectory(torch.eye(4, dtype=torch.float64).repeat(self.config.frames, 1, 1))
 
     def _check_limits(self, delta: SphericalDelta, source: Spherical | None) -> None:

@@ -13,7 +13,7 @@ from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.examination import Options
 from gcd_model.families import Traits, family_named
 from gcd_model.networks import Networks, random_networks
-from gcd_model.own_format import precision
+from gcd_model.own_format import FULL_PRECISION, precision
 from gcd_model.synthesizer import Synthesizer
 
 PACKAGED = Path(__file__).parent / "weights"
@@ -124,7 +124,7 @@ def _device(name: str) -> torch.device:
 def _moved(networks: Networks, place: _Place) -> Networks:
     """Everything to its device and precision; what has both already stays in the mapped file."""
     for name, module in networks.named_children():
-        module.to(place.device, torch.float32 if name == "decoder" else place.dtype)
+        module.to(place.device, torch.float32 if name in FULL_PRECISION else place.dtype)
     return networks
 
 

@@ -3,15 +3,17 @@
 import torch
 from torch import nn
 
+from gcd_model.class_head import ClassHead
 from gcd_model.conditioning import CameraEmbedder
 from gcd_model.config import ModelConfig
 from gcd_model.image_encoder import ImageEncoder
+from gcd_model.plane_mix import PlaneMix
 from gcd_model.unet import VideoUNet
 from gcd_model.vae import Encoder, TemporalDecoder
 
 
 class Networks(nn.Module):
-    """U-Net, camera embedder, image tower and autoencoders.
+    """U-Net, camera embedder, image tower and autoencoders; a class head and a plane mix where the config has them.
 
     Attribute names are ours; `checkpoints.py` knows the published ones. With a shared VAE the target encoder is
     also the condition encoder.
@@ -26,11 +28,22 @@ class Networks(nn.Module):
         self.target_encoder = Encoder(config.vae, quant=config.vae.shared)
         self.own_condition_encoder = None if config.vae.shared else Encoder(config.vae, quant=True)
         self.decoder = TemporalDecoder(config.vae)
+        self.class_head = None if config.class_head is None else ClassHead(config.class_head, config.unet.width)
+        self.plane_mix = _plane_mix(config)
+        if config.is_ours:
+            self.unet.start_apart()
 
     @property
     def condition_encoder(self) -> Encoder:
         """The encoder the source frames go through."""
         return self.target_encoder if self.own_condition_encoder is None else self.own_condition_encoder
+
+
+def _plane_mix(config: ModelConfig) -> PlaneMix | None:
+    if config.plane_mix is None or config.plane_warp is None:
+        return None
+    classes = 0 if config.class_head is None else len(config.class_head.classes)
+    return PlaneMix(config.plane_mix, config.plane_warp.layers, config.vae.latent_channels, classes)
 
 
 def empty_networks(config: ModelConfig) -> Networks:

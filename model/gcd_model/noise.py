@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gcd_model.config import SamplingConfig
+from gcd_model.config import Prediction, SamplingConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,16 +18,20 @@ class Preconditioning:
     c_noise: Tensor
 
 
-def preconditioning(sigma: Tensor) -> Preconditioning:
+def preconditioning(sigma: Tensor, prediction: Prediction = "v") -> Preconditioning:
     """Coefficients that turn the raw network F into the denoiser D.
 
         D(x, sigma) = c_skip * x + c_out * F(c_in * x, c_noise)
 
     Args:
         sigma: noise level, positive, any shape.
+        prediction: "v" as published; "x0", where F is the clean sample itself, is ours, for small networks.
     Source: Karras et al. 2022, Eq. 7, with the v-prediction coefficients of Stable Video Diffusion (sigma_data 1).
     """
     scale = (sigma**2 + 1).rsqrt()
+    if prediction == "x0":
+        skip, out = torch.zeros_like(sigma), torch.ones_like(sigma)
+        return Preconditioning(c_skip=skip, c_out=out, c_in=scale, c_noise=sigma.log() / 4)
     return Preconditioning(c_skip=scale**2, c_out=-sigma * scale, c_in=scale, c_noise=sigma.log() / 4)
 
 

@@ -22,6 +22,9 @@ PRECISIONS: dict[str, torch.dtype] = {
 }
 """What --dtype takes."""
 
+FULL_PRECISION = ("decoder", "plane_mix")
+"""Networks that compute in float32 whatever --dtype says: what they make is looked at."""
+
 _DTYPES = {torch.float64: "F64", torch.float32: "F32", torch.bfloat16: "BF16", torch.float16: "F16"}
 
 

@@ -16,15 +16,17 @@ from gcd_model.conditioning import (
     condition_tokens,
     micro_conditioning,
 )
+from gcd_model.decoding import Denoised, LayerStack, Pictures, decode
+from gcd_model.denoiser import Denoiser, start_noise
 from gcd_model.errors import DeviceMemoryError, NonFiniteError, OptionError, ShapeError
 from gcd_model.families import Traits
 from gcd_model.geometry import Trajectory
 from gcd_model.image_encoder import clip_pixels
 from gcd_model.layers import prepare
 from gcd_model.networks import Networks
-from gcd_model.noise import edm_sigmas, guidance_scale, preconditioning, unit_noise
-from gcd_model.sampler import euler, guided
-from gcd_model.vae import to_pixels
+from gcd_model.noise import edm_sigmas, guidance_scale, unit_noise
+from gcd_model.plane_warp import PathWarpCache, PathWarps
+from gcd_model.sampler import euler
 
 Given = ParamSpec("Given")
 Made = TypeVar("Made")
@@ -89,6 +91,8 @@ class Synthesizer:
 
     def __init__(self, networks: Networks, traits: Traits) -> None:
         self._networks, self._traits = networks, traits
+        config = traits.config
+        self._warps = None if config.plane_warp is None else PathWarpCache(config.plane_warp, config.vae.down_factor)
         networks.requires_grad_(False)
         prepare(networks)
 
@@ -112,6 +116,8 @@ class Synthesizer:
         extra: [T, C', h, w], for checkpoints with further condition channels.
         """
         augmentation = Augmentation() if augmentation is None else augmentation
+        told, warps = augmentation.strength, self._warps is not None
+        strength = self._traits.config.sampling.augmentation if told is None else told
         self._traits.check_size(*clip.video.shape[-2:])
         self._check_extra(extra)
         noise = augmentation.noise
@@ -119,13 +125,15 @@ class Synthesizer:
             noise = unit_noise(tuple(clip.video.shape), augmentation.seed)
         if noise.shape != clip.video.shape:
             raise ShapeError(f"augmentation noise must be {list(clip.video.shape)}, got {list(noise.shape)}")
-        noisy = clip.video + augmentation.strength * noise.to(clip.video.device)
+        noisy = clip.video + strength * noise.to(clip.video.device)
         return SourceFeatures(
             tokens=self._tokens(clip.video),
             latents=_in_chunks(self._condition_mean, noisy),
             extra=None if extra is None else extra.to(self._like),
             fps=clip.fps,
-            augmentation=augmentation.strength,
+            augmentation=strength,
+            video=clip.video if warps else None,
+            mount=(clip.mount or self._traits.mount) if warps else None,
         )
 
     @_out_of_memory_is_our_error
@@ -137,11 +145,19 @@ class Synthesizer:
         options = RenderOptions() if options is None else options
         self._check_lengths(features, trajectories)
         buckets = [self._bucket(path, options) for path in trajectories]
-        latents = self._denoise(_Job(features, tuple(trajectories), tuple(buckets), options))  # [V, S, T, C, h, w]
-        pixels = self._decode(latents)  # [V, S, T, 3, H, W]
-        latents = latents.cpu()
+        warps = tuple(self._path_warps(features, path) for path in trajectories)
+        job = _Job(features, tuple(trajectories), tuple(buckets), options, warps)
+        denoised = self._denoise(job)
+        pictures = self._decode(job, denoised)
+        latents = denoised.latents.cpu()
         return [
-            View(samples=pixels[v], latents=latents[v], trajectory=path, motion_bucket=buckets[v])
+            View(
+                samples=pictures[v].pixels,
+                latents=latents[v],
+                trajectory=path,
+                motion_bucket=buckets[v],
+                classes=pictures[v].classes,
+            )
             for v, path in enumerate(trajectories)
         ]
 
@@ -176,22 +192,34 @@ class Synthesizer:
     def _condition_mean(self, frames: Tensor) -> Tensor:
         return self._networks.condition_encoder(frames.to(self._like)).mean
 
-    def _denoise(self, job: "_Job") -> Tensor:
+    def _path_warps(self, features: SourceFeatures, trajectory: Trajectory) -> PathWarps | None:
+        if self._warps is None:
+            return None
+        if features.video is None or features.mount is None:
+            raise ShapeError(f"{self._traits.name} warps the source video, which these features lack; encode it here")
+        height, width = features.video.shape[-2:]
+        return self._warps.warps(features.mount, trajectory, height, width, self._like.device)
+
+    def _denoise(self, job: "_Job") -> Denoised:
         config, options = self._traits.config, job.options
         first, last = options.guidance or config.sampling.guidance
         scale = guidance_scale(first, last, config.frames).to(self._like.device)
         conditioning = self._condition(job, unconditional=(first, last) != (1.0, 1.0))
         sigmas = edm_sigmas(config.sampling, options.steps or config.sampling.steps)
-        denoise = self._denoiser(conditioning, sigmas, scale)
-        noise = job.noise(config.frames).to(self._like.device)  # [S, T, C, h, w]
-        start = noise.repeat(len(job.trajectories), 1, 1, 1, 1) * (sigmas[0] ** 2 + 1).sqrt().item()
-        latents = euler(denoise, start, sigmas, progress=options.progress, cancel=options.cancel)
+        unet, head = self._networks.unet, self._networks.class_head
+        denoiser = Denoiser(unet, head, conditioning, sigmas, scale, config.prediction)
+        noise = job.noise(config.frames, shared=config.sampling.shared_noise).to(self._like.device)  # [S, T, C, h, w]
+        start = start_noise(noise, sigmas, len(job.trajectories))
+        latents = euler(denoiser, start, sigmas, progress=options.progress, cancel=options.cancel)
         if not latents.isfinite().all():
             raise NonFiniteError(
                 f"{self._traits.name} produced NaN or Inf in the latents (precision {self._traits.precision}, seed "
                 f"{options.seed}); try --dtype float32, and look at the weights with `gcd-node weights inspect`"
             )
-        return latents.unflatten(0, (len(job.trajectories), options.samples))
+        each, logits = (len(job.trajectories), options.samples), denoiser.class_logits
+        if logits is not None:
+            logits = logits.unflatten(0, (*each, config.frames))
+        return Denoised(latents=latents.unflatten(0, each), class_logits=logits)
 
     def _condition(self, job: "_Job", *, unconditional: bool) -> Conditioning:
         """Rows are ordered view by view, sample by sample."""
@@ -207,56 +235,60 @@ class Synthesizer:
             vector=torch.cat([vector.expand(per_frame, -1) for vector in vectors]).to(self._like),
             camera=None if cameras is None else torch.cat(cameras),
             tokens=condition_tokens(job.features, views, unconditional=unconditional),
-            latents=condition_latents(job.features, views, unconditional=unconditional),
+            latents=condition_latents(job.features, views, job.channels(), unconditional=unconditional),
             branches=2 if unconditional else 1,
         )
 
-    def _denoiser(self, given: Conditioning, sigmas: Tensor, scale: Tensor) -> Callable[[Tensor, int], Tensor]:
-        """D(x, sigma_i) with guidance, on x: [K, T, C, h, w] float32."""
-        unet, like = self._networks.unet, self._like
-        levels = preconditioning(sigmas[:-1])
-        labels = levels.c_noise.float().to(like.device)
-        plan = unet.plan(labels, given.vector, given.camera, given.tokens, repeats=given.branches)
-        c_in, c_out, c_skip = (c.tolist() for c in (levels.c_in, levels.c_out, levels.c_skip))
-
-        def denoise(x: Tensor, i: int) -> Tensor:
-            rows = (x * c_in[i]).flatten(0, 1).to(like).repeat(given.branches, 1, 1, 1)
-            raw = unet(rows, given.latents, plan.step(i)).float().unflatten(0, (-1, *x.shape[:2]))
-            branches = c_skip[i] * x + c_out[i] * raw  # [R, K, T, C, h, w]
-            return guided(branches[0], branches[1], scale) if given.branches == 2 else branches[0]
-
-        return denoise
-
-    def _decode(self, latents: Tensor) -> Tensor:
-        """[V, S, T, C, h, w] -> RGB in [0, 1], [V, S, T, 3, H, W] on the CPU, one clip at a time."""
-        decoder, frames = self._networks.decoder, self._traits.config.frames
-        scaled = (latents / self._traits.config.vae.scale).flatten(0, 1)
-        clips = [to_pixels(decoder(clip.to(decoder.stem.weight), frames)).cpu() for clip in scaled]
-        pixels = torch.stack(clips).unflatten(0, latents.shape[:2])
-        if not pixels.isfinite().all():
+    def _decode(self, job: "_Job", denoised: Denoised) -> list[Pictures]:
+        mixes = self._networks.plane_mix is not None
+        pictures = decode(self._networks, denoised, [job.layers(warps) if mixes else None for warps in job.warps])
+        if not all(view.pixels.isfinite().all() for view in pictures):
             raise NonFiniteError(f"{self._traits.name} decoded to NaN or Inf; the weights are damaged")
-        return pixels
+        return pictures
 
 
 @dataclass(frozen=True, slots=True)
 class _Job:
-    """What one call of `render` was asked for."""
+    """What one call of `render` was asked for. warps: one per trajectory; None for models without."""
 
     features: SourceFeatures
     trajectories: tuple[Trajectory, ...]
     buckets: tuple[float, ...]
     options: RenderOptions
+    warps: tuple[PathWarps | None, ...]
 
-    def noise(self, frames: int) -> Tensor:
-        """Unit noise the sampling starts from, [S, T, C, h, w]; the same for every view."""
+    def noise(self, frames: int, *, shared: bool) -> Tensor:
+        """Unit noise the sampling starts from, [S, T, C, h, w]; the same for every view, and if `shared` frame."""
         samples, given = self.options.samples, self.options.initial_noise
-        shape = (frames, self.features.latents.shape[1], *self.features.latents.shape[2:])
+        each = self.features.latents.shape[1:]
         if given is None:
-            return torch.stack([unit_noise(shape, self.options.seed, 1 + s) for s in range(samples)])
+            shape, seed = (1 if shared else frames, *each), self.options.seed
+            return torch.stack([unit_noise(shape, seed, 1 + s).expand(frames, *each) for s in range(samples)])
         given = given[None] if given.ndim == 4 else given
-        if tuple(given.shape) != (samples, *shape):
-            raise OptionError(f"initial noise must be {[samples, *shape]}, got {list(given.shape)}")
+        if tuple(given.shape) != (samples, frames, *each):
+            raise OptionError(f"initial noise must be {[samples, frames, *each]}, got {list(given.shape)}")
         return given.float()
+
+    def channels(self) -> Tensor | None:
+        """Warp channels of all views and samples, [V*S*T, C', h, w], or None."""
+        samples, frames = self.options.samples, torch.arange(self.features.frames)
+        made = [
+            warps.channels(self._source(warps), frames).repeat(samples, 1, 1, 1)
+            for warps in self.warps
+            if warps is not None
+        ]
+        return torch.cat(made) if made else None
+
+    def layers(self, warps: PathWarps | None) -> LayerStack | None:
+        """The source warped along one view's path."""
+        if warps is None:
+            return None
+        warped, valid = warps.layers(self._source(warps), torch.arange(self.features.frames))
+        return LayerStack(warped=warped, valid=valid)
+
+    def _source(self, warps: PathWarps) -> Tensor:
+        assert self.features.video is not None  # `_path_warps` looked
+        return self.features.video.to(warps.device)
 
 
 def _in_chunks(network: Callable[[Tensor], Tensor], frames: Tensor) -> Tensor:

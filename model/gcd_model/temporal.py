@@ -6,7 +6,7 @@ Frames are flattened into the batch, time fastest: row b*T + t is frame t of cli
 import torch
 from torch import Tensor, nn
 
-from gcd_model.layers import Attention, Derived, FeedForward, ResBlock, TokenAttention, embedding_mlp, sinusoid
+from gcd_model.layers import Attention, Derived, FeedForward, ResBlock, TokenAttention, embedding_mlp, sinusoid, zeroed
 
 
 class TemporalShare(Derived[Tensor]):
@@ -55,10 +55,19 @@ class VideoResBlock(nn.Module):
         self.share = share
 
     def forward(
-        self, x: Tensor, frames: int, spatial_embedding: Tensor | None = None, temporal_embedding: Tensor | None = None
+        self,
+        x: Tensor,
+        frames: int | None,
+        spatial_embedding: Tensor | None = None,
+        temporal_embedding: Tensor | None = None,
     ) -> Tensor:
-        """x: [B*T, C, H, W] -> [B*T, C', H, W]. embeddings: [B*T, C'], already projected."""
+        """x: [B*T, C, H, W] -> [B*T, C', H, W]. embeddings: [B*T, C'], already projected.
+
+        frames: T; None for unrelated frames, which stay apart.
+        """
         x = self.spatial(x, None if spatial_embedding is None else spatial_embedding[..., None, None])
+        if frames is None:
+            return x
         if temporal_embedding is not None:
             temporal_embedding = temporal_embedding.unflatten(0, (-1, frames)).transpose(1, 2)[..., None, None]
         video = x.unflatten(0, (-1, frames)).transpose(1, 2)  # [B, C', T, H, W]
@@ -136,11 +145,27 @@ class VideoTransformer(nn.Module):
         self.share = TemporalShare(of_sigmoid="space", initial=0.5)
         self.proj_out = nn.Linear(channels, channels)
 
-    def forward(self, x: Tensor, frames: int, spatial_cross: Tensor | None, temporal_cross: Tensor | None) -> Tensor:
-        """x: [B*T, C, H, W] -> the same shape. spatial_cross: [B*T, C]. temporal_cross: [B, C]."""
+    def start_apart(self) -> None:
+        """Make the part across frames the identity, so that what single frames taught holds for clips at first."""
+        for layer in (self.positions.mlp[-1], self.temporal.attention.out):
+            zeroed(layer)
+        for feed in (self.temporal.feed_first, self.temporal.feed):
+            zeroed(feed.contract)
+
+    def forward(
+        self, x: Tensor, frames: int | None, spatial_cross: Tensor | None, temporal_cross: Tensor | None
+    ) -> Tensor:
+        """x: [B*T, C, H, W] -> the same shape. spatial_cross: [B*T, C]. temporal_cross: [B, C].
+
+        frames: T; None for unrelated frames, which stay apart.
+        """
         tokens = self.proj_in(self.norm(x).flatten(2).transpose(1, 2))  # [B*T, L, C]
         tokens = self.spatial(tokens, spatial_cross)
-        across = tokens.unflatten(0, (-1, frames)).transpose(1, 2)  # [B, L, T, C]
-        across = self.temporal(across + self.positions.derived()[:frames], temporal_cross)
-        tokens = self.share.blend(tokens, across.transpose(1, 2).flatten(0, 1))
+        if frames is not None:
+            tokens = self._across(tokens, frames, temporal_cross)
         return x + self.proj_out(tokens).transpose(1, 2).unflatten(2, x.shape[-2:])
+
+    def _across(self, tokens: Tensor, frames: int, cross: Tensor | None) -> Tensor:
+        across = tokens.unflatten(0, (-1, frames)).transpose(1, 2)  # [B, L, T, C]
+        across = self.temporal(across + self.positions.derived()[:frames], cross)
+        return self.share.blend(tokens, across.transpose(1, 2).flatten(0, 1))

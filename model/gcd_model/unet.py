@@ -104,8 +104,8 @@ class Stage(nn.Module):
         assert temporal is not None, "tokens were given to a U-Net without cross-attention"
         return spatial(tokens), temporal(tokens[::frames])  # across frames only the first frame's token counts
 
-    def forward(self, x: Tensor, inputs: StageInputs, frames: int) -> Tensor:
-        """x: [N, C, h, w] -> [N, C', h, w]."""
+    def forward(self, x: Tensor, inputs: StageInputs, frames: int | None) -> Tensor:
+        """x: [N, C, h, w] -> [N, C', h, w]. frames: None for unrelated frames."""
         x = self.res(x, frames, inputs.spatial_embedding, inputs.temporal_embedding)
         if self.attention is None:
             return x
@@ -191,33 +191,52 @@ class VideoUNet(nn.Module):
         for level in self.up:
             yield from level.stages
 
-    def forward(self, latents: Tensor, condition: Tensor, inputs: Sequence[StageInputs]) -> Tensor:
+    def forward(
+        self, latents: Tensor, condition: Tensor, inputs: Sequence[StageInputs], *, image_mode: bool = False
+    ) -> Tensor:
         """One evaluation of the network F.
 
         Args:
             latents: [B*T, C, h, w], scaled noisy latents. condition: [B*T, C', h, w], source latents, unscaled.
             inputs: one step of a plan made for this batch.
+            image_mode: leave out every layer across frames; the rows are then unrelated frames, any number of them.
         Returns:
             [B*T, C, h, w].
         """
-        inputs_left = iter(inputs)
+        return self.project(self.features(latents, condition, inputs, image_mode=image_mode))
+
+    def features(
+        self, latents: Tensor, condition: Tensor, inputs: Sequence[StageInputs], *, image_mode: bool = False
+    ) -> Tensor:
+        """What the last norm sees, [B*T, width, h, w]; `project` makes the network's output of it. See `forward`."""
+        inputs_left, frames = iter(inputs), None if image_mode else self.frames
         x = self.stem(torch.cat([latents, condition], dim=1))
         skips = [x]
         for level in self.down:
             for stage in level.stages:
-                x = stage(x, next(inputs_left), self.frames)
+                x = stage(x, next(inputs_left), frames)
                 skips.append(x)
             if level.down is not None:
                 x = level.down(x)
                 skips.append(x)
         for stage in self.middle:
-            x = stage(x, next(inputs_left), self.frames)
+            x = stage(x, next(inputs_left), frames)
         for level in self.up:
             for stage in level.stages:
-                x = stage(torch.cat([x, skips.pop()], dim=1), next(inputs_left), self.frames)
+                x = stage(torch.cat([x, skips.pop()], dim=1), next(inputs_left), frames)
             if level.up is not None:
                 x = level.up(x)
-        return self.conv_out(F.silu(self.norm_out(x)))
+        return x
+
+    def project(self, features: Tensor) -> Tensor:
+        """[B*T, width, h, w] -> [B*T, C, h, w]."""
+        return self.conv_out(F.silu(self.norm_out(features)))
+
+    def start_apart(self) -> None:
+        """Make all transformers across frames the identity too: for learning from single frames first, then clips."""
+        for stage in self.all_stages():
+            if stage.attention is not None:
+                stage.attention.start_apart()
 
     def _start_as_identity(self) -> None:
         for stage in self.all_stages():

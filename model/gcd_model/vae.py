@@ -76,7 +76,8 @@ class Encoder(nn.Module):
     def __init__(self, config: VAEConfig, *, quant: bool) -> None:
         super().__init__()
         widths, moments = config.widths, 2 * config.latent_channels
-        self.stem = nn.Conv2d(3, widths[0], 3, padding=1)
+        self.patch = config.patch
+        self.stem = nn.Conv2d(3 * config.patch**2, widths[0], 3, padding=1)
         self.levels = nn.Sequential(
             *(EncoderLevel(widths[max(level - 1, 0)], level, config) for level in range(len(widths)))
         )
@@ -87,7 +88,8 @@ class Encoder(nn.Module):
 
     def forward(self, frames: Tensor) -> Posterior:
         """frames: [N, 3, H, W] in [-1, 1]."""
-        x = self.middle(self.levels(self.stem(frames)))
+        x = frames if self.patch == 1 else F.pixel_unshuffle(frames, self.patch)
+        x = self.middle(self.levels(self.stem(x)))
         moments = self.conv_out(F.silu(self.norm_out(x)))
         return Posterior.of_moments(moments if self.quant is None else self.quant(moments))
 
@@ -120,8 +122,8 @@ class DecoderLevel(nn.Module):
         )
         self.up = Upsample(width) if level > 0 else nn.Identity()
 
-    def forward(self, x: Tensor, frames: int) -> Tensor:
-        """x: [B*T, C, h, w] -> [B*T, C', 2h, 2w]."""
+    def forward(self, x: Tensor, frames: int | None) -> Tensor:
+        """x: [B*T, C, h, w] -> [B*T, C', 2h, 2w]. frames: None for unrelated frames."""
         for block in self.blocks:
             x = block(x, frames)
         return self.up(x)
@@ -143,18 +145,32 @@ class TemporalDecoder(nn.Module):
         above = [*widths[1:], widths[-1]]
         self.levels = Layers[DecoderLevel](DecoderLevel(above[i], i, config) for i in reversed(range(len(widths))))
         self.norm_out = nn.GroupNorm(config.norm_groups, widths[0], eps=1e-6)
-        self.conv_out = nn.Conv2d(widths[0], 3, 3, padding=1)
-        self.mix_frames = nn.Conv3d(3, 3, (3, 1, 1), padding=(1, 0, 0))
+        self.patch, colours = config.patch, 3 * config.patch**2
+        self.conv_out = nn.Conv2d(widths[0], colours, 3, padding=1)
+        self.mix_frames = nn.Conv3d(colours, colours, (3, 1, 1), padding=(1, 0, 0))
+        _keep_frames_apart(self.mix_frames)
 
-    def forward(self, latents: Tensor, frames: int) -> Tensor:
-        """latents: [B*T, C, h, w], unscaled -> [B*T, 3, H, W], about [-1, 1]."""
+    def forward(self, latents: Tensor, frames: int | None) -> Tensor:
+        """latents: [B*T, C, h, w], unscaled -> [B*T, 3, H, W], about [-1, 1].
+
+        frames: T; None for unrelated frames: every layer across frames is then left out.
+        """
         x = self.middle_in(self.stem(latents), frames)
         x = self.middle_out(self.middle_attention(x), frames)
         for level in self.levels:
             x = level(x, frames)
         x = self.conv_out(F.silu(self.norm_out(x)))
-        video = x.unflatten(0, (-1, frames)).transpose(1, 2)  # [B, 3, T, H, W]
-        return self.mix_frames(video).transpose(1, 2).flatten(0, 1)
+        if frames is not None:
+            video = x.unflatten(0, (-1, frames)).transpose(1, 2)  # [B, 3 * patch^2, T, H / patch, W / patch]
+            x = self.mix_frames(video).transpose(1, 2).flatten(0, 1)
+        return x if self.patch == 1 else F.pixel_shuffle(x, self.patch)
+
+
+def _keep_frames_apart(mix: nn.Conv3d) -> None:
+    """Start as the identity, so that a decoder trained on single frames decodes clips alike."""
+    assert mix.bias is not None
+    nn.init.dirac_(mix.weight)
+    nn.init.zeros_(mix.bias)
 
 
 def to_pixels(decoded: Tensor) -> Tensor:

@@ -6,8 +6,19 @@ import torch
 from torch import Tensor, nn
 
 from gcd_model.clip import Clip
-from gcd_model.config import ImageEncoderConfig, ModelConfig, SamplingConfig, UNetConfig, VAEConfig
-from gcd_model.families import KUBRIC90, Traits
+from gcd_model.config import (
+    ClassHeadConfig,
+    ImageEncoderConfig,
+    ModelConfig,
+    PlaneMixConfig,
+    PlaneWarpConfig,
+    SamplingConfig,
+    SemanticClass,
+    UNetConfig,
+    VAEConfig,
+    warp_channels,
+)
+from gcd_model.families import DRIVING, KUBRIC90, Traits
 from gcd_model.networks import Networks
 from gcd_model.synthesizer import Synthesizer
 
@@ -47,6 +58,43 @@ TINY = ModelConfig(
     sampling=SamplingConfig(steps=3),
 )
 """As little network as shows every behaviour of the synthesizer."""
+
+TINY_CLASSES = (
+    SemanticClass(name="road", colour=(90, 90, 90)),
+    SemanticClass(name="car", colour=(0, 0, 200)),
+    SemanticClass(name="sky", colour=(120, 180, 230)),
+)
+
+TINY_DRIVING = ModelConfig(
+    frames=3,
+    height=32,
+    width=48,
+    camera="none",
+    unet=UNetConfig(
+        latent_channels=4,
+        condition_channels=4 + warp_channels(PlaneWarpConfig(), 4),
+        width=16,
+        multipliers=(1, 2),
+        attention=(False, True),
+        blocks_per_level=1,
+        embedding_width=32,
+        head_width=16,
+        context_width=None,
+        vector_width=24,
+        camera_width=0,
+        norm_groups=8,
+    ),
+    vae=VAEConfig(width=8, multipliers=(1, 2), blocks_per_level=1, norm_groups=4, scale=1.0, shared=True, patch=2),
+    image_encoder=None,
+    sampling=SamplingConfig(
+        steps=1, sigma_max=80.0, sigma_min=0.6, guidance=(1.0, 1.0), shared_noise=True, augmentation=0.0
+    ),
+    prediction="x0",
+    plane_warp=PlaneWarpConfig(),
+    plane_mix=PlaneMixConfig(width=16, dilations=(1, 2)),
+    class_head=ClassHeadConfig(classes=TINY_CLASSES, width=16, upscale=2),
+)
+"""The same with every switch that is ours."""
 
 
 def draw(*shape: int, seed: int = 0) -> Tensor:
@@ -105,6 +153,13 @@ def tiny_synthesizer(config: ModelConfig = TINY, *, family_known: bool = True, s
     randomise(networks, seed)
     traits = tiny_traits(config)
     return Synthesizer(networks, traits if family_known else replace(traits, family=None))
+
+
+def tiny_driving(config: ModelConfig = TINY_DRIVING, seed: int = 0) -> Synthesizer:
+    """A random driving checkpoint with every switch of ours, ready to run."""
+    networks = Networks(config)
+    randomise(networks, seed)
+    return Synthesizer(networks, replace(tiny_traits(config), name="tiny-driving", family=DRIVING))
 
 
 def random_clip(config: ModelConfig = TINY, *, frames: int | None = None, seed: int = 0) -> Clip:

@@ -12,6 +12,7 @@ from gcd_model.geometry import (
     DRIVING_GOAL_TARGET,
     DRIVING_SOURCE_POSITION,
     DRIVING_SOURCE_TARGET,
+    CameraMount,
     Interpolation,
     Spherical,
     SphericalDelta,
@@ -196,6 +197,15 @@ def test_a_direct_driving_path_is_the_gradual_ones_goal_throughout() -> None:
     direct = driving_trajectory(frames=14, move_time=0)
     assert direct.at_goal == (True,) * 14
     assert_close(direct.source_from_target, goal.expand(14, 4, 4), rtol=0, atol=1e-12)
+
+
+def test_the_driving_path_stays_where_it_is_in_the_vehicles_frame_however_the_camera_is_mounted() -> None:
+    trained, other = CameraMount(), CameraMount(height_m=1.1, forward_m=-0.3, left_m=0.4, tilt_deg=9.0, hfov_deg=60.0)
+    published = driving_trajectory(frames=14, move_time=13).source_from_target
+    assert_close(driving_trajectory(frames=14, move_time=13, mount=trained).source_from_target, published)
+    moved = driving_trajectory(frames=14, move_time=13, mount=other).source_from_target
+    assert_close(other.vehicle_from_camera @ moved, trained.vehicle_from_camera @ published)
+    assert float((moved - published).abs().max()) > 0.1
 
 
 def test_the_driving_path_is_not_on_the_sphere() -> None:

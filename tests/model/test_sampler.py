@@ -55,6 +55,14 @@ def test_a_network_that_predicts_v_exactly_makes_the_denoiser_exact(sigma: float
     assert_close(c.c_skip * noisy + c.c_out * v, clean, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("sigma", [0.6, 80.0])
+def test_a_network_that_predicts_the_clean_sample_is_the_denoiser(sigma: float) -> None:
+    level = torch.tensor(sigma, dtype=torch.float64)
+    ours, published = preconditioning(level, "x0"), preconditioning(level)
+    assert (ours.c_skip.item(), ours.c_out.item()) == (0.0, 1.0)
+    assert (ours.c_in, ours.c_noise) == (published.c_in, published.c_noise)
+
+
 def test_preconditioning_has_the_published_coefficients() -> None:
     c = preconditioning(torch.tensor([3.0], dtype=torch.float64))
     assert c.c_skip.item() == pytest.approx(1 / 10)

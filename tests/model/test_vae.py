@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.testing import assert_close
 
 from gcd_model.config import VAEConfig
+from gcd_model.errors import OptionError
 from gcd_model.layers import prepare
 from gcd_model.temporal import VideoResBlock
 from gcd_model.vae import DecoderLevel, Encoder, Posterior, TemporalDecoder
@@ -130,3 +131,41 @@ def test_gradients_reach_every_parameter_of_the_decoder() -> None:
     result: Tensor = decoder(draw(FRAMES, 4, 2, 2), FRAMES)
     result.square().sum().backward()
     assert all(p.grad is not None and p.grad.any() for p in decoder.parameters())
+
+
+PATCHED = VAEConfig(latent_channels=6, width=8, multipliers=(1, 2), blocks_per_level=1, norm_groups=4, patch=2)
+
+
+def test_patches_make_an_autoencoder_coarser_without_another_level() -> None:
+    assert PATCHED.down_factor == 4
+    encoder, decoder = Encoder(PATCHED, quant=True), TemporalDecoder(PATCHED)
+    posterior = encoder(draw(FRAMES, 3, 16, 24))
+    assert posterior.mean.shape == (FRAMES, 6, 4, 6)
+    assert decoder(posterior.mean, FRAMES).shape == (FRAMES, 3, 16, 24)
+
+
+def test_pixels_of_a_patch_come_back_where_they_were() -> None:
+    encoder, decoder, frames = Encoder(PATCHED, quant=False), TemporalDecoder(PATCHED), draw(FRAMES, 3, 16, 24)
+    patches: list[Tensor] = []
+    encoder.stem.register_forward_pre_hook(lambda _, given: patches.append(given[0]))
+    encoder(frames)
+    decoder.mix_frames.register_forward_hook(lambda _, __, made: patches[0].unflatten(0, (1, -1)).transpose(1, 2))
+    assert torch.equal(decoder(draw(FRAMES, 6, 4, 6), FRAMES), frames)
+
+
+def test_unrelated_frames_are_decoded_apart_and_any_number_of_them() -> None:
+    decoder, latents = TemporalDecoder(PATCHED), draw(5, 6, 4, 6)
+    randomise(decoder)
+    together = decoder(latents, None)
+    assert_close(together[3:4], decoder(latents[3:4], None))
+    assert relative_error(decoder(latents, 5), together) > 1e-3
+
+
+def test_a_fresh_decoder_leaves_frames_apart() -> None:
+    decoder, latents = TemporalDecoder(PATCHED), draw(5, 6, 4, 6)
+    assert_close(decoder(latents, 5), decoder(latents, None))
+
+
+def test_a_patch_of_no_pixels_is_refused() -> None:
+    with pytest.raises(OptionError, match="at least 1 pixel, got 0"):
+        VAEConfig(patch=0)

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import torch
 from msgspec.structs import replace as struct_replace
 
 from gcd_model import (
+    DRIVING_SMALL,
     FAMILIES,
     SMALL,
     Augmentation,
@@ -44,19 +45,36 @@ def traits(family: str = "kubric90", *, move_time: int = 13) -> Traits:
     )
 
 
+def warping_traits() -> Traits:
+    """Of a model that warps by planes, uses its camera's mount and draws class maps."""
+    config = struct_replace(DRIVING_SMALL, height=HEIGHT, width=WIDTH)
+    return replace(traits("driving"), config=config)
+
+
+def fake_classes(made: Traits, samples: int) -> torch.Tensor | None:
+    """Class numbers u8 [S, T, H, W] that differ from sample to sample, frame to frame and column to column."""
+    if not made.classes:
+        return None
+    sizes = (samples, made.config.frames, HEIGHT, WIDTH)
+    s, t, _, x = torch.meshgrid(*(torch.arange(size) for size in sizes), indexing="ij")
+    return ((s + t + x) % len(made.classes)).to(torch.uint8)
+
+
 class FakeSynthesizer:
     """Gives the source back, darker by the seed's last bits; `act` is called before every render."""
 
     def __init__(self, made: Traits, act: Callable[[RenderOptions], None] | None = None) -> None:
         self.traits = made
         self.asked: list[tuple[list[Trajectory], RenderOptions]] = []
+        self.clips: list[Clip] = []
         self._act = act
 
     def encode(
         self, clip: Clip, augmentation: Augmentation | None = None, extra: torch.Tensor | None = None
     ) -> SourceFeatures:
-        strength = 0.02 if augmentation is None else augmentation.strength
-        return SourceFeatures(tokens=None, latents=clip.video, extra=extra, fps=clip.fps, augmentation=strength)
+        self.clips.append(clip)
+        strength = None if augmentation is None else augmentation.strength
+        return SourceFeatures(tokens=None, latents=clip.video, extra=extra, fps=clip.fps, augmentation=strength or 0.0)
 
     def render(
         self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
@@ -68,7 +86,13 @@ class FakeSynthesizer:
         video = ((features.latents + 1) / 2 * (1 - (options.seed % 7) / 100)).clamp(0, 1)
         samples = torch.stack([video * (1 - s / 10) for s in range(options.samples)])
         return [
-            View(samples=samples, latents=features.latents[None], trajectory=path, motion_bucket=127.0)
+            View(
+                samples=samples,
+                latents=features.latents[None],
+                trajectory=path,
+                motion_bucket=127.0,
+                classes=fake_classes(self.traits, options.samples),
+            )
             for path in trajectories
         ]
 

@@ -12,6 +12,7 @@ import pytest
 
 from gcd_node.cli import run_app
 from gcd_node.config import load_config
+from gcd_node.demo import demo_weights
 from gcd_node.pictures import write_png, write_video
 from gcd_node.publisher import Publisher
 from gcd_node.publisher_options import PublisherOptions
@@ -85,6 +86,7 @@ def test_synthesize_writes_frames_video_strip_and_arrays(clip: Path, tmp_path: P
     assert len(list((out / "frames").glob("*.png"))) == 14
     assert (out / "view.mp4").stat().st_size > 1000
     assert (out / "strip.png").stat().st_size > 1000
+    assert not (out / "classes.npz").exists()
     arrays = np.load(saved)
     assert arrays["latents"].shape == (14, 4, 16, 24)
     assert arrays["frames"].shape == (14, *SIZE, 3)
@@ -251,9 +253,10 @@ def test_the_demo_ends_with_pictures_of_what_arrived_in_the_other_process(tmp_pa
         timeout=110,
     )
     assert done.returncode == 0, done.stderr
-    assert "noise" in done.stdout
+    assert ("noise" in done.stdout) == demo_weights().startswith("random:")
+    assert "Shown, from left to right: input" in " ".join(done.stdout.split())
     assert "windows in the other process" in done.stdout
-    for name in ("side_by_side.mp4", "strip.png"):
+    for name in ("side_by_side.mp4", "side_by_side.png"):
         assert (tmp_path / "gcd-demo" / name).stat().st_size > 10_000
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from wire_messages import end, origin, pixels, view_header, window
+from wire_messages import CLASSES, class_map, end, numbers, origin, pixels, view_header, window
 
 import gcd_node
 from gcd_node.envelope import (
@@ -20,6 +20,7 @@ from gcd_node.envelope import (
     Flags,
     NoteMessage,
     ViewMessage,
+    colours,
     decode,
     encode,
     images,
@@ -30,17 +31,24 @@ from gcd_node.envelope import (
 from gcd_node.errors import MessageError
 from gcd_node.jpeg import encode_frames
 
-PLANNER_FILES = ("envelope", "header", "record_json", "subscriber", "endpoints", "errors", "jpeg")
+PLANNER_FILES = ("envelope", "header", "class_colours", "record_json", "subscriber", "endpoints", "errors", "jpeg")
 
 
-def rebuilt(message: ViewMessage, changes: dict, *, removed: str = "", payload: bytes | None = None) -> bytes:
+def rebuilt(
+    message: ViewMessage,
+    changes: dict,
+    *,
+    removed: str = "",
+    payload: bytes | None = None,
+    topic: bytes = b"view/top/win",
+) -> bytes:
     """The message with header keys changed and a right checksum."""
     part = encode(message)
     length = 16 * struct.unpack_from("<H", part, 36)[0]
     header = json.loads(part[64 : 64 + length])
     header = {key: value for key, value in (header | changes).items() if key != removed}
     body = part[64 + length :] if payload is None else payload
-    return raw_part(json.dumps(header).encode(), body)
+    return raw_part(json.dumps(header).encode(), body, topic=topic)
 
 
 def raw_part(header: bytes, payload: bytes = b"", *, topic: bytes = b"view/top/win", flags: int = 5) -> bytes:
@@ -64,6 +72,14 @@ def test_a_deviation_survives_the_round_trip() -> None:
     message = ViewMessage(topic="view/top/std", header=header, payload=payload_of(grey))
     assert decode(encode(message)) == message
     assert images(decode(encode(message))).shape == (2, 4, 6, 1)
+
+
+def test_a_class_map_survives_the_round_trip_with_what_its_numbers_mean() -> None:
+    message = dataclasses.replace(class_map(5), sequence=4)
+    decoded = decode(encode(message))
+    assert decoded == message
+    assert decoded.header.classes == CLASSES
+    assert np.array_equal(images(decoded), numbers(5)[..., None])
 
 
 def test_what_the_model_cannot_say_survives_as_none() -> None:
@@ -197,6 +213,54 @@ def test_unknown_header_keys_and_a_newer_minor_are_ignored() -> None:
     message = window()
     decoded = decode(rebuilt(message, {"proto": "gcd/1.7", "novelty": {"deep": [1]}}))
     assert decoded.header == dataclasses.replace(message.header, proto="gcd/1.7")
+
+
+# Class maps
+
+
+def test_a_class_map_is_shown_in_the_colours_of_its_ontology() -> None:
+    drawn = np.array([[[0, 1, 7], [7, 7, 0]]], np.uint8)
+    shown = colours(class_map(drawn=drawn))
+    of = {each.id: each.colour for each in CLASSES}
+    assert [[tuple(pixel) for pixel in row] for row in shown[0].tolist()] == [[of[n] for n in row] for row in drawn[0]]
+    assert not shown.flags.writeable
+
+
+def test_pictures_are_shown_as_they_are_and_grey_levels_as_grey() -> None:
+    assert np.array_equal(colours(window(images=pixels(2))), pixels(2))
+    grey = pixels(3, channels=1)
+    message = ViewMessage(topic="view/top/win", header=view_header(shape=grey.shape), payload=payload_of(grey))
+    assert np.array_equal(colours(message), np.repeat(grey, 3, axis=-1))
+
+
+def test_a_class_number_without_a_name_is_refused_when_shown() -> None:
+    with pytest.raises(MessageError, match="3 class numbers of its ontology, got 2"):
+        colours(class_map(drawn=np.array([[[0, 1, 2]]], np.uint8)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"classes": None}, "cls message needs encoding class8 and `classes`"),
+        ({"classes": []}, "name each number once"),
+        ({"classes": [{"id": 1, "name": "a", "colour": [0, 0, 0]}] * 2}, "name each number once"),
+        ({"classes": [{"id": 256, "name": "a", "colour": [0, 0, 0]}]}, "0 to 255"),
+        ({"classes": [{"id": -1, "name": "a", "colour": [0, 0, 0]}]}, "0 to 255"),
+        ({"classes": [{"id": 1, "name": "a", "colour": [0, 0, 256]}]}, "0 to 255"),
+        ({"classes": [{"id": 1, "name": "a", "colour": [0, 0]}]}, "three colour levels"),
+        ({"classes": [{"id": 1, "name": "a"}]}, "lacks 'colour'"),
+        ({"encoding": "mono8"}, "classes belong to class8 alone"),
+    ],
+)
+def test_an_ontology_that_says_nothing_clear_is_refused(changes, words) -> None:
+    with pytest.raises(MessageError, match=words):
+        decode(rebuilt(class_map(), changes, topic=b"view/top/cls"))
+
+
+def test_damage_to_a_class_map_raises_nothing_but_message_errors() -> None:
+    message, foreign = class_map(), [True, -1, 2**70, "", [], {}, [[]], [None], [{}], [{"id": "a"}], [1] * 3]
+    for value in foreign:
+        assert is_refused(rebuilt(message, {"classes": value}, topic=b"view/top/cls"))
 
 
 # Refusals say what was wanted and what came
@@ -385,7 +449,8 @@ PAGE = (Path(gcd_node.__file__).parent.parent / "docs" / "protocol.md").read_tex
 def test_the_protocol_page_names_every_header_key() -> None:
     header = json.loads(header_text(jpeg_message()))
     nested = [*header["src"], *header["quality"], *header["model"], *header["pose"][0], *header["src_pose"]]
-    assert [key for key in (*header, *nested, "scale") if f"`{key}`" not in PAGE] == []
+    classes = json.loads(header_text(class_map()))["classes"]
+    assert [key for key in (*header, *nested, "scale", "classes", *classes[0]) if f"`{key}`" not in PAGE] == []
 
 
 def test_the_example_on_the_protocol_page_is_a_message() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zmq
-from wire_messages import OTHER_BOOT, end, lines_of, pixels, start_reader, window
+from wire_messages import CLASSES, OTHER_BOOT, class_map, end, lines_of, numbers, pixels, start_reader, window
 
 import gcd_node
 from gcd_node.envelope import encode
@@ -216,9 +216,37 @@ def test_all_views_end_when_the_last_one_does(sender) -> None:
     assert found == [("a", 0), ("b", 0), ("b", 1)]
 
 
-def test_all_views_cannot_be_conflated() -> None:
-    with pytest.raises(ConfigError, match="name a view"):
-        ViewSubscriber("tcp://127.0.0.1:1", None, conflate=True)
+@pytest.mark.parametrize(("view", "kind"), [(None, "win"), ("top", None), (None, None)])
+def test_all_views_or_kinds_cannot_be_conflated(view, kind) -> None:
+    with pytest.raises(ConfigError, match="name a view and a kind"):
+        ViewSubscriber("tcp://127.0.0.1:1", view, kind, conflate=True)
+
+
+def test_a_class_map_arrives_with_its_ontology_and_ends_on_its_own(tmp_path) -> None:
+    with Publisher(lockstep(tmp_path)) as publisher, ViewSubscriber(publisher.endpoint, "top", "cls") as views:
+        publisher.send(window(3))
+        publisher.send(class_map(3))
+        view = views.receive(5000)
+        publisher.end(end(kind="win"))
+        publisher.end(end(kind="cls", window_id=3))
+        assert views.receive(5000) is None
+        assert views.ended
+    assert view.header.encoding == "class8"
+    assert view.header.classes == CLASSES
+    assert np.array_equal(view.images[..., 0], numbers(3))
+    assert not view.images.flags.writeable
+    assert [tuple(pixel) for pixel in view.colours[0, 0].tolist()] == [
+        next(each.colour for each in CLASSES if each.id == number) for number in numbers(3)[0, 0]
+    ]
+
+
+def test_all_kinds_of_one_view_leave_other_views_out(sender) -> None:
+    with ViewSubscriber(sender.endpoint, "top", None, conflate=False) as views:
+        sender.wait()
+        sender.send(encode(window(0, view_id="topdown")), encode(window(1)), encode(class_map(1)))
+        sender.send(sender.numbered(1, end()), sender.numbered(1, end(kind="cls")))
+        found = [(view.message.topic, view.header.window_id) for view in views]
+    assert found == [("view/top/win", 1), ("view/top/cls", 1)]
 
 
 @pytest.mark.parametrize("endpoint", ["", "here", "http://127.0.0.1:80"])

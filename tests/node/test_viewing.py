@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from rich.console import Console
-from wire_messages import end, pixels, view_header, window
+from wire_messages import CLASSES, class_map, end, numbers, pixels, view_header, window
 
 from gcd_node.envelope import ViewMessage
 from gcd_node.errors import OutputError
@@ -125,6 +125,45 @@ def test_grey_views_are_saved_as_grey(tmp_path) -> None:
     with ViewSaver(tmp_path) as saver:
         saver.add(received(ViewMessage(topic="view/top/win", header=header, payload=grey.tobytes())))
     assert np.array_equal(read_video(tmp_path / "top.mkv"), np.broadcast_to(grey, (2, 16, 16, 3)))
+
+
+def test_class_maps_are_saved_in_colour_with_a_legend_and_as_numbers(tmp_path) -> None:
+    drawn = [numbers(i, height=16, width=16) for i in range(2)]
+    with ViewSaver(tmp_path) as saver:
+        for i in range(2):
+            saver.add(received(window(i, images=pixels(i, height=16, width=16))))
+            saver.add(received(class_map(i, drawn=drawn[i])))
+        assert saver.files == len([path for path in tmp_path.rglob("*.*") if path.is_file()])
+    folder = tmp_path / "top" / "cls"
+    assert np.array_equal(np.load(folder / "000001.npy"), drawn[1])
+    shown = cv2.cvtColor(cv2.imread(str(folder / "000001_01.png")), cv2.COLOR_BGR2RGB)
+    for each in CLASSES:
+        assert (shown[drawn[1][1] == each.id] == each.colour).all()
+    assert np.array_equal(read_video(tmp_path / "top" / "cls.mkv")[3], shown)
+    legend = cv2.cvtColor(cv2.imread(str(folder / "legend.png")), cv2.COLOR_BGR2RGB).reshape(-1, 3)
+    assert {each.colour for each in CLASSES} <= {tuple(pixel) for pixel in legend.tolist()}
+    assert len(read_video(tmp_path / "top.mkv")) == 4  # windows stay apart from class maps
+
+
+def test_a_watch_of_all_kinds_ends_when_all_have(tmp_path) -> None:
+    request = WatchRequest(endpoint=f"ipc://{tmp_path}/data", view="top", kind=None, timeout_s=10)
+    options = PublisherOptions(
+        data=request.endpoint, status=None, lockstep=True, min_subscribers=1, end_delay_ms=0, drain_ms=3000
+    )
+    reports: list[WatchReport] = []
+    with Publisher(options) as publisher:
+        thread = threading.Thread(target=lambda: reports.append(watch(request, lambda rows: None)), daemon=True)
+        thread.start()
+        publisher.send(window(0, view_id="side"))
+        publisher.send(window(0))
+        publisher.send(class_map(0))
+        publisher.end(end())
+        publisher.send(class_map(1))
+        publisher.end(end(kind="cls"))
+        thread.join(15)
+    assert reports
+    assert reports[0].ended
+    assert [(row.topic, row.window_id) for row in reports[0].rows] == [("view/top/cls", 1), ("view/top/win", 0)]
 
 
 def test_a_view_that_changes_its_size_is_an_error(tmp_path) -> None:

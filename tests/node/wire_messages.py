@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 import gcd_node
 from gcd_node.envelope import EndMessage, ViewKind, ViewMessage, payload_of, view_topic
 from gcd_node.header import (
+    ClassRecord,
     EndHeader,
     ModelRecord,
     OriginHeader,
@@ -97,7 +99,27 @@ def window(
     return ViewMessage(topic=view_topic(view_id, kind), header=header, payload=payload_of(images))
 
 
-def end(*, view_id: str = "top", window_id: int = 0, boot_id: str = BOOT) -> EndMessage:
+CLASSES = (
+    ClassRecord(id=0, name="sky", colour=(90, 160, 255)),
+    ClassRecord(id=1, name="road", colour=(80, 80, 80)),
+    ClassRecord(id=7, name="own_car", colour=(255, 128, 0)),
+)
+
+
+def numbers(seed: int = 0, frames: int = 2, height: int = 4, width: int = 6) -> NDArray[np.uint8]:
+    """A class map of CLASSES, u8 [T, H, W]."""
+    known = np.array([each.id for each in CLASSES], np.uint8)
+    return np.random.default_rng(seed).choice(known, (frames, height, width))
+
+
+def class_map(window_id: int = 0, *, view_id: str = "top", drawn: NDArray[np.uint8] | None = None) -> ViewMessage:
+    drawn = numbers(window_id) if drawn is None else drawn
+    header = view_header(view_id=view_id, window_id=window_id, shape=(*drawn.shape, 1))
+    header = replace(header, encoding="class8", classes=CLASSES, range=(0, 7))
+    return ViewMessage(topic=view_topic(view_id, "cls"), header=header, payload=payload_of(drawn))
+
+
+def end(*, view_id: str = "top", window_id: int = 0, boot_id: str = BOOT, kind: ViewKind = "win") -> EndMessage:
     header = EndHeader(
         node_id="gcd",
         boot_id=boot_id,
@@ -107,7 +129,7 @@ def end(*, view_id: str = "top", window_id: int = 0, boot_id: str = BOOT) -> End
         window_id=window_id,
         clock="replay",
     )
-    return EndMessage(topic=view_topic(view_id, "win"), header=header)
+    return EndMessage(topic=view_topic(view_id, kind), header=header)
 
 
 def origin(boot_id: str = BOOT) -> OriginHeader:

@@ -8,6 +8,9 @@ from rich.console import Console
 from rich.table import Table
 
 from gcd_model import FAMILIES, SMALL, SVD_14, Family, ModelConfig
+from gcd_train import cli_generate
+from gcd_train.cli_evaluate import evaluate_command
+from gcd_train.cli_train import train
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -15,6 +18,11 @@ app = typer.Typer(
     help="Data, training and evaluation for virtual camera views.\n\n"
     "What is here so far describes what can be trained; generators and the trainer come with the next releases.",
 )
+
+
+app.add_typer(cli_generate.app, name="generate")
+app.command("evaluate")(evaluate_command)
+app.command()(train)
 
 
 @app.callback()

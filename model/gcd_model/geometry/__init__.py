@@ -1,5 +1,6 @@
 """Poses, spherical cameras, camera paths and the pinhole: plain geometry, no network."""
 
+from gcd_model.geometry.mount import CameraMount
 from gcd_model.geometry.orbit import Orbit
 from gcd_model.geometry.pinhole import Intrinsics, center_crop_box
 from gcd_model.geometry.pose import (
@@ -42,6 +43,7 @@ __all__ = [
     "DRIVING_SOURCE_TARGET",
     "LOOK_AT",
     "RIGID_TOLERANCE",
+    "CameraMount",
     "DeltaFit",
     "Interpolation",
     "Intrinsics",

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from gcd_model.errors import OptionError, ShapeError
+from gcd_model.geometry.mount import CameraMount
 from gcd_model.geometry.pose import look_at, relative_pose, require_rigid
 from gcd_model.geometry.spherical import DeltaFit, Spherical, SphericalDelta, nearest_delta, sphere_poses, to_pose
 
@@ -114,20 +115,25 @@ def spherical_trajectory(
     return _trajectory_on_sphere(source, path_progress(frames, move_time, interpolation)[:, None] * _numbers(delta))
 
 
-def driving_trajectory(*, frames: int, move_time: int) -> Trajectory:
+def driving_trajectory(*, frames: int, move_time: int, mount: CameraMount | None = None) -> Trajectory:
     """ParallelDomain-4D's one path: from the forward camera to one above and behind the vehicle.
 
     Position and looked-at point move separately, each straight and at a sine pace.
 
     Args:
         frames, move_time: see path_progress().
-    Source: Generative Camera Dolly, ParallelDomain-4D, as released.
+        mount: where the source camera really is, None for the data set's. The path stays where it is in the vehicle's
+            frame; only the poses seen from the source camera change.
+    Source: Generative Camera Dolly, ParallelDomain-4D, as released; other mounts are ours.
     """
     done = path_progress(frames, move_time, "sine")[:, None]
     position = torch.lerp(_point(DRIVING_SOURCE_POSITION), _point(DRIVING_GOAL_POSITION), done)  # [T, 3]
     target = torch.lerp(_point(DRIVING_SOURCE_TARGET), _point(DRIVING_GOAL_TARGET), done)
-    world_from_source = look_at(_point(DRIVING_SOURCE_POSITION), _point(DRIVING_SOURCE_TARGET))
-    return pose_trajectory(relative_pose(world_from_source, look_at(position, target)))
+    if mount is None:
+        vehicle_from_source = look_at(_point(DRIVING_SOURCE_POSITION), _point(DRIVING_SOURCE_TARGET))
+    else:
+        vehicle_from_source = mount.vehicle_from_camera
+    return pose_trajectory(relative_pose(vehicle_from_source, look_at(position, target)))
 
 
 def pose_trajectory(source_from_target: Tensor) -> Trajectory:

@@ -1,0 +1,69 @@
+"""Where the source camera stands: on a sphere around the scene, or mounted on a vehicle; which, the model decides."""
+
+from gcd_model import ASSUMED_SOURCE, CameraMount, OptionError, Spherical, Traits
+from gcd_node.config import SourcePose
+
+_MOUNT_TOLERANCE_M, _MOUNT_TOLERANCE_DEG = 0.05, 0.5
+
+
+def require_usable(pose: SourcePose | None, traits: Traits) -> None:
+    """Refuse a pose in words the model does not know.
+
+    Raises:
+        OptionError: angles for a model that is not steered by them, a mount for one that cannot use it.
+    """
+    steered, warps = traits.config.camera != "none", traits.mount is not None
+    if pose is None:
+        return
+    if pose.on_vehicle and not warps:
+        reason = "is steered by angles" if steered else "sees nothing but the pictures"
+        remedy = "; state elevation and radius instead" if steered else "; leave it out"
+        raise OptionError(f"{traits.name} {reason} and has no use for a mount (height, forward, left, tilt){remedy}")
+    if pose.on_sphere and not steered:
+        remedy = "; state the mount instead: height, forward, left, tilt" if warps else "; leave them out"
+        raise OptionError(f"{traits.name} is not steered by angles and has no use for elevation and radius{remedy}")
+
+
+def stated_sphere(pose: SourcePose | None) -> Spherical | None:
+    """The camera on the sphere, None if nobody stated it. Raises PoseError."""
+    if pose is None or pose.on_vehicle:
+        return None
+    return Spherical(
+        azimuth_deg=0.0,
+        elevation_deg=ASSUMED_SOURCE.elevation_deg if pose.elevation_deg is None else pose.elevation_deg,
+        radius_m=ASSUMED_SOURCE.radius_m if pose.radius is None else pose.radius,
+    )
+
+
+def stated_mount(pose: SourcePose | None, hfov_deg: float | None, traits: Traits) -> CameraMount | None:
+    """The camera on its vehicle, for a model that warps; None if nothing was stated, or for other models.
+
+    hfov_deg: horizontal field of view of the picture the model is given, None if nobody knows.
+    Raises:
+        OptionError: numbers that no camera has.
+    """
+    trained = traits.mount
+    if trained is None or (pose is None and hfov_deg is None):
+        return None
+    stated = SourcePose() if pose is None else pose
+    return CameraMount(
+        height_m=trained.height_m if stated.height_m is None else stated.height_m,
+        forward_m=trained.forward_m if stated.forward_m is None else stated.forward_m,
+        left_m=trained.left_m if stated.left_m is None else stated.left_m,
+        tilt_deg=trained.tilt_deg if stated.tilt_deg is None else stated.tilt_deg,
+        hfov_deg=trained.hfov_deg if hfov_deg is None else hfov_deg,
+    )
+
+
+def is_foreign(mount: CameraMount | None, traits: Traits) -> bool:
+    """Whether the camera stands or looks otherwise than in training; its field of view is another matter."""
+    trained = traits.mount
+    if mount is None or trained is None:
+        return False
+    away_m = (
+        mount.height_m - trained.height_m,
+        mount.forward_m - trained.forward_m,
+        mount.left_m - trained.left_m,
+    )
+    turned_deg = abs(mount.tilt_deg - trained.tilt_deg)
+    return max(map(abs, away_m)) > _MOUNT_TOLERANCE_M or turned_deg > _MOUNT_TOLERANCE_DEG

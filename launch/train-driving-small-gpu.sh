@@ -1,0 +1,35 @@
+#!/usr/bin/env bash
+# Train `driving-small` on one machine with a GPU and 16 cores, rendering included, in about 25 minutes.
+#
+#   launch/train-driving-small-gpu.sh
+#
+# Every step keeps what it has done: after a stop, or on a machine that is lent for ten minutes at a time, run the
+# same line again. Afterwards: runs/driving-small-gpu/ holds the weights, the log and the evaluation.
+#
+#   PYTHON   the interpreter that has torch (default: python3)
+#   WHEELS   a folder of wheels, for a machine without network; else packages come from the index
+#   MINUTES  stop cleanly after so many minutes (default: 60)
+#   OUT      where the result is copied (default: nowhere)
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+PYTHON=${PYTHON:-python3}
+RUN=runs/driving-small-gpu
+CLIPS=${CLIPS:-4000}
+export PYTHONPATH="$PWD:$PWD/model:$PWD/train"
+
+"$PYTHON" -c 'import torch; assert torch.cuda.is_available(), "no CUDA device: train with the recipe package:driving-small"'
+"$PYTHON" -c 'import cv2, kornia, moderngl, msgspec, rich, safetensors, typer, zmq' 2>/dev/null ||
+  "$PYTHON" -m pip install -q ${WHEELS:+--no-index --find-links "$WHEELS"} \
+    kornia opencv-contrib-python-headless moderngl glcontext msgspec rich safetensors typer pyzmq
+
+gcd_train() { timeout --signal=TERM "$((${MINUTES:-60} * 60 - SECONDS))" \
+  "$PYTHON" -c 'from gcd_train.cli import main; main()' "$@"; }
+
+keep() { if [ -n "${OUT:-}" ]; then cp -r "$RUN"/*.safetensors "$RUN"/*.jsonl "$RUN"/report* "$OUT"/ 2>/dev/null || true; fi; }
+trap keep EXIT
+
+gcd_train generate driving --out "$RUN/valid" --first-seed 1000000 --clips 40
+gcd_train generate driving --out "$RUN/train" --clips "$CLIPS"
+gcd_train train package:driving-small-gpu --data "$RUN/train" --valid "$RUN/valid" --out "$RUN"
+gcd_train evaluate --weights "$RUN/driving-small.safetensors" --data "$RUN/valid" --train "$RUN/train" --out "$RUN/report"

@@ -1,0 +1,154 @@
+"""The command line with a model that warps by planes and draws class maps: a tiny random one, in a real file."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from fakes import FakeSynthesizer, warping_traits
+from msgspec.structs import replace
+
+from gcd_model import DRIVING_CLASSES, DRIVING_SMALL, CameraMount
+from gcd_model.checkpoints import save_weights
+from gcd_model.networks import random_networks
+from gcd_model.own_format import Card
+from gcd_node import cli_synthesize
+from gcd_node.cli import run_app
+from gcd_node.pictures import write_video
+
+HEIGHT, WIDTH = 64, 96
+UNET = replace(DRIVING_SMALL.unet, width=16, head_width=16, embedding_width=32)
+VAE = replace(DRIVING_SMALL.vae, width=8)
+TINY = replace(DRIVING_SMALL, height=HEIGHT, width=WIDTH, unet=UNET, vae=VAE)
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
+    card = Card(name="tiny", config=TINY, family="driving", move_time=13, trained=False)
+    save_weights(random_networks(TINY, seed=0), path, card)
+    return path
+
+
+@pytest.fixture
+def clip(tmp_path: Path) -> Path:
+    np.save(tmp_path / "clip.npy", np.random.default_rng(0).random((14, HEIGHT, WIDTH, 3), np.float32))
+    return tmp_path / "clip.npy"
+
+
+def synthesize(source: Path, weights: Path | str, out: Path, *options: str) -> int:
+    return run_app(["synthesize", str(source), "--weights", str(weights), "--out", str(out), *options])
+
+
+def test_synthesize_writes_the_class_map_as_numbers_with_their_meaning_and_shows_it(
+    clip: Path, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert synthesize(clip, weights, out, "--samples", "2") == 0
+    assert "classes.npz" in capsys.readouterr().out
+    arrays = np.load(out / "classes.npz")
+    assert arrays["classes"].shape == (2, 14, HEIGHT, WIDTH)
+    assert arrays["classes"].dtype == np.uint8
+    assert arrays["classes"].max() < len(DRIVING_CLASSES)
+    assert arrays["ids"].tolist() == list(range(13))
+    assert arrays["names"].tolist() == [each.name for each in DRIVING_CLASSES]
+    assert [tuple(colour) for colour in arrays["colours"].tolist()] == [each.colour for each in DRIVING_CLASSES]
+    strip = cv2.cvtColor(cv2.imread(str(out / "strip.png")), cv2.COLOR_BGR2RGB)
+    third = strip[2 * (HEIGHT + 4) : 2 * (HEIGHT + 4) + HEIGHT, :WIDTH]
+    assert np.array_equal(third, arrays["colours"][arrays["classes"][0, 0]])
+    assert len(strip) > 3 * HEIGHT + 8  # the legend below
+
+
+@pytest.mark.parametrize(
+    ("options", "mount"),
+    [
+        ([], None),
+        (["--hfov-deg", "85"], CameraMount()),
+        (["--mount-height", "2.5", "--mount-tilt", "10"], CameraMount(height_m=2.5, tilt_deg=10.0)),
+        (["--mount-left", "0.5", "--mount-forward", "0"], CameraMount(left_m=0.5, forward_m=0.0)),
+        (["--hfov-deg", "100", "--mount-height", "2"], CameraMount(hfov_deg=100.0, height_m=2.0)),
+    ],
+)
+def test_the_mount_reaches_clip_and_path(
+    options: list[str], mount: CameraMount | None, clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = FakeSynthesizer(warping_traits())
+    monkeypatch.setattr(cli_synthesize, "load_synthesizer", lambda *_, **__: model)
+    assert synthesize(clip, "fake", tmp_path / "out", *options) == 0
+    assert model.clips[0].mount == mount
+    wanted = model.traits.plan_view(mount=mount).source_from_target
+    assert torch.equal(model.asked[0][0][0].source_from_target, wanted)
+
+
+def test_a_video_is_cropped_and_its_field_of_view_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_video(tmp_path / "wide.mkv", [np.zeros((2 * WIDTH, 4 * WIDTH, 3), np.uint8)] * 14, 10.0)
+    model = FakeSynthesizer(warping_traits())
+    monkeypatch.setattr(cli_synthesize, "load_synthesizer", lambda *_, **__: model)
+    assert synthesize(tmp_path / "wide.mkv", "fake", tmp_path / "out", "--hfov-deg", "90") == 0
+    mount = model.clips[0].mount
+    assert mount is not None
+    assert mount.hfov_deg == pytest.approx(2 * np.degrees(np.arctan(0.75)))  # 2:1 became 3:2
+
+
+@pytest.mark.parametrize(
+    ("model", "options", "reason"),
+    [
+        ("random:kubric90", ["--mount-height", "1.5"], "steered by angles"),
+        ("random:kubric90", ["--hfov-deg", "85"], "no use for --hfov-deg"),
+        ("random:driving", ["--mount-tilt", "3"], "leave it out"),
+        ("tiny", ["--source-elevation-deg", "5"], "state the mount instead"),
+        ("tiny", ["--source-radius", "15"], "state the mount instead"),
+        ("tiny", ["--source-radius", "15", "--mount-left", "0"], "state one of the two"),
+        ("tiny", ["--mount-height", "0"], "above the ground"),
+        ("tiny", ["--mount-height", "nan"], "finite"),
+        ("tiny", ["--mount-tilt", "95"], "between -90 and 90"),
+        ("tiny", ["--hfov-deg", "180"], "180"),
+    ],
+)
+def test_a_mount_that_cannot_be_is_one_line_and_exit_64(
+    model: str, options: list[str], reason: str, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    size = (HEIGHT, WIDTH) if model == "tiny" else (128, 192)
+    np.save(tmp_path / "clip.npy", np.zeros((14, *size, 3), np.float32))
+    chosen = weights if model == "tiny" else model
+    assert synthesize(tmp_path / "clip.npy", chosen, tmp_path / "out", *options) == 64
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert lines[-1].startswith("error: ")
+    assert reason in lines[-1]
+    assert not (tmp_path / "out").exists()
+
+
+def test_view_saves_windows_and_class_maps_of_a_running_node(weights: Path, tmp_path: Path) -> None:
+    video = tmp_path / "v.mkv"
+    write_video(video, [np.full((2 * HEIGHT, 2 * WIDTH, 3), 5 * i, np.uint8) for i in range(28)], 10.0)
+    settings = tmp_path / "launch.toml"
+    settings.write_text(f"""
+        [source]
+        path = "{video}"
+        pace = "lockstep"
+        hfov_deg = 85.0
+        [source.pose]
+        height_m = 1.7
+        [model]
+        weights = "{weights}"
+        [view.main]
+        [publish]
+        data = "ipc://{tmp_path}/data"
+        status = "ipc://{tmp_path}/status"
+        end_delay_ms = 10
+        min_subscribers = 1
+    """)
+    node = subprocess.Popen([sys.executable, "-m", "gcd_node", "run", str(settings)], stderr=subprocess.DEVNULL)
+    try:
+        saving = ["--kind", "all", "--save", str(tmp_path / "s"), "--timeout", "60"]
+        assert run_app(["view", f"ipc://{tmp_path}/data", "--view", "main", *saving]) == 0
+        assert node.wait(30) == 0
+    finally:
+        node.kill()
+    saved = tmp_path / "s" / "main"
+    assert len(list(saved.glob("*.png"))) == len(list((saved / "cls").glob("*_*.png"))) == 28
+    assert [np.load(path).shape for path in sorted((saved / "cls").glob("*.npy"))] == [(14, HEIGHT, WIDTH)] * 2
+    assert (saved / "cls" / "legend.png").exists()

@@ -1,0 +1,191 @@
+"""Where the source camera stands: on a sphere or on its vehicle, and which model takes which."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fakes import WIDTH, Box, FakeSource, FakeSynthesizer, traits, warping_traits
+
+from gcd_model import CameraMount, OptionError, Traits
+from gcd_node.config import NodeConfig, SourcePose, load_config, parse_config
+from gcd_node.errors import ConfigError
+from gcd_node.node import Node
+from gcd_node.source_pose import is_foreign, require_usable, stated_mount, stated_sphere
+
+
+def config(pose: str | None = None, *, source: str = "", more: str = "") -> NodeConfig:
+    text = f"""
+        {more}
+        [source]
+        kind = "synthetic"
+        pace = "lockstep"
+        {source}
+        {"" if pose is None else "[source.pose]"}
+        {pose or ""}
+        [model]
+        weights = "fake"
+        [view.main]
+    """
+    return parse_config(text.encode(), "test")
+
+
+def run(settings: NodeConfig, made: Traits, source: FakeSource | None = None) -> tuple[FakeSynthesizer, Box]:
+    model, box = FakeSynthesizer(made), Box()
+    Node(settings, model, source or FakeSource(14, fps=10.0), box).run()
+    return model, box
+
+
+def matrices(box: Box) -> np.ndarray:
+    found = box.of("win")[0].header.source_from_view
+    assert found is not None
+    return np.array(found).reshape(-1, 4, 4)
+
+
+@pytest.mark.parametrize("pose", ["height_m = 2.4", "tilt_deg = 12.0", "left_m = 0.4\nforward_m = -1.0", ""])
+def test_the_view_stays_where_it_is_on_the_vehicle_however_the_camera_is_mounted(pose: str) -> None:
+    _, usual = run(config(), warping_traits())
+    model, box = run(config(pose), warping_traits())
+    mount = model.clips[0].mount
+    assert mount is not None
+    moved = mount.vehicle_from_camera.numpy() @ matrices(box)
+    assert moved == pytest.approx(CameraMount().vehicle_from_camera.numpy() @ matrices(usual), abs=1e-9)
+
+
+def test_clip_and_path_are_given_the_same_mount() -> None:
+    made = warping_traits()
+    model, _ = run(config("height_m = 2.0\ntilt_deg = 5.0"), made)
+    mount = CameraMount(height_m=2.0, tilt_deg=5.0)
+    assert model.clips[0].mount == mount
+    wanted = made.plan_view(mount=mount).source_from_target.numpy()
+    assert model.asked[0][0][0].source_from_target.numpy() == pytest.approx(wanted)
+
+
+def test_what_is_left_out_is_as_the_model_was_trained() -> None:
+    assert stated_mount(SourcePose(height_m=2.0), None, warping_traits()) == CameraMount(height_m=2.0)
+    assert stated_mount(SourcePose(), None, warping_traits()) == CameraMount()
+    assert stated_mount(None, None, warping_traits()) is None
+    assert stated_mount(None, 70.0, warping_traits()) == CameraMount(hfov_deg=70.0)
+
+
+def test_nothing_stated_leaves_the_mount_to_the_model() -> None:
+    model, box = run(config(), warping_traits())
+    assert model.clips[0].mount is None
+    assert box.of("win")[0].header.quality.ood == ()
+    meta = next(fields for topic, fields in box.notes if topic == "meta")
+    assert meta["mount"] == {
+        "height_m": 1.55,
+        "forward_m": 1.6,
+        "left_m": 0.0,
+        "tilt_deg": 0.0,
+        "hfov_deg": 85.0,
+        "assumed": True,
+    }
+
+
+def test_the_mounts_field_of_view_is_that_of_the_cropped_picture_and_the_views_is_the_trained_one() -> None:
+    wide = FakeSource(14, fps=10.0, size=(4 * WIDTH, 2 * WIDTH))  # 2:1, cropped to 3:2
+    model, box = run(config(source="hfov_deg = 90.0"), warping_traits(), wide)
+    mount, header = model.clips[0].mount, box.of("win")[0].header
+    assert mount is not None
+    assert mount.hfov_deg == pytest.approx(2 * np.degrees(np.arctan(0.75)))  # three quarters of the width are left
+    assert "hfov" in header.quality.ood
+    assert header.intrinsics is not None
+    assert header.intrinsics[0] == pytest.approx(WIDTH / 2 / np.tan(np.radians(42.5)))
+
+
+def test_meta_tells_a_stated_mount() -> None:
+    _, box = run(config("height_m = 2.0"), warping_traits())
+    meta = next(fields for topic, fields in box.notes if topic == "meta")
+    assert meta["mount"]["height_m"] == 2.0
+    assert meta["mount"]["assumed"] is False
+    _, box = run(config(), traits("driving"))
+    assert next(fields for topic, fields in box.notes if topic == "meta")["mount"] is None
+
+
+@pytest.mark.parametrize(
+    ("pose", "foreign"),
+    [("height_m = 1.56", False), ("height_m = 1.9", True), ("tilt_deg = 3.0", True), ("left_m = -0.5", True)],
+)
+def test_a_mount_unlike_the_trained_one_is_flagged_and_refused_when_strict(
+    pose: str, foreign: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING):
+        _, box = run(config(pose), warping_traits())
+    assert ("view" in box.of("win")[0].header.quality.ood) == foreign
+    assert ("camera mount" in caplog.text) == foreign
+    if foreign:
+        with pytest.raises(ConfigError, match="strict: camera mount"):
+            run(config(pose, more="strict = true"), warping_traits())
+
+
+def test_a_model_that_does_not_warp_has_no_foreign_mount() -> None:
+    assert not is_foreign(CameraMount(height_m=3.0), traits())
+    assert stated_mount(None, 60.0, traits()) is None
+
+
+@pytest.mark.parametrize(
+    ("family", "pose", "words"),
+    [
+        ("kubric90", "height_m = 1.5", "steered by angles.*state elevation and radius instead"),
+        ("driving", "tilt_deg = 2.0", "nothing but the pictures.*leave it out"),
+        ("svd", "left_m = 0.0", "nothing but the pictures.*leave it out"),
+        ("driving", "radius = 15.0", "not steered by angles.*leave them out"),
+        ("small", "elevation_deg = 5.0", "not steered by angles.*state the mount instead"),
+    ],
+)
+def test_a_pose_in_words_the_model_does_not_know_is_refused_before_the_first_frame(
+    family: str, pose: str, words: str
+) -> None:
+    made = warping_traits() if family == "small" else traits(family)
+    with pytest.raises(ConfigError, match=rf"\[source\.pose\]: fake .*{words}"):
+        Node(config(pose), FakeSynthesizer(made), FakeSource(14, fps=10.0), Box())
+
+
+def test_the_pose_of_every_launch_file_suits_its_model() -> None:
+    paths = sorted((Path(__file__).parents[2] / "launch").glob("*.toml"))
+    assert paths
+    for path in paths:
+        settings = load_config(path)
+        kind, _, name = settings.model.weights.partition(":")
+        require_usable(settings.source.pose, traits(name) if kind == "random" else warping_traits())
+
+
+def test_a_pose_that_says_nothing_suits_every_model() -> None:
+    for made in (warping_traits(), traits(), traits("driving"), traits("svd")):
+        require_usable(SourcePose(), made)
+        require_usable(None, made)
+
+
+@pytest.mark.parametrize(
+    ("pose", "reason"),
+    [
+        ("radius = 15.0\nheight_m = 1.5", "state one of the two"),
+        ("height_m = 0.0", "> 0"),
+        ("height_m = inf", "<= 100"),
+        ("tilt_deg = 90.0", "< 90"),
+        ("forward_m = 'far'", "Expected `float"),
+        ("hight_m = 1.5", "did you mean `height_m`"),
+    ],
+)
+def test_an_impossible_pose_is_refused_by_its_key(pose: str, reason: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        config(pose)
+    assert reason in str(caught.value)
+
+
+def test_numbers_that_are_none_are_refused() -> None:
+    with pytest.raises((OptionError, ConfigError)):
+        run(config("tilt_deg = nan"), warping_traits())
+
+
+def test_a_sphere_is_filled_with_what_is_assumed() -> None:
+    assert stated_sphere(None) is None
+    half = stated_sphere(SourcePose(radius=14.0))
+    assert half is not None
+    assert (half.elevation_deg, half.radius_m) == (5.0, 14.0)
+    assert stated_sphere(SourcePose(height_m=2.0)) is None
+
+
+def test_the_mount_is_part_of_what_the_digest_names() -> None:
+    assert config("height_m = 2.0").digest != config("height_m = 2.1").digest

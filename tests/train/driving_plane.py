@@ -1,0 +1,126 @@
+"""A world that is one painted ground plane under a sky, drawn by following each pixel's ray: no renderer."""
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import torch
+from torch import Tensor
+
+from gcd_model.config import DRIVING_CLASSES, SemanticClass
+from gcd_model.geometry import CameraMount
+from gcd_train.baselines.cameras import CameraPair, pixel_rays
+from gcd_train.datasets.paired import PairedClip
+from gcd_train.scenes.writer import DEPTH_UNIT_M, World
+
+SKY, ROAD, TERRAIN = 0, 1, 4
+
+
+def picture(vehicle_from_camera: Tensor, rays: Tensor, phase: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Colour [H, W, 3] in [0, 1], depth [H, W] (0: sky) and classes [H, W] of the plane."""
+    turned = rays @ vehicle_from_camera[:3, :3].T
+    depth = -vehicle_from_camera[2, 3] / turned[..., 2]
+    ground = (depth > 0) & (depth < 200)
+    points = vehicle_from_camera[:3, 3] + turned * depth[..., None]
+    x, y = points[..., 0], points[..., 1]
+    colour = torch.stack([0.5 + 0.3 * torch.sin(y / 4 + phase), 0.5 + 0.3 * torch.cos(x / 9), 0.4 + 0 * x], dim=-1)
+    colour = torch.where(ground[..., None], colour, 0.8)
+    labels = torch.where(ground, torch.where(y.abs() < 3, ROAD, TERRAIN), SKY)
+    return colour, torch.where(ground, depth, 0.0), labels
+
+
+def plane_clip(cameras: CameraPair, phase: float = 0.0) -> PairedClip:
+    """The plane as both cameras of a driving clip see it."""
+    still = cameras.mount.vehicle_from_camera
+    moving = still @ cameras.source_from_target
+    source = [picture(still, pixel_rays(cameras.source), phase) for _ in moving]
+    target = [picture(pose, pixel_rays(cameras.target), phase) for pose in moving]
+    s_rgb, s_depth, s_labels = (torch.stack(kind) for kind in zip(*source, strict=True))
+    t_rgb, t_depth, t_labels = (torch.stack(kind) for kind in zip(*target, strict=True))
+    return PairedClip(
+        source=_bytes(s_rgb * 255),
+        target=_bytes(t_rgb * 255),
+        source_depth=s_depth.numpy().astype(np.float32),
+        target_depth=t_depth.numpy().astype(np.float32),
+        source_classes=_bytes(s_labels),
+        target_classes=_bytes(t_labels),
+        source_instances=_bytes(0 * s_labels),
+        target_instances=_bytes(0 * t_labels),
+        seed=0,
+    )
+
+
+def _bytes(values: Tensor) -> np.ndarray:
+    return values.double().round().to(torch.uint8).numpy()
+
+
+@dataclass(frozen=True)
+class PlaneClips:
+    """Clips of that world with different paint."""
+
+    clips: tuple[PairedClip, ...]
+    classes: tuple[SemanticClass, ...] = DRIVING_CLASSES
+    fps: float = 10.0
+
+    @classmethod
+    def make(cls, count: int, *, frames: int = 4, height: int = 32, width: int = 48) -> "PlaneClips":
+        cameras = CameraPair.driving(CameraMount(), frames=frames, height=height, width=width)
+        return cls(tuple(plane_clip(cameras, phase=float(i)) for i in range(count)))
+
+    def write(self, folder: Path) -> Path:
+        """A data folder with these clips in one shard."""
+        folder.mkdir(parents=True, exist_ok=True)
+        world = World(
+            name="driving",
+            width=self.width,
+            height=self.height,
+            frames=self.frames,
+            fps=self.fps,
+            hfov_deg=85.0,
+            oversample=1,
+            clips_per_shard=len(self),
+            classes=self.classes,
+        )
+        (folder / "world.json").write_bytes(msgspec.json.encode(world))
+        with zipfile.ZipFile(folder / f"shard-00000000-{len(self)}.zip", "w") as archive:
+            for number, clip in enumerate(self.clips):
+                for kind, strip in _strips(clip).items():
+                    archive.writestr(f"{number:08d}/{kind}.png", cv2.imencode(".png", strip)[1].tobytes())
+        return folder
+
+    def __len__(self) -> int:
+        return len(self.clips)
+
+    def __getitem__(self, number: int) -> PairedClip:
+        return self.clips[number]
+
+    def rgb(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+        return self.clips[number].source, self.clips[number].target
+
+    def target_classes(self, number: int) -> np.ndarray:
+        return self.clips[number].target_classes
+
+    @property
+    def frames(self) -> int:
+        return len(self.clips[0].source)
+
+    @property
+    def height(self) -> int:
+        return self.clips[0].source.shape[1]
+
+    @property
+    def width(self) -> int:
+        return self.clips[0].source.shape[2]
+
+
+def _strips(clip: PairedClip) -> dict[str, np.ndarray]:
+    strips: dict[str, np.ndarray] = {}
+    for side in ("source", "target"):
+        strips[f"{side}.rgb"] = getattr(clip, side)[..., ::-1]
+        strips[f"{side}.depth"] = np.rint(getattr(clip, f"{side}_depth") / DEPTH_UNIT_M).astype(np.uint16)
+        strips[f"{side}.classes"] = getattr(clip, f"{side}_classes")
+        strips[f"{side}.instances"] = getattr(clip, f"{side}_instances")
+    return {kind: np.ascontiguousarray(np.concatenate(frames)) for kind, frames in strips.items()}

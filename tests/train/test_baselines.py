@@ -1,0 +1,204 @@
+import numpy as np
+import pytest
+import torch
+from driving_plane import PlaneClips, plane_clip
+from torch.testing import assert_close
+
+from gcd_model.config import PlaneWarpConfig
+from gcd_model.geometry import CameraMount
+from gcd_model.plane_warp import plane_warp
+from gcd_train.baselines import (
+    CameraPair,
+    CopySource,
+    DepthReprojection,
+    GroundHomography,
+    MajorityMap,
+    MeanTarget,
+    TargetStatistics,
+    driving_baselines,
+    fit_statistics,
+    to_pictures,
+)
+from gcd_train.baselines.cameras import pixel_rays, to_pixels
+from gcd_train.baselines.depth_reprojection import splat
+from gcd_train.baselines.ground_homography import ground_grid, plane_homography
+from gcd_train.datasets.paired import PairedClip
+from gcd_train.errors import DataError
+from gcd_train.metrics import psnr
+
+FRAMES, HEIGHT, WIDTH = 5, 64, 96
+MARK, MARK_CLASS = -1.0, 12
+
+
+def cameras(mount: CameraMount | None = None) -> CameraPair:
+    return CameraPair.driving(mount or CameraMount(), frames=FRAMES, height=HEIGHT, width=WIDTH)
+
+
+def marked_fill() -> TargetStatistics:
+    """A fill no picture holds, so that holes can be told."""
+    mean = torch.full((FRAMES, 3, HEIGHT, WIDTH), MARK)
+    return TargetStatistics(mean=mean, majority=torch.full((FRAMES, HEIGHT, WIDTH), MARK_CLASS, dtype=torch.uint8))
+
+
+def near_ground(clip: PairedClip) -> torch.Tensor:
+    """Where the paint is coarse enough for the source picture to hold it, bool [T, H, W]."""
+    return torch.from_numpy((clip.target_depth > 0) & (clip.target_depth < 25))
+
+
+def agreement(video: torch.Tensor, target: torch.Tensor, seen: torch.Tensor) -> tuple[float, float]:
+    """Share of pixels seen, and root mean square error on them."""
+    error = ((video - target) ** 2).mean(dim=1)[seen].mean().sqrt()
+    return float(seen.float().mean()), float(error)
+
+
+@pytest.mark.parametrize("mount", [CameraMount(), CameraMount(height_m=1.9, tilt_deg=4.0)])
+def test_reprojecting_a_plane_gives_the_picture_drawn_by_rays(mount: CameraMount) -> None:
+    clip = plane_clip(cameras(mount))
+    made = DepthReprojection(cameras=cameras(mount), fill=marked_fill(), classes=13).predict(clip)
+    assert made.video is not None
+    assert made.classes is not None
+    seen = made.video[:, 0] > MARK / 2
+    assert seen.float().mean() > 0.5
+    share, error = agreement(made.video, to_pictures(clip.target), seen & near_ground(clip))
+    assert share > 0.15
+    assert error < 0.03
+    right = made.classes == torch.from_numpy(clip.target_classes)
+    assert right[seen].float().mean() > 0.97
+    assert (made.classes[~seen] == MARK_CLASS).all()
+
+
+def test_reprojecting_into_the_same_camera_changes_nothing() -> None:
+    clip = plane_clip(cameras())
+    made = DepthReprojection(cameras=cameras(), fill=marked_fill(), classes=13).predict(clip)
+    assert made.video is not None
+    assert made.classes is not None
+    assert_close(made.video[0], to_pictures(clip.source)[0], rtol=0, atol=1e-5)
+    assert torch.equal(made.classes[0], torch.from_numpy(clip.source_classes)[0])
+
+
+@pytest.mark.parametrize("mount", [CameraMount(), CameraMount(height_m=1.2, tilt_deg=-3.0)])
+def test_the_ground_homography_gives_the_picture_of_a_plane_drawn_by_rays(mount: CameraMount) -> None:
+    clip = plane_clip(cameras(mount))
+    made = GroundHomography(cameras=cameras(mount), fill=marked_fill()).predict(clip)
+    assert made.video is not None
+    assert made.classes is not None
+    seen = (made.video[:, 0] > MARK / 2) & near_ground(clip)
+    share, error = agreement(made.video, to_pictures(clip.target), seen)
+    assert share > 0.15
+    assert error < 0.03
+    assert (made.classes == torch.from_numpy(clip.target_classes))[seen].float().mean() > 0.97
+
+
+def test_a_homography_takes_target_pixels_to_the_source_pixels_of_the_same_ground_points() -> None:
+    pair = cameras(CameraMount(height_m=1.3, tilt_deg=2.0))
+    vehicle_from_source = pair.mount.vehicle_from_camera
+    vehicle_from_target = vehicle_from_source @ pair.source_from_target
+    point = torch.tensor([14.0, -2.5, 0.0, 1.0], dtype=torch.float64)
+    homography = plane_homography(pair.source_from_target, -vehicle_from_target[:, 2, :3], vehicle_from_target[:, 2, 3])
+    in_target = (torch.linalg.inv(vehicle_from_target) @ point)[:, :3]
+    in_source = (torch.linalg.inv(vehicle_from_source) @ point)[:3]
+    moved = torch.einsum("tij,tj->ti", homography, in_target / in_target[:, 2:])
+    expected = to_pixels(in_source, pair.source).expand(FRAMES, 2)
+    assert_close(to_pixels(moved, pair.source), expected, rtol=0, atol=1e-8)
+
+
+def test_the_homography_agrees_with_the_models_own_ground_warp() -> None:
+    pair = cameras()
+    grid, seen = ground_grid(pair)
+    warps = plane_warp(PlaneWarpConfig(), pair.mount, pair.source_from_target, HEIGHT, WIDTH)
+    assert (seen == warps.valid[:, 0]).float().mean() > 0.999
+    both = seen & warps.valid[:, 0]
+    assert_close(grid[both], warps.grid[:, 0][both], rtol=0, atol=1e-4)
+
+
+def test_the_nearer_surface_hides_the_farther_one() -> None:
+    camera = cameras().source
+    ray = pixel_rays(camera)[20, 30]
+    points = torch.stack([ray * 9.0, ray * 3.0, ray * 20.0])
+    shown, covered = splat(torch.tensor([[0.2, 0.7, 0.9]]), points, camera)
+    assert shown[0, 20, 30].item() == pytest.approx(0.7)
+    assert torch.nonzero(covered).tolist() == [[20, 30]]
+
+
+def test_points_behind_the_camera_or_beside_the_picture_are_not_drawn() -> None:
+    camera = cameras().source
+    points = torch.tensor([[0.0, 0.0, -5.0], [50.0, 0.0, 5.0], [0.0, 0.0, 0.05]], dtype=torch.float64)
+    shown, covered = splat(torch.ones(1, 3), points, camera)
+    assert not covered.any()
+    assert not shown.any()
+
+
+def test_the_sky_is_reprojected_as_far_away() -> None:
+    clip = plane_clip(cameras())
+    made = DepthReprojection(cameras=cameras(), fill=marked_fill(), classes=13).predict(clip)
+    assert made.classes is not None
+    sky = torch.from_numpy(clip.target_classes) == 0
+    found = made.classes[sky]
+    assert ((found == 0) | (found == MARK_CLASS)).float().mean() > 0.97
+
+
+def test_a_wrongly_declared_mount_costs_the_homography() -> None:
+    clip = plane_clip(cameras(CameraMount(height_m=1.55)))
+    scores = []
+    for height_m in (1.55, 1.8):
+        pair = cameras(CameraMount(height_m=height_m))
+        statistics = TargetStatistics(mean=to_pictures(clip.target), majority=torch.from_numpy(clip.target_classes))
+        video = GroundHomography(cameras=pair, fill=statistics).predict(clip).video
+        assert video is not None
+        scores.append(float(psnr(video, to_pictures(clip.target))[1:].mean()))
+    assert scores[0] > scores[1] + 0.5
+
+
+def test_copying_shows_the_source_and_its_classes() -> None:
+    clip = PlaneClips.make(1)[0]
+    made = CopySource().predict(clip)
+    assert made.video is not None
+    assert made.classes is not None
+    assert np.array_equal((made.video * 255).round().permute(0, 2, 3, 1).numpy(), clip.source)
+    assert np.array_equal(made.classes.numpy(), clip.source_classes)
+
+
+def test_the_mean_target_is_by_pixel_and_frame_number() -> None:
+    clips = PlaneClips.make(3)
+    mean = MeanTarget(statistics=fit_statistics(clips)).predict(clips[0]).video
+    expected = np.stack([clip.target for clip in clips.clips]).mean(axis=0) / 255
+    assert mean is not None
+    assert np.abs(mean.permute(0, 2, 3, 1).numpy() - expected).max() < 1e-6
+
+
+def test_the_majority_map_takes_the_commonest_class_of_each_pixel() -> None:
+    clips = PlaneClips.make(3)
+    clips[0].target_classes[1, 5, 7] = clips[2].target_classes[1, 5, 7] = 9
+    clips[1].target_classes[2, 3, 4] = 9
+    usual = clips[0].target_classes[2, 3, 4]
+    majority = MajorityMap(statistics=fit_statistics(clips)).predict(clips[1]).classes
+    assert majority is not None
+    assert (majority[1, 5, 7], majority[2, 3, 4]) == (9, usual)
+
+
+def test_constant_statistics_have_each_frames_mean_colour_and_commonest_class() -> None:
+    clips = PlaneClips.make(2)
+    statistics = fit_statistics(clips)
+    constant = statistics.constant
+    assert_close(constant.mean[2, :, 0, 0], statistics.mean[2].mean(dim=(1, 2)))
+    assert constant.mean[1].flatten(1).std(dim=1).max() < 1e-6
+    assert constant.majority[3].unique().tolist() == [int(statistics.majority[3].flatten().mode().values)]
+
+
+def test_statistics_of_no_clips_are_refused() -> None:
+    with pytest.raises(DataError, match="training clips"):
+        fit_statistics(PlaneClips(()))
+
+
+def test_every_baseline_follows_one_protocol() -> None:
+    clips = PlaneClips.make(2)
+    baselines = driving_baselines(fit_statistics(clips), CameraMount(), len(clips.classes))
+    names = [each.name for each in baselines]
+    assert len(set(names)) == len(names) == 6
+    assert [each.name for each in baselines if each.privileged] == names[-2:]
+    shape = (clips.frames, 3, clips.height, clips.width)
+    for each in baselines:
+        made = each.predict(clips[0])
+        assert made.video is not None or made.classes is not None
+        assert made.video is None or (made.video.shape == shape and made.video.dtype == torch.float32)
+        assert made.classes is None or made.classes.dtype == torch.uint8

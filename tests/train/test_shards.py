@@ -1,0 +1,117 @@
+"""Data folders: written whole or not at all, continued, read back as they were drawn."""
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from headless import needs_egl
+from typer.testing import CliRunner
+
+from gcd_train.cli import app
+from gcd_train.datasets.paired import PairedClips
+from gcd_train.errors import DataError
+from gcd_train.scenes.driving import driving_scene
+from gcd_train.scenes.renderer import Renderer
+from gcd_train.scenes.writer import World, generate, read_world, shard_path, write_shard
+
+TINY = World(name="driving", width=48, height=32, frames=2, fps=10.0, hfov_deg=85.0, oversample=1, clips_per_shard=2)
+
+
+@needs_egl
+def test_clips_are_read_as_they_were_drawn(tmp_path: Path) -> None:
+    list(generate(tmp_path, TINY, range(3), workers=1))
+    clips = PairedClips.open(tmp_path)
+    assert (len(clips), clips.frames, clips.height, clips.width, clips.fps) == (3, 2, 32, 48, 10.0)
+    with Renderer(48, 32, oversample=1) as renderer:
+        drawn = renderer.render(driving_scene(2, frames=2))
+    clip = clips[2]
+    assert clip.seed == 2
+    for name, frames in drawn.items():
+        np.testing.assert_array_equal(getattr(clip, name), np.stack([frame.rgb for frame in frames]))
+        np.testing.assert_array_equal(getattr(clip, f"{name}_classes"), np.stack([frame.classes for frame in frames]))
+        np.testing.assert_array_equal(
+            getattr(clip, f"{name}_instances"), np.stack([frame.instances for frame in frames])
+        )
+        depth = np.stack([frame.depth for frame in frames])
+        np.testing.assert_allclose(getattr(clip, f"{name}_depth"), depth.clip(0, 255.99), atol=1 / 256)
+
+
+@needs_egl
+def test_generation_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    write_partial = tmp_path / "shard-00000002-2.123.partial"
+    tmp_path.mkdir(exist_ok=True)
+    write_partial.write_bytes(b"cut off")
+    list(generate(tmp_path, TINY, range(2), workers=1))
+    first = shard_path(tmp_path, range(2))
+    written = first.stat().st_mtime_ns
+    seen = [progress.done for progress in generate(tmp_path, TINY, range(4), workers=1)]
+    assert seen == [2, 4]
+    assert first.stat().st_mtime_ns == written
+    assert len(PairedClips.open(tmp_path)) == 4
+
+
+@needs_egl
+def test_a_failing_scene_leaves_no_shard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(self: Renderer, scene: object) -> None:
+        raise RuntimeError("driver lost")
+
+    monkeypatch.setattr(Renderer, "render", broken)
+    with pytest.raises(RuntimeError, match="driver lost"):
+        write_shard(tmp_path, TINY, range(2))
+    assert list(tmp_path.iterdir()) == []
+
+
+@needs_egl
+def test_a_folder_of_another_world_is_refused(tmp_path: Path) -> None:
+    list(generate(tmp_path, TINY, range(1), workers=1))
+    with pytest.raises(DataError, match="choose another folder"):
+        list(generate(tmp_path, msgspec.structs.replace(TINY, width=96), range(1), workers=1))
+    assert read_world(tmp_path) == TINY
+
+
+@needs_egl
+def test_a_damaged_shard_is_named(tmp_path: Path) -> None:
+    list(generate(tmp_path, TINY, range(2), workers=1))
+    shard = shard_path(tmp_path, range(2))
+    shard.write_bytes(shard.read_bytes()[:-200])
+    with pytest.raises(DataError, match=shard.name):
+        PairedClips.open(tmp_path)
+
+
+def test_folders_without_data_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"world\.json"):
+        PairedClips.open(tmp_path)
+    (tmp_path / "world.json").write_bytes(msgspec.json.encode(TINY))
+    with pytest.raises(DataError, match="no finished shard"):
+        PairedClips.open(tmp_path)
+    (tmp_path / "world.json").write_text('{"name": 3}')
+    with pytest.raises(DataError, match="cannot be read"):
+        PairedClips.open(tmp_path)
+
+
+@needs_egl
+def test_the_command_makes_clips_and_a_contact_sheet(tmp_path: Path) -> None:
+    sheet = tmp_path / "sheet.png"
+    options = [
+        "--clips",
+        "1",
+        "--width",
+        "48",
+        "--height",
+        "32",
+        "--frames",
+        "2",
+        "--oversample",
+        "1",
+        "--workers",
+        "1",
+    ]
+    made = CliRunner().invoke(
+        app, ["generate", "driving", "--out", str(tmp_path / "data"), *options, "--contact-sheet", str(sheet)]
+    )
+    assert made.exit_code == 0, made.output
+    assert sheet.read_bytes().startswith(b"\x89PNG")
+    again = CliRunner().invoke(app, ["generate", "driving", "--out", str(tmp_path / "data"), "--clips", "1"])
+    assert again.exit_code == 1
+    assert "choose another folder" in again.output

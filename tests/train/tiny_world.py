@@ -1,0 +1,101 @@
+"""Clips, networks and recipes small enough to train in a second."""
+
+import msgspec
+import numpy as np
+
+from gcd_model.class_head import SemanticClass
+from gcd_model.config import DRIVING_CLASSES
+from gcd_train.recipe import Recipe, parse_recipe
+
+FRAMES, HEIGHT, WIDTH = 4, 32, 64
+
+RECIPE = b"""
+name = "tiny"
+seed = 3
+[model]
+frames = 4
+height = 32
+width = 64
+[model.unet]
+width = 16
+multipliers = [1, 2, 3]
+head_width = 16
+embedding_width = 32
+[model.vae]
+width = 16
+multipliers = [1, 1, 2]
+[log]
+valid_clips = 1
+[vae]
+budget = { updates = 6 }
+crop = 16
+clips = 2
+frames = 2
+optimiser = { rate = 2e-3, warm_up = 2, final = 0.1, clip = 1.0 }
+[latents]
+[unet]
+budget = { updates = 6 }
+image_share = 0.5
+image_batch = 4
+clip_batch = 1
+augmentation = 0.0
+optimiser = { rate = 1e-3, warm_up = 2, flat = 0.3, final = 0.02, clip = 1.0 }
+ema = { limit = 0.998, horizon = 0.15 }
+noise = { fixed_share = 0.5, shared = 1.0 }
+loss = { weight_limit = 5.0, sensitivity = true, class_map = 0.25 }
+[decoder]
+budget = { updates = 4 }
+clips = 2
+batch = 2
+optimiser = { rate = 1e-3 }
+ema = { limit = 0.9 }
+"""
+
+
+class TinyClips:
+    """Random gradients; the target is the source upside down."""
+
+    def __init__(self, count: int = 2, seed: int = 0) -> None:
+        random = np.random.default_rng(seed)
+        low = random.integers(0, 255, (count, FRAMES, 4, 8, 3), np.uint8)
+        self._clips = low.repeat(HEIGHT // 4, axis=2).repeat(WIDTH // 8, axis=3)
+        self._ids = (self._clips[..., 0] % len(DRIVING_CLASSES)).astype(np.uint8)
+
+    def __len__(self) -> int:
+        return len(self._clips)
+
+    @property
+    def classes(self) -> tuple[SemanticClass, ...]:
+        return DRIVING_CLASSES
+
+    def seed(self, number: int, /) -> int:
+        return 100 + number
+
+    def rgb(self, number: int, /) -> tuple[np.ndarray, np.ndarray]:
+        return self._clips[number], self._clips[number][:, ::-1]
+
+    def target_classes(self, number: int, /) -> np.ndarray:
+        return self._ids[number]
+
+
+class Never:
+    """A stop signal that is never set."""
+
+    def is_set(self) -> bool:
+        return False
+
+
+class After:
+    """A stop signal that is set the n-th time it is asked."""
+
+    def __init__(self, asked: int) -> None:
+        self._left = asked
+
+    def is_set(self) -> bool:
+        self._left -= 1
+        return self._left <= 0
+
+
+def tiny_recipe(**changes: object) -> Recipe:
+    """The tiny recipe, with top-level fields replaced."""
+    return msgspec.structs.replace(parse_recipe(RECIPE, "tiny"), **changes)

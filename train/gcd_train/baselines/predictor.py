@@ -1,0 +1,52 @@
+"""The one protocol of everything that is evaluated: a clip in, its target view out."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gcd_train.datasets.clip_source import Bytes
+
+
+class SourceClip(Protocol):
+    """What a predictor may look at: the source side of a `PairedClip`.
+
+    source: uint8 [T, H, W, 3] RGB. source_depth: float32 [T, H, W], metres along the optical axis, 0 for the sky.
+    source_classes: uint8 [T, H, W].
+    """
+
+    @property
+    def source(self) -> Bytes: ...
+    @property
+    def source_depth(self) -> NDArray[np.float32]: ...
+    @property
+    def source_classes(self) -> Bytes: ...
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Prediction:
+    """A view as it is measured.
+
+    video: float32 [T, 3, H, W] in [0, 1], or None. classes: uint8 [T, H, W], or None.
+    """
+
+    video: Tensor | None = None
+    classes: Tensor | None = None
+
+
+class Predictor(Protocol):
+    """Makes the target view of a clip from its source alone, or, where `privileged`, from its exact depth too."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def privileged(self) -> bool: ...
+    def predict(self, clip: SourceClip) -> Prediction: ...
+
+
+def to_pictures(frames: Bytes) -> Tensor:
+    """uint8 [T, H, W, 3] -> float32 [T, 3, H, W] in [0, 1]."""
+    return torch.from_numpy(np.ascontiguousarray(frames)).permute(0, 3, 1, 2).float() / 255.0

@@ -1,0 +1,1 @@
+"""Clips as the trainer and the evaluation read them."""

@@ -1,0 +1,119 @@
+"""The diffusion loss: weighting over noise levels, the focal selection with its schedule, class weights.
+
+Source: Van Hoorick et al. 2024 (GCD), section 3 and appendix, with the numbers of the released model.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+FOCAL_SHARE = 0.9
+"""How much the hardest elements count; the plain mean counts the rest."""
+_COLOUR_TOLERANCE = 0.02  # mean absolute difference over the channels of a picture in [-1, 1]
+_BIAS_BEFORE, _BIAS_AFTER = 0.5, 0.5  # shares of the class weights that act before and after the selection
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ClassWeight:
+    """Elements of a class count this much more. colour: 8-bit RGB of the class in a semantic picture."""
+
+    colour: tuple[int, int, int]
+    weight: float
+
+
+def _weights(weight: float, *colours: tuple[int, int, int]) -> tuple[ClassWeight, ...]:
+    return tuple(ClassWeight(colour=colour, weight=weight) for colour in colours)
+
+
+PARALLEL_DOMAIN_WEIGHTS: tuple[ClassWeight, ...] = (
+    *_weights(7.0, (220, 20, 180), (64, 64, 64), (128, 128, 128), (192, 192, 192), (220, 20, 60)),
+    *_weights(3.0, (0, 60, 100), (0, 0, 142), (0, 0, 90), (32, 32, 32), (119, 11, 32), (0, 0, 230)),
+    *_weights(3.0, (128, 230, 128), (0, 0, 70), (0, 64, 64)),
+)
+"""ParallelDomain-4D, semantic pictures: living beings and riders first, then vehicles; trains are left out."""
+
+
+def edm_weight(sigma: Tensor, limit: float | None = None) -> Tensor:
+    """Weight of a noise level, (s^2 + 1) / s^2, at most `limit`: any shape to the same.
+
+    Source: Karras et al. 2022, table 1, sigma_data 1. With a limit: Hang et al. 2023, min-SNR, in terms of x0.
+    """
+    weight = (sigma**2 + 1) / sigma**2
+    return weight if limit is None else weight.clamp(max=limit)
+
+
+def focal_fraction(step: int, *, final: float = 0.1, steps: int = 5000) -> float:
+    """Share of a frame's elements that the focal loss keeps: from 1 at step 0 to `final`, linear over `steps`.
+
+    step: updates of the optimiser so far.
+    """
+    done = min(max(step / steps, 0.0), 1.0)
+    return (1 - done) + final * done
+
+
+def focal_mean(values: Tensor, fraction: float) -> Tensor:
+    """Per frame, 0.9 times the mean of the largest elements plus 0.1 times the mean of all: [N, ...] -> [N].
+
+    The elements are those of one frame, channels included; floor(n * fraction) of n are kept. A fraction of 1 or
+    more gives the plain mean.
+    """
+    rows = values.flatten(1)
+    if fraction >= 1:
+        return rows.mean(1)
+    kept = max(int(rows.shape[1] * fraction), 1)
+    largest = rows.topk(kept, dim=1, sorted=False).values
+    return FOCAL_SHARE * largest.mean(1) + (1 - FOCAL_SHARE) * rows.mean(1)
+
+
+def class_emphasis(pictures: Tensor, weights: Sequence[ClassWeight], size: tuple[int, int]) -> Tensor:
+    """How much more each latent element counts: sum over classes of mask * (weight - 1), [N, 1, h, w].
+
+    Args:
+        pictures: [N, 3, H, W], semantic pictures in [-1, 1]; a class is where its colour is.
+        size: (h, w) of the latents; masks are averaged over areas, so an element may belong to a class partly.
+    """
+    emphasis = torch.zeros_like(pictures[:, :1])
+    for weight in weights:
+        colour = pictures.new_tensor(weight.colour)[:, None, None] / 127.5 - 1
+        mask = (pictures - colour).abs().mean(1, keepdim=True) < _COLOUR_TOLERANCE
+        emphasis = emphasis + mask * (weight.weight - 1)
+    return F.interpolate(emphasis, size=size, mode="area")
+
+
+def frame_losses(
+    denoised: Tensor,
+    target: Tensor,
+    *,
+    fraction: float,
+    emphasis: Tensor | None = None,
+    channel_weights: Tensor | None = None,
+) -> Tensor:
+    """Squared error of each frame before the weight of its noise level: [N].
+
+        all = raw + 0.5 bias;  loss = focal(all) + 0.5 mean(bias);  bias = raw * emphasis
+
+    Args:
+        denoised, target: [N, C, h, w]. fraction: see `focal_mean`.
+        emphasis: [N, 1, h, w] of `class_emphasis`.
+        channel_weights: [C], multiplies the squared error (ours, for latents whose channels matter unequally).
+    """
+    raw = (denoised - target) ** 2
+    if channel_weights is not None:
+        raw = raw * channel_weights[:, None, None]
+    if emphasis is None:
+        return focal_mean(raw, fraction)
+    bias = raw * emphasis
+    return focal_mean(raw + _BIAS_BEFORE * bias, fraction) + _BIAS_AFTER * bias.flatten(1).mean(1)
+
+
+def class_frequency_weights(frequencies: Tensor, power: float) -> Tensor:
+    """Weights of the classes in a cross-entropy, frequency^-power, one on average over pixels: [K] -> [K].
+
+    A class that never occurs is treated as one pixel in a hundred thousand. Ours, for the class-map head.
+    """
+    shares = (frequencies.double() / frequencies.sum()).clamp(min=1e-5)
+    raw = shares**-power
+    return (raw / (raw * shares).sum()).float()

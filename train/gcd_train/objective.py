@@ -1,0 +1,141 @@
+"""The diffusion objective on one batch, through the networks that are shipped.
+
+Source: Van Hoorick et al. 2024 (GCD), section 3: noise level per clip, v-prediction, conditioning dropped per frame,
+conditioning augmentation in pixel space; x0-prediction, fixed noise levels, shared noise and the class map are ours.
+"""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from gcd_model.class_head import ClassHead
+from gcd_model.config import Prediction
+from gcd_model.noise import preconditioning
+from gcd_model.unet import VideoUNet
+from gcd_train.draws import Draws
+from gcd_train.loop import StepLoss
+from gcd_train.losses import edm_weight, focal_fraction, frame_losses
+from gcd_train.precision import Precision
+from gcd_train.recipe import LossRecipe, NoiseRecipe
+
+
+class Denoiser(nn.Module):
+    """U-Net and class head under the names they have in `Networks`."""
+
+    def __init__(self, unet: VideoUNet, class_head: ClassHead | None, prediction: Prediction) -> None:
+        super().__init__()
+        self.unet, self.class_head = unet, class_head
+        self.prediction: Prediction = prediction
+
+    def forward(self, noisy: Tensor, sigma: Tensor, batch: "Batch") -> tuple[Tensor, Tensor | None]:
+        """D(x, sigma) and the class logits.
+
+        Args:
+            noisy: [N, C, h, w]. sigma: [N].
+        Returns:
+            [N, C, h, w] and [N, K, H', W'] or None, float32.
+        """
+        levels = preconditioning(sigma, self.prediction)
+        plan = self.unet.plan(levels.c_noise[None], batch.vector, None, batch.tokens)
+        scaled, image_mode = _column(levels.c_in) * noisy, batch.frames == 1
+        features = self.unet.features(scaled, batch.condition, plan.step(0), image_mode=image_mode)
+        raw = self.unet.project(features).float()
+        logits = None if self.class_head is None else self.class_head(features).float()
+        return _column(levels.c_skip) * noisy + _column(levels.c_out) * raw, logits
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Batch:
+    """N rows, time fastest: whole clips of `frames` frames, or unrelated frames with `frames` 1.
+
+    target: [N, C, h, w], scaled latents. condition: [N, C', h, w]. vector: [N, V]. tokens: [N, D] or None.
+    classes: int64 [N, H', W'] or None. emphasis: [N, 1, h, w] of `class_emphasis`, or None.
+    """
+
+    target: Tensor
+    condition: Tensor
+    vector: Tensor
+    tokens: Tensor | None
+    classes: Tensor | None
+    emphasis: Tensor | None
+    frames: int
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Weights:
+    """Constant weights of the loss. channels: [C] or None. classes: [K] or None."""
+
+    channels: Tensor | None = None
+    classes: Tensor | None = None
+
+
+def draw_sigma(draws: Draws, clips: int, recipe: NoiseRecipe) -> Tensor:
+    """One noise level a clip, [B]: exp(log_mean + log_std * n), or the fixed one. Source: Karras et al. 2022."""
+    sigma = torch.exp(recipe.log_mean + recipe.log_std * draws.normal(clips))
+    fixed = draws.chance(recipe.fixed_share, clips)
+    return torch.where(fixed, torch.full_like(sigma, recipe.fixed_sigma), sigma)
+
+
+def draw_noise(draws: Draws, shape: torch.Size, frames: int, shared: float) -> Tensor:
+    """Unit noise [N, C, h, w], of whose variance the frames of a clip have the given share in common."""
+    own = draws.normal(*shape)
+    if shared == 0 or frames == 1:
+        return own
+    common = draws.normal(shape[0] // frames, *shape[1:]).repeat_interleave(frames, dim=0)
+    return shared**0.5 * common + (1 - shared) ** 0.5 * own
+
+
+def drop(rows: Tensor, draws: Draws, probability: float) -> Tensor:
+    """Rows set to zero, each with the given probability by itself."""
+    if probability == 0:
+        return rows
+    kept = ~draws.chance(probability, rows.shape[0])
+    return rows * kept.view(-1, *[1] * (rows.ndim - 1)).to(rows.dtype)
+
+
+def diffusion_loss(
+    denoiser: Denoiser,
+    batch: Batch,
+    draws: Draws,
+    precision: Precision,
+    *,
+    noise: NoiseRecipe,
+    loss: LossRecipe,
+    weights: Weights,
+    step: int,
+) -> StepLoss:
+    """The loss of one batch: mean over frames of w(sigma) * frame loss, plus the class map's cross-entropy.
+
+    step: updates of the optimiser so far, for the focal schedule.
+    """
+    sigma = draw_sigma(draws, batch.target.shape[0] // batch.frames, noise).repeat_interleave(batch.frames)
+    unit = draw_noise(draws, batch.target.shape, batch.frames, noise.shared)
+    with precision.arithmetic():
+        denoised, logits = denoiser(batch.target + _column(sigma) * unit, sigma, batch)
+    fraction = focal_fraction(step, final=loss.focal_fraction, steps=loss.focal_steps) if loss.focal else 1.0
+    rows = frame_losses(
+        denoised, batch.target, fraction=fraction, emphasis=batch.emphasis, channel_weights=weights.channels
+    )
+    total = (rows * edm_weight(sigma, loss.weight_limit)).mean()
+    parts = {"latent": total.detach()}
+    if logits is not None and batch.classes is not None and loss.class_map:
+        parts["class_map"] = class_map_loss(logits, batch.classes, sigma >= loss.class_from_sigma, weights.classes)
+        total = total + loss.class_map * parts["class_map"]
+    return StepLoss(total, parts, batch.target.shape[0])
+
+
+def class_map_loss(logits: Tensor, classes: Tensor, counted: Tensor, weights: Tensor | None) -> Tensor:
+    """Weighted cross-entropy, mean over pixels of the counted rows.
+
+    Args:
+        logits: [N, K, H, W]. classes: int64 [N, H, W]. counted: bool [N]. weights: [K] or None.
+    """
+    pixels = F.cross_entropy(logits, classes, weight=weights, reduction="none")  # [N, H, W]
+    rows = pixels.flatten(1).mean(1) * counted
+    return rows.sum() / counted.sum().clamp(min=1)
+
+
+def _column(values: Tensor) -> Tensor:
+    return values.view(-1, 1, 1, 1)

@@ -1,0 +1,48 @@
+"""Differences between pictures: gradients, structural similarity, and the autoencoder's Kullback-Leibler term."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from gcd_model.vae import Posterior
+
+_C1, _C2 = 0.02**2, 0.06**2  # (0.01 L)^2 and (0.03 L)^2 for pictures in [-1, 1], so L = 2
+_WINDOW, _WINDOW_SIGMA = 7, 1.5
+
+
+def gradient_l1(pictures: Tensor, targets: Tensor) -> Tensor:
+    """Mean absolute difference of horizontal and vertical pixel differences, [N, C, H, W] each -> scalar."""
+    difference = pictures - targets
+    across = (difference[..., 1:] - difference[..., :-1]).abs().mean()
+    down = (difference[..., 1:, :] - difference[..., :-1, :]).abs().mean()
+    return across + down
+
+
+def ssim(pictures: Tensor, targets: Tensor) -> Tensor:
+    """Structural similarity, mean over pictures in [-1, 1], [N, C, H, W] each -> scalar.
+
+    Source: Wang et al. 2004, with a Gaussian window of 7 pixels and no padding.
+    """
+    pairs = torch.cat([pictures, targets, pictures**2, targets**2, pictures * targets], dim=1)
+    a, b, aa, bb, ab = _smoothed(pairs).chunk(5, dim=1)
+    covariance = 2 * (ab - a * b) + _C2
+    variance = (aa - a**2) + (bb - b**2) + _C2
+    return ((2 * a * b + _C1) * covariance / ((a**2 + b**2 + _C1) * variance)).mean()
+
+
+def kl_to_normal(posterior: Posterior) -> Tensor:
+    """Kullback-Leibler divergence to the standard normal, mean over elements.
+
+    Source: Kingma and Welling 2014, appendix B.
+    """
+    log_variance = posterior.log_variance
+    return 0.5 * (posterior.mean**2 + log_variance.exp() - 1 - log_variance).mean()
+
+
+def _smoothed(x: Tensor) -> Tensor:
+    offsets = torch.arange(_WINDOW, device=x.device, dtype=x.dtype) - _WINDOW // 2
+    window = torch.exp(-(offsets**2) / (2 * _WINDOW_SIGMA**2))
+    window = window / window.sum()
+    channels = x.shape[1]
+    rows = F.conv2d(x, window.view(1, 1, 1, -1).expand(channels, 1, 1, -1), groups=channels)
+    return F.conv2d(rows, window.view(1, 1, -1, 1).expand(channels, 1, -1, 1), groups=channels)

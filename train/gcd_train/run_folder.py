@@ -1,0 +1,38 @@
+"""Where a run keeps its things, and its metrics file."""
+
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from gcd_train.errors import RunError
+from gcd_train.recipe import StageName
+
+
+@dataclass(frozen=True, slots=True)
+class RunFolder:
+    """The folder of one run: `STAGE/state.pt`, `STAGE/samples/`, `metrics.jsonl`, and the weights at the end."""
+
+    path: Path
+
+    def stage(self, name: StageName) -> Path:
+        """The folder of a stage."""
+        return self.path / name
+
+    def state(self, name: StageName) -> Path:
+        """A training stage's state."""
+        return self.stage(name) / "state.pt"
+
+    def sample(self, name: StageName, updates: int) -> Path:
+        """A sample picture after so many updates."""
+        return self.stage(name) / "samples" / f"{updates:07d}.png"
+
+    def record(self, stage: StageName, kind: str, values: dict[str, float | int | str]) -> None:
+        """Append one line to metrics.jsonl: stage, kind, time of day, then the values. Raises RunError."""
+        line = json.dumps({"stage": stage, "kind": kind, "time": round(time.time(), 3), **values})
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            with (self.path / "metrics.jsonl").open("a") as file:
+                file.write(line + "\n")
+        except OSError as error:
+            raise RunError(f"cannot write in {self.path}: {error.strerror}; choose another --out") from error

@@ -1,0 +1,1 @@
+"""Procedural worlds: a description of a scene, the renderer that draws it, the writer that stores it."""

@@ -1,0 +1,148 @@
+"""Clips on disk: shards that appear whole, written by several processes, resumable.
+
+A data folder holds `world.json` (what it is) and `shard-<first seed>.zip` files. In a shard every clip has
+`<seed>/scene.json` and one PNG per camera and kind, all frames one below the other: colour as RGB, depth as 16 bit in
+1/256 metre (0: sky), classes and instances as 8 bit.
+"""
+
+import json
+import os
+import zipfile
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+
+from gcd_model.config import DRIVING_CLASSES, SemanticClass
+from gcd_train.errors import DataError
+from gcd_train.scenes.description import Scene
+from gcd_train.scenes.renderer import Renderer, Rendering
+from gcd_train.scenes.worlds import WORLDS, WorldOptions
+
+DEPTH_UNIT_M = 1 / 256
+_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+
+
+class World(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a data folder says about itself; all its shards were made alike.
+
+    format: of this layout. oversample: see Renderer. options: what the generator was told.
+    """
+
+    name: str
+    width: int
+    height: int
+    frames: int
+    fps: float
+    hfov_deg: float
+    oversample: int
+    clips_per_shard: int
+    options: WorldOptions = WorldOptions()
+    classes: tuple[SemanticClass, ...] = DRIVING_CLASSES
+    format: int = 1
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Progress:
+    """done, total: clips, counting what was there before."""
+
+    done: int
+    total: int
+
+
+def generate(out: Path, world: World, seeds: range, workers: int) -> Iterator[Progress]:
+    """Make the clips of `seeds`; finished shards of an earlier run are kept.
+
+    Raises:
+        DataError: the folder holds another kind of data.
+        RenderError: nothing can be drawn on this machine.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    _agree(out, world)
+    shards = [seeds[i : i + world.clips_per_shard] for i in range(0, len(seeds), world.clips_per_shard)]
+    missing = [shard for shard in shards if not shard_path(out, shard).exists()]
+    done = len(seeds) - sum(map(len, missing))
+    yield Progress(done=done, total=len(seeds))
+    os.environ["LP_NUM_THREADS"] = "1"  # one core a worker: software OpenGL would take them all
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        jobs = {pool.submit(write_shard, out, world, shard): len(shard) for shard in missing}
+        try:
+            for job in as_completed(jobs):
+                job.result()
+                done += jobs[job]
+                yield Progress(done=done, total=len(seeds))
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def shard_path(out: Path, seeds: range) -> Path:
+    """Where the clips of these seeds lie: the name tells the first and how many."""
+    return out / f"shard-{seeds[0]:08d}-{len(seeds)}.zip"
+
+
+def write_shard(out: Path, world: World, seeds: range) -> None:
+    """Render and store a run of clips; the file appears under its name once it is complete."""
+    path = shard_path(out, seeds)
+    partial = path.with_suffix(f".{os.getpid()}.partial")
+    try:
+        with (
+            Renderer(world.width, world.height, oversample=world.oversample) as renderer,
+            zipfile.ZipFile(partial, "w", zipfile.ZIP_STORED) as archive,
+        ):
+            for seed in seeds:
+                scene = WORLDS[world.name](seed, world.frames, world.options)
+                _store(archive, f"{seed:08d}", scene, renderer.render(scene))
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _agree(out: Path, world: World) -> None:
+    """Write `world.json`, or make sure that the one that is there says the same."""
+    path = out / "world.json"
+    if not path.exists():
+        partial = path.with_suffix(".partial")
+        partial.write_bytes(msgspec.json.format(msgspec.json.encode(world)))
+        partial.replace(path)
+    elif read_world(out) != world:
+        raise DataError(f"{out} holds clips of another world or size (see its world.json); choose another folder")
+
+
+def read_world(folder: Path) -> World:
+    """What a data folder says about itself. Raises DataError."""
+    path = folder / "world.json"
+    if not path.is_file():
+        raise DataError(f"{folder} is no data folder: it has no world.json; make one with `gcd-train generate driving`")
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=World)
+    except msgspec.MsgspecError as error:
+        raise DataError(f"{path} cannot be read: {error}; make the folder anew with this version") from error
+
+
+def _store(archive: zipfile.ZipFile, name: str, scene: Scene, views: dict[str, list[Rendering]]) -> None:
+    facts = {**scene.facts, "hfov_deg": scene.hfov_deg}
+    poses = {camera: np.round(poses, 6).tolist() for camera, poses in scene.cameras.items()}
+    archive.writestr(f"{name}/scene.json", json.dumps({"facts": facts, "world_from_camera": poses}))
+    for camera, frames in views.items():
+        for kind, strip in _strips(frames).items():
+            encoded, data = cv2.imencode(".png", strip, _PNG)
+            if not encoded:
+                raise DataError(f"clip {name}: OpenCV could not write {camera}.{kind} as PNG")
+            archive.writestr(f"{name}/{camera}.{kind}.png", data.tobytes())
+
+
+def _strips(frames: list[Rendering]) -> dict[str, Any]:
+    """Every kind of picture, all frames one below the other, as OpenCV wants them."""
+    depth = np.concatenate([frame.depth for frame in frames])
+    return {
+        "rgb": np.concatenate([frame.rgb for frame in frames])[..., ::-1],
+        "depth": np.rint(depth / DEPTH_UNIT_M).clip(0, 65535).astype(np.uint16),
+        "classes": np.concatenate([frame.classes for frame in frames]),
+        "instances": np.concatenate([frame.instances for frame in frames]),
+    }

@@ -1,0 +1,72 @@
+"""The U-Net and the class head: single frames first if the recipe says so, then whole clips."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from torch import nn
+
+from gcd_model.networks import Networks
+from gcd_train.batches import BatchSource
+from gcd_train.draws import Draws
+from gcd_train.loop import Progress, StepLoss
+from gcd_train.objective import Denoiser, Weights, diffusion_loss
+from gcd_train.precision import Precision
+from gcd_train.recipe import UNetRecipe
+from gcd_train.schedule import ParameterGroup
+from gcd_train.validation import Validation
+
+
+class UNetTask:
+    """See `Task`."""
+
+    def __init__(
+        self,
+        networks: Networks,
+        batches: BatchSource,
+        validation: Validation,
+        recipe: UNetRecipe,
+        weights: Weights,
+        precision: Precision,
+        seed: int,
+    ) -> None:
+        self._networks, self._batches, self._validation = networks, batches, validation
+        self._recipe, self._weights, self._precision, self._seed = recipe, weights, precision, seed
+        precision.placed(networks)
+        self._denoiser = Denoiser(networks.unet, networks.class_head, networks.config.prediction)
+
+    @property
+    def module(self) -> nn.Module:
+        """U-Net and class head."""
+        return self._denoiser
+
+    def parameter_groups(self) -> Sequence[ParameterGroup]:
+        """Everything that can be trained."""
+        trained = [parameter for parameter in self._denoiser.parameters() if parameter.requires_grad]
+        return [ParameterGroup(parameters=trained)]
+
+    def step_loss(self, progress: Progress) -> StepLoss:
+        """The diffusion loss on single frames or on whole clips."""
+        draws = Draws(self._seed, "unet", progress.updates, self._precision.device)
+        recipe = self._recipe
+        if progress.share < recipe.image_share:
+            batch = self._batches.single_frames(draws, recipe.image_batch)
+        else:
+            batch = self._batches.whole_clips(draws, recipe.clip_batch)
+        return diffusion_loss(
+            self._denoiser,
+            batch,
+            draws,
+            self._precision,
+            noise=recipe.noise,
+            loss=recipe.loss,
+            weights=self._weights,
+            step=progress.updates,
+        )
+
+    def after_update(self, progress: Progress) -> bool:
+        """Nothing to do."""
+        return False
+
+    def measure(self, picture: Path) -> dict[str, float]:
+        """Held-out clips through the shipped synthesizer, without the plane mix."""
+        return self._validation.measure(self._networks, picture)

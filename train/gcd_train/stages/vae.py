@@ -1,0 +1,171 @@
+"""The autoencoder, on crops of source and target frames."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from gcd_model import ModelConfig
+from gcd_model.networks import Networks
+from gcd_model.vae import Encoder, Posterior, TemporalDecoder
+from gcd_train.datasets.clip_source import Bytes, ClipSource, KeptClips, to_network
+from gcd_train.draws import Draws
+from gcd_train.errors import RecipeError
+from gcd_train.loop import Progress, StepLoss
+from gcd_train.metrics import psnr
+from gcd_train.picture_losses import gradient_l1, kl_to_normal, ssim
+from gcd_train.pictures import write_sheet
+from gcd_train.precision import Precision
+from gcd_train.recipe import VAERecipe
+from gcd_train.schedule import ParameterGroup
+
+_STATISTICS_CLIPS = 16
+
+
+class Autoencoder(nn.Module):
+    """Encoder and decoder under the names they have in `Networks`, and whether the latents were normalised."""
+
+    normalised: Tensor
+
+    def __init__(self, networks: Networks) -> None:
+        super().__init__()
+        self.target_encoder, self.decoder = networks.target_encoder, networks.decoder
+        self.register_buffer("normalised", torch.zeros((), dtype=torch.bool))
+
+
+class VAETask:
+    """See `Task`."""
+
+    def __init__(
+        self,
+        networks: Networks,
+        clips: ClipSource,
+        valid: ClipSource,
+        recipe: VAERecipe,
+        precision: Precision,
+        seed: int,
+    ) -> None:
+        config = networks.config
+        _require_shared(config)
+        self._precision, self._seed, self._recipe, self._valid = precision, seed, recipe, valid
+        order = Draws(seed, "vae-pool", 0, torch.device("cpu")).order(len(clips))
+        self._clips = KeptClips(clips, order[: recipe.pool])
+        self._pair = precision.placed(Autoencoder(networks))
+
+    @property
+    def module(self) -> nn.Module:
+        """Encoder and decoder."""
+        return self._pair
+
+    def parameter_groups(self) -> Sequence[ParameterGroup]:
+        """Everything."""
+        return [ParameterGroup(parameters=list(self._pair.parameters()))]
+
+    def step_loss(self, progress: Progress) -> StepLoss:
+        """L1, gradients, structural similarity and the Kullback-Leibler term on one batch of crops."""
+        draws = Draws(self._seed, "vae", progress.updates, self._precision.device)
+        recipe, apart = self._recipe, progress.share < self._recipe.image_share
+        run = 1 if apart else recipe.frames
+        crops = self._crops(draws, recipe.clips * recipe.frames // run, run)
+        with self._precision.arithmetic():
+            posterior = self._pair.target_encoder(crops)
+            noise = draws.normal(*posterior.mean.shape)
+            decoded = self._pair.decoder(posterior.sample(noise), None if apart else run)
+        return self._loss(crops, decoded.float(), Posterior(posterior.mean.float(), posterior.log_variance.float()))
+
+    def after_update(self, progress: Progress) -> bool:
+        """Normalises the latents once, when the time has come."""
+        if self._pair.normalised or progress.share < self._recipe.normalise_at:
+            return False
+        mean, std = self._statistics()
+        normalise_latents(self._pair.target_encoder, self._pair.decoder, mean, std)
+        self._pair.normalised.fill_(True)
+        return True
+
+    def measure(self, picture: Path) -> dict[str, float]:
+        """PSNR of held-out targets, encoded and decoded; the latents' own spread."""
+        shown: list[list[Tensor]] = []
+        scores: list[Tensor] = []
+        means: list[Tensor] = []
+        for number in range(min(len(self._valid), 4)):
+            frames = to_network(self._valid.rgb(number)[1]).to(self._precision.device)
+            latents = self._pair.target_encoder(frames).mean
+            decoded = self._pair.decoder(latents, frames.shape[0]).clamp(-1, 1)
+            scores.append(psnr((decoded + 1) / 2, (frames + 1) / 2).mean())
+            means.append(latents)
+            shown += [[decoded[0], decoded[-1]], [frames[0], frames[-1]]]
+        write_sheet(picture, shown)
+        spread = torch.cat(means).transpose(0, 1).flatten(1).std(1)
+        return {
+            "psnr": float(torch.stack(scores).mean()),
+            "latent_std_least": float(spread.min()),
+            "latent_std_most": float(spread.max()),
+        }
+
+    def _loss(self, crops: Tensor, decoded: Tensor, posterior: Posterior) -> StepLoss:
+        recipe = self._recipe
+        parts = {
+            "l1": (decoded - crops).abs().mean(),
+            "gradient": gradient_l1(decoded, crops),
+            "ssim": ssim(decoded, crops),
+            "kl": kl_to_normal(posterior),
+        }
+        total = parts["l1"] + recipe.gradient * parts["gradient"]
+        total = total + recipe.ssim * (1 - parts["ssim"]) + recipe.kl * parts["kl"]
+        return StepLoss(total, parts, crops.shape[0])
+
+    def _crops(self, draws: Draws, count: int, run: int) -> Tensor:
+        """[count * run, 3, crop, crop] in [-1, 1]: runs of source or target frames, half of them mirrored."""
+        numbers = draws.below(len(self._clips), count).tolist()
+        sides, flips = draws.below(2, count).tolist(), draws.below(2, count).tolist()
+        crops: list[Tensor] = []
+        for number, side, flip in zip(numbers, sides, flips, strict=True):
+            crop = self._crop(self._clips.rgb(number)[side], draws, run)
+            crops.append(to_network(crop[:, :, ::-1] if flip else crop))
+        return self._precision.frames(torch.cat(crops))
+
+    def _crop(self, clip: Bytes, draws: Draws, run: int) -> Bytes:
+        sizes = (run, self._recipe.crop, self._recipe.crop)
+        first, top, left = (
+            int(draws.below(whole - part + 1, 1)) for whole, part in zip(clip.shape[:3], sizes, strict=True)
+        )
+        return clip[first : first + run, top : top + sizes[1], left : left + sizes[2]]
+
+    @torch.no_grad()
+    def _statistics(self) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of each latent channel, [C], over whole frames of some clips."""
+        draws = Draws(self._seed, "vae-statistics", 0, self._precision.device)
+        numbers = draws.below(len(self._clips), _STATISTICS_CLIPS).tolist()
+        rows: list[Tensor] = []
+        for number in numbers:
+            frames = torch.cat([to_network(side) for side in self._clips.rgb(number)])
+            rows.append(self._pair.target_encoder(self._precision.frames(frames[::3])).mean)
+        values = torch.cat(rows).transpose(0, 1).flatten(1)  # [C, everything]
+        return values.mean(1), values.std(1).clamp(min=1e-4)
+
+
+@torch.no_grad()
+def normalise_latents(encoder: Encoder, decoder: TemporalDecoder, mean: Tensor, std: Tensor) -> None:
+    """Give the latents zero mean and unit spread without changing what encoder and decoder do together.
+
+    The encoder's last 1x1 convolution and the decoder's first take the change in; only the rim of a picture is touched,
+    where the decoder pads with zeros.
+
+    Args:
+        mean, std: [C], of the latents so far.
+    """
+    quant, stem, channels = encoder.quant, decoder.stem, mean.shape[0]
+    assert quant is not None, "a shared encoder has a quant convolution"
+    assert quant.bias is not None
+    assert stem.bias is not None
+    quant.weight[:channels] /= std[:, None, None, None]
+    quant.bias[:channels] = (quant.bias[:channels] - mean) / std
+    quant.bias[channels:] -= 2 * std.log()  # log-variance
+    stem.bias += torch.einsum("oiyx,i->o", stem.weight, mean)
+    stem.weight *= std[:, None, None]
+
+
+def _require_shared(config: ModelConfig) -> None:
+    if not config.vae.shared:
+        raise RecipeError("the VAE stage trains models with one shared autoencoder; this one has two: leave it out")

@@ -1,0 +1,80 @@
+"""How good the networks are on held-out clips, through the synthesizer that is shipped."""
+
+from pathlib import Path
+
+import msgspec
+import torch
+from torch import Tensor
+
+from gcd_model import Clip, Family, Synthesizer, Traits
+from gcd_model.class_head import palette
+from gcd_model.networks import Networks
+from gcd_train.datasets.clip_source import ClipSource, to_network
+from gcd_train.metrics import confusion_matrix, mean_iou, psnr
+from gcd_train.pictures import write_sheet
+
+_SHOWN_CLIPS = 4
+
+
+class Validation:
+    """Held-out clips and how the model takes them. plane_mix: whether that switch counts yet."""
+
+    def __init__(self, clips: ClipSource, family: Family, *, count: int, plane_mix: bool) -> None:
+        self._clips, self._family, self._plane_mix = clips, family, plane_mix
+        self._count = min(count, len(clips))
+
+    def measure(self, networks: Networks, picture: Path) -> dict[str, float]:
+        """PSNR over frames 2 to T and of the last, mean IoU of the class map; writes a sheet of samples.
+
+        One row shows source, view, target and, with a class head, predicted and true class map of a frame.
+        """
+        synthesizer = self._synthesizer(networks)
+        scores: list[Tensor] = []
+        counts: Tensor | None = None
+        shown: list[list[Tensor]] = []
+        for number in range(self._count):
+            source, target = (to_network(side) for side in self._clips.rgb(number))
+            view = synthesizer.render(
+                synthesizer.encode(Clip(video=source, fps=self._family.fps)), [synthesizer.traits.plan_view()]
+            )[0]
+            scores.append(psnr(view.video, (target + 1) / 2)[1:])
+            rows = [source, view.video * 2 - 1, target]
+            if view.classes is not None:
+                truth = torch.from_numpy(self._clips.target_classes(number).copy())
+                met = confusion_matrix(view.classes[0, 1:], truth[1:], len(self._clips.classes))
+                counts = met if counts is None else counts + met
+                rows += [self._painted(view.classes[0]), self._painted(truth)]
+            if number < _SHOWN_CLIPS:
+                shown += _excerpt(rows)
+        write_sheet(picture, shown)
+        table = torch.stack(scores)  # [clips, T - 1]
+        values = {"psnr": float(table.mean()), "psnr_last": float(table[:, -1].mean())}
+        return values if counts is None else {**values, "miou": mean_iou(counts)}
+
+    def _synthesizer(self, networks: Networks) -> Synthesizer:
+        """A copy of the networks behind the door that users take."""
+        config = networks.config if self._plane_mix else msgspec.structs.replace(networks.config, plane_mix=None)
+        copy = Networks(config)
+        known = copy.state_dict()
+        copy.load_state_dict({name: value for name, value in networks.state_dict().items() if name in known})
+        device = networks.unet.stem.weight.device
+        traits = Traits(
+            name="validation",
+            config=config,
+            family=self._family,
+            move_time=config.frames - 1,
+            sha256_12="0" * 12,
+            precision="float32",
+            device=str(device),
+        )
+        return Synthesizer(copy.to(device), traits)
+
+    def _painted(self, ids: Tensor) -> Tensor:
+        """Class ids [T, H, W] as pictures [T, 3, H, W] in [-1, 1]."""
+        colours = palette(tuple(self._clips.classes)).float() / 127.5 - 1
+        return colours[ids.long().cpu()].permute(0, 3, 1, 2)
+
+
+def _excerpt(rows: list[Tensor]) -> list[list[Tensor]]:
+    frames = rows[0].shape[0]
+    return [[video[t] for video in rows] for t in (frames // 2, frames - 1)]
