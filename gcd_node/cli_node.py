@@ -50,6 +50,8 @@ def run(config: ConfigPath) -> None:
     status = console.status(f"loading {settings.model.weights}")
     with status, open_session(settings, _told(console)) as (node, publisher):
         console.print(f"views on {publisher.endpoint}, status on {publisher.status_endpoint}", soft_wrap=True)
+        if node.traits.classes:
+            console.print("each view comes with its class map, topic view/<id>/cls", highlight=False)
         if not node.traits.trained:
             console.print(f"{node.traits.name}: these weights are random, so every picture is noise.")
         status.update("running")

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ TINY = World(name="driving", width=48, height=32, frames=2, fps=10.0, hfov_deg=8
 
 @needs_egl
 def test_clips_are_read_as_they_were_drawn(tmp_path: Path) -> None:
-    list(generate(tmp_path, TINY, range(3), workers=1))
+    list(generate(tmp_path, TINY, range(3), workers=2))
     clips = PairedClips.open(tmp_path)
     assert (len(clips), clips.frames, clips.height, clips.width, clips.fps) == (3, 2, 32, 48, 10.0)
     with Renderer(48, 32, oversample=1) as renderer:
@@ -113,5 +114,26 @@ def test_the_command_makes_clips_and_a_contact_sheet(tmp_path: Path) -> None:
     assert made.exit_code == 0, made.output
     assert sheet.read_bytes().startswith(b"\x89PNG")
     again = CliRunner().invoke(app, ["generate", "driving", "--out", str(tmp_path / "data"), "--clips", "1"])
-    assert again.exit_code == 1
+    assert again.exit_code == 66
     assert "choose another folder" in again.output
+
+
+@needs_egl
+def test_a_film_holds_the_source_view_of_a_longer_drive(tmp_path: Path) -> None:
+    film = tmp_path / "drive.mp4"
+    options = ["--seed", "3", "--frames", "20", "--width", "48", "--height", "32"]
+    made = CliRunner().invoke(app, ["generate", "film", "--out", str(film), *options])
+    assert made.exit_code == 0, made.output
+    video = cv2.VideoCapture(str(film))
+    pictures = [video.read()[1] for _ in range(20)]
+    assert pictures[19].shape == (32, 48, 3)
+    assert not video.read()[0]
+    with Renderer(48, 32) as renderer:
+        drawn = renderer.render(driving_scene(3, frames=20))["source"]
+    assert np.abs(pictures[19][..., ::-1].astype(int) - drawn[19].rgb).mean() < 12
+
+
+def test_a_mount_that_is_no_number_is_refused(tmp_path: Path) -> None:
+    made = CliRunner().invoke(app, ["generate", "driving", "--out", str(tmp_path), "--mount-height", "nan"])
+    assert made.exit_code == 78
+    assert "mount" in made.output

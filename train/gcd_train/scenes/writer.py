@@ -70,13 +70,24 @@ def generate(out: Path, world: World, seeds: range, workers: int) -> Iterator[Pr
     done = len(seeds) - sum(map(len, missing))
     yield Progress(done=done, total=len(seeds))
     os.environ["LP_NUM_THREADS"] = "1"  # one core a worker: software OpenGL would take them all
+    for made in _written(out, world, missing, workers):
+        done += made
+        yield Progress(done=done, total=len(seeds))
+
+
+def _written(out: Path, world: World, shards: list[range], workers: int) -> Iterator[int]:
+    """How many clips each shard added, as it is finished; one worker is this process."""
+    if workers == 1:
+        for shard in shards:
+            write_shard(out, world, shard)
+            yield len(shard)
+        return
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        jobs = {pool.submit(write_shard, out, world, shard): len(shard) for shard in missing}
+        jobs = {pool.submit(write_shard, out, world, shard): len(shard) for shard in shards}
         try:
             for job in as_completed(jobs):
                 job.result()
-                done += jobs[job]
-                yield Progress(done=done, total=len(seeds))
+                yield jobs[job]
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 
