@@ -5,7 +5,7 @@ from gcd_node.errors import ConfigError
 from gcd_node.frame import FrameSource
 from gcd_node.sources.image_folder import ImageFolder, list_pictures, read_picture
 from gcd_node.sources.packaged import resolve_path
-from gcd_node.sources.synthetic import SyntheticDrive, packaged_drive, write_drive
+from gcd_node.sources.synthetic import SyntheticDrive
 from gcd_node.sources.video_file import VideoFile
 
 __all__ = [
@@ -14,10 +14,8 @@ __all__ = [
     "VideoFile",
     "list_pictures",
     "open_source",
-    "packaged_drive",
     "read_picture",
     "resolve_path",
-    "write_drive",
 ]
 
 

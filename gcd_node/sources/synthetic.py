@@ -2,22 +2,18 @@
 
 from collections.abc import Iterator
 from itertools import count
-from pathlib import Path
 
 import cv2
 import numpy as np
 
 from gcd_node.errors import SourceError
 from gcd_node.frame import MAX_FPS, Frame, Image, SourceInfo
-from gcd_node.pictures import write_video
 from gcd_node.sources.pace import Pace, Pacer
 from gcd_node.sources.ray_cast import draw_street
 from gcd_node.sources.street import Street
 
 HFOV_DEG = 85.0
 """Horizontal field of view of the driving camera, degrees; it stands 1.6 m ahead of the car's middle, 1.55 m up."""
-
-_CLIP_FRAMES, _CLIP_WIDTH, _CLIP_HEIGHT = 42, 432, 288
 
 
 class SyntheticDrive:
@@ -92,18 +88,3 @@ class SyntheticDrive:
     def close(self) -> None:
         """End `frames` soon, from any thread."""
         self._pacer.stop()
-
-
-def packaged_drive() -> SyntheticDrive:
-    """The drive that `package:drive.mp4` shows: 42 frames (three windows of 14), 432 x 288, 10 FPS."""
-    return SyntheticDrive(width=_CLIP_WIDTH, height=_CLIP_HEIGHT, frames=_CLIP_FRAMES, smooth=True)
-
-
-def write_drive(path: Path) -> None:
-    """Write the clip that ships with the package, mp4v.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    drive = packaged_drive()
-    write_video(path, [frame.image for frame in drive.frames()], drive.info.fps_nominal)

@@ -1,5 +1,6 @@
 """Data folders: written whole or not at all, continued, read back as they were drawn."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -137,3 +138,17 @@ def test_a_mount_that_is_no_number_is_refused(tmp_path: Path) -> None:
     made = CliRunner().invoke(app, ["generate", "driving", "--out", str(tmp_path), "--mount-height", "nan"])
     assert made.exit_code == 78
     assert "mount" in made.output
+
+
+@needs_egl
+def test_the_packaged_drive_is_the_film_of_its_seed() -> None:
+    video = cv2.VideoCapture(str(Path(__file__).parents[2] / "gcd_node" / "assets" / "drive.mp4"))
+    shown = [video.read()[1] for _ in range(42)]
+    scene = driving_scene(2_000_021, frames=42)
+    ends = [0, 41]
+    cameras = {"source": scene.cameras["source"][ends]}
+    with Renderer(432, 288) as renderer:
+        drawn = renderer.render(replace(scene, poses=scene.poses[ends], focus=scene.focus[ends], cameras=cameras))
+    for view, frame in zip(drawn["source"], ends, strict=True):
+        error = np.mean((shown[frame][..., ::-1].astype(float) - view.rgb) ** 2)
+        assert 10 * np.log10(255**2 / error) > 22
