@@ -77,6 +77,8 @@ class VAEConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     Otherwise two encoders exist: the condition encoder (with quant convolution) and the target encoder (without).
     scale: latents the U-Net works on are this times what the target encoder gives.
     patch: pixels along each side that become channels before the first and after the last layer; 1 as published.
+    linear: a linear map from each block of down_factor x down_factor pixels to its latent, and one back, beside the
+        convolutions; ours, so that a small autoencoder starts from principal components instead of from nothing.
     """
 
     latent_channels: int = 4
@@ -87,6 +89,7 @@ class VAEConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     scale: float = 0.18215
     shared: bool = False
     patch: int = 1
+    linear: bool = False
 
     def __post_init__(self) -> None:
         _require_multiple("the VAE", self.width, "norm_groups", self.norm_groups)
@@ -355,6 +358,7 @@ DRIVING_SMALL = ModelConfig(
         scale=1.0,
         shared=True,
         patch=2,
+        linear=True,
     ),
     image_encoder=None,
     sampling=SamplingConfig(

@@ -149,9 +149,24 @@ class ResBlock(nn.Module):
         return skip + self.residual(x, embedding)
 
 
+class FrameConv(nn.Conv3d):
+    """A convolution over three frames at each pixel, computed as a 2D one over frames and flattened pixels.
+
+    The same weights and the same function; on the CPU the 3D kernels of torch take three times as long.
+    """
+
+    def __init__(self, in_channels: int, out_channels: int) -> None:
+        super().__init__(in_channels, out_channels, (3, 1, 1), padding=(1, 0, 0))
+
+    def forward(self, input: Tensor) -> Tensor:  # noqa: A002  the name in torch
+        """[B, C, T, H, W] -> [B, C', T, H, W]."""
+        rows = F.conv2d(input.flatten(3), self.weight.squeeze(-1), self.bias, padding=(1, 0))
+        return rows.unflatten(3, input.shape[-2:])
+
+
 def _conv3(in_channels: int, out_channels: int, temporal: bool) -> nn.Module:
     if temporal:
-        return nn.Conv3d(in_channels, out_channels, (3, 1, 1), padding=(1, 0, 0))
+        return FrameConv(in_channels, out_channels)
     return nn.Conv2d(in_channels, out_channels, 3, padding=1)
 
 

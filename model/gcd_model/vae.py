@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gcd_model.config import VAEConfig
-from gcd_model.layers import Downsample, Layers, ResBlock, Upsample, zeroed
+from gcd_model.layers import Downsample, FrameConv, Layers, ResBlock, Upsample, zeroed
 from gcd_model.temporal import TemporalShare, VideoResBlock
 
 
@@ -85,12 +85,17 @@ class Encoder(nn.Module):
         self.norm_out = nn.GroupNorm(config.norm_groups, widths[-1], eps=1e-6)
         self.conv_out = nn.Conv2d(widths[-1], moments, 3, padding=1)
         self.quant = nn.Conv2d(moments, moments, 1) if quant else None
+        block = config.down_factor
+        self.linear = nn.Conv2d(3, config.latent_channels, block, stride=block) if config.linear else None
 
     def forward(self, frames: Tensor) -> Posterior:
         """frames: [N, 3, H, W] in [-1, 1]."""
         x = frames if self.patch == 1 else F.pixel_unshuffle(frames, self.patch)
         x = self.middle(self.levels(self.stem(x)))
         moments = self.conv_out(F.silu(self.norm_out(x)))
+        if self.linear is not None:
+            straight = self.linear(frames)  # [N, C, h, w], of the mean; the log-variance gets none
+            moments = moments + F.pad(straight, (0, 0, 0, 0, 0, straight.shape[1]))
         return Posterior.of_moments(moments if self.quant is None else self.quant(moments))
 
 
@@ -147,8 +152,10 @@ class TemporalDecoder(nn.Module):
         self.norm_out = nn.GroupNorm(config.norm_groups, widths[0], eps=1e-6)
         self.patch, colours = config.patch, 3 * config.patch**2
         self.conv_out = nn.Conv2d(widths[0], colours, 3, padding=1)
-        self.mix_frames = nn.Conv3d(colours, colours, (3, 1, 1), padding=(1, 0, 0))
+        self.mix_frames = FrameConv(colours, colours)
         _keep_frames_apart(self.mix_frames)
+        self.block = config.down_factor
+        self.linear = nn.Conv2d(config.latent_channels, 3 * self.block**2, 1) if config.linear else None
 
     def forward(self, latents: Tensor, frames: int | None) -> Tensor:
         """latents: [B*T, C, h, w], unscaled -> [B*T, 3, H, W], about [-1, 1].
@@ -163,7 +170,8 @@ class TemporalDecoder(nn.Module):
         if frames is not None:
             video = x.unflatten(0, (-1, frames)).transpose(1, 2)  # [B, 3 * patch^2, T, H / patch, W / patch]
             x = self.mix_frames(video).transpose(1, 2).flatten(0, 1)
-        return x if self.patch == 1 else F.pixel_shuffle(x, self.patch)
+        x = x if self.patch == 1 else F.pixel_shuffle(x, self.patch)
+        return x if self.linear is None else x + F.pixel_shuffle(self.linear(latents), self.block)
 
 
 def _keep_frames_apart(mix: nn.Conv3d) -> None:

@@ -4,6 +4,7 @@ Random numbers need no state of their own: they follow from the seed and the num
 """
 
 import os
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from pickle import UnpicklingError
@@ -58,6 +59,8 @@ def save_state(path: Path, state: StageState) -> None:
 
 def load_state(path: Path, stage: str) -> StageState:
     """Read a state. Raises RunError if it is damaged, of another format or of another stage."""
+    if not zipfile.is_zipfile(path):  # what torch writes; other bytes would reach its unpickler
+        raise RunError(f"{path} is no state, or only half of one; delete it to start the stage anew")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, UnpicklingError, EOFError, ValueError) as error:

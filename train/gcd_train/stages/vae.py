@@ -4,9 +4,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gcd_model import ModelConfig
+from gcd_model.layers import zeroed
 from gcd_model.networks import Networks
 from gcd_model.vae import Encoder, Posterior, TemporalDecoder
 from gcd_train.datasets.clip_source import Bytes, ClipSource, KeptClips, to_network
@@ -21,6 +23,7 @@ from gcd_train.recipe import VAERecipe
 from gcd_train.schedule import ParameterGroup
 
 _STATISTICS_CLIPS = 16
+_START_LOG_VARIANCE = -5.0
 
 
 class Autoencoder(nn.Module):
@@ -51,6 +54,8 @@ class VAETask:
         self._precision, self._seed, self._recipe, self._valid = precision, seed, recipe, valid
         order = Draws(seed, "vae-pool", 0, torch.device("cpu")).order(len(clips))
         self._clips = KeptClips(clips, order[: recipe.pool])
+        if config.vae.linear:
+            start_from_components(networks.target_encoder, networks.decoder, self._some_frames(_STATISTICS_CLIPS))
         self._pair = precision.placed(Autoencoder(networks))
 
     @property
@@ -132,15 +137,16 @@ class VAETask:
         )
         return clip[first : first + run, top : top + sizes[1], left : left + sizes[2]]
 
+    def _some_frames(self, count: int) -> Tensor:
+        """Every third frame of both sides of `count` clips, [N, 3, H, W] in [-1, 1]."""
+        numbers = Draws(self._seed, "vae-statistics", 0, torch.device("cpu")).below(len(self._clips), count)
+        return torch.cat([to_network(side[::3]) for number in numbers.tolist() for side in self._clips.rgb(number)])
+
     @torch.no_grad()
     def _statistics(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of each latent channel, [C], over whole frames of some clips."""
-        draws = Draws(self._seed, "vae-statistics", 0, self._precision.device)
-        numbers = draws.below(len(self._clips), _STATISTICS_CLIPS).tolist()
-        rows: list[Tensor] = []
-        for number in numbers:
-            frames = torch.cat([to_network(side) for side in self._clips.rgb(number)])
-            rows.append(self._pair.target_encoder(self._precision.frames(frames[::3])).mean)
+        frames = self._some_frames(_STATISTICS_CLIPS)
+        rows = [self._pair.target_encoder(self._precision.frames(part)).mean for part in frames.split(8)]
         values = torch.cat(rows).transpose(0, 1).flatten(1)  # [C, everything]
         return values.mean(1), values.std(1).clamp(min=1e-4)
 
@@ -164,6 +170,43 @@ def normalise_latents(encoder: Encoder, decoder: TemporalDecoder, mean: Tensor, 
     quant.bias[channels:] -= 2 * std.log()  # log-variance
     stem.bias += torch.einsum("oiyx,i->o", stem.weight, mean)
     stem.weight *= std[:, None, None]
+    if decoder.linear is not None:
+        assert decoder.linear.bias is not None
+        decoder.linear.bias += decoder.linear.weight[:, :, 0, 0] @ mean
+        decoder.linear.weight *= std[:, None, None]
+
+
+@torch.no_grad()
+def start_from_components(encoder: Encoder, decoder: TemporalDecoder, frames: Tensor) -> None:
+    """Set the linear paths to the principal components of pixel blocks, at unit spread, and the rest to silence.
+
+    So training starts at the best linear code, and the convolutions learn what is missing.
+
+    Args:
+        frames: [N, 3, H, W] in [-1, 1]. encoder, decoder: with linear paths.
+    """
+    there, back, quant = encoder.linear, decoder.linear, encoder.quant
+    assert there is not None, "the config has linear paths"
+    assert back is not None, "the config has linear paths"
+    assert quant is not None, "a shared encoder has a quant convolution"
+    channels, block = there.out_channels, decoder.block
+    pixels = F.pixel_unshuffle(frames, block).movedim(1, -1).flatten(0, 2)  # [blocks, 3 * block^2]
+    mean = pixels.mean(0)
+    spread, components = torch.linalg.eigh((pixels - mean).T.cov())  # ascending
+    std, rows = spread[-channels:].flip(0).clamp(min=1e-8).sqrt(), components[:, -channels:].flip(1).T  # [C, pixels]
+    for layer in (encoder.conv_out, decoder.conv_out, quant, there, back):
+        zeroed(layer)
+    quant.weight[:, :, 0, 0] = torch.eye(2 * channels)
+    _bias(encoder.conv_out)[channels:] = _START_LOG_VARIANCE
+    there.weight.copy_((rows / std[:, None]).unflatten(1, (3, block, block)))
+    _bias(there).copy_(-(rows / std[:, None]) @ mean)
+    back.weight[:, :, 0, 0] = rows.T * std
+    _bias(back).copy_(mean)
+
+
+def _bias(layer: nn.Conv2d) -> Tensor:
+    assert layer.bias is not None
+    return layer.bias
 
 
 def _require_shared(config: ModelConfig) -> None:

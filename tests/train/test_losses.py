@@ -1,0 +1,102 @@
+import math
+
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from gcd_train.losses import (
+    PARALLEL_DOMAIN_WEIGHTS,
+    ClassWeight,
+    class_emphasis,
+    class_frequency_weights,
+    edm_weight,
+    focal_fraction,
+    focal_mean,
+    frame_losses,
+)
+
+
+def numbers(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    ("step", "kept"), [(0, 1.0), (1250, 0.775), (2500, 0.55), (5000, 0.1), (5001, 0.1), (13000, 0.1)]
+)
+def test_the_focal_loss_keeps_less_and_less_until_step_5000(step: int, kept: float) -> None:
+    assert focal_fraction(step) == pytest.approx(kept)
+
+
+def test_the_weight_of_a_noise_level_is_that_of_a_unit_weight_on_v() -> None:
+    sigma = torch.tensor([0.1, 1.0, 80.0], dtype=torch.float64)
+    target, error, noise = 0.3, 0.2, 1.1
+    v = (noise - sigma * target) / (1 + sigma**2).sqrt()
+    noisy = target + sigma * noise
+    denoised = noisy / (1 + sigma**2) - sigma / (1 + sigma**2).sqrt() * (v + error)
+    assert_close(edm_weight(sigma) * (denoised - target) ** 2, torch.full_like(sigma, error**2))
+
+
+def test_a_limit_caps_the_weight_of_low_noise() -> None:
+    assert_close(edm_weight(torch.tensor([0.1, 80.0]), 5.0), torch.tensor([5.0, 1 + 1 / 6400]))
+
+
+def test_keeping_everything_is_the_plain_mean() -> None:
+    values = numbers(3, 4, 2, 5).abs()
+    assert_close(focal_mean(values, 1.0), values.mean((1, 2, 3)))
+
+
+def test_the_largest_elements_are_taken_within_each_frame() -> None:
+    values = torch.tensor([[[0.0, 1.0, 2.0, 3.0, 10.0]], [[5.0, 0.0, 0.0, 0.0, 0.0]]])
+    assert_close(focal_mean(values, 0.5), torch.tensor([0.9 * 6.5 + 0.1 * 3.2, 0.9 * 2.5 + 0.1 * 1.0]))
+
+
+def test_the_number_of_kept_elements_is_rounded_down() -> None:
+    values = torch.arange(10.0)[None]
+    assert_close(focal_mean(values, 0.39), torch.tensor([0.9 * 8 + 0.1 * 4.5]))
+
+
+def test_class_weights_act_half_before_and_half_after_the_selection() -> None:
+    denoised, target = numbers(2, 3, 2, 2), numbers(2, 3, 2, 2, seed=1)
+    emphasis = numbers(2, 1, 2, 2, seed=2).abs()
+    raw = (denoised - target) ** 2
+    total = (raw + 0.5 * raw * emphasis).flatten(1)
+    top = total.sort(dim=1, descending=True).values[:, :6].mean(1)
+    expected = 0.9 * top + 0.1 * total.mean(1) + 0.5 * (raw * emphasis).flatten(1).mean(1)
+    assert_close(frame_losses(denoised, target, fraction=0.5, emphasis=emphasis), expected)
+
+
+def test_channel_weights_multiply_the_squared_error() -> None:
+    denoised, target, weights = numbers(2, 3, 2, 2), numbers(2, 3, 2, 2, seed=1), torch.tensor([1.0, 0.0, 3.0])
+    raw = (denoised - target) ** 2
+    expected = (raw[:, 0] + 3 * raw[:, 2]).mean((1, 2)) / 3
+    assert_close(frame_losses(denoised, target, fraction=1.0, channel_weights=weights.double()), expected)
+
+
+def test_a_class_is_where_its_colour_is_and_masks_are_averaged_over_areas() -> None:
+    weights = (ClassWeight(colour=(220, 20, 60), weight=7.0), ClassWeight(colour=(0, 0, 142), weight=3.0))
+    picture = torch.zeros(1, 3, 4, 8)
+    picture[..., :2, :2] = torch.tensor([220, 20, 60]).view(3, 1, 1) / 127.5 - 1
+    picture[..., :4, 4:] = torch.tensor([0, 2, 141]).view(3, 1, 1) / 127.5 - 1  # within the tolerance
+    emphasis = class_emphasis(picture, weights, (1, 2))
+    assert_close(emphasis, torch.tensor([[[[6.0 * 4 / 16, 2.0]]]]))
+
+
+def test_a_colour_more_than_three_levels_off_is_no_class() -> None:
+    picture = (torch.tensor([220, 20, 69]).view(1, 3, 1, 1) / 127.5 - 1).expand(1, 3, 2, 2)
+    assert class_emphasis(picture, PARALLEL_DOMAIN_WEIGHTS, (1, 1)).item() == 0
+
+
+def test_living_beings_weigh_seven_and_vehicles_three() -> None:
+    assert sorted(weight.weight for weight in PARALLEL_DOMAIN_WEIGHTS) == [3.0] * 9 + [7.0] * 5
+
+
+def test_frequency_weights_are_one_on_average_and_fall_with_frequency() -> None:
+    counts = torch.tensor([1000, 100, 10])
+    weights = class_frequency_weights(counts, 0.35)
+    assert float((weights * counts).sum() / counts.sum()) == pytest.approx(1.0)
+    assert float(weights[2] / weights[0]) == pytest.approx(100**0.35, rel=1e-5)
+
+
+def test_a_class_that_never_occurs_gets_a_finite_weight() -> None:
+    assert all(map(math.isfinite, class_frequency_weights(torch.tensor([5, 0]), 0.35).tolist()))

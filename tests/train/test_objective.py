@@ -1,0 +1,160 @@
+"""The objective against formulas written out here, and the laws of its random draws."""
+
+import msgspec
+import pytest
+import torch
+from tiny_world import FRAMES, TinyClips, tiny_recipe
+from torch import Tensor
+from torch.testing import assert_close
+
+from gcd_model.networks import Networks, random_networks
+from gcd_model.noise import preconditioning
+from gcd_train.batches import PixelBatches
+from gcd_train.datasets.clip_source import to_network
+from gcd_train.draws import Draws
+from gcd_train.model_setup import model_config
+from gcd_train.objective import Batch, Denoiser, Weights, diffusion_loss, draw_noise, draw_sigma, drop
+from gcd_train.precision import Precision
+from gcd_train.recipe import LossRecipe, NoiseRecipe, UNetRecipe
+
+CPU = torch.device("cpu")
+PRECISION = Precision(CPU, half=False, channels_last=False)
+PAPER = LossRecipe()
+
+
+def draws(update: int = 0) -> Draws:
+    return Draws(1, "test", update, CPU)
+
+
+def tiny_networks(prediction: str) -> Networks:
+    config = msgspec.structs.replace(model_config(tiny_recipe().model), prediction=prediction)
+    return random_networks(config, seed=2)
+
+
+def batch_of(networks: Networks, clips: int) -> Batch:
+    made, unet = draws(99), networks.config.unet
+    rows = clips * FRAMES
+    return Batch(
+        target=made.normal(rows, unet.latent_channels, 4, 8),
+        condition=made.normal(rows, unet.condition_channels, 4, 8),
+        vector=made.normal(rows, unet.vector_width),
+        tokens=None,
+        classes=None,
+        emphasis=None,
+        frames=FRAMES,
+    )
+
+
+def network_output(networks: Networks, noisy: Tensor, sigma: Tensor, batch: Batch) -> Tensor:
+    plan = networks.unet.plan(0.25 * sigma.log()[None], batch.vector, None, None)
+    scaled = noisy / (sigma**2 + 1).sqrt()[:, None, None, None]
+    return networks.unet(scaled, batch.condition, plan.step(0))
+
+
+@pytest.mark.parametrize("step", [0, 2500, 5000])
+def test_loss_and_gradient_equal_the_papers_formula_on_fixed_noise(step: int) -> None:
+    networks = tiny_networks("v")
+    batch, noise = batch_of(networks, 2), NoiseRecipe()
+    denoiser = Denoiser(networks.unet, None, "v")
+    loss = diffusion_loss(denoiser, batch, draws(), PRECISION, noise=noise, loss=PAPER, weights=Weights(), step=step)
+    probe = networks.unet.conv_out.weight
+    (gradient,) = torch.autograd.grad(loss.total, probe)
+
+    again = draws()
+    sigma = draw_sigma(again, 2, noise).repeat_interleave(FRAMES)
+    unit = draw_noise(again, batch.target.shape, FRAMES, 0.0)
+    wide = sigma[:, None, None, None]
+    v = (unit - wide * batch.target) / (1 + wide**2).sqrt()
+    raw = network_output(networks, batch.target + wide * unit, sigma, batch)
+    errors = ((raw - v) ** 2).flatten(1)  # unit weight on v
+    kept = {0: 1.0, 2500: 0.55, 5000: 0.1}[step]
+    top = errors.sort(dim=1, descending=True).values[:, : int(errors.shape[1] * kept)].mean(1)
+    expected = (0.9 * top + 0.1 * errors.mean(1)).mean()
+    (expected_gradient,) = torch.autograd.grad(expected, probe)
+    assert_close(loss.total, expected, rtol=1e-4, atol=1e-5)
+    assert_close(gradient, expected_gradient, rtol=1e-3, atol=1e-4)
+
+
+def test_an_x0_network_is_asked_for_the_clean_latents() -> None:
+    networks = tiny_networks("x0")
+    batch = batch_of(networks, 1)
+    noise, recipe = NoiseRecipe(fixed_share=1.0), LossRecipe(focal=False, weight_limit=5.0)
+    loss = diffusion_loss(
+        Denoiser(networks.unet, None, "x0"), batch, draws(), PRECISION,
+        noise=noise, loss=recipe, weights=Weights(), step=0,
+    )  # fmt: skip
+    again = draws()
+    sigma = draw_sigma(again, 1, noise).repeat_interleave(FRAMES)
+    unit = draw_noise(again, batch.target.shape, FRAMES, 0.0)
+    raw = network_output(networks, batch.target + 80 * unit, sigma, batch)
+    assert_close(loss.total, ((raw - batch.target) ** 2).mean() * (1 + 1 / 6400), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("prediction", ["v", "x0"])
+def test_a_perfect_network_has_no_loss(prediction: str) -> None:
+    sigma = torch.tensor([0.3, 80.0], dtype=torch.float64)
+    x0, n = torch.tensor(0.7, dtype=torch.float64), torch.tensor(-0.4, dtype=torch.float64)
+    raw = {"v": (n - sigma * x0) / (1 + sigma**2).sqrt(), "x0": x0}[prediction]
+    levels = preconditioning(sigma, prediction)  # pyright: ignore[reportArgumentType]
+    assert_close(levels.c_skip * (x0 + sigma * n) + levels.c_out * raw, x0.expand(2))
+
+
+def test_noise_levels_are_log_normal() -> None:
+    logs = draw_sigma(draws(), 20000, NoiseRecipe()).log()
+    assert logs.mean().item() == pytest.approx(1.0, abs=0.05)
+    assert logs.std().item() == pytest.approx(1.6, abs=0.05)
+
+
+def test_a_share_of_the_clips_gets_the_fixed_noise_level() -> None:
+    fixed = draw_sigma(draws(), 20000, NoiseRecipe(fixed_share=0.6)) == 80.0
+    assert fixed.double().mean().item() == pytest.approx(0.6, abs=0.02)
+
+
+@pytest.mark.parametrize(("shared", "correlation"), [(0.0, 0.0), (0.9, 0.9), (1.0, 1.0)])
+def test_frames_of_a_clip_share_as_much_noise_as_the_recipe_says(shared: float, correlation: float) -> None:
+    noise = draw_noise(draws(), torch.Size((4, 4, 50, 50)), 2, shared).unflatten(0, (2, 2))
+    assert noise.std().item() == pytest.approx(1.0, abs=0.03)
+    assert (noise[:, 0] * noise[:, 1]).mean().item() == pytest.approx(correlation, abs=0.05)
+    assert (noise[0] * noise[1]).mean().item() == pytest.approx(0.0, abs=0.05)
+
+
+def test_conditioning_is_dropped_frame_by_frame_one_time_in_ten() -> None:
+    kept = drop(torch.ones(20000, 2, 1, 1), draws(), 0.1)
+    assert torch.equal(kept[:, 0], kept[:, 1])  # the whole row or nothing
+    assert 1 - kept.mean().item() == pytest.approx(0.1, abs=0.01)
+
+
+def pixel_batch(augmentation: float, dropout: float = 0.0) -> tuple[Batch, Networks, Tensor]:
+    networks = tiny_networks("v")
+    recipe = tiny_recipe().unet
+    changed: UNetRecipe = msgspec.structs.replace(
+        recipe, image_share=0.0, loss=LossRecipe(), augmentation=augmentation, dropout=dropout
+    )
+    source, target = (to_network(side) for side in TinyClips(1).rgb(0))
+    batches = PixelBatches(TinyClips(1), networks, changed, PRECISION)
+    return batches.batch(source, target, FRAMES, draws()), networks, source
+
+
+def test_augmentation_noise_is_added_to_the_pixels_the_encoder_sees() -> None:
+    batch, networks, source = pixel_batch(0.02)
+    noisy = source + 0.02 * draws().normal(*source.shape)
+    channels = networks.config.vae.latent_channels
+    assert_close(batch.condition[:, :channels], networks.condition_encoder(noisy).mean)
+
+
+def test_without_augmentation_the_condition_is_the_clean_mean() -> None:
+    batch, networks, source = pixel_batch(0.0)
+    channels = networks.config.vae.latent_channels
+    assert_close(batch.condition[:, :channels], networks.condition_encoder(source).mean)
+
+
+def test_dropping_every_condition_leaves_zeros() -> None:
+    batch, _, _ = pixel_batch(0.0, dropout=1.0)
+    assert not batch.condition.any()
+    assert batch.target.any()
+
+
+def test_draws_follow_from_seed_stage_and_update_alone() -> None:
+    assert torch.equal(draws(5).normal(3), draws(5).normal(3))
+    assert not torch.equal(draws(5).normal(3), draws(6).normal(3))
+    assert not torch.equal(draws(5).normal(3), Draws(2, "test", 5, CPU).normal(3))

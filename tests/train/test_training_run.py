@@ -1,0 +1,207 @@
+"""Whole runs of all stages at a tiny size."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips, tiny_recipe
+
+from gcd_model import Clip, load_synthesizer
+from gcd_train.checkpoint import load_state
+from gcd_train.datasets.clip_source import to_network
+from gcd_train.datasets.latents import LatentClips
+from gcd_train.errors import DataError, Interrupted, RecipeError, RunError
+from gcd_train.loop import StopSignal
+from gcd_train.recipe import Budget, Recipe, StageName
+from gcd_train.run_folder import RunFolder
+from gcd_train.trainer import RunInputs, Trainer
+
+
+def trainer(path: Path, recipe: Recipe | None = None, stop: StopSignal | None = None, clips: int = 2) -> Trainer:
+    inputs = RunInputs(
+        recipe=recipe or tiny_recipe(),
+        clips=TinyClips(clips),
+        valid=TinyClips(1, seed=9),
+        folder=RunFolder(path),
+        stop=stop or Never(),
+    )
+    return Trainer(inputs)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run; tests only read it."""
+    path = tmp_path_factory.mktemp("run")
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    trainer(path).run()
+    torch.set_num_threads(threads)
+    return path
+
+
+def test_a_run_ends_in_a_weight_file_that_renders(run: Path) -> None:
+    synthesizer = load_synthesizer(run / "tiny.safetensors", device="cpu")
+    source, _ = TinyClips(1, seed=4).rgb(0)
+    features = synthesizer.encode(Clip(video=to_network(source), fps=10.0))
+    view = synthesizer.render(features, [synthesizer.traits.plan_view()])[0]
+    assert view.video.shape == (FRAMES, 3, HEIGHT, WIDTH)
+    assert view.classes is not None
+    assert view.classes.shape == (1, FRAMES, HEIGHT, WIDTH)
+    assert synthesizer.traits.family is not None
+    assert (synthesizer.traits.family.name, synthesizer.traits.move_time) == ("driving", FRAMES - 1)
+    assert synthesizer.traits.trained
+
+
+def test_the_weight_file_holds_the_averaged_weights_in_half_precision(run: Path) -> None:
+    networks = load_synthesizer(run / "tiny.safetensors", device="cpu", dtype="float16").networks
+    average = load_state(run / "unet" / "state.pt", "unet").average
+    assert average is not None
+    assert torch.equal(networks.unet.conv_out.weight, average["unet.conv_out.weight"].half())
+
+
+def test_every_stage_writes_metrics_and_samples(run: Path) -> None:
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    measured = {line["stage"]: line for line in lines if line["kind"] == "measured"}
+    assert set(measured) == {"vae", "unet", "decoder", "export"}
+    assert all(5 < line["psnr"] < 60 for line in measured.values())
+    assert all(0 <= measured[stage]["miou"] <= 1 for stage in ("unet", "decoder", "export"))
+    assert {line["stage"] for line in lines if line["kind"] == "loss"} == {"vae", "unet", "decoder"}
+    for stage in ("vae", "unet", "decoder"):
+        assert len(list((run / stage / "samples").glob("*.png"))) == 1
+    assert measured["export"]["bytes"] == (run / "tiny.safetensors").stat().st_size
+
+
+def test_a_finished_run_does_nothing_but_export_again(run: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*") if path.suffix in (".pt", ".npy")}
+    trainer(run).run()
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+def test_latents_have_zero_mean_and_unit_spread(run: Path) -> None:
+    meta = LatentClips.open(run / "latents").meta
+    assert np.abs(meta.mean).max() < 1.0
+    assert 0.3 < min(meta.std) <= max(meta.std) < 3.0
+    assert sum(meta.sensitivity) / len(meta.sensitivity) == pytest.approx(1.0)
+    assert sum(meta.class_counts) == 2 * FRAMES * (HEIGHT // 2) * (WIDTH // 2)
+
+
+def test_rows_are_the_encoded_frames_and_mirroring_mirrors_the_rest(run: Path) -> None:
+    clips = LatentClips.open(run / "latents")
+    both, frame = torch.tensor([1, 1]), torch.tensor([2, 2])
+    rows = clips.rows(both, frame, torch.tensor([False, True]), torch.device("cpu"))
+    assert rows.classes is not None
+    assert torch.equal(rows.half[1], rows.half[0].flip(-1))
+    assert torch.equal(rows.classes[1], rows.classes[0].flip(-1))
+    assert not torch.equal(rows.source[0], rows.source[1])
+    source = to_network(TinyClips().rgb(1)[0])[2]
+    assert rows.half[0].float().div(127.5).sub(1).mean().item() == pytest.approx(source.mean().item(), abs=0.01)
+
+
+def assert_same(first: object, second: object, where: str = "state") -> None:
+    assert type(first) is type(second), where
+    if isinstance(first, torch.Tensor):
+        assert torch.equal(first, second), where  # pyright: ignore[reportArgumentType]
+    elif isinstance(first, Mapping):
+        assert first.keys() == second.keys(), where  # pyright: ignore[reportAttributeAccessIssue]
+        for key, value in first.items():
+            assert_same(value, second[key], f"{where}.{key}")  # pyright: ignore[reportIndexIssue]
+    elif isinstance(first, list):
+        for i, (a, b) in enumerate(zip(first, second, strict=True)):  # pyright: ignore[reportArgumentType]
+            assert_same(a, b, f"{where}.{i}")
+    else:
+        assert first == second, where
+
+
+def folder_with(run: Path, path: Path, *parts: str) -> Path:
+    """A run folder that shares finished stages with another."""
+    path.mkdir(parents=True, exist_ok=True)
+    for part in parts:
+        (path / part).symlink_to(run / part)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("stage", "before", "at"),
+    [
+        ("vae", (), 2),
+        ("vae", (), 5),
+        ("unet", ("vae", "latents"), 2),
+        ("unet", ("vae", "latents"), 5),
+        ("decoder", ("vae", "latents", "unet"), 2),
+    ],
+)
+def test_a_resumed_stage_equals_an_uninterrupted_one_bit_for_bit(
+    run: Path, tmp_path: Path, stage: StageName, before: tuple[str, ...], at: int
+) -> None:
+    torch.set_num_threads(1)
+    path = folder_with(run, tmp_path / "again", *before)
+    with pytest.raises(Interrupted, match=f"update {at}"):
+        trainer(path, stop=After(at)).run(stage)
+    assert load_state(path / stage / "state.pt", stage).updates == at
+    trainer(path).run(stage)
+    resumed, whole = (load_state(folder / stage / "state.pt", stage) for folder in (path, run))
+    for name in ("updates", "identity", "module", "optimiser", "average"):
+        assert_same(getattr(resumed, name), getattr(whole, name), name)
+
+
+def test_encoding_goes_on_where_it_stopped(run: Path, tmp_path: Path) -> None:
+    torch.set_num_threads(1)
+    path = folder_with(run, tmp_path / "again", "vae")
+    with pytest.raises(Interrupted, match="clip 1 of 2"):
+        trainer(path, stop=After(1)).run("latents")
+    with pytest.raises(RunError, match="no finished latents"):
+        LatentClips.open(path / "latents")
+    trainer(path, clips=3).run("latents")  # the data has grown; the run keeps the clips it began with
+    for name in ("source", "target", "half", "classes"):
+        first, second = (np.load(folder / "latents" / f"{name}.npy") for folder in (path, run))
+        assert np.array_equal(first, second), name
+
+
+def test_a_longer_budget_trains_on(run: Path, tmp_path: Path) -> None:
+    path = folder_with(run, tmp_path / "again", "latents")
+    (path / "vae").mkdir()
+    (path / "vae" / "state.pt").write_bytes((run / "vae" / "state.pt").read_bytes())
+    recipe = tiny_recipe()
+    assert recipe.vae is not None
+    longer = msgspec.structs.replace(recipe.vae, budget=Budget(updates=7))
+    trainer(path, recipe=tiny_recipe(vae=longer)).run("vae")
+    assert load_state(path / "vae" / "state.pt", "vae").updates == 7
+    with pytest.raises(RunError, match="another autoencoder"):
+        trainer(path, recipe=tiny_recipe(vae=longer)).run("unet")
+
+
+def test_a_state_of_another_seed_is_not_resumed(run: Path, tmp_path: Path) -> None:
+    path = folder_with(run, tmp_path / "again", "vae")
+    with pytest.raises(RunError, match="another model, seed"):
+        trainer(path, recipe=tiny_recipe(seed=4)).run("vae")
+
+
+def test_a_stage_wants_the_one_before_it(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="--stage vae"):
+        trainer(tmp_path).run("unet")
+
+
+def test_a_stage_the_recipe_lacks_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match="no stage 'decoder'"):
+        trainer(tmp_path, recipe=tiny_recipe(decoder=None)).run("decoder")
+
+
+def test_clips_of_another_size_are_refused(run: Path, tmp_path: Path) -> None:
+    path = folder_with(run, tmp_path / "again", "vae")
+    recipe = tiny_recipe()
+    larger = msgspec.structs.replace(recipe.model, width=2 * WIDTH)
+    with pytest.raises(DataError, match="4 frames of 128x32"):
+        trainer(path, recipe=tiny_recipe(model=larger)).run("latents")
+
+
+def test_without_decoder_stage_the_file_has_no_plane_mix(run: Path, tmp_path: Path) -> None:
+    path = folder_with(run, tmp_path / "again", "vae", "latents", "unet")
+    trainer(path, recipe=tiny_recipe(decoder=None)).run("export")
+    config: Any = load_synthesizer(path / "tiny.safetensors", device="cpu").traits.config
+    assert config.plane_mix is None
+    assert config.class_head is not None
