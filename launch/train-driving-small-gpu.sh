@@ -23,13 +23,17 @@ export PYTHONPATH="$PWD:$PWD/model:$PWD/train"
   "$PYTHON" -m pip install -q ${WHEELS:+--no-index --find-links "$WHEELS"} \
     kornia opencv-contrib-python-headless moderngl glcontext msgspec rich safetensors typer pyzmq
 
-gcd_train() { timeout --signal=TERM "$((${MINUTES:-60} * 60 - SECONDS))" \
-  "$PYTHON" -c 'from gcd_train.cli import main; main()' "$@"; }
+gcd_train() {
+  local left=$((${MINUTES:-60} * 60 - SECONDS))
+  if [ "$left" -le 0 ]; then echo "out of MINUTES before: $1; run the same line to go on" >&2; exit 0; fi
+  timeout --signal=TERM "$left" "$PYTHON" -c 'from gcd_train.cli import main; main()' "$@"
+}
 
 keep() { if [ -n "${OUT:-}" ]; then cp -r "$RUN"/*.safetensors "$RUN"/*.jsonl "$RUN"/report* "$OUT"/ 2>/dev/null || true; fi; }
 trap keep EXIT
 
-gcd_train generate driving --out "$RUN/valid" --first-seed 1000000 --clips 40
+gcd_train generate driving --out "$RUN/test" --first-seed 1000000 --clips 40
+gcd_train generate driving --out "$RUN/valid" --first-seed 1000100 --clips 16
 gcd_train generate driving --out "$RUN/train" --clips "$CLIPS"
 gcd_train train package:driving-small-gpu --data "$RUN/train" --valid "$RUN/valid" --out "$RUN"
-gcd_train evaluate --weights "$RUN/driving-small.safetensors" --data "$RUN/valid" --train "$RUN/train" --out "$RUN/report"
+gcd_train evaluate --weights "$RUN/driving-small.safetensors" --data "$RUN/test" --train "$RUN/train" --out "$RUN/report"

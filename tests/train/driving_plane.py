@@ -70,8 +70,8 @@ class PlaneClips:
         cameras = CameraPair.driving(CameraMount(), frames=frames, height=height, width=width)
         return cls(tuple(plane_clip(cameras, phase=float(i)) for i in range(count)))
 
-    def write(self, folder: Path) -> Path:
-        """A data folder with these clips in one shard."""
+    def write(self, folder: Path, first_seed: int = 0) -> Path:
+        """A data folder with these clips in one shard, under seeds from `first_seed` on."""
         folder.mkdir(parents=True, exist_ok=True)
         world = World(
             name="driving",
@@ -85,8 +85,8 @@ class PlaneClips:
             classes=self.classes,
         )
         (folder / "world.json").write_bytes(msgspec.json.encode(world))
-        with zipfile.ZipFile(folder / f"shard-00000000-{len(self)}.zip", "w") as archive:
-            for number, clip in enumerate(self.clips):
+        with zipfile.ZipFile(folder / f"shard-{first_seed:08d}-{len(self)}.zip", "w") as archive:
+            for number, clip in enumerate(self.clips, start=first_seed):
                 for kind, strip in _strips(clip).items():
                     archive.writestr(f"{number:08d}/{kind}.png", cv2.imencode(".png", strip)[1].tobytes())
         return folder

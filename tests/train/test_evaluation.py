@@ -54,6 +54,7 @@ class FakeTraits:
     config: object
     name: str = "fake-small"
     classes: tuple[SemanticClass, ...] = DRIVING_CLASSES
+    mount: CameraMount | None = None
     asked: list[CameraMount | None] = field(default_factory=list)
 
     def plan_view(self, *, mount: CameraMount | None = None) -> str:

@@ -27,7 +27,7 @@ def commands() -> list[list[str]]:
 
 
 def test_it_runs_every_step() -> None:
-    assert [words[0] for words in commands()] == ["generate", "generate", "train", "evaluate"]
+    assert [words[0] for words in commands()] == ["generate", "generate", "generate", "train", "evaluate"]
 
 
 @pytest.mark.parametrize("words", commands(), ids=lambda words: " ".join(words[:4]))

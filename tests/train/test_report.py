@@ -124,7 +124,7 @@ def run(*arguments: object) -> tuple[int, str]:
 
 
 def test_baselines_are_evaluated_from_the_command_line(tmp_path: Path) -> None:
-    held_out, training = PlaneClips.make(2).write(tmp_path / "a"), PlaneClips.make(3).write(tmp_path / "b")
+    held_out, training = PlaneClips.make(2).write(tmp_path / "a", 1000), PlaneClips.make(3).write(tmp_path / "b")
     code, output = run("--data", held_out, "--train", training, "--out", tmp_path / "out", "--limit", 1)
     assert code == 0, output
     assert "depth_reprojection" in output
@@ -135,7 +135,8 @@ def test_baselines_are_evaluated_from_the_command_line(tmp_path: Path) -> None:
 
 def test_clips_from_a_folder_measure_as_they_do_in_memory(tmp_path: Path) -> None:
     clips = PlaneClips.make(2)
-    code, output = run("--data", clips.write(tmp_path / "a"), "--train", tmp_path / "a", "--out", tmp_path / "out")
+    held_out, training = clips.write(tmp_path / "a", 1000), clips.write(tmp_path / "b")
+    code, output = run("--data", held_out, "--train", training, "--out", tmp_path / "out")
     assert code == 0, output
     read = json.loads((tmp_path / "out" / "evaluation.json").read_text())
     baselines = driving_baselines(fit_statistics(clips), CameraMount(), len(clips.classes))

@@ -1,5 +1,6 @@
 """Data folders: written whole or not at all, continued, read back as they were drawn."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from headless import needs_egl
 from typer.testing import CliRunner
 
 from gcd_train.cli import app
-from gcd_train.datasets.paired import PairedClips
+from gcd_train.datasets.paired import PairedClips, require_apart
 from gcd_train.errors import DataError
 from gcd_train.scenes.driving import driving_scene
 from gcd_train.scenes.renderer import Renderer
@@ -152,3 +153,34 @@ def test_the_packaged_drive_is_the_film_of_its_seed() -> None:
     for view, frame in zip(drawn["source"], ends, strict=True):
         error = np.mean((shown[frame][..., ::-1].astype(float) - view.rgb) ** 2)
         assert 10 * np.log10(255**2 / error) > 22
+
+
+@needs_egl
+def test_growing_a_folder_makes_every_scene_once(tmp_path: Path) -> None:
+    list(generate(tmp_path, TINY, range(3), workers=1))
+    abandoned = tmp_path / "shard-00000009-2.1.partial"
+    abandoned.write_bytes(b"cut off")
+    os.utime(abandoned, (0, 0))
+    list(generate(tmp_path, TINY, range(1, 6), workers=1))
+    clips = PairedClips.open(tmp_path)
+    assert [clips.seed(number) for number in range(len(clips))] == [0, 1, 2, 3, 4, 5]
+    assert not abandoned.exists()
+
+
+@needs_egl
+def test_a_scene_in_two_shards_counts_once(tmp_path: Path) -> None:
+    write_shard(tmp_path, TINY, range(2))
+    write_shard(tmp_path, TINY, range(1, 3))
+    (tmp_path / "world.json").write_bytes(msgspec.json.encode(TINY))
+    clips = PairedClips.open(tmp_path)
+    assert [clips.seed(number) for number in range(len(clips))] == [0, 1, 2]
+
+
+@needs_egl
+def test_sets_that_share_scenes_are_refused(tmp_path: Path) -> None:
+    for name, seeds in (("a", range(3)), ("b", range(2, 4)), ("c", range(7, 8))):
+        list(generate(tmp_path / name, TINY, seeds, workers=1))
+    first, second, third = (PairedClips.open(tmp_path / name) for name in "abc")
+    require_apart(first, third)
+    with pytest.raises(DataError, match="share 1 scenes, first: seed 2"):
+        require_apart(first, second)

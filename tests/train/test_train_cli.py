@@ -1,5 +1,6 @@
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -26,10 +27,25 @@ def test_an_unknown_family_is_refused_with_the_known_ones() -> None:
     assert "kubric90" in result.output
 
 
-def test_architectures_lists_both_set_ups() -> None:
+@pytest.mark.parametrize(
+    ("options", "code", "words"),
+    [
+        (["--declared-height", "0"], 78, "above the ground"),
+        (["--no-baselines", "--data", "no[where]"], 66, "no[where]"),
+    ],
+)
+def test_evaluation_says_what_is_wrong_in_one_line(tmp_path: Path, options: list[str], code: int, words: str) -> None:
+    folders = [*([] if "--data" in options else ["--data", str(tmp_path)]), "--out", str(tmp_path / "report")]
+    result = CliRunner().invoke(app, ["evaluate", *folders, *options])
+    assert result.exit_code == code
+    assert words in result.output
+    assert "Traceback" not in result.output
+
+
+def test_architectures_lists_all_set_ups() -> None:
     result = CliRunner().invoke(app, ["architectures"], env={"COLUMNS": "200"})
     assert "320, 640, 1280, 1280" in result.stdout
-    assert "SMALL" in result.stdout
+    assert "DRIVING_SMALL" in result.stdout
 
 
 @pytest.mark.parametrize("module", ["gcd_model", "gcd_node", "gcd_node.cli", "gcd_train.cli"])

@@ -7,7 +7,7 @@ from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
-from gcd_model import FAMILIES, SMALL, SVD_14, Family, ModelConfig
+from gcd_model import DRIVING_SMALL, FAMILIES, SMALL, SVD_14, Family, ModelConfig
 from gcd_train import cli_generate
 from gcd_train.cli_evaluate import evaluate_command
 from gcd_train.cli_train import train
@@ -15,8 +15,7 @@ from gcd_train.cli_train import train
 app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="rich",
-    help="Data, training and evaluation for virtual camera views.\n\n"
-    "What is here so far describes what can be trained; generators and the trainer come with the next releases.",
+    help="Data, training and evaluation for virtual camera views.",
 )
 
 
@@ -52,7 +51,7 @@ def architectures() -> None:
     table = Table(title="Network set-ups")
     for column in ("set-up", "size", "frames", "U-Net widths", "VAE widths", "image tower", "steps"):
         table.add_column(column)
-    for name, config in (("SVD_14", SVD_14), ("SMALL", SMALL)):
+    for name, config in (("SVD_14", SVD_14), ("DRIVING_SMALL", DRIVING_SMALL), ("SMALL", SMALL)):
         table.add_row(name, *_config_row(config))
     Console().print(table)
 

@@ -9,11 +9,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gcd_model import Synthesizer, load_synthesizer
-from gcd_model.errors import ModelError
 from gcd_model.geometry import CameraMount
 from gcd_train.baselines import Predictor, driving_baselines, fit_statistics
-from gcd_train.datasets.paired import PairedClips
-from gcd_train.errors import RecipeError, TrainError
+from gcd_train.cli_errors import errors_shown
+from gcd_train.datasets.paired import PairedClips, require_apart
+from gcd_train.errors import RecipeError
 from gcd_train.evaluation import SynthesizedViews, class_grid, evaluate, require_same_kind
 from gcd_train.report import Conditions, MountNumbers, Report, to_markdown, write_contact_sheet, write_report
 
@@ -37,8 +37,9 @@ def evaluate_command(
     dtype: Annotated[str | None, typer.Option(help="float32, bfloat16 or float16.")] = None,
 ) -> None:
     """Measure weights and baselines on held-out clips, frames 2 to the last."""
-    mount = CameraMount(height_m=declared_height, tilt_deg=declared_tilt)
-    try:
+    with errors_shown():
+        mount = CameraMount(height_m=declared_height, tilt_deg=declared_tilt)
+        out.mkdir(parents=True, exist_ok=True)  # to know at once
         clips = PairedClips.open(data, limit)
         model = None if weights is None else load_synthesizer(weights, device=device, dtype=dtype)
         training = _training_clips(train, train_limit) if baselines else None
@@ -50,11 +51,8 @@ def evaluate_command(
         write_report(report, out)
         shown = predictors[-1] if model is None else predictors[0]
         write_contact_sheet(out / "contact_sheet.png", shown, clips, range(min(sheet_clips, len(clips))))
-    except (TrainError, ModelError) as error:
-        _LOG.print(f"[red]error:[/] {error}", highlight=False)
-        raise typer.Exit(getattr(error, "exit_code", 1)) from error
     typer.echo(to_markdown(report))
-    _LOG.print(f"wrote {out}/evaluation.json, evaluation.md and contact_sheet.png", highlight=False)
+    _LOG.print(f"wrote {out}/evaluation.json, evaluation.md and contact_sheet.png", highlight=False, markup=False)
 
 
 def _training_clips(folder: Path | None, limit: int) -> PairedClips:
@@ -74,6 +72,7 @@ def _predictors(
         found.append(SynthesizedViews.of(model, clips, mount))
     if training is not None:
         require_same_kind(training, clips)
+        require_apart(training, clips)
         statistics = _watched(training, "training clips", lambda tell: fit_statistics(training, progress=tell))
         found += driving_baselines(statistics, mount, len(clips.classes))
     return tuple(found)

@@ -1,8 +1,6 @@
 """`gcd-train generate`: make data."""
 
 import os
-from collections.abc import Generator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -10,9 +8,8 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from gcd_model import ModelError
 from gcd_model.geometry import CameraMount
-from gcd_train.errors import TrainError
+from gcd_train.cli_errors import errors_shown
 from gcd_train.scenes.contact_sheet import write_contact_sheet
 from gcd_train.scenes.driving import FPS, HFOV_DEG
 from gcd_train.scenes.film import write_film
@@ -43,7 +40,7 @@ def driving(
     contact_sheet: Annotated[Path | None, typer.Option(help="Also draw the first clips into this PNG.")] = None,
 ) -> None:
     """Road scenes: a forward camera, and the path to the view from above (ParallelDomain-4D's set-up)."""
-    with _errors_shown():
+    with errors_shown():
         CameraMount(height_m=mount_height, tilt_deg=mount_tilt)  # refuses what is no mount before anything is made
     world = World(
         name="driving",
@@ -56,7 +53,7 @@ def driving(
         clips_per_shard=clips_per_shard,
         options=WorldOptions(height_m=mount_height, tilt_deg=mount_tilt),
     )
-    with _errors_shown():
+    with errors_shown():
         _generate(out, world, range(first_seed, first_seed + clips), workers or os.cpu_count() or 1)
         if contact_sheet is not None:
             write_contact_sheet(out, contact_sheet)
@@ -71,17 +68,8 @@ def film(
     height: Annotated[int, typer.Option(min=16, help="Pixels.")] = 288,
 ) -> None:
     """One longer drive as a video, seen from the forward camera; the packaged drive was made so."""
-    with _errors_shown():
+    with errors_shown():
         write_film(out, seed, frames=frames, width=width, height=height)
-
-
-@contextmanager
-def _errors_shown() -> Generator[None]:
-    try:
-        yield
-    except (TrainError, ModelError) as error:
-        Console(stderr=True, highlight=False).print(f"gcd-train: {error}", markup=False, soft_wrap=True)
-        raise typer.Exit(error.exit_code if isinstance(error, TrainError) else 78) from error
 
 
 def _generate(out: Path, world: World, seeds: range, workers: int) -> None:

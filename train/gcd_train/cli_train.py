@@ -10,11 +10,9 @@ from typing import Annotated, TypeAlias, get_args
 
 import torch
 import typer
-from rich.console import Console
 from typer import Argument, Option
 
-from gcd_model import ModelError
-from gcd_train.errors import TrainError
+from gcd_train.cli_errors import errors_shown
 from gcd_train.recipe import StageName, load_recipe
 
 RecipeFile: TypeAlias = Annotated[
@@ -34,15 +32,12 @@ def train(recipe: RecipeFile, data: Data, valid: Valid, out: Out, stage: Stage =
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     if threads is not None:
         torch.set_num_threads(threads)
-    try:
+    with errors_shown():
         _run(recipe, data, valid, out, _stage_named(stage))
-    except (TrainError, ModelError) as error:
-        Console(stderr=True, highlight=False).print(f"gcd-train: {error}", markup=False, soft_wrap=True)
-        raise typer.Exit(error.exit_code if isinstance(error, TrainError) else 70) from error
 
 
 def _run(recipe: str, data: Path, valid: Path, out: Path, stage: StageName | None) -> None:
-    from gcd_train.datasets.paired import PairedClips
+    from gcd_train.datasets.paired import PairedClips, require_apart
     from gcd_train.run_folder import RunFolder
     from gcd_train.trainer import RunInputs, Trainer
 
@@ -53,10 +48,13 @@ def _run(recipe: str, data: Path, valid: Path, out: Path, stage: StageName | Non
 
     signal.signal(signal.SIGINT, ask)
     signal.signal(signal.SIGTERM, ask)
+    loaded = load_recipe(recipe)
+    clips, held_out = PairedClips.open(data), PairedClips.open(valid)
+    require_apart(clips, held_out)
     inputs = RunInputs(
-        recipe=load_recipe(recipe),
-        clips=PairedClips.open(data),
-        valid=PairedClips.open(valid),
+        recipe=loaded,
+        clips=clips,
+        valid=held_out,
         folder=RunFolder(out),
         stop=stop,
     )

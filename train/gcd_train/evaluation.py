@@ -57,7 +57,8 @@ class SynthesizedViews:
     @classmethod
     def of(cls, synthesizer: ViewSynthesizer, clips: HeldOutClips, mount: CameraMount | None = None) -> Self:
         """A model that is measured on these clips. Raises DataError where the two do not fit together."""
-        traits, mount = synthesizer.traits, None if mount == CameraMount() else mount
+        traits = synthesizer.traits
+        trained = traits.mount or CameraMount()
         wanted = (traits.config.frames, traits.config.height, traits.config.width)
         given = (clips.frames, clips.height, clips.width)
         if wanted != given:
@@ -66,7 +67,7 @@ class SynthesizedViews:
             )
         if traits.classes and _names(traits.classes) != _names(clips.classes):
             raise DataError(f"{traits.name} has classes {_names(traits.classes)}, the clips {_names(clips.classes)}")
-        return cls(synthesizer=synthesizer, fps=clips.fps, mount=mount)
+        return cls(synthesizer=synthesizer, fps=clips.fps, mount=None if mount == trained else mount)
 
     @property
     def name(self) -> str:

@@ -107,7 +107,7 @@ class Loop:
 
     def __init__(self, task: Task, folder: RunFolder, options: LoopOptions) -> None:
         self._task, self._folder, self._options = task, folder, options
-        self._updates, self._seconds, self._frames = 0, 0.0, 0
+        self._updates, self._seconds = 0, 0.0
         self._optimiser = build_optimiser(task.parameter_groups(), options.optimiser)
         self._ema = None if options.ema is None else Ema(task.module, options.ema)
         self._window = _Window()

@@ -48,9 +48,8 @@ class PairedClips:
         world = read_world(folder)
         places: list[tuple[Path, str]] = []
         for path in sorted(folder.glob("shard-*.zip")):
-            if limit is not None and len(places) >= limit:
-                break
             places += [(path, name) for name in _clip_names(path)]
+        places = sorted({name: (path, name) for path, name in reversed(places)}.values(), key=lambda place: place[1])
         if not places:
             raise DataError(f"{folder} holds no finished shard; run `gcd-train generate {world.name}` to its end")
         return cls(world, tuple(places[:limit]))
@@ -124,6 +123,16 @@ class PairedClips:
         if strip is None or strip.shape[:2] != (self.frames * self.height, self.width):
             raise DataError(f"{path}: {name}/{kind}.png is damaged; delete the shard and generate again")
         return strip.reshape(self.frames, self.height, *strip.shape[1:])  # pyright: ignore[reportReturnType]
+
+
+def require_apart(training: PairedClips, held_out: PairedClips) -> None:
+    """Raises DataError if two sets share scenes: what was learned from them says nothing about others."""
+    shared = {training.seed(i) for i in range(len(training))} & {held_out.seed(i) for i in range(len(held_out))}
+    if shared and training.world.name == held_out.world.name:
+        raise DataError(
+            f"training and held-out clips share {len(shared)} scenes, first: seed {min(shared)}; generate the held-out "
+            "ones with --first-seed 1000000"
+        )
 
 
 def _clip_names(path: Path) -> list[str]:

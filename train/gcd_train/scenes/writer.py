@@ -7,6 +7,7 @@ A data folder holds `world.json` (what it is) and `shard-<first seed>.zip` files
 
 import json
 import os
+import time
 import zipfile
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -26,6 +27,7 @@ from gcd_train.scenes.renderer import Renderer, Rendering
 from gcd_train.scenes.worlds import WORLDS, WorldOptions
 
 DEPTH_UNIT_M = 1 / 256
+_ABANDONED_S = 3600.0  # no shard takes so long
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 
@@ -65,14 +67,34 @@ def generate(out: Path, world: World, seeds: range, workers: int) -> Iterator[Pr
     """
     out.mkdir(parents=True, exist_ok=True)
     _agree(out, world)
-    shards = [seeds[i : i + world.clips_per_shard] for i in range(0, len(seeds), world.clips_per_shard)]
-    missing = [shard for shard in shards if not shard_path(out, shard).exists()]
+    missing = _missing_shards(out, seeds, world.clips_per_shard)
     done = len(seeds) - sum(map(len, missing))
     yield Progress(done=done, total=len(seeds))
     os.environ["LP_NUM_THREADS"] = "1"  # one core a worker: software OpenGL would take them all
     for made in _written(out, world, missing, workers):
         done += made
         yield Progress(done=done, total=len(seeds))
+
+
+def _missing_shards(out: Path, seeds: range, size: int) -> list[range]:
+    """Runs of at most `size` seeds of which no finished shard has any; what killed workers left is removed."""
+    there: set[int] = set()
+    for path in out.glob("shard-*-*.zip"):
+        first, count = (int(number) for number in path.stem.split("-")[1:])
+        there.update(range(first, first + count))
+    for leftover in out.glob("shard-*.partial"):
+        if time.time() - leftover.stat().st_mtime > _ABANDONED_S:
+            leftover.unlink()
+    shards: list[range] = []
+    for seed in seeds:
+        if seed in there:
+            continue
+        grows = shards and shards[-1].stop == seed and len(shards[-1]) < size
+        if grows:
+            shards[-1] = range(shards[-1].start, seed + 1)
+        else:
+            shards.append(range(seed, seed + 1))
+    return shards
 
 
 def _written(out: Path, world: World, shards: list[range], workers: int) -> Iterator[int]:

@@ -1,0 +1,33 @@
+"""Errors of every `gcd-train` command, as its user sees them."""
+
+from collections.abc import Generator
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+
+import typer
+from rich.console import Console
+
+from gcd_model import ModelError
+from gcd_train.errors import RunError, TrainError
+
+_OPTION = 78  # sysexits: what the model refuses here is an option or a weight file the user named
+
+
+@contextmanager
+def errors_shown() -> Generator[None]:
+    """What a user can do something about becomes one line and an exit code; the rest stays a traceback."""
+    try:
+        yield
+    except (TrainError, ModelError) as error:
+        _say(error)
+        raise typer.Exit(error.exit_code if isinstance(error, TrainError) else _OPTION) from error
+    except BrokenProcessPool as error:
+        _say("a worker was killed, most likely for want of memory; give fewer --workers, the finished part stays")
+        raise typer.Exit(RunError.exit_code) from error
+    except OSError as error:
+        _say(f"{error}; see to the disk or the path, then run the same line to go on")
+        raise typer.Exit(RunError.exit_code) from error
+
+
+def _say(message: object) -> None:
+    Console(stderr=True, highlight=False).print(f"gcd-train: {message}", markup=False, soft_wrap=True)
