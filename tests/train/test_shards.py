@@ -1,6 +1,9 @@
 """Data folders: written whole or not at all, continued, read back as they were drawn."""
 
 import os
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -184,3 +187,20 @@ def test_sets_that_share_scenes_are_refused(tmp_path: Path) -> None:
     require_apart(first, third)
     with pytest.raises(DataError, match="share 1 scenes, first: seed 2"):
         require_apart(first, second)
+
+
+@needs_egl
+def test_sigterm_stops_the_workers_and_keeps_whole_shards(tmp_path: Path) -> None:
+    size = ["--width", "48", "--height", "32", "--frames", "2", "--oversample", "1", "--clips-per-shard", "1"]
+    line = ["generate", "driving", "--out", str(tmp_path), "--clips", "5000", "--workers", "2", *size]
+    code = "from gcd_train.cli import main; main()"
+    running = subprocess.Popen([sys.executable, "-c", code, *line], stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 60
+    while not list(tmp_path.glob("*.zip")) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    running.terminate()
+    _, said = running.communicate(timeout=60)  # returns only once no worker holds the pipe any more
+    assert running.returncode == 130, said
+    assert "run the same line to go on" in said
+    assert len(PairedClips.open(tmp_path)) >= 1
+    assert not list(tmp_path.glob("*.partial"))

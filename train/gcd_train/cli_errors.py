@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 
 from gcd_model import ModelError
-from gcd_train.errors import RunError, TrainError
+from gcd_train.errors import Interrupted, RunError, TrainError
 
 _OPTION = 78  # sysexits: what the model refuses here is an option or a weight file the user named
 
@@ -21,6 +21,9 @@ def errors_shown() -> Generator[None]:
     except (TrainError, ModelError) as error:
         _say(error)
         raise typer.Exit(error.exit_code if isinstance(error, TrainError) else _OPTION) from error
+    except KeyboardInterrupt as error:
+        _say("stopped; what is finished stays, run the same line to go on")
+        raise typer.Exit(Interrupted.exit_code) from error
     except BrokenProcessPool as error:
         _say("a worker was killed, most likely for want of memory; give fewer --workers, the finished part stays")
         raise typer.Exit(RunError.exit_code) from error

@@ -1,6 +1,7 @@
 """`gcd-train generate`: make data."""
 
 import os
+import signal
 from pathlib import Path
 from typing import Annotated
 
@@ -73,6 +74,7 @@ def film(
 
 
 def _generate(out: Path, world: World, seeds: range, workers: int) -> None:
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, so that no worker is left behind
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task("clips", total=len(seeds))

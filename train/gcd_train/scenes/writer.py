@@ -7,6 +7,7 @@ A data folder holds `world.json` (what it is) and `shard-<first seed>.zip` files
 
 import json
 import os
+import signal
 import time
 import zipfile
 from collections.abc import Iterator
@@ -104,7 +105,7 @@ def _written(out: Path, world: World, shards: list[range], workers: int) -> Iter
             write_shard(out, world, shard)
             yield len(shard)
         return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(workers, get_context("spawn"), initializer=_leave_stopping_to_the_parent) as pool:
         jobs = {pool.submit(write_shard, out, world, shard): len(shard) for shard in shards}
         try:
             for job in as_completed(jobs):
@@ -112,6 +113,11 @@ def _written(out: Path, world: World, shards: list[range], workers: int) -> Iter
                 yield jobs[job]
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _leave_stopping_to_the_parent() -> None:
+    """Ctrl-C reaches every process of a terminal; workers finish their shard and are not given another."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def shard_path(out: Path, seeds: range) -> Path:
