@@ -1,6 +1,7 @@
 """Whole runs of all stages at a tiny size."""
 
 import json
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,13 +13,15 @@ import torch
 from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips, tiny_recipe
 
 from gcd_model import Clip, load_synthesizer
+from gcd_model.config import DRIVING_CLASSES
+from gcd_model.geometry import CameraMount
 from gcd_train.checkpoint import load_state
 from gcd_train.datasets.clip_source import to_network
 from gcd_train.datasets.latents import LatentClips
 from gcd_train.errors import DataError, Interrupted, RecipeError, RunError
-from gcd_train.loop import StopSignal
 from gcd_train.recipe import Budget, Recipe, StageName
 from gcd_train.run_folder import RunFolder
+from gcd_train.stop import StopSignal
 from gcd_train.trainer import RunInputs, Trainer
 
 
@@ -69,7 +72,7 @@ def test_every_stage_writes_metrics_and_samples(run: Path) -> None:
     measured = {line["stage"]: line for line in lines if line["kind"] == "measured"}
     assert set(measured) == {"vae", "unet", "decoder", "export"}
     assert all(5 < line["psnr"] < 60 for line in measured.values())
-    assert all(0 <= measured[stage]["miou"] <= 1 for stage in ("unet", "decoder", "export"))
+    assert all(0 <= measured[stage]["miou_full"] <= 1 for stage in ("unet", "decoder", "export"))
     assert {line["stage"] for line in lines if line["kind"] == "loss"} == {"vae", "unet", "decoder"}
     for stage in ("vae", "unet", "decoder"):
         assert len(list((run / stage / "samples").glob("*.png"))) == 1
@@ -132,7 +135,7 @@ def folder_with(run: Path, path: Path, *parts: str) -> Path:
         ("vae", (), 5),
         ("unet", ("vae", "latents"), 2),
         ("unet", ("vae", "latents"), 5),
-        ("decoder", ("vae", "latents", "unet"), 2),
+        ("decoder", ("vae", "latents", "unet", "predictions"), 2),
     ],
 )
 def test_a_resumed_stage_equals_an_uninterrupted_one_bit_for_bit(
@@ -205,3 +208,67 @@ def test_without_decoder_stage_the_file_has_no_plane_mix(run: Path, tmp_path: Pa
     config: Any = load_synthesizer(path / "tiny.safetensors", device="cpu").traits.config
     assert config.plane_mix is None
     assert config.class_head is not None
+
+
+def test_predicting_goes_on_where_it_stopped(run: Path, tmp_path: Path) -> None:
+    torch.set_num_threads(1)
+    path = folder_with(run, tmp_path / "again", "vae", "latents", "unet")
+    with pytest.raises(Interrupted, match="predicting 1 of 2"):
+        trainer(path, stop=After(1)).run("decoder")
+    assert not (path / "predictions" / "meta.json").exists()
+    trainer(path).run("decoder")
+    for name in ("latents", "decoded", "logits"):
+        first, second = (np.load(folder / "predictions" / f"{name}.npy") for folder in (path, run))
+        assert np.array_equal(first, second), name
+
+
+def test_a_kill_between_the_last_renames_of_the_latents_loses_nothing(run: Path, tmp_path: Path) -> None:
+    path = folder_with(run, tmp_path / "again", "vae")
+    shutil.copytree(run / "latents", path / "latents")
+    meta = json.loads((path / "latents" / "meta.json").read_text())
+    (path / "latents" / "meta.json").unlink()
+    (path / "latents" / "clips.json").write_text(json.dumps({"meta": meta, "done": 2}))
+    (path / "latents" / "half.npy").rename(path / "latents" / "half.npy.part")  # the others had their names already
+    trainer(path).run("latents")
+    assert LatentClips.open(path / "latents").meta == LatentClips.open(run / "latents").meta
+
+
+def test_weights_of_two_runs_are_never_exported_together(run: Path, tmp_path: Path) -> None:
+    other, path = tmp_path / "other", folder_with(run, tmp_path / "mixed", "latents", "unet", "decoder")
+    shorter = msgspec.structs.replace(tiny_recipe().vae, budget=Budget(updates=2))
+    trainer(other, recipe=tiny_recipe(vae=shorter)).run("vae")
+    (path / "vae").symlink_to(other / "vae")
+    with pytest.raises(RunError, match=r"unet/state\.pt belongs to another"):
+        trainer(path).run("export")
+    assert not (path / "tiny.safetensors").exists()
+
+
+def test_a_stage_killed_before_its_last_measurement_measures_when_run_again(run: Path, tmp_path: Path) -> None:
+    path = folder_with(run, tmp_path / "again", "latents")
+    (path / "vae").mkdir()
+    (path / "vae" / "state.pt").write_bytes((run / "vae" / "state.pt").read_bytes())
+    trainer(path).run("vae")
+    assert len(list((path / "vae" / "samples").glob("*.png"))) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("mount", CameraMount(height_m=1.2), "generate clips with the model's mount"),
+        ("fps", 5.0, "the clips have 5"),
+        ("classes", DRIVING_CLASSES[:5], "classes are not the model's"),
+    ],
+)
+def test_clips_the_model_does_not_fit_are_refused_before_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, value: object, words: str
+) -> None:
+    monkeypatch.setattr(TinyClips, name, value)
+    with pytest.raises(DataError, match=words):
+        trainer(tmp_path)
+
+
+def test_latents_of_other_clips_are_not_used(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = folder_with(run, tmp_path / "again", "vae", "latents")
+    monkeypatch.setattr(TinyClips, "origin", "another world")
+    with pytest.raises(RunError, match="of other clips"):
+        trainer(path).run("unet")

@@ -93,6 +93,7 @@ def options(budget: Budget, clock: Clock) -> LoopOptions:
         ema=None,
         log=LogRecipe(log_s=1000.0, save_s=1000.0, measure_s=1000.0),
         stop=Never(),
+        frames_per_clip=4,
         clock=clock,
     )
 

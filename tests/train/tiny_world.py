@@ -5,6 +5,7 @@ import numpy as np
 
 from gcd_model.class_head import SemanticClass
 from gcd_model.config import DRIVING_CLASSES
+from gcd_model.geometry import CameraMount
 from gcd_train.recipe import Recipe, parse_recipe
 
 FRAMES, HEIGHT, WIDTH = 4, 32, 64
@@ -67,6 +68,10 @@ class TinyClips:
     @property
     def classes(self) -> tuple[SemanticClass, ...]:
         return DRIVING_CLASSES
+
+    fps = 10.0
+    mount = CameraMount()
+    origin = "tiny"
 
     def seed(self, number: int, /) -> int:
         return 100 + number

@@ -13,7 +13,7 @@ from gcd_model.networks import Networks
 from gcd_train.datasets.clip_source import ClipSource, to_network
 from gcd_train.datasets.latents import LatentClips, LatentRows
 from gcd_train.draws import Draws
-from gcd_train.errors import RecipeError
+from gcd_train.errors import DataError, RecipeError
 from gcd_train.losses import PARALLEL_DOMAIN_WEIGHTS, class_emphasis
 from gcd_train.model_setup import path_warps
 from gcd_train.objective import Batch, drop
@@ -119,6 +119,10 @@ class PixelBatches:
     def whole_clips(self, draws: Draws, count: int) -> Batch:
         """See BatchSource."""
         pairs = [self._clips.rgb(number) for number in draws.below(len(self._clips), count).tolist()]
+        config = self._networks.config
+        wanted = (config.frames, config.height, config.width)
+        for given in {pair[0].shape[:3] for pair in pairs} - {wanted}:
+            raise DataError(f"clips must be T, H, W = {wanted} for this model, got {given}; generate them anew")
         source, target = (
             self._precision.frames(torch.cat([to_network(pair[side]) for pair in pairs])) for side in (0, 1)
         )

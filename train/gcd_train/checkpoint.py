@@ -71,3 +71,12 @@ def load_state(path: Path, stage: str) -> StageState:
         return StageState(**content)
     except TypeError as error:
         raise RunError(f"{path} is damaged ({error}); delete it to start the stage anew") from error
+
+
+def require_identity(path: Path, state: StageState, identity: str) -> None:
+    """Raises RunError if a state belongs to something else than is about to be trained."""
+    if state.identity != identity:
+        raise RunError(
+            f"{path} belongs to another model, seed or earlier stage ({state.identity}, now {identity}); "
+            f"choose another --out, or delete {path.parent} and what follows it"
+        )

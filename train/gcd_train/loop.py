@@ -11,12 +11,13 @@ from typing import Protocol
 import torch
 from torch import Tensor, nn
 
-from gcd_train.checkpoint import StageState, load_state, save_state
+from gcd_train.checkpoint import StageState, load_state, require_identity, save_state
 from gcd_train.ema import Ema
 from gcd_train.errors import Interrupted, RunError, TrainError
 from gcd_train.recipe import Budget, EmaRecipe, LogRecipe, OptimiserRecipe, StageName
 from gcd_train.run_folder import RunFolder
 from gcd_train.schedule import ParameterGroup, build_optimiser, set_rate
+from gcd_train.stop import StopSignal
 
 _log = logging.getLogger(__name__)
 
@@ -63,17 +64,9 @@ class Task(Protocol):
         ...
 
 
-class StopSignal(Protocol):
-    """Whatever can be asked to stop: a threading.Event."""
-
-    def is_set(self) -> bool:
-        """True once the work should stop."""
-        ...
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class LoopOptions:
-    """How a stage runs. identity: see StageState. clock: seconds, for tests."""
+    """How a stage runs. identity: see StageState. frames_per_clip: for the log. clock: seconds, for tests."""
 
     stage: StageName
     identity: str
@@ -82,6 +75,7 @@ class LoopOptions:
     ema: EmaRecipe | None
     log: LogRecipe
     stop: StopSignal
+    frames_per_clip: int
     clock: Callable[[], float] = time.perf_counter
 
 
@@ -127,6 +121,8 @@ class Loop:
         options = self._options
         saved = measured = logged = options.clock()
         if self.progress.share >= 1:
+            if not self._folder.sample(options.stage, self._updates).exists():
+                self._measure()  # killed at the very end
             return
         while self.progress.share < 1:
             self._update()
@@ -180,12 +176,13 @@ class Loop:
             )
         left_s = self._seconds * (1 - progress.share) / max(progress.share, 1e-9)
         _log.info(
-            "%s %3.0f %%  update %d  %s  %.1f frames/s  %s left",
+            "%s %3.0f %%  update %d  %s  %.1f frames/s (%.2f clips/s)  %s left",
             self._options.stage,
             100 * progress.share,
             progress.updates,
             "  ".join(f"{name} {value:.4g}" for name, value in values.items() if name != "frames_per_s"),
             values["frames_per_s"],
+            values["frames_per_s"] / self._options.frames_per_clip,
             _duration(left_s),
         )
         self._folder.record(self._options.stage, "loss", {**self._when(), **values})
@@ -235,15 +232,6 @@ class Loop:
         if self._ema is not None and state.average is not None:
             self._ema.load_state_dict(state.average)
         self._updates, self._seconds = state.updates, state.seconds
-
-
-def require_identity(path: Path, state: StageState, identity: str) -> None:
-    """Raises RunError if a state belongs to something else than is about to be trained."""
-    if state.identity != identity:
-        raise RunError(
-            f"{path} belongs to another model, seed or earlier stage ({state.identity}, now {identity}); "
-            f"choose another --out, or delete {path.parent} and what follows it"
-        )
 
 
 def _duration(seconds: float) -> str:

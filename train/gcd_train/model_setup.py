@@ -14,7 +14,7 @@ from gcd_model.errors import OptionError
 from gcd_model.geometry import driving_trajectory
 from gcd_model.networks import Networks
 from gcd_model.plane_warp import PathWarps, trained_mount
-from gcd_train.checkpoint import load_state
+from gcd_train.checkpoint import load_state, require_identity
 from gcd_train.errors import RecipeError, RunError
 from gcd_train.recipe import ComputeRecipe, ModelRecipe, StageName, UNetChanges, VAEChanges
 from gcd_train.run_folder import RunFolder
@@ -35,6 +35,7 @@ def model_config(recipe: ModelRecipe) -> ModelConfig:
             base,
             unet=msgspec.structs.replace(base.unet, **_given(recipe.unet)),
             vae=msgspec.structs.replace(base.vae, **_given(recipe.vae)),
+            prediction=recipe.prediction or base.prediction,
             frames=recipe.frames or base.frames,
             height=recipe.height or base.height,
             width=recipe.width or base.width,
@@ -123,15 +124,18 @@ def start_networks(recipe: ModelRecipe, config: ModelConfig, seed: int) -> Netwo
     return networks
 
 
-def fill(networks: Networks, folder: RunFolder, stage: StageName) -> None:
+def fill(networks: Networks, folder: RunFolder, stage: StageName, identity: str) -> None:
     """Copy what a stage trained into networks, averaged where it averages.
 
-    Raises RunError if it has not run, or if names or shapes do not fit.
+    identity: what its state must belong to. Raises RunError if it has not run, or if identity, names or shapes do not
+    fit.
     """
     path = folder.state(stage)
     if not path.exists():
         raise RunError(f"{path} is missing: run `gcd-train train ... --stage {stage}` first")
-    known, best = networks.state_dict(), load_state(path, stage).best
+    state = load_state(path, stage)
+    require_identity(path, state, identity)
+    known, best = networks.state_dict(), state.best
     given = {name: value for name, value in best.items() if name in known}
     lacking = sorted(name for name in known if name.startswith(_PREFIXES.get(stage, ())) and name not in given)
     wrong = [name for name, value in given.items() if value.shape != known[name].shape]

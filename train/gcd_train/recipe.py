@@ -213,11 +213,13 @@ class VAEChanges(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 class ModelRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Which networks: a named set-up, and what differs.
 
+    prediction: what the network says, left out as the base has it; "v" is the paper's.
     weights: a weight file to start from; left out, everything starts at random. family: how it is used, see
     `gcd-train families`. frames, height, width: trained length and size in pixels, left out as the base has them.
     """
 
     base: Literal["driving-small", "svd-14", "small"] = "driving-small"
+    prediction: Literal["v", "x0"] | None = None
     weights: str | None = None
     family: str = "driving"
     frames: Count | None = None
@@ -272,6 +274,10 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def __post_init__(self) -> None:
         if self.unet.source == "latents" and self.latents is None:
             raise ValueError('unet.source "latents" needs a [latents] table')
+        if self.unet.source == "latents" and self.latents is not None:
+            given, told = self.latents.augmentation, self.unet.augmentation
+            if given != told:
+                raise ValueError(f"latents.augmentation is {given:g}, but unet.augmentation tells the network {told:g}")
         if self.decoder is not None and self.latents is None:
             raise ValueError("[decoder] works on encoded clips and needs a [latents] table")
         if self.vae is None and self.model.weights is None:

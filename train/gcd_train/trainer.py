@@ -8,13 +8,14 @@ import torch
 
 from gcd_model import ModelConfig
 from gcd_model.networks import Networks
+from gcd_model.plane_warp import trained_mount
 from gcd_train.batches import BatchSource, EncodedBatches, PixelBatches
 from gcd_train.datasets.clip_source import ClipSource, KeptClips, numbers_of
 from gcd_train.datasets.latents import LatentClips
 from gcd_train.datasets.predictions import Predictions, PredictionsMeta, write_predictions
 from gcd_train.draws import Draws
-from gcd_train.errors import RecipeError, RunError
-from gcd_train.loop import Loop, LoopOptions, StopSignal, Task
+from gcd_train.errors import DataError, RecipeError, RunError
+from gcd_train.loop import Loop, LoopOptions, Task
 from gcd_train.losses import class_frequency_weights
 from gcd_train.model_setup import digest_of, family_of, fill, model_config, start_networks, weights_digest
 from gcd_train.objective import Weights
@@ -26,6 +27,7 @@ from gcd_train.stages.export import export, without_plane_mix
 from gcd_train.stages.latents import LatentsJob, encode_clips
 from gcd_train.stages.unet import UNetTask
 from gcd_train.stages.vae import VAETask
+from gcd_train.stop import StopSignal
 from gcd_train.validation import Validation
 
 _log = logging.getLogger(__name__)
@@ -52,6 +54,8 @@ class Trainer:
         self._config: ModelConfig = model_config(inputs.recipe.model)
         self._family = family_of(inputs.recipe.model)
         self._precision = Precision.of(inputs.recipe.compute)
+        for clips in (inputs.clips, inputs.valid):
+            require_fit(clips, self._config, inputs.recipe.unet.fps)
 
     def run(self, only: StageName | None = None) -> None:
         """Every stage that is not finished, or just one.
@@ -78,8 +82,19 @@ class Trainer:
         networks = start_networks(self._recipe.model, self._config, self._recipe.seed)
         for stage in stages:
             if stage in self._recipe.stages:
-                fill(networks, self._folder, stage)
+                fill(networks, self._folder, stage, self._identity(stage, networks))
         return networks
+
+    def _identity(self, stage: StageName, networks: Networks) -> str:
+        """What a stage's state belongs to; `networks` hold what was trained before it."""
+        config, seed = self._config, self._recipe.seed
+        if stage == "vae":
+            return digest_of(config.vae, seed)
+        if stage == "unet":
+            shape = digest_of(config.unet, config.prediction, config.plane_warp, seed)
+            return f"{_autoencoder_digest(networks)}-{shape}"
+        mix = digest_of(config.plane_warp, config.plane_mix)
+        return f"{weights_digest(networks.unet.state_dict())}-{digest_of(seed)}-{mix}"
 
     def _loop(
         self, task: Task, stage: StageName, recipe: VAERecipe | UNetRecipe | DecoderRecipe, identity: str
@@ -92,13 +107,16 @@ class Trainer:
             ema=recipe.ema,
             log=self._recipe.log,
             stop=self._inputs.stop,
+            frames_per_clip=self._config.frames,
         )
         Loop(task, self._folder, options).run()
 
     def _train_vae(self) -> None:
         recipe, seed = _present(self._recipe.vae), self._recipe.seed
-        task = VAETask(self._networks(), self._inputs.clips, self._inputs.valid, recipe, self._precision, seed)
-        self._loop(task, "vae", recipe, digest_of(self._config.vae, seed))
+        networks = self._networks()
+        identity = self._identity("vae", networks)
+        task = VAETask(networks, self._inputs.clips, self._inputs.valid, recipe, self._precision, seed)
+        self._loop(task, "vae", recipe, identity)
 
     def _encode(self) -> None:
         recipe, networks = _present(self._recipe.latents), self._networks("vae")
@@ -109,16 +127,16 @@ class Trainer:
             recipe=recipe,
             precision=self._precision,
             seed=self._recipe.seed,
-            identity=f"{_autoencoder_digest(networks)}-{digest_of(recipe, self._recipe.seed)}",
+            identity=self._latents_identity(networks),
             stop=self._inputs.stop,
         )
         encode_clips(job)
 
     def _train_unet(self) -> None:
         recipe, networks = self._recipe.unet, self._networks("vae")
-        autoencoder = _autoencoder_digest(networks)
+        identity = self._identity("unet", networks)
         self._precision.placed(networks)
-        clips = self._latent_clips(autoencoder) if recipe.source == "latents" else None
+        clips = self._latent_clips(networks) if recipe.source == "latents" else None
         task = UNetTask(
             networks,
             self._batches(networks, clips),
@@ -128,13 +146,12 @@ class Trainer:
             self._precision,
             self._recipe.seed,
         )
-        shape = digest_of(self._config.unet, self._config.prediction, self._config.plane_warp, self._recipe.seed)
-        self._loop(task, "unet", recipe, f"{autoencoder}-{shape}")
+        self._loop(task, "unet", recipe, identity)
 
     def _train_decoder(self) -> None:
         recipe, networks = _present(self._recipe.decoder), self._networks("vae", "unet")
-        clips = self._latent_clips(_autoencoder_digest(networks))
-        identity = f"{weights_digest(networks.unet.state_dict())}-{digest_of(self._recipe.seed)}"
+        identity = self._identity("decoder", networks)
+        clips = self._latent_clips(networks)
         self._precision.placed(networks)
         data = DecoderData(
             clips=KeptClips(self._inputs.clips, numbers_of(self._inputs.clips, clips.meta.seeds)),
@@ -143,23 +160,17 @@ class Trainer:
             class_weights=class_weights(clips, recipe.class_power, self._precision.device),
         )
         task = DecoderTask(networks, data, self._validation(plane_mix=True), recipe, self._precision, self._recipe.seed)
-        mix = digest_of(self._config.plane_warp, self._config.plane_mix)
-        self._loop(task, "decoder", recipe, f"{identity}-{mix}")
+        self._loop(task, "decoder", recipe, identity)
 
     def _predictions(self, networks: Networks, clips: LatentClips, recipe: DecoderRecipe, identity: str) -> Predictions:
         """What the U-Net makes of some clips; made now unless they are there."""
         folder = self._folder.path / "predictions"
         order = Draws(self._recipe.seed, "decoder-clips", 0, torch.device("cpu")).order(clips.meta.clips)
         meta = PredictionsMeta(identity=identity, clips=tuple(order[: recipe.clips]))
-        if not (folder / "meta.json").exists():
-            _log.info("predicting %d clips", len(meta.clips))
-            batches = EncodedBatches(clips, self._config, self._recipe.unet, self._precision)
-            predictor = Predictor(networks, clips, batches, self._precision, self._recipe.seed)
-            write_predictions(folder, meta, predictor.predict)
-        made = Predictions.open(folder)
-        if made.meta != meta:
-            raise RunError(f"{folder} was made by another U-Net or of other clips; delete it and run again")
-        return made
+        batches = EncodedBatches(clips, self._config, self._recipe.unet, self._precision)
+        predictor = Predictor(networks, clips, batches, self._precision, self._recipe.seed)
+        write_predictions(folder, meta, predictor.predict, self._inputs.stop)
+        return Predictions.open(folder)
 
     def _export(self) -> None:
         mixes = "decoder" in self._recipe.stages
@@ -171,12 +182,16 @@ class Trainer:
         count = self._recipe.log.valid_clips
         return Validation(self._inputs.valid, self._family, count=count, plane_mix=plane_mix)
 
-    def _latent_clips(self, autoencoder: str) -> LatentClips:
+    def _latents_identity(self, networks: Networks) -> str:
+        told = digest_of(_present(self._recipe.latents), self._recipe.seed, self._inputs.clips.origin)
+        return f"{_autoencoder_digest(networks)}-{told}"
+
+    def _latent_clips(self, networks: Networks) -> LatentClips:
         clips = LatentClips.open(self._folder.stage("latents"))
-        if not clips.meta.identity.startswith(autoencoder):
+        if clips.meta.identity != self._latents_identity(networks):
             raise RunError(
-                f"{self._folder.stage('latents')} was made by another autoencoder than this run's; delete it and run "
-                "the latents stage again"
+                f"{self._folder.stage('latents')} was made by another autoencoder, of other clips or with other "
+                "options than this run's; delete it and run the latents stage again"
             )
         return clips.resident(self._precision.device) if self._recipe.compute.resident else clips
 
@@ -192,6 +207,20 @@ class Trainer:
             return Weights()
         channels = torch.tensor(clips.meta.sensitivity, device=device) if loss.sensitivity else None
         return Weights(channels=channels, classes=class_weights(clips, loss.class_power, device))
+
+
+def require_fit(clips: ClipSource, config: ModelConfig, fps: float) -> None:
+    """Raises DataError if the clips are not what the model and its recipe take them for."""
+    if clips.fps != fps:
+        raise DataError(f"the recipe's unet.fps is {fps:g}, the clips have {clips.fps:g}; change one of them")
+    if config.plane_warp is not None and clips.mount != trained_mount(config.plane_warp):
+        raise DataError(
+            f"the model warps for {trained_mount(config.plane_warp)}, the clips were taken with {clips.mount}; "
+            "generate clips with the model's mount"
+        )
+    head = config.class_head
+    if head is not None and [kind.name for kind in head.classes] != [kind.name for kind in clips.classes]:
+        raise DataError("the clips' classes are not the model's; generate them with this version")
 
 
 def class_weights(clips: LatentClips, power: float, device: torch.device) -> torch.Tensor | None:

@@ -24,7 +24,7 @@ class Validation:
         self._count = min(count, len(clips))
 
     def measure(self, networks: Networks, picture: Path) -> dict[str, float]:
-        """PSNR over frames 2 to T and of the last, mean IoU of the class map; writes a sheet of samples.
+        """PSNR over frames 2 to T and of the last, mean IoU of the class map at picture size; writes a sample sheet.
 
         One row shows source, view, target and, with a class head, predicted and true class map of a frame.
         """
@@ -49,7 +49,7 @@ class Validation:
         write_sheet(picture, shown)
         table = torch.stack(scores)  # [clips, T - 1]
         values = {"psnr": float(table.mean()), "psnr_last": float(table[:, -1].mean())}
-        return values if counts is None else {**values, "miou": mean_iou(counts)}
+        return values if counts is None else {**values, "miou_full": mean_iou(counts)}
 
     def _synthesizer(self, networks: Networks) -> Synthesizer:
         """A copy of the networks behind the door that users take."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gcd_model.class_head import SemanticClass
+from gcd_model.geometry import CameraMount
 from gcd_train.errors import DataError
 
 Bytes: TypeAlias = NDArray[np.uint8]
@@ -24,6 +25,21 @@ class ClipSource(Protocol):
     @property
     def classes(self) -> Sequence[SemanticClass]:
         """The ontology of the class maps."""
+        ...
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        ...
+
+    @property
+    def mount(self) -> CameraMount:
+        """How the source camera really sits on the vehicle."""
+        ...
+
+    @property
+    def origin(self) -> str:
+        """Names the world and its options, whatever number of clips there is."""
         ...
 
     def seed(self, number: int, /) -> int:
@@ -59,6 +75,21 @@ class KeptClips:
     def classes(self) -> Sequence[SemanticClass]:
         """The ontology of the class maps."""
         return self._clips.classes
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        return self._clips.fps
+
+    @property
+    def mount(self) -> CameraMount:
+        """How the source camera really sits on the vehicle."""
+        return self._clips.mount
+
+    @property
+    def origin(self) -> str:
+        """Names the world and its options."""
+        return self._clips.origin
 
     def seed(self, number: int, /) -> int:
         """What a clip was made from."""

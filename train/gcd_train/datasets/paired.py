@@ -1,15 +1,19 @@
 """Clips of a data folder: what the source camera saw, and what the target camera saw at the same times."""
 
+import hashlib
+import re
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
 import cv2
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from gcd_model.config import SemanticClass
+from gcd_model.geometry import CameraMount
 from gcd_train.errors import DataError
 from gcd_train.scenes.writer import DEPTH_UNIT_M, World, read_world
 
@@ -93,6 +97,18 @@ class PairedClips:
         return self.world.fps
 
     @property
+    def mount(self) -> CameraMount:
+        """How the source camera really sits on the vehicle."""
+        options = self.world.options
+        return CameraMount(height_m=options.height_m, tilt_deg=options.tilt_deg, hfov_deg=self.world.hfov_deg)
+
+    @property
+    def origin(self) -> str:
+        """Names the world and its options, whatever number of clips there is."""
+        told = msgspec.json.encode(msgspec.structs.replace(self.world, clips_per_shard=0), order="deterministic")
+        return hashlib.sha256(told).hexdigest()[:8]
+
+    @property
     def frames(self) -> int:
         """T."""
         return self.world.frames
@@ -138,6 +154,9 @@ def require_apart(training: PairedClips, held_out: PairedClips) -> None:
 def _clip_names(path: Path) -> list[str]:
     try:
         with zipfile.ZipFile(path) as archive:
-            return sorted({name.split("/")[0] for name in archive.namelist()})
+            names = {name.split("/")[0] for name in archive.namelist()}
     except (OSError, zipfile.BadZipFile) as error:
         raise DataError(f"{path} is damaged ({error}); delete it and generate again") from error
+    if not all(re.fullmatch(r"\d{8,12}", name) for name in names):
+        raise DataError(f"{path} holds something else than clips named by their seed; take it out of the folder")
+    return sorted(names)

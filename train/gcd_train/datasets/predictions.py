@@ -4,17 +4,26 @@ meta.json (written last), latents.npy float16 [M, T, C, h, w], decoded.npy float
 head, logits.npy float16 [M, T, K, h', w'].
 """
 
+import logging
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Self, TypeVar
 
 import msgspec
 import numpy as np
 import torch
 from torch import Tensor
 
-from gcd_train.errors import RunError
+from gcd_train.errors import Interrupted, RunError
+from gcd_train.stop import StopSignal
+
+_log = logging.getLogger(__name__)
+_PROGRESS = "begun.json"
+_SAVE_EVERY = 16  # clips
+_LOG_S = 15.0
+Kind = TypeVar("Kind", bound=msgspec.Struct)
 
 
 class PredictionsMeta(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -66,21 +75,74 @@ class Predictions:
         return Predicted(rows["latents"], rows["decoded"], rows.get("logits"))
 
 
-def write_predictions(folder: Path, meta: PredictionsMeta, predict: Callable[[int], Predicted]) -> None:
-    """Write what `predict` says of each clip of `meta`. Raises RunError."""
+def write_predictions(
+    folder: Path, meta: PredictionsMeta, predict: Callable[[int], Predicted], stop: StopSignal
+) -> None:
+    """Write what `predict` says of each clip of `meta`; goes on where it stopped, does nothing if all is there.
+
+    Raises:
+        Interrupted: the stop signal was set; run again to go on.
+        RunError: the folder holds predictions of something else, or cannot be written.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        files: dict[str, np.memmap[tuple[int, ...], np.dtype[np.float16]]] = {}
-        for place, number in enumerate(meta.clips):
-            for name, rows in predict(number).arrays.items():
-                if name not in files:
-                    shape = (len(meta.clips), *rows.shape)
-                    files[name] = np.lib.format.open_memmap(folder / f"{name}.npy", "w+", np.float16, shape)
-                files[name][place] = rows.half().cpu().numpy()
-        for file in files.values():
-            file.flush()
-        unfinished = folder / "meta.json.part"
-        unfinished.write_bytes(msgspec.json.encode(meta))
-        unfinished.replace(folder / "meta.json")
-    except OSError as error:
-        raise RunError(f"cannot write predictions in {folder}: {error.strerror}; free some space") from error
+        if (folder / "meta.json").exists():
+            _require_same(folder, meta, _read(folder / "meta.json", PredictionsMeta))
+            return
+        _write_missing(folder, meta, predict, stop)
+        (folder / _PROGRESS).unlink(missing_ok=True)
+    except (OSError, ValueError) as error:
+        raise RunError(f"cannot write predictions in {folder} ({error}); free some space, or delete it") from error
+
+
+class _Begun(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """An unfinished folder. done: clips already in the arrays."""
+
+    meta: PredictionsMeta
+    done: int
+
+
+def _write_missing(folder: Path, meta: PredictionsMeta, predict: Callable[[int], Predicted], stop: StopSignal) -> None:
+    begun = folder / _PROGRESS
+    done = 0
+    if begun.exists():
+        kept = _read(begun, _Begun)
+        _require_same(folder, meta, kept.meta)
+        done = kept.done
+    files: dict[str, np.memmap[tuple[int, ...], np.dtype[np.float16]]] = {}
+    logged = started = time.perf_counter()
+    for place in range(done, len(meta.clips)):
+        for name, rows in predict(meta.clips[place]).arrays.items():
+            if name not in files:
+                shape = (len(meta.clips), *rows.shape)
+                mode = "r+" if done else "w+"
+                files[name] = np.lib.format.open_memmap(folder / f"{name}.npy", mode, np.float16, shape)
+            files[name][place] = rows.half().cpu().numpy()
+        now, made = time.perf_counter(), place + 1 - done
+        if now - logged > _LOG_S:
+            logged, left_s = now, (len(meta.clips) - place - 1) * (now - started) / made
+            _log.info("predicting  clip %d of %d  %.0f s left", place + 1, len(meta.clips), left_s)
+        if stop.is_set() or made % _SAVE_EVERY == 0:
+            for file in files.values():
+                file.flush()
+            _replace(begun, msgspec.json.encode(_Begun(meta=meta, done=place + 1)))
+        if stop.is_set():
+            raise Interrupted(f"stopped after predicting {place + 1} of {len(meta.clips)} clips; run again to go on")
+    for file in files.values():
+        file.flush()
+    _replace(folder / "meta.json", msgspec.json.encode(meta))
+
+
+def _require_same(folder: Path, meta: PredictionsMeta, found: PredictionsMeta) -> None:
+    if found != meta:
+        raise RunError(f"{folder} was made by another U-Net or of other clips; delete it and run again")
+
+
+def _read(path: Path, kind: type[Kind]) -> Kind:
+    return msgspec.json.decode(path.read_bytes(), type=kind)
+
+
+def _replace(path: Path, content: bytes) -> None:
+    unfinished = path.with_name(path.name + ".part")
+    unfinished.write_bytes(content)
+    unfinished.replace(path)

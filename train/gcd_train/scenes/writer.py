@@ -7,6 +7,7 @@ A data folder holds `world.json` (what it is) and `shard-<first seed>.zip` files
 
 import json
 import os
+import re
 import signal
 import time
 import zipfile
@@ -80,8 +81,11 @@ def generate(out: Path, world: World, seeds: range, workers: int) -> Iterator[Pr
 def _missing_shards(out: Path, seeds: range, size: int) -> list[range]:
     """Runs of at most `size` seeds of which no finished shard has any; what killed workers left is removed."""
     there: set[int] = set()
-    for path in out.glob("shard-*-*.zip"):
-        first, count = (int(number) for number in path.stem.split("-")[1:])
+    for path in out.glob("shard-*.zip"):
+        named = re.fullmatch(r"shard-(\d+)-(\d+)", path.stem)
+        if named is None:
+            raise DataError(f"{path} is no shard of this program; take it out of the folder")
+        first, count = (int(number) for number in named.groups())
         there.update(range(first, first + count))
     for leftover in out.glob("shard-*.partial"):
         if time.time() - leftover.stat().st_mtime > _ABANDONED_S:

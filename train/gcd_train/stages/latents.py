@@ -20,10 +20,10 @@ from gcd_train.datasets.clip_source import ClipSource, numbers_of, to_network
 from gcd_train.datasets.latents import LatentsMeta
 from gcd_train.draws import Draws
 from gcd_train.errors import DataError, Interrupted, RunError
-from gcd_train.loop import StopSignal
 from gcd_train.metrics import majority_classes
 from gcd_train.precision import Precision
 from gcd_train.recipe import LatentsRecipe
+from gcd_train.stop import StopSignal
 
 _log = logging.getLogger(__name__)
 _SAVE_EVERY = 32  # clips
@@ -112,10 +112,13 @@ def _begin(job: LatentsJob) -> tuple[LatentsMeta, dict[str, Any], int]:
 
 
 def _opened(folder: Path, meta: LatentsMeta, mode: str) -> dict[str, Any]:
-    return {
-        name: np.lib.format.open_memmap(folder / f"{name}.npy.part", mode=mode, dtype=kind, shape=shape)  # pyright: ignore[reportArgumentType]
-        for name, (shape, kind) in meta.shapes.items()
-    }
+    """The arrays under their unfinished names; under the final ones where a run was killed between the renames."""
+    arrays: dict[str, Any] = {}
+    for name, (shape, kind) in meta.shapes.items():
+        unfinished, final = folder / f"{name}.npy.part", folder / f"{name}.npy"
+        path = final if mode == "r+" and final.exists() and not unfinished.exists() else unfinished
+        arrays[name] = np.lib.format.open_memmap(path, mode=mode, dtype=kind, shape=shape)  # pyright: ignore[reportArgumentType]
+    return arrays
 
 
 def _description(job: LatentsJob) -> LatentsMeta:
@@ -200,7 +203,9 @@ def _finish(job: LatentsJob, meta: LatentsMeta, arrays: dict[str, Any]) -> None:
     )
     arrays.clear()
     for name in meta.shapes:
-        (job.folder / f"{name}.npy.part").replace(job.folder / f"{name}.npy")
+        unfinished = job.folder / f"{name}.npy.part"
+        if unfinished.exists():
+            unfinished.replace(job.folder / f"{name}.npy")
     _write(job.folder / "meta.json", msgspec.json.format(msgspec.json.encode(meta)))
     (job.folder / "clips.json").unlink()
 
