@@ -22,7 +22,7 @@ def test_the_papers_recipe_holds_the_published_numbers() -> None:
     assert (unet.noise.log_mean, unet.noise.log_std, unet.noise.fixed_share, unet.noise.shared) == (1.0, 1.6, 0, 0)
     assert (unet.loss.focal, unet.loss.focal_steps, unet.loss.focal_fraction) == (True, 5000, 0.1)
     assert (unet.dropout, unet.augmentation, unet.loss.weight_limit) == (0.1, 0.02, None)
-    assert (unet.budget.updates, unet.clip_batch, unet.source) == (13000, 24, "pixels")
+    assert (unet.budget.updates, unet.clip_batch * unet.accumulate, unet.source) == (13000, 24, "pixels")
 
 
 def test_the_small_recipes_fit_the_size_of_the_package() -> None:

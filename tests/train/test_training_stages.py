@@ -1,6 +1,7 @@
 """Laws of single stages that a whole run does not show."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -115,6 +116,37 @@ def test_a_loss_that_is_no_number_stops_the_run_and_is_not_saved(tmp_path: Path)
     with pytest.raises(TrainError, match="lower the learning rate"):
         loop.run()
     assert not (tmp_path / "vae" / "state.pt").exists()
+
+
+class Distances:
+    """A task whose parts pull one number to different places; keeps the gradient of each update."""
+
+    def __init__(self, places: Sequence[float]) -> None:
+        self.module = nn.ParameterDict({"x": nn.Parameter(torch.tensor(1.0))})
+        self.gradients: list[float] = []
+        self._places = places
+
+    def parameter_groups(self) -> Sequence[ParameterGroup]:
+        return [ParameterGroup(parameters=list(self.module.parameters()))]
+
+    def step_loss(self, progress: Progress) -> StepLoss:
+        loss = (self.module["x"] - self._places[progress.part]) ** 2
+        return StepLoss(loss, {"distance": loss}, 1)
+
+    def after_update(self, progress: Progress) -> bool:
+        gradient = self.module["x"].grad
+        assert gradient is not None
+        self.gradients.append(gradient.item())
+        return False
+
+    def measure(self, picture: Path) -> dict[str, float]:
+        return {}
+
+
+def test_the_gradient_of_an_update_is_the_mean_over_its_parts(tmp_path: Path) -> None:
+    task = Distances([0.0, 3.0, 9.0])
+    Loop(task, RunFolder(tmp_path), replace(options(Budget(updates=1), Clock()), parts=3)).run()
+    assert task.gradients == [pytest.approx(2 * (1 - (0 + 3 + 9) / 3))]
 
 
 def test_a_linear_path_starts_as_the_best_linear_code() -> None:

@@ -4,7 +4,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -24,10 +24,11 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Where a stage is before an update. share: of the budget, 0 to 1."""
+    """Where a stage is before an update. share: of the budget, 0 to 1. part: of an update made of several batches."""
 
     updates: int
     share: float
+    part: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +67,8 @@ class Task(Protocol):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class LoopOptions:
-    """How a stage runs. identity: see StageState. frames_per_clip: for the log. clock: seconds, for tests."""
+    """How a stage runs. identity: see StageState. frames_per_clip: for the log. parts: batches
+    whose gradients make one update. clock: seconds, for tests."""
 
     stage: StageName
     identity: str
@@ -76,6 +78,7 @@ class LoopOptions:
     log: LogRecipe
     stop: StopSignal
     frames_per_clip: int
+    parts: int = 1
     clock: Callable[[], float] = time.perf_counter
 
 
@@ -146,8 +149,11 @@ class Loop:
         progress = self.progress
         set_rate(self._optimiser, progress.updates, progress.share, recipe)
         self._optimiser.zero_grad(set_to_none=True)
-        loss = self._task.step_loss(progress)
-        loss.total.backward()
+        for part in range(self._options.parts):
+            loss = self._task.step_loss(replace(progress, part=part))
+            (loss.total / self._options.parts).backward()
+            kept = {name: value.detach() for name, value in loss.parts.items()}
+            self._window.losses.append(StepLoss(loss.total.detach(), kept, loss.frames))
         if recipe.clip is not None:
             trained = [p for group in self._optimiser.param_groups for p in group["params"]]
             nn.utils.clip_grad_norm_(trained, recipe.clip)
@@ -155,8 +161,6 @@ class Loop:
         self._updates += 1
         if self._ema is not None:
             self._ema.update(self._updates)
-        kept = {name: value.detach() for name, value in loss.parts.items()}
-        self._window.losses.append(StepLoss(loss.total.detach(), kept, loss.frames))
         spent = self._options.clock() - started
         self._seconds += spent
         self._window.seconds += spent

@@ -142,7 +142,7 @@ class UNetRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     source: "latents" reads what the latents stage wrote, "pixels" encodes every batch anew with fresh noise.
     image_share: share of the budget with single frames, the temporal layers left out; then whole clips.
-    image_batch: frames of such a batch. clip_batch: clips of a batch.
+    image_batch: frames of such a batch. clip_batch: clips of a batch. accumulate: batches an update.
     dropout: probability, for each frame and each stream by itself, that the network sees zeros.
     augmentation: noise strength on source frames, what the network is told and, with "pixels", what it gets.
     fps, motion_bucket: what the network is told.
@@ -155,6 +155,7 @@ class UNetRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     image_share: Share = 0.0
     image_batch: Count = 16
     clip_batch: Count = 3
+    accumulate: Count = 1
     noise: NoiseRecipe = NoiseRecipe()
     loss: LossRecipe = LossRecipe()
     dropout: Share = 0.1

@@ -108,6 +108,7 @@ class Trainer:
             log=self._recipe.log,
             stop=self._inputs.stop,
             frames_per_clip=self._config.frames,
+            parts=recipe.accumulate if isinstance(recipe, UNetRecipe) else 1,
         )
         Loop(task, self._folder, options).run()
 

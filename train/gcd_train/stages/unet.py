@@ -46,8 +46,8 @@ class UNetTask:
 
     def step_loss(self, progress: Progress) -> StepLoss:
         """The diffusion loss on single frames or on whole clips."""
-        draws = Draws(self._seed, "unet", progress.updates, self._precision.device)
         recipe = self._recipe
+        draws = Draws(self._seed, "unet", progress.updates * recipe.accumulate + progress.part, self._precision.device)
         if progress.share < recipe.image_share:
             batch = self._batches.single_frames(draws, recipe.image_batch)
         else:
