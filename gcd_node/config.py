@@ -50,20 +50,43 @@ class SourcePose(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         return (self.height_m, self.forward_m, self.left_m, self.tilt_deg) != (None,) * 4
 
 
+SourceKind: TypeAlias = Literal["file", "folder", "synthetic", "mcap", "v4l2", "rtsp", "oak"]
+LIVE_KINDS: frozenset[SourceKind] = frozenset({"v4l2", "rtsp", "oak"})
+"""Sources that cannot be played again, and that may fall silent and come back."""
+
+
 class SourceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Where frames come from.
 
-    path: a video file or a folder of images; `package:drive.mp4` is the clip that ships. Not for `synthetic`.
+    path: a video file, a folder of images or an MCAP log; `package:drive.mp4` is the clip that ships.
+    device: of `v4l2` a number or a path such as /dev/video0; of `oak` a device id, left out if there is just one.
+    url: of `rtsp`: rtsp://, or http:// and udp:// streams of the same decoder. May hold a password: never logged.
+    topic: of `mcap`: where the pictures are; left out if the log has just one such topic.
+    width, height: what a live camera is asked for; it may give something else, which is then used and said.
     pace: "realtime" plays at the recorded speed; "lockstep" waits for the model and skips nothing.
     fps: of an image folder, which cannot say; otherwise leave it out.
     hfov_deg: horizontal field of view of the source picture, if known; published as intrinsics, and part of the
         mount for models that warp by known planes.
     resize: "released" is the bilinear resize the checkpoints were trained with, "area" averages (less aliasing).
     frames: stop a synthetic source after this many.
+    calibration: a ROS camera_info YAML file; left out, what the source itself knows (OAK memory, CameraInfo in a log).
+        With one, pictures are undistorted and cut to the field of view the model was trained with.
+    open_timeout_s: how long a live camera may take to open.
+    stall_ms: silence after which a live source counts as stalled; left out, 3 frame periods and at least 200.
+    max_reconnects: give up after so many failed attempts in a row; left out, never.
     """
 
-    kind: Literal["file", "folder", "synthetic"] = "file"
+    kind: SourceKind = "file"
     path: str | None = None
+    device: str | None = None
+    url: str | None = None
+    topic: str | None = None
+    width: Count | None = None
+    height: Count | None = None
+    calibration: str | None = None
+    open_timeout_s: Positive = 5.0
+    stall_ms: Positive | None = None
+    max_reconnects: Annotated[int, Meta(ge=0)] | None = None
     pace: Literal["realtime", "lockstep"] = "realtime"
     loop: bool = False
     fps: Positive | None = None
@@ -75,8 +98,14 @@ class SourceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     pose: SourcePose | None = None
 
     def __post_init__(self) -> None:
-        if (self.path is None) != (self.kind == "synthetic"):
+        if (self.path is None) != (self.kind not in ("file", "folder", "mcap")):
             raise ValueError(f"source kind {self.kind!r} {'takes no' if self.path else 'needs a'} path")
+        if (self.url is None) != (self.kind != "rtsp"):
+            raise ValueError(f"source kind {self.kind!r} {'takes no' if self.url else 'needs a'} url")
+        if self.device is not None and self.kind not in ("v4l2", "oak"):
+            raise ValueError(f"source kind {self.kind!r} takes no device")
+        if self.kind in LIVE_KINDS and (self.pace == "lockstep" or self.loop):
+            raise ValueError(f"a {self.kind} camera does not wait and cannot be played again: leave pace and loop out")
         if self.kind == "folder" and self.fps is None:
             raise ValueError("an image folder does not know its frame rate: give fps")
 
@@ -157,6 +186,53 @@ class PublishConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     end_delay_ms: Annotated[int, Meta(ge=0)] = 500
 
 
+class ControlConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The control socket. endpoint: as in [publish]; left out, the node takes no commands."""
+
+    endpoint: str | None = "ipc"
+
+
+class SecurityConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Who may connect over tcp: without both of these only this machine may.
+
+    keys: folder with the node's CURVE key pair, as `gcd-node keys` makes it.
+    allow: file of allowed client keys and their roles, viewer or operator.
+    """
+
+    keys: str | None = None
+    allow: str | None = None
+
+    def __post_init__(self) -> None:
+        if (self.keys is None) != (self.allow is None):
+            raise ValueError("encryption without a list of clients lets everybody in: state keys and allow, or neither")
+
+
+class HealthConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What the node tells of itself beside the status socket.
+
+    http: "127.0.0.1:PORT" of /healthz, /readyz and /metrics; left out, none. Loopback only.
+    log: "text" or "json" lines on stderr.
+    """
+
+    http: str | None = None
+    log: Literal["text", "json"] = "text"
+
+
+class LifeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How the node behaves beside others.
+
+    autostart: configure and activate at once; else it waits for commands.
+    idle_s: without a subscriber for so long, nothing is rendered; 0 renders always.
+    hang_s: a model step may take so long before the node counts as hung.
+    nice: added to the process's niceness, 0 to 19.
+    """
+
+    autostart: bool = True
+    idle_s: Annotated[float, Meta(ge=0)] = 0.0
+    hang_s: Positive = 60.0
+    nice: Annotated[int, Meta(ge=0, le=19)] = 0
+
+
 class NodeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A whole launch file. strict: refuse what would only be flagged as out of the trained domain."""
 
@@ -165,6 +241,10 @@ class NodeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     view: Annotated[dict[ViewId, ViewConfig], Meta(min_length=1)]
     window: WindowConfig = WindowConfig()
     publish: PublishConfig = PublishConfig()
+    control: ControlConfig = ControlConfig()
+    security: SecurityConfig = SecurityConfig()
+    health: HealthConfig = HealthConfig()
+    life: LifeConfig = LifeConfig()
     node_id: Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{1,32}$")] = "gcd"
     strict: bool = False
 
@@ -225,5 +305,9 @@ def _keys_at(place: str) -> list[str]:
         "view": ViewConfig,
         "window": WindowConfig,
         "publish": PublishConfig,
+        "control": ControlConfig,
+        "security": SecurityConfig,
+        "health": HealthConfig,
+        "life": LifeConfig,
     }
     return list(sections[place.split("[")[0].strip(".")].__struct_fields__)

@@ -3,12 +3,15 @@
     NodeError 70
     ├── UsageError 64         options that contradict each other or make no sense
     ├── SourceError 66        an input is missing, empty, damaged or undecodable; a camera is lost
-    │   └── TooShortError 65      an input has fewer frames than one window
+    │   ├── TooShortError 65      an input has fewer frames than one window
+    │   ├── SourceAbsentError 69  there is no such camera
+    │   └── SourceLostError 75    a camera is gone and did not come back
     ├── MessageError 65       bytes that are not a valid message of this protocol
     ├── StaleError 69         a view arrived too old to be used
     ├── EndpointError 73      an endpoint is in use or cannot be bound
     ├── OutputError 73        a result cannot be written
     ├── ModelFailedError 70   the model keeps producing unusable views
+    ├── ControlError 70       a command was refused, or nobody answers it
     └── ConfigError 78        a launch file or a setting is wrong
 
 Every message says what was wanted, what came, and what to do. Standard library only, Python 3.10 syntax: planners
@@ -40,6 +43,18 @@ class TooShortError(SourceError):
     exit_code = 65
 
 
+class SourceAbsentError(SourceError):
+    """There is no such camera; the message lists those there are."""
+
+    exit_code = 69
+
+
+class SourceLostError(SourceError):
+    """A camera is gone and did not come back."""
+
+    exit_code = 75
+
+
 class MessageError(NodeError):
     """Bytes that are not a valid message of this protocol."""
 
@@ -68,6 +83,16 @@ class ModelFailedError(NodeError):
     """The model keeps producing unusable views."""
 
     exit_code = 70
+
+
+class ControlError(NodeError):
+    """A command was refused, or nobody answers it. code: of the protocol, section 5; None if nobody answered."""
+
+    exit_code = 70
+
+    def __init__(self, message: str, code: "str | None" = None) -> None:
+        super().__init__(message)
+        self.code = code
 
 
 class ConfigError(NodeError):

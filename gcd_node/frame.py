@@ -7,13 +7,16 @@ from typing import Literal, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from gcd_node.calibration import LensModel
+from gcd_node.config import LIVE_KINDS, SourceKind
 from gcd_node.errors import SourceError
 
 Image: TypeAlias = NDArray[np.uint8]
 """u8 [H, W, 3], RGB."""
 
 Clock: TypeAlias = Literal["realtime", "replay"]
-"""Domain of a stamp: "realtime" is a clock other devices share, "replay" counts from the start of a recording."""
+"""Domain of a stamp. "realtime": a live source; its stamps are on this host's monotonic clock, and are converted to
+UTC when they are published. "replay": of a recording, from its start or from its own clock."""
 
 
 MAX_FPS = 1000.0
@@ -58,9 +61,11 @@ class SourceInfo:
     clock: domain of the stamps.
     codec: of a recording, four characters or a picture format; None if there is none.
     hfov_deg: horizontal field of view, if the source itself knows it.
+    lens: calibration the source itself knows, for pictures of the size above.
+    stamp_uncertainty_us: how far a stamp may be from mid-exposure.
     """
 
-    kind: Literal["file", "folder", "synthetic"]
+    kind: SourceKind
     id: str
     width: int
     height: int
@@ -68,10 +73,27 @@ class SourceInfo:
     clock: Clock
     codec: str | None = None
     hfov_deg: float | None = None
+    lens: LensModel | None = None
+    stamp_uncertainty_us: int = 500
+
+    @property
+    def live(self) -> bool:
+        """Whether it cannot be played again, and may fall silent and come back."""
+        return self.kind in LIVE_KINDS
 
 
 class FrameSource(Protocol):
-    """Where frames come from. It is open once it is made; what cannot be opened raises SourceError there."""
+    """Where frames come from. It is open once it is made; what cannot be opened raises SourceError there, within its
+    open time-out.
+
+    A live source that falls silent only blocks in `frames`: whoever watches it (stall timer) closes it and makes a new
+    one. Its stamps may repeat or step back if the device does; the window builder sorts that out.
+    """
+
+    @property
+    def corrupt(self) -> int:
+        """Frames so far that arrived damaged and were not yielded."""
+        ...
 
     @property
     def info(self) -> SourceInfo:
@@ -79,12 +101,13 @@ class FrameSource(Protocol):
         ...
 
     def frames(self) -> Iterator[Frame]:
-        """Yield frames with rising `stamp_ns`; return at the end; raise SourceError if the device is lost.
+        """Yield frames with rising `stamp_ns`; return at the end; raise SourceLostError if the device is lost.
 
-        Of a recording, every call starts at its beginning.
+        Of a recording, every call starts at its beginning. Of a live source, frames the caller was too slow for are
+        skipped (their sequence numbers show it): the next one is always the newest.
         """
         ...
 
     def close(self) -> None:
-        """End `frames` soon, from any thread, for good; a second call does nothing."""
+        """End `frames` within a second, from any thread, for good, even if the device never answers again."""
         ...
