@@ -1,9 +1,37 @@
 """What is known of a lens, and where it comes from: ROS camera_info files, CameraInfo messages, a camera's memory."""
 
+import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal, TypeAlias
 
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from gcd_node.errors import ConfigError
+
 Distortion: TypeAlias = Literal["none", "plumb_bob", "rational_polynomial", "equidistant"]
+
+_COUNTS: dict[Distortion, tuple[int, ...]] = {
+    "none": (0,),
+    "plumb_bob": (4, 5),
+    "rational_polynomial": (8, 12, 14),
+    "equidistant": (4,),
+}
+_NAMES: dict[str, Distortion] = {
+    "": "none",
+    "none": "none",
+    "plumb_bob": "plumb_bob",
+    "pinhole": "plumb_bob",  # older camera_info files name the projection instead
+    "rational_polynomial": "rational_polynomial",
+    "equidistant": "equidistant",
+    "fisheye": "equidistant",
+    "kannala_brandt": "equidistant",
+}
+_SHAPE_TOLERANCE = 0.01
+_LARGEST_FILE = 16384
+_HALF_PIXEL = 0.5
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -11,7 +39,9 @@ class LensModel:
     """A calibrated camera as OpenCV and ROS describe it: pixel coordinates count from the centre of the first pixel.
 
     width, height: of the pictures it was calibrated for. fx, fy, cx, cy: pixels of those.
-    coefficients: of `distortion`, in OpenCV's order.
+    coefficients: of `distortion`, in OpenCV's order: none has 0, plumb_bob 4 or 5, rational_polynomial 8, 12 or 14,
+        equidistant (fish-eye) 4.
+    Raises ConfigError for numbers that no camera has.
     """
 
     width: int
@@ -22,3 +52,178 @@ class LensModel:
     cy: float
     distortion: Distortion = "none"
     coefficients: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise ConfigError(f"a calibration must be for pictures of some size, got {self.width} x {self.height}")
+        if not all(map(math.isfinite, (self.fx, self.fy, self.cx, self.cy, *self.coefficients))):
+            raise ConfigError(f"a calibration must hold finite numbers, got {self}; calibrate the camera again")
+        if self.fx <= 0 or self.fy <= 0:
+            raise ConfigError(f"focal lengths must be positive pixels, got fx {self.fx:g}, fy {self.fy:g}")
+        if not (0 <= self.cx < self.width and 0 <= self.cy < self.height):
+            raise ConfigError(
+                f"the optical axis must lie in the {self.width} x {self.height} picture, got cx {self.cx:g}, "
+                f"cy {self.cy:g}"
+            )
+        if len(self.coefficients) not in _COUNTS[self.distortion]:
+            wanted = " or ".join(map(str, _COUNTS[self.distortion]))
+            raise ConfigError(f"{self.distortion} distortion has {wanted} coefficients, got {len(self.coefficients)}")
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """[3, 3], from camera axes (x right, y down, z ahead) to homogeneous pixels of the undistorted picture."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def resized(self, width: int, height: int) -> "LensModel":
+        """The same lens for the same picture at another size.
+
+        Raises:
+            ConfigError: no picture, or one of another shape, so that nobody knows which part of it was kept.
+        """
+        if width < 1 or height < 1:
+            raise ConfigError(
+                f"a calibration cannot be for {width} x {height} pictures: are its binning numbers right?"
+            )
+        across, along = width / self.width, height / self.height
+        if abs(across / along - 1) > _SHAPE_TOLERANCE:
+            raise ConfigError(
+                f"the calibration is for {self.width} x {self.height} pictures, the source gives {width} x {height}, "
+                "which is another shape; calibrate at the size you run"
+            )
+        return LensModel(
+            width=width,
+            height=height,
+            fx=self.fx * across,
+            fy=self.fy * along,
+            cx=(self.cx + _HALF_PIXEL) * across - _HALF_PIXEL,
+            cy=(self.cy + _HALF_PIXEL) * along - _HALF_PIXEL,
+            distortion=self.distortion,
+            coefficients=self.coefficients,
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CameraInfo:
+    """What a ROS CameraInfo message or a Foxglove CameraCalibration states.
+
+    width, height: of the full picture. d: distortion; k: [9] of the raw picture; p: [12] of the rectified one, or ().
+    binning: pixels joined across and down, 0 and 1 are none. roi: left, top, width, height of the part of the full
+        picture that is sent; all 0 is the whole.
+    """
+
+    width: int
+    height: int
+    distortion_model: str
+    d: tuple[float, ...]
+    k: tuple[float, ...]
+    p: tuple[float, ...] = ()
+    binning: tuple[int, int] = (1, 1)
+    roi: tuple[int, int, int, int] = (0, 0, 0, 0)
+
+
+def lens_of(info: CameraInfo, *, rectified: bool = False) -> LensModel | None:
+    """The lens of pictures that come with a CameraInfo; None if the camera was never calibrated (k is all zero).
+
+    Args:
+        rectified: the pictures are undistorted already: p holds, and there is no distortion left.
+    Raises:
+        ConfigError: an unknown kind of distortion, or numbers that no camera has.
+    Source: the ROS message sensor_msgs/CameraInfo.
+    """
+    matrix = info.p if rectified else info.k
+    if not any(matrix):
+        return None
+    columns = 4 if rectified else 3
+    if len(matrix) != 3 * columns:
+        raise ConfigError(f"a camera matrix must have {3 * columns} numbers, got {len(matrix)}")
+    kind, coefficients = ("none", ()) if rectified else _distortion(info)
+    left, top, part_wide, part_high = info.roi
+    across, along = (max(each, 1) for each in info.binning)
+    whole = LensModel(
+        width=part_wide or info.width,
+        height=part_high or info.height,
+        fx=matrix[0],
+        cx=matrix[2] - left,
+        fy=matrix[columns + 1],
+        cy=matrix[columns + 2] - top,
+        distortion=kind,
+        coefficients=coefficients,
+    )
+    return whole if (across, along) == (1, 1) else whole.resized(whole.width // across, whole.height // along)
+
+
+def _distortion(info: CameraInfo) -> tuple[Distortion, tuple[float, ...]]:
+    kind = _NAMES.get(info.distortion_model.strip().lower())
+    if kind is None:
+        known = ", ".join(_COUNTS)
+        raise ConfigError(f"unknown distortion_model {info.distortion_model[:40]!r}; known are {known}")
+    if not any(info.d):  # drivers of ideal cameras send no coefficients, or zeros, under any name but the fish-eye's
+        return (kind, (0.0,) * 4) if kind == "equidistant" else ("none", ())
+    if kind == "plumb_bob" and len(info.d) in _COUNTS["rational_polynomial"]:
+        kind = "rational_polynomial"  # the same formula, longer
+    return kind, info.d
+
+
+class _Matrix(msgspec.Struct, frozen=True, kw_only=True):
+    data: tuple[float, ...]
+
+
+class _File(msgspec.Struct, frozen=True, kw_only=True):
+    """A camera_info file as ROS calibrators write it; other keys of it are of no interest here."""
+
+    image_width: int
+    image_height: int
+    camera_matrix: _Matrix
+    distortion_coefficients: _Matrix = _Matrix(data=())
+    distortion_model: str | None = None
+    camera_model: str | None = None
+
+
+def load_lens(path: Path) -> LensModel:
+    """Read a ROS camera_info YAML file, as `cameracalibrator` and camera drivers write it.
+
+    Raises:
+        ConfigError: missing, not YAML, something in it is missing or no camera has it.
+    """
+    try:
+        with path.open("rb") as file:
+            text = file.read(_LARGEST_FILE + 1)
+    except OSError as error:
+        raise ConfigError(f"cannot read the calibration {path}: {error.strerror}; check the path") from error
+    if len(text) > _LARGEST_FILE:
+        raise ConfigError(f"{path} is larger than {_LARGEST_FILE} bytes: give a ROS camera_info YAML file")
+    return parse_lens(text, str(path))
+
+
+def parse_lens(text: bytes, name: str) -> LensModel:
+    """The same of a file's content; `name` is for messages. Raises ConfigError as `load_lens`."""
+    try:
+        stated = msgspec.convert(_parse_yaml(text, name), _File, strict=False)  # YAML takes 1e-05 for a word
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{name} is not a ROS camera_info file: {error}") from error
+    info = CameraInfo(
+        width=stated.image_width,
+        height=stated.image_height,
+        distortion_model=stated.distortion_model or stated.camera_model or "plumb_bob",
+        d=stated.distortion_coefficients.data,
+        k=stated.camera_matrix.data,
+    )
+    try:
+        lens = lens_of(info)
+    except ConfigError as error:
+        raise ConfigError(f"{name}: {error}") from error
+    if lens is None:
+        raise ConfigError(f"{name} holds no calibration: its camera matrix is zero; calibrate the camera")
+    return lens
+
+
+def _parse_yaml(text: bytes, name: str) -> object:
+    try:
+        import yaml
+    except ImportError as error:
+        raise ConfigError("to read a calibration file, PyYAML is needed: pip install pyyaml") from error
+    try:
+        return yaml.safe_load(text)  # the loader in C would end the process on deep nesting
+    except (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ConfigError(f"{name} is not valid YAML: {reason}; give a ROS camera_info YAML file") from error

@@ -16,7 +16,12 @@ from gcd_model import (
     PoseError,
     ShapeError,
 )
+from gcd_node.cli_bench import bench
+from gcd_node.cli_check import check_launch
+from gcd_node.cli_control import ctl, keys
 from gcd_node.cli_node import demo, run, view
+from gcd_node.cli_soak import soak
+from gcd_node.cli_status import status
 from gcd_node.cli_synthesize import synthesize
 from gcd_node.cli_weights import weights
 from gcd_node.errors import NodeError
@@ -30,9 +35,15 @@ app = typer.Typer(
 )
 app.command()(demo)
 app.command()(run)
+app.command("check")(check_launch)
 app.command()(view)
+app.command()(status)
 app.command()(synthesize)
+app.command()(ctl)
+app.command()(soak)
+app.add_typer(keys, name="keys")
 app.add_typer(weights, name="weights")
+app.add_typer(bench, name="bench")
 
 EXIT_CODES: tuple[tuple[type[ModelError], int], ...] = (
     (CheckpointError, 65),

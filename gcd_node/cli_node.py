@@ -1,24 +1,35 @@
 """`gcd-node demo`, `run` and `view`: the live side of the command line."""
 
+import os
 import statistics
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Literal, TypeAlias
 
+import typer
 from rich.console import Console
 from rich.live import Live
+from rich.status import Status
 from rich.table import Table
 from typer import Argument, Option
 
+from gcd_model import Traits
+from gcd_node.cli_check import Changes, ConfigPath, PrintConfig
 from gcd_node.config import load_config
+from gcd_node.config_text import to_toml
 from gcd_node.demo import DemoReport, run_demo
+from gcd_node.logs import log_json_lines
 from gcd_node.model_worker import WindowReport
-from gcd_node.node import Summary
-from gcd_node.session import open_session, run_until_signal
+from gcd_node.node import NodeOptions
+from gcd_node.session import ends_by_itself, open_session, run_until_signal
+from gcd_node.stream import Summary
+from gcd_node.systemd import service_manager
 from gcd_node.viewing import ViewRow, WatchRequest, render, watch
 
 DemoOut: TypeAlias = Annotated[Path, Option(help="Folder for the pictures.")]
-ConfigPath: TypeAlias = Annotated[Path, Argument(metavar="CONFIG", help="A launch file, such as launch/demo.toml.")]
+Once: TypeAlias = Annotated[
+    bool | None, Option("--once/--stay", help="End with the source or the first failure; else wait for commands.")
+]
 Endpoint: TypeAlias = Annotated[str, Argument(metavar="ENDPOINT", help="ipc, ipc://PATH or tcp://HOST:PORT.")]
 ViewName: TypeAlias = Annotated[str | None, Option("--view", help="One view's id; else all.")]
 Kind: TypeAlias = Annotated[
@@ -43,21 +54,37 @@ def demo(out: DemoOut = Path("gcd-demo")) -> None:
     console.print(f"wrote {' and '.join(map(str, report.files))}", soft_wrap=True)
 
 
-def run(config: ConfigPath) -> None:
-    """Run the node on a launch file until its source ends, or Ctrl-C."""
-    settings = load_config(config)
+def run(config: ConfigPath, changes: Changes = None, print_config: PrintConfig = False, once: Once = None) -> None:
+    """Run the node on a launch file: on a recording until that ends, else until shutdown or Ctrl-C."""
+    settings = load_config(config, changes or ())
+    if print_config:
+        typer.echo(to_toml(settings), nl=False)
+        return
+    if settings.health.log == "json":
+        log_json_lines()
+    os.nice(settings.life.nice)
     console = Console(stderr=True)
     status = console.status(f"loading {settings.model.weights}")
-    with status, open_session(settings, _told(console)) as (node, publisher):
+    options = NodeOptions(
+        once=ends_by_itself(settings) if once is None else once,
+        on_configured=lambda traits: _tell_configured(console, status, traits),
+        service=service_manager(),
+    )
+    with status, open_session(settings, _told(console), options) as (node, publisher):
         console.print(f"views on {publisher.endpoint}, status on {publisher.status_endpoint}", soft_wrap=True)
-        if node.traits.classes:
-            console.print("each view comes with its class map, topic view/<id>/cls", highlight=False)
-        if not node.traits.trained:
-            console.print(f"{node.traits.name}: these weights are random, so every picture is noise.")
-        status.update("running")
         summary = run_until_signal(node, publisher)
-    sent = publisher.stats.sent
-    console.print(_table(summary, f"{sent} messages sent"))
+        left_behind = node.left_behind
+    console.print(_table(summary, f"{publisher.stats.sent} messages sent"))
+    if left_behind:
+        os._exit(0)  # Python would wait for ever for a thread that hangs in a driver
+
+
+def _tell_configured(console: Console, status: Status, traits: Traits) -> None:
+    if traits.classes:
+        console.print("each view comes with its class map, topic view/<id>/cls", highlight=False)
+    if not traits.trained:
+        console.print(f"{traits.name}: these weights are random, so every picture is noise.")
+    status.update("running")
 
 
 def view(

@@ -3,12 +3,14 @@
 import difflib
 import hashlib
 import re
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import msgspec
 from msgspec import Meta
 
+from gcd_node.config_changes import with_changes
 from gcd_node.errors import ConfigError
 
 Positive: TypeAlias = Annotated[float, Meta(gt=0)]
@@ -258,8 +260,8 @@ class NodeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         return hashlib.sha256(rendered).hexdigest()[:12]
 
 
-def load_config(path: Path) -> NodeConfig:
-    """Read a launch file.
+def load_config(path: Path, changes: Sequence[str] = ()) -> NodeConfig:
+    """Read a launch file. changes: such as `model.steps=4`, made before anything is checked.
 
     Raises:
         ConfigError: missing, not TOML, an unknown key (the nearest known one is named), a value out of range.
@@ -270,13 +272,14 @@ def load_config(path: Path) -> NodeConfig:
         raise ConfigError(
             f"cannot read the launch file {path}: {error.strerror}; give the path of a TOML file"
         ) from error
-    return parse_config(text, str(path))
+    return parse_config(text, str(path), changes)
 
 
-def parse_config(text: bytes, name: str) -> NodeConfig:
+def parse_config(text: bytes, name: str, changes: Sequence[str] = ()) -> NodeConfig:
     """Read a launch file's content; `name` is for the message. Raises ConfigError as `load_config`."""
     try:
-        return msgspec.toml.decode(text, type=NodeConfig)
+        table = msgspec.toml.decode(text, type=dict[str, Any])
+        return msgspec.convert(with_changes(table, changes), NodeConfig, strict=True)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{name}: {_explained(str(error))}") from error
     except (msgspec.DecodeError, UnicodeDecodeError) as error:

@@ -10,17 +10,19 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
+from gcd_model import Traits
 from gcd_node.comparison import Moment, comparison
-from gcd_node.config import ModelSection, NodeConfig, PublishConfig, SourceConfig, ViewConfig
+from gcd_node.config import ControlConfig, ModelSection, NodeConfig, PublishConfig, SourceConfig, ViewConfig
 from gcd_node.errors import NodeError
 from gcd_node.frame import Image
 from gcd_node.header import ClassRecord
 from gcd_node.model_worker import WindowReport
-from gcd_node.node import Summary
+from gcd_node.node import NodeOptions
 from gcd_node.pictures import make_folder, spread, write_png, write_video
 from gcd_node.publisher import Publisher
 from gcd_node.session import open_session, run_until_signal
 from gcd_node.sources import read_picture
+from gcd_node.stream import Summary
 from gcd_node.view_message import ontology
 
 VIEW_ID = "topdown"
@@ -58,6 +60,7 @@ def demo_config(folder: Path) -> NodeConfig:
         model=ModelSection(weights=demo_weights()),
         view={VIEW_ID: ViewConfig(kind="fixed")},
         publish=PublishConfig(data=f"ipc://{folder}/data", status=f"ipc://{folder}/status"),
+        control=ControlConfig(endpoint=None),
         node_id="demo",
     )
 
@@ -78,11 +81,17 @@ def run_demo(out: Path, on_window: Callable[[WindowReport], None]) -> DemoReport
     with tempfile.TemporaryDirectory(prefix="gcd-demo-") as name:
         folder = Path(name)
         config = demo_config(folder)
-        with open_session(config, remember) as (node, publisher), _receiver(publisher, folder / "received") as receiver:
-            traits, summary = node.traits, run_until_signal(node, publisher)
+        models: list[Traits] = []
+        options = NodeOptions(on_configured=models.append)
+        with (
+            open_session(config, remember, options) as (node, publisher),
+            _receiver(publisher, folder / "received") as receiver,
+        ):
+            summary = run_until_signal(node, publisher)
             publisher.close()
             receiver.wait(_RECEIVER_TIMEOUT_S)
         views, maps = (_arrived(folder / "received" / VIEW_ID / kind) for kind in (".", "cls"))
+    (traits,) = models
     shown = moments(inputs, views, maps)
     return DemoReport(
         summary=summary,

@@ -12,7 +12,7 @@ from typing import Literal, TypeAlias
 
 from gcd_node.errors import ConfigError, EndpointError
 
-Channel: TypeAlias = Literal["data", "status"]
+Channel: TypeAlias = Literal["data", "status", "control"]
 
 _EXAMPLES = '"ipc", "ipc:///some/path" or "tcp://127.0.0.1:5580"'
 
@@ -58,17 +58,30 @@ def resolve_endpoint(endpoint: str, channel: Channel) -> str:
     raise ConfigError(f"an endpoint is {_EXAMPLES}, got {endpoint!r}")
 
 
-def check_bindable(endpoint: str) -> None:
-    """Refuse a resolved endpoint that others could reach: without keys, only this machine may connect.
+def own_endpoint(endpoint: str, channel: Channel) -> str:
+    """resolve_endpoint() for who binds: the runtime folder is made if it is needed.
 
     Raises:
-        ConfigError: tcp beyond loopback.
+        ConfigError, EndpointError: as resolve_endpoint() and make_runtime_folder().
     """
-    if endpoint.startswith("ipc://") or is_loopback(endpoint):
+    if endpoint == "ipc":
+        make_runtime_folder()
+    return resolve_endpoint(endpoint, channel)
+
+
+def check_bindable(endpoint: str, *, secured: bool = False) -> None:
+    """Refuse a resolved endpoint that others could reach: without keys, only this machine may connect.
+
+    secured: the socket asks for CURVE keys and has a list of allowed clients.
+
+    Raises:
+        ConfigError: tcp beyond loopback, not secured.
+    """
+    if secured or endpoint.startswith("ipc://") or is_loopback(endpoint):
         return
     raise ConfigError(
-        f"{endpoint} can be reached from other machines, which needs CURVE keys and a list of allowed clients; "
-        "this version has neither: bind tcp://127.0.0.1:PORT, or ipc, and tunnel to it"
+        f"{endpoint} can be reached from other machines, which needs CURVE keys and a list of allowed clients: state "
+        "both [security] keys and [security] allow, see `gcd-node keys`; or bind tcp://127.0.0.1:PORT, or ipc"
     )
 
 

@@ -12,6 +12,7 @@
     ├── OutputError 73        a result cannot be written
     ├── ModelFailedError 70   the model keeps producing unusable views
     ├── ControlError 70       a command was refused, or nobody answers it
+    ├── AuthError 77          a node does not let us in
     └── ConfigError 78        a launch file or a setting is wrong
 
 Every message says what was wanted, what came, and what to do. Standard library only, Python 3.10 syntax: planners
@@ -93,6 +94,12 @@ class ControlError(NodeError):
     def __init__(self, message: str, code: "str | None" = None) -> None:
         super().__init__(message)
         self.code = code
+
+
+class AuthError(NodeError):
+    """A node does not let us in: it asks for a key, or does not know ours, or is another one than we think."""
+
+    exit_code = 77
 
 
 class ConfigError(NodeError):

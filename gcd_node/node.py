@@ -1,227 +1,303 @@
-"""The node: source, reader thread, model thread and publisher, started and stopped together."""
+"""The node: lives from configure to shutdown, does what it is asked, and says how it is."""
 
-import math
+import contextlib
+import logging
+import queue
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 
-from gcd_model import Traits, ViewSynthesizer
-from gcd_node.capture import Newest, read
+from gcd_model import ModelError, Traits
 from gcd_node.config import NodeConfig
-from gcd_node.envelope import NoteTopic
-from gcd_node.errors import SourceError, TooShortError
-from gcd_node.frame import FrameSource
-from gcd_node.model_worker import ModelWorker, Outbox, WindowReport, WorkCounts
-from gcd_node.preparation import fit_of, prepare_run
-from gcd_node.record_json import to_json
-from gcd_node.view_message import camera_matrix, end_messages, origin
-from gcd_node.virtual_view import virtual_views
-from gcd_node.window import FrameWindow, WindowBuilder
+from gcd_node.control_message import Code, Command, Outcome
+from gcd_node.envelope import new_boot_id
+from gcd_node.errors import ControlError, NodeError, SourceAbsentError, SourceError, SourceLostError
+from gcd_node.health import Health
+from gcd_node.health_report import Level
+from gcd_node.keys import Role
+from gcd_node.lifecycle import Lifecycle, State, Verb
+from gcd_node.live_config import LiveConfig
+from gcd_node.machinery import Links, Machinery, Parts
+from gcd_node.model_worker import WindowReport
+from gcd_node.node_commands import NodeCommands
+from gcd_node.node_status import Announcer
+from gcd_node.outbox import Outbox
+from gcd_node.source_watch import Backoff
+from gcd_node.stream import Summary
+from gcd_node.systemd import ServiceManager
+from gcd_node.vigil import Vigil
 
+_LOG = logging.getLogger(__name__)
 _TICK_S = 0.1
-_STATUS_PERIOD_S = 1.0
-_STOP_DELAY_MS = 100
+_PATIENCE_S = 4.0
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Summary:
-    """What a run came to. fps: of a window. window_s: from one window to the next. dropped: windows never rendered."""
+class NodeOptions:
+    """How a node is run.
 
-    counts: WorkCounts
-    fps: float
-    dropped: int
-    frames: int
-    rejected: dict[str, int] = field(default_factory=dict[str, int])
-    window_s: float
+    once: end with the first source that ends, and with whatever fails; else stay and wait for commands.
+    on_configured, on_window: told of the model once it is loaded, and of every window.
+    service: the service manager to be told, if there is one.
+    """
+
+    once: bool = True
+    on_configured: Callable[[Traits], None] | None = None
+    on_window: Callable[[WindowReport], None] | None = None
+    service: ServiceManager | None = None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Done:
+    """A transition is over. asked: somebody outside had asked for it."""
+
+    verb: Verb
+    asked: bool
+    error: Exception | None
 
 
 class Node:
-    """One run over one source. `run` blocks; `stop` may be called from any thread or signal handler."""
+    """Implements Commands. `run` blocks; `stop` and `handle` may be called from other threads, `stop` from a signal
+    handler too. Transitions are worked through in a thread of their own, so that status and commands go on."""
 
-    def __init__(
-        self,
-        config: NodeConfig,
-        synthesizer: ViewSynthesizer,
-        source: FrameSource,
-        outbox: Outbox,
-        on_window: Callable[[WindowReport], None] | None = None,
-    ) -> None:
-        """Check everything that can be checked without a frame.
-
-        Raises:
-            ConfigError, ViewRangeError, ViewFixedError: see prepare_run() and virtual_views().
-            OptionError: the motion number cannot be worked out and was not given.
-        """
-        self._info, fps = prepare_run(config, synthesizer.traits, source.info)
-        self._source, self._outbox = source, outbox
-        self._views = virtual_views(config, synthesizer.traits, self._info.mount)
-        if config.model.motion_bucket is None:
-            for view in self._views:
-                synthesizer.traits.motion_bucket(view.planned())
-        fit = fit_of(config, synthesizer.traits)
-        fit.crop_box(source.info.width, source.info.height)
-        self._builder = WindowBuilder(
-            frames=synthesizer.traits.config.frames,
-            fps=fps,
-            stride=config.window.stride,
-            max_skew=config.window.max_skew,
-            source_fps=source.info.fps_nominal,
-            fit=fit.image,
+    def __init__(self, config: NodeConfig, parts: Parts, outbox: Outbox, options: NodeOptions | None = None) -> None:
+        """Nothing is opened or loaded before `run`."""
+        self._config, self._outbox, self._options = config, outbox, options or NodeOptions()
+        self.health = Health()
+        self._announcer = Announcer(config.node_id, new_boot_id(), outbox, self.health)
+        links = Links(
+            outbox=outbox,
+            health=self.health,
+            announcer=self._announcer,
+            on_over=self._notice_over,
+            on_window=self._options.on_window,
         )
-        self._newest = Newest[FrameWindow](lossless=config.source.pace == "lockstep")
-        self._worker = ModelWorker(self._info, synthesizer, self._views, outbox, on_window)
-        self._window_s = (config.window.stride or self._builder.frames) / fps
+        self._machinery = Machinery(LiveConfig(config), parts, links)
+        self._commands = NodeCommands(self._machinery, self._announcer, self.health, self.ask)
+        self._life, self._order = Lifecycle(), threading.Lock()
+        self._inbox: queue.SimpleQueue[_Done | str] = queue.SimpleQueue()
+        self._work: threading.Thread | None = None
+        self._vigil = Vigil(self._announcer, self.health, config.life.hang_s, self._options.service)
+        self._backoff = Backoff()
+        self._stop_s: float | None = None
+        self._retry_s: float | None = None
+        self._on_its_own = config.life.autostart
         self._failure: Exception | None = None
-        self._stopped = False
-        self._beats = 0
 
     @property
-    def traits(self) -> Traits:
-        """The model's."""
-        return self._info.traits
+    def state(self) -> State:
+        """Where its life stands."""
+        return self._life.state
 
-    def run(self) -> Summary:
-        """Work until the source ends or `stop` is called, then announce the end of every view.
-
-        Raises:
-            SourceError: the source was lost, or gave too few frames. ModelFailedError: see ModelWorker.work().
-        """
-        self._note("meta", self._meta())
-        self._note("status", self._status("activating", "connecting"))
-        reader = threading.Thread(target=read, args=(self._source, self._builder, self._newest), name="reader")
-        model = threading.Thread(target=self._work, name="model")
-        model.start()
-        try:
-            self._worker.warm.wait()
-            reader.start()
-            self._watch(model)
-        finally:
-            self._close()
-            model.join()
-            if reader.ident is not None:
-                reader.join()
-        self._announce_end()
-        if self._failure is not None:
-            raise self._failure
-        return self._summary()
+    @property
+    def left_behind(self) -> bool:
+        """After `run`: whether a thread hangs that Python would wait for in vain."""
+        return self._machinery.left_behind or (self._work is not None and self._work.is_alive())
 
     def stop(self) -> None:
-        """End soon: no new window begins, the one in work is abandoned at its next step."""
-        self._stopped = True
-        self._worker.cancel()
+        """End in order, soon: no new window begins, the one in work is abandoned at its next step."""
         self._outbox.hurry()
-        self._close()
+        self._inbox.put("stop")
 
-    def _close(self) -> None:
-        self._newest.close()
-        self._source.close()
+    def handle(self, command: Command, role: Role) -> Outcome:
+        """Carry a command out, or begin to; see Commands."""
+        return self._commands.handle(command, role)
 
-    def _work(self) -> None:
+    def event(self, code: str, fields: dict[str, object]) -> None:
+        """Publish what another part of the process has noticed, as a warning."""
+        self._announcer.event(code, Level.WARN, fields)
+
+    def ask(self, verb: Verb, dry_run: bool) -> Outcome:
+        """Begin a transition; an event tells how it ends."""
+        if verb == "activate" and self.health.snapshot().model.state == "failed":
+            return Outcome(code=Code.NOT_READY, message="the model has failed; cleanup and configure load it anew")
+        if verb == "activate" and self._machinery.left_behind:
+            return Outcome(code=Code.NOT_READY, message="a thread of the last activation hangs; restart the process")
+        refusal = self._life.refusal(verb)
+        if refusal is not None:
+            return Outcome(code=Code.WRONG_STATE, message=refusal)
+        if dry_run:
+            return Outcome(message=f"{verb} would begin")
+        if verb == "shutdown":
+            self.stop()
+            return Outcome(code=Code.ACCEPTED, message="ending in order")
         try:
-            self._worker.work(self._newest)
-        except Exception as error:
+            self._begin(verb, asked=True)
+        except ControlError as error:  # somebody else was faster
+            return Outcome(code=Code.WRONG_STATE, message=str(error))
+        self._on_its_own &= verb not in ("deactivate", "cleanup")
+        return Outcome(code=Code.ACCEPTED, message=f"{verb} has begun; an event tells how it ends")
+
+    def run(self) -> Summary:
+        """Live until shutdown.
+
+        Raises:
+            what made it end: SourceLostError if a camera was given up; with `once` whatever a transition or the stream
+            failed with.
+        """
+        try:
+            self._turn()
+            if self._on_its_own:
+                self._begin("configure")
+            else:
+                self._vigil.ready()
+            while self.state is not State.FINALIZED and not self._overdue():
+                self._hear()
+                self._tick()
+        finally:
+            self._machinery.interrupt()
+            if self._work is not None:
+                self._work.join(0.0 if self._overdue() else _PATIENCE_S)
+            self._machinery.close()
+        if self._failure is not None:
+            raise self._failure
+        return self._machinery.summary
+
+    # Life loop.
+
+    def _hear(self) -> None:
+        try:
+            message = self._inbox.get(timeout=_TICK_S)
+        except queue.Empty:
+            return
+        if isinstance(message, _Done):
+            self._finish(message)
+        elif message == "stop":
+            self._prepare_stop()
+        elif self.state is State.ACTIVE and self._machinery.has_ended:
+            self._try("deactivate")
+        if self._stop_s is not None:
+            self._try("shutdown")
+
+    def _tick(self) -> None:
+        stream = self._machinery.stream
+        if stream is not None:
+            stream.tick()
+        self._vigil.look(0.0 if stream is None else stream.worker.silent_s)
+        if self._retry_s is not None and time.monotonic() >= self._retry_s and self.state is State.INACTIVE:
+            self._retry_s = None
+            self._try("activate")
+        self._announcer.status_if_due()
+
+    def _notice_over(self) -> None:
+        self._inbox.put("over")
+
+    def _prepare_stop(self) -> None:
+        if self._stop_s is None:
+            self._stop_s = time.monotonic()
+            self._vigil.stopping()
+        self._machinery.interrupt()
+
+    def _overdue(self) -> bool:
+        """Whether the end is wanted and something holds it up for too long."""
+        return self._stop_s is not None and time.monotonic() - self._stop_s > _PATIENCE_S
+
+    # Transitions.
+
+    def _begin(self, verb: Verb, *, asked: bool = False) -> None:
+        """Raises ControlError if it cannot be begun now."""
+        with self._order:
+            self._life.begin(verb)
+        self._turn()
+        if verb == "configure":
+            self._vigil.loading()
+        self._work = threading.Thread(target=self._perform, args=(verb, asked), name=verb, daemon=True)
+        self._work.start()
+
+    def _try(self, verb: Verb) -> None:
+        """Begin a transition, unless a command was faster or the life is elsewhere."""
+        if self._life.refusal(verb) is None:
+            with contextlib.suppress(ControlError):
+                self._begin(verb)
+
+    def _perform(self, verb: Verb, asked: bool) -> None:
+        work: dict[Verb, Callable[[], None]] = {
+            "configure": self._machinery.configure,
+            "activate": self._machinery.activate,
+            "deactivate": self._machinery.deactivate,
+            "cleanup": self._machinery.cleanup,
+            "shutdown": self._machinery.deactivate,
+        }
+        error: Exception | None = None
+        try:
+            work[verb]()
+        except Exception as raised:  # the end of a thread: the life loop looks at it
+            error = raised
+        self._inbox.put(_Done(verb=verb, asked=asked, error=error))
+
+    def _finish(self, done: _Done) -> None:
+        if done.error is None:
+            with self._order:
+                self._life.succeed()
+            self._turn()
+            self._go_on(done)
+            return
+        expected = done.verb in ("configure", "activate") and isinstance(done.error, NodeError | ModelError)
+        with self._order:
+            if expected:
+                self._life.fail()
+            else:
+                self._life.error()
+        if not expected:
+            _LOG.error("%s broke", done.verb, exc_info=done.error)
+            self._recover(final=done.verb == "shutdown")
+        self._turn()
+        self._announcer.event(_code(done).value, Level.ERROR, {"verb": done.verb, "message": str(done.error)})
+        self._after_failure(done.error, done.verb)
+
+    def _recover(self, *, final: bool) -> None:
+        self._machinery.close()
+        self.health.model("absent")
+        with self._order:
+            self._life.recover(cleaned=not final)
+
+    def _go_on(self, done: _Done) -> None:
+        """What follows by itself after a transition that went well."""
+        if done.asked:
+            self._announcer.event("STATE", Level.OK, {"verb": done.verb, "state": self.state.label})
+        if done.verb == "configure":
+            self._tell_configured()
+            if self._on_its_own and not done.asked:
+                self._try("activate")
+        elif done.verb == "activate":
+            self._backoff.reset()
+            self._vigil.ready()
+            if self._machinery.has_ended:  # before the node was active
+                self._try("deactivate")
+        elif done.verb == "deactivate" and not done.asked and self._stop_s is None:
+            self._after_stream(self._machinery.failure)
+
+    def _tell_configured(self) -> None:
+        traits = self._machinery.traits
+        if traits is not None and self._options.on_configured is not None:
+            self._options.on_configured(traits)
+
+    def _after_stream(self, failure: Exception | None) -> None:
+        """A stream has ended by itself."""
+        if failure is not None:
+            self._after_failure(failure, "activate")
+        elif self._options.once:
+            self._prepare_stop()
+
+    def _after_failure(self, error: Exception, verb: Verb) -> None:
+        """Give up, try again later, or wait for somebody to ask."""
+        self._vigil.ready()
+        if self._stop_s is not None and verb != "shutdown":
+            return
+        if self._options.once or isinstance(error, SourceLostError):
             self._failure = error
+            self._prepare_stop()
+        elif verb == "activate" and self._on_its_own and self._machinery.is_live and isinstance(error, SourceError):
+            self._retry_s = time.monotonic() + self._backoff.next_s()
 
-    def _watch(self, model: threading.Thread) -> None:
-        next_s = 0.0
-        told: dict[str, int] = {}
-        while model.is_alive():
-            if time.monotonic() >= next_s:
-                next_s = time.monotonic() + _STATUS_PERIOD_S
-                self._note("status", self._status("active", "streaming"))
-            self._note_new_reasons(told)
-            model.join(_TICK_S)
+    def _turn(self) -> None:
+        self.health.state(self.state.label)
+        self._announcer.status()
 
-    def _note_new_reasons(self, told: dict[str, int]) -> None:
-        """An event for every kind of trouble that has happened since the last look."""
-        for reason, count in self._builder.counts.reasons.items():
-            if count > told.get(reason, 0):
-                self._note("event", {"code": reason, "level": 1, "count": count})
-                told[reason] = count
 
-    def _announce_end(self) -> None:
-        code, source, model = self._end_reason()
-        self._note("event", {"code": code, "level": 0 if self._failure is None else 2})
-        status = self._status("inactive", source)
-        if self._failure is not None:
-            status |= {"level": 2, "reasons": [*self._info.ood, code]}
-        self._note("status", status | {"model": {**self._model_status(), "state": model}})
-        delay_ms = _STOP_DELAY_MS if self._stopped else None
-        for view in self._views:
-            for message in end_messages(self._info, view.view_id, view.rev, self._worker.counts.last_window_id):
-                self._outbox.end(message, delay_ms=delay_ms)
-
-    def _end_reason(self) -> tuple[str, str, str]:
-        """Event code, and the states of source and model at the end."""
-        if isinstance(self._failure, TooShortError):
-            return "TOO_SHORT", "ended", "ready"
-        if isinstance(self._failure, SourceError):
-            return "SRC_LOST", "lost", "ready"
-        if self._failure is not None:
-            return "MODEL_FAILED", "closed", "failed"
-        return ("STOPPED", "closed", "ready") if self._stopped else ("SRC_ENDED", "ended", "ready")
-
-    def _note(self, topic: NoteTopic, fields: dict[str, object]) -> None:
-        self._outbox.note(topic, origin(self._info), fields)
-
-    def _summary(self) -> Summary:
-        built = self._builder.counts
-        return Summary(
-            counts=self._worker.counts,
-            fps=self._builder.fps,
-            dropped=self._newest.dropped,
-            frames=built.frames,
-            rejected={str(reason): count for reason, count in built.reasons.items()},
-            window_s=self._window_s,
-        )
-
-    def _status(self, state: str, source: str) -> dict[str, object]:
-        """As wire protocol, section 4, as far as this node knows it."""
-        self._beats += 1
-        built, sent = self._builder.counts, self._outbox.stats
-        return {
-            "state": state,
-            "level": 1 if self._info.ood else 0,
-            "reasons": list(self._info.ood),
-            "source": {"state": source, "fps": self._info.source.fps_nominal, "dropped": built.dropped},
-            "window": {
-                "built": built.built,
-                "rejected": sum(built.reasons.values()),
-                "reason_counts": dict(built.reasons),
-                "skipped": self._newest.dropped,
-            },
-            "model": self._model_status(),
-            "publish": {"sent": sent.sent, "subs": sent.subscribers, "bytes": sent.bytes, "dropped": sent.dropped},
-            "heartbeat_seq": self._beats,
-        }
-
-    def _model_status(self) -> dict[str, object]:
-        counts = self._worker.counts
-        recent_ms = sorted(1000.0 * seconds for seconds in tuple(counts.render_s))
-        status: dict[str, object] = {"state": "busy", "nan_windows": counts.nan_windows}
-        if recent_ms:
-            status["ms_p50"] = round(recent_ms[len(recent_ms) // 2], 1)
-            status["ms_p99"] = round(recent_ms[math.ceil(0.99 * len(recent_ms)) - 1], 1)
-        return status
-
-    def _meta(self) -> dict[str, object]:
-        """What does not change during a run: weights, views, cameras, classes."""
-        traits, camera = self._info.traits, self._info.intrinsics
-        mount, pose = self._info.mount or traits.mount, self._info.config.source.pose
-        assumed = pose is None or not pose.on_vehicle
-        return {
-            "weights": {
-                "name": traits.name,
-                "family": "unknown" if traits.family is None else traits.family.name,
-                "sha256_12": traits.sha256_12,
-                "trained": traits.trained,
-            },
-            "views": [view.view_id for view in self._views],
-            "K": None if camera is None else list(camera_matrix(camera)),
-            "mount": None if mount is None else {**asdict(mount), "assumed": assumed},
-            "classes": [to_json(each) for each in self._info.classes],
-            "size": [traits.config.width, traits.config.height],
-            "fps": self._builder.fps,
-            "cfg_digest": self._info.config.digest,
-        }
+def _code(done: _Done) -> Code:
+    """What the event of a failed transition says."""
+    if isinstance(done.error, SourceAbsentError | SourceLostError):
+        return Code.NOT_READY
+    return Code.BAD_ARG if isinstance(done.error, NodeError | ModelError) else Code.INTERNAL

@@ -1,13 +1,16 @@
 """What can be said of a run before its first frame: frame rate, cameras, and what lies outside the trained domain."""
 
 import logging
+from pathlib import Path
 
 from gcd_model import CameraMount, Intrinsics, OptionError, Traits
+from gcd_node.calibration import LensModel, load_lens
 from gcd_node.config import NodeConfig
 from gcd_node.envelope import new_boot_id
 from gcd_node.errors import ConfigError
 from gcd_node.frame import SourceInfo
 from gcd_node.preprocess import Fit
+from gcd_node.rectify import Rectifier
 from gcd_node.source_pose import is_foreign, require_usable, stated_mount
 from gcd_node.view_message import Run
 from gcd_node.window import RATE_TOLERANCE, choose_fps
@@ -21,8 +24,9 @@ def prepare_run(config: NodeConfig, traits: Traits, source: SourceInfo) -> tuple
     """Everything that can be said before the first frame, and the frame rate windows will have.
 
     Raises:
-        ConfigError: a frame rate the source cannot give; a source pose in words the model does not know; in strict
-            mode, a rate, field of view or mount the model was not trained for.
+        ConfigError: a frame rate the source cannot give; a source pose in words the model does not know; pictures the
+            model cannot be given, see fit_of(); in strict mode, a rate, field of view or mount the model was not
+            trained for.
     """
     fps, foreign_rate = config.window.fps, False
     if fps is None:
@@ -31,7 +35,8 @@ def prepare_run(config: NodeConfig, traits: Traits, source: SourceInfo) -> tuple
         raise ConfigError(f"[window] fps {fps:g} is more than the {source.fps_nominal:g} the source gives; lower it")
     elif traits.rates:
         foreign_rate = fps not in traits.rates
-    camera = _source_camera(config, traits, source)
+    fit = fit_of(config, traits, source)
+    camera = _source_camera(config, source, fit)
     mount = _mount(config, traits, camera)
     foreign = {"fps": foreign_rate, "hfov": _is_foreign_field(camera, traits), "view": is_foreign(mount, traits)}
     ood = tuple(name for name, is_so in foreign.items() if is_so)
@@ -44,6 +49,7 @@ def prepare_run(config: NodeConfig, traits: Traits, source: SourceInfo) -> tuple
         intrinsics=_view_camera(camera, traits),
         mount=mount,
         ood=ood,
+        resize=fit.resize,
     )
     return run, fps
 
@@ -67,12 +73,14 @@ def _mount(config: NodeConfig, traits: Traits, camera: Intrinsics | None) -> Cam
         raise ConfigError(f"[source.pose]: {error}") from error
 
 
-def _source_camera(config: NodeConfig, traits: Traits, source: SourceInfo) -> Intrinsics | None:
+def _source_camera(config: NodeConfig, source: SourceInfo, fit: Fit | Rectifier) -> Intrinsics | None:
     """The camera of the picture the model is given; None if nobody states a field of view."""
+    if isinstance(fit, Rectifier):
+        return fit.camera
     stated = config.source.hfov_deg or source.hfov_deg
     if stated is None:
         return None
-    return fit_of(config, traits).intrinsics(Intrinsics.from_hfov(stated, source.width, source.height))
+    return fit.intrinsics(Intrinsics.from_hfov(stated, source.width, source.height))
 
 
 def _view_camera(camera: Intrinsics | None, traits: Traits) -> Intrinsics | None:
@@ -95,11 +103,33 @@ def _trained_hfov_deg(traits: Traits) -> float | None:
     return None if traits.family is None else traits.family.hfov_deg
 
 
-def fit_of(config: NodeConfig, traits: Traits) -> Fit:
-    """How the source's pictures become the model's."""
-    return Fit(
-        width=traits.config.width,
-        height=traits.config.height,
-        resize=config.source.resize,
-        allow_upscale=config.source.allow_upscale,
-    )
+def fit_of(config: NodeConfig, traits: Traits, source: SourceInfo) -> Fit | Rectifier:
+    """How the source's pictures become the model's: undistorted and cut to its field of view if there is a
+    calibration, else cropped to its shape.
+
+    Raises:
+        ConfigError: they are too small, the calibration is unusable or for other pictures, or it contradicts hfov_deg.
+    """
+    width, height = traits.config.width, traits.config.height
+    lens = _lens(config, source)
+    if lens is not None:
+        return Rectifier(
+            lens.resized(source.width, source.height),
+            width=width,
+            height=height,
+            hfov_deg=_trained_hfov_deg(traits),
+            allow_upscale=config.source.allow_upscale,
+        )
+    fit = Fit(width=width, height=height, resize=config.source.resize, allow_upscale=config.source.allow_upscale)
+    fit.crop_box(source.width, source.height)
+    return fit
+
+
+def _lens(config: NodeConfig, source: SourceInfo) -> LensModel | None:
+    """The stated calibration, else what the source itself knows, unless a stated hfov_deg overrides that."""
+    stated = config.source
+    if stated.calibration is None:
+        return source.lens if stated.hfov_deg is None else None
+    if stated.hfov_deg is not None:
+        raise ConfigError("[source] calibration and hfov_deg say the same thing twice; leave one of them out")
+    return load_lens(Path(stated.calibration).expanduser())

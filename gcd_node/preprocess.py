@@ -14,6 +14,9 @@ from gcd_node.frame import Image
 Resize: TypeAlias = Literal["released", "area"]
 """released: bilinear, as in training; it aliases when it shrinks a lot. area: averages, and does not."""
 
+ResizePath: TypeAlias = Literal[Resize, "remap2x_area"]
+"""What is published as `src.resize`; remap2x_area: undistorted at twice the size, then averaged."""
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Fit:

@@ -3,7 +3,7 @@
 ZeroMQ sockets belong to one thread, so callers hand messages over through a bounded queue. The thread looks at its
 sockets at least every 10 ms: without that, welcome messages and subscriptions would never be served.
 
-Longer than most files: the two sockets and the thread that owns them are one matter, and only here is ZeroMQ bound.
+Longer than most files: the two sockets and the thread that owns them are one matter.
 """
 
 import logging
@@ -13,17 +13,17 @@ import time
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import zmq
 
-from gcd_node.endpoints import Channel, check_bindable, free_ipc_path, is_ipv6, make_runtime_folder, resolve_endpoint
+from gcd_node.endpoints import own_endpoint
 from gcd_node.envelope import TOPIC_BYTES, WELCOME, EndMessage, NoteMessage, NoteTopic, ViewMessage, encode
 from gcd_node.errors import EndpointError, NodeError
 from gcd_node.header import OriginHeader
 from gcd_node.publisher_options import PublisherOptions, PublisherStats
+from gcd_node.security import Context, EventSink, Gate, Socket, unbind
 
 _LOG = logging.getLogger(__name__)
 _IDLE_S = 0.01
@@ -44,14 +44,14 @@ class _Parcel:
 class Publisher:
     """Publishes views, ends and notes. Use it as a context manager; every method may be called from any thread.
 
-    Make one per boot_id: sequences count from 0 here.
+    Make one per boot_id: sequences count from 0 here. on_event gets AUTH_DENIED and its fields, from another thread.
 
     Raises:
         EndpointError: an endpoint is in use or cannot be bound.
         ConfigError: an endpoint is no endpoint, or others than this machine could reach it.
     """
 
-    def __init__(self, options: PublisherOptions) -> None:
+    def __init__(self, options: PublisherOptions, on_event: EventSink | None = None) -> None:
         self._options = options
         self._queue: queue.Queue[_Parcel] = queue.Queue(options.queue_size)
         self._notes: queue.SimpleQueue[bytes] = queue.SimpleQueue()
@@ -63,11 +63,13 @@ class Publisher:
         self._dropped = 0
         self._context = zmq.Context()
         try:
-            self._data = _DataSocket(self._context, options)
-            self._status = None if options.status is None else _StatusSocket(self._context, options.status)
+            self._gate = Gate(self._context, options.security, on_event)
+            self._data = _DataSocket(self._context, self._gate, options)
+            self._status = None if options.status is None else _StatusSocket(self._context, self._gate, options.status)
         except BaseException:
             self._context.destroy(linger=0)
             raise
+        self._gate.start()
         self._thread = threading.Thread(target=self._serve, name="publisher", daemon=True)
         self._thread.start()
 
@@ -188,6 +190,7 @@ class Publisher:
         self._closed.set()
         self._closing.set()
         self._thread.join()
+        self._gate.close()
         self._context.term()
 
     # What follows runs in the publisher thread alone.
@@ -267,10 +270,10 @@ class Publisher:
 class _DataSocket:
     """The data socket; in lockstep it refuses rather than skips."""
 
-    def __init__(self, context: "zmq.Context[zmq.Socket[bytes]]", options: PublisherOptions) -> None:
+    def __init__(self, context: Context, gate: Gate, options: PublisherOptions) -> None:
         self._options = options
-        self._socket = _bound(context, _own_endpoint(options.data, "data"), _DATA_HWM, no_drop=options.lockstep)
-        self.endpoint = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        self._socket = _made(context, _DATA_HWM, no_drop=options.lockstep)
+        self.endpoint = gate.bind(self._socket, own_endpoint(options.data, "data"), "data")
         self.sent = self.bytes = self.subscribers = 0
         self.ended = False
         self._last_sent = time.monotonic()
@@ -303,15 +306,15 @@ class _DataSocket:
         self._socket.poll(timeout_ms)
 
     def close(self, linger_ms: int) -> None:
-        _unbind(self._socket, self.endpoint, linger_ms)
+        unbind(self._socket, self.endpoint, linger_ms)
 
 
 class _StatusSocket:
     """The status socket: keeps the last message of each topic for whoever comes later."""
 
-    def __init__(self, context: "zmq.Context[zmq.Socket[bytes]]", endpoint: str) -> None:
-        self._socket = _bound(context, _own_endpoint(endpoint, "status"), _STATUS_HWM, no_drop=False)
-        self.endpoint = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
+    def __init__(self, context: Context, gate: Gate, endpoint: str) -> None:
+        self._socket = _made(context, _STATUS_HWM, no_drop=False)
+        self.endpoint = gate.bind(self._socket, own_endpoint(endpoint, "status"), "status")
         self._last: dict[bytes, bytes] = {}
 
     def serve(self) -> None:
@@ -325,10 +328,10 @@ class _StatusSocket:
         self._socket.send(part)
 
     def close(self, linger_ms: int) -> None:
-        _unbind(self._socket, self.endpoint, linger_ms)
+        unbind(self._socket, self.endpoint, linger_ms)
 
 
-def _events(socket: "zmq.Socket[bytes]") -> list[bytes]:
+def _events(socket: Socket) -> list[bytes]:
     """Pending subscribe (first byte 1) and unsubscribe (first byte 0) events; anything else a peer sends is ignored."""
     found: list[bytes] = []
     while socket.poll(0):
@@ -338,27 +341,7 @@ def _events(socket: "zmq.Socket[bytes]") -> list[bytes]:
     return found
 
 
-def _unbind(socket: "zmq.Socket[bytes]", endpoint: str, linger_ms: int) -> None:
-    """Close; an ipc file goes first, while it is still ours: ZeroMQ leaves it behind."""
-    if endpoint.startswith("ipc://"):
-        Path(endpoint.removeprefix("ipc://")).unlink(missing_ok=True)
-    socket.close(linger_ms)
-
-
-def _own_endpoint(endpoint: str, channel: Channel) -> str:
-    if endpoint == "ipc":
-        make_runtime_folder()
-    return resolve_endpoint(endpoint, channel)
-
-
-def _bound(
-    context: "zmq.Context[zmq.Socket[bytes]]", endpoint: str, high_water_mark: int, *, no_drop: bool
-) -> "zmq.Socket[bytes]":
-    check_bindable(endpoint)
-    if endpoint.startswith("ipc://"):
-        free_ipc_path(
-            Path(endpoint.removeprefix("ipc://"))
-        )  # ZeroMQ itself would take a live endpoint away without a word
+def _made(context: Context, high_water_mark: int, *, no_drop: bool) -> Socket:
     socket = context.socket(zmq.XPUB)
     socket.set(zmq.XPUB_VERBOSER, 1)  # VERBOSE, and unsubscriptions too: only so can subscribers be counted
     socket.set(zmq.XPUB_NODROP, int(no_drop))
@@ -366,9 +349,4 @@ def _bound(
     socket.set(zmq.SNDHWM, high_water_mark)
     socket.set(zmq.MAXMSGSIZE, _MAX_SUBSCRIPTION)
     socket.set(zmq.LINGER, 0)
-    socket.set(zmq.IPV6, int(is_ipv6(endpoint)))
-    try:
-        socket.bind(endpoint)
-    except zmq.ZMQError as error:
-        raise EndpointError(f"cannot bind {endpoint}: {error.strerror}; stop who uses it or choose another") from error
     return socket

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from gcd_node.security import ServerSecurity
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PublisherOptions:
@@ -13,6 +15,7 @@ class PublisherOptions:
     linger_ms: how long an orderly close waits for readers to take the end and leave; drain_ms: the same in lockstep,
         and there also how long a queued message may wait for a reader.
     queue_size: messages between the callers and the thread.
+    security: keys and allowed clients of tcp endpoints; without them only this machine can be let in.
     """
 
     data: str = "ipc"
@@ -23,6 +26,7 @@ class PublisherOptions:
     linger_ms: int = 1000
     drain_ms: int = 5000
     queue_size: int = 8
+    security: ServerSecurity | None = None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

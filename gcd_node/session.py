@@ -1,44 +1,58 @@
-"""One run of a launch file: opens everything in the order that fails fastest, and closes it again."""
+"""A whole node in this process: everything a launch file names, opened in the order that fails fastest."""
 
 import logging
+import os
 import signal
 from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from types import FrameType
 
 import torch
 
 from gcd_model import OptionError, ViewSynthesizer, load_synthesizer
-from gcd_node.config import ModelSection, NodeConfig, PublishConfig
+from gcd_node.allow_list import load_server_security
+from gcd_node.config import LIVE_KINDS, ModelSection, NodeConfig
+from gcd_node.control import ControlOptions, ControlServer
 from gcd_node.errors import ConfigError
+from gcd_node.machinery import Parts
+from gcd_node.metrics_server import MetricsServer
 from gcd_node.model_worker import WindowReport
-from gcd_node.node import Node, Summary
+from gcd_node.node import Node, NodeOptions
 from gcd_node.publisher import Publisher
 from gcd_node.publisher_options import PublisherOptions
+from gcd_node.security import ServerSecurity
 from gcd_node.sources import open_source
+from gcd_node.stream import Summary
 
 _LOG = logging.getLogger(__name__)
 
 
-def publisher_options(config: PublishConfig, *, lockstep: bool) -> PublisherOptions:
+def publisher_options(config: NodeConfig, security: ServerSecurity | None = None) -> PublisherOptions:
     """The publisher's options for a launch file."""
+    publish = config.publish
     return PublisherOptions(
-        data=config.data,
-        status=config.status,
-        lockstep=lockstep,
-        min_subscribers=config.min_subscribers,
-        end_delay_ms=config.end_delay_ms,
+        data=publish.data,
+        status=publish.status,
+        lockstep=config.source.pace == "lockstep",
+        min_subscribers=publish.min_subscribers,
+        end_delay_ms=publish.end_delay_ms,
+        security=security,
     )
 
 
+def model_threads(section: ModelSection) -> int:
+    """CPU threads for the model: as stated, else one less than this process may use, for the rest of the robot."""
+    return section.threads or max(1, len(os.sched_getaffinity(0)) - 1)
+
+
 def load_model(section: ModelSection) -> ViewSynthesizer:
-    """The model of a launch file, on as many threads as it says.
+    """The model of a launch file, on as many threads as model_threads() says.
 
     Raises:
         CheckpointError: see load_synthesizer(). ConfigError: options the checkpoint cannot have.
     """
-    if section.threads is not None:
-        torch.set_num_threads(section.threads)
+    torch.set_num_threads(model_threads(section))
     try:
         return load_synthesizer(
             section.weights,
@@ -52,24 +66,38 @@ def load_model(section: ModelSection) -> ViewSynthesizer:
         raise ConfigError(f"[model]: {error}") from error
 
 
+def ends_by_itself(config: NodeConfig) -> bool:
+    """Whether a run ends with its source when nobody says otherwise: recordings end, cameras and commands go on."""
+    return config.source.kind not in LIVE_KINDS and config.life.autostart
+
+
 @contextmanager
 def open_session(
-    config: NodeConfig, on_window: Callable[[WindowReport], None] | None = None
+    config: NodeConfig, on_window: Callable[[WindowReport], None] | None = None, options: NodeOptions | None = None
 ) -> Generator[tuple[Node, Publisher]]:
-    """A node ready to run, and its publisher, already bound.
-
-    The source is opened first and the sockets are bound second: both fail within a second or two, before minutes
-    may go into loading weights.
+    """A node ready to run, and its publisher, already bound; its control and health sockets too, if it has any.
 
     Raises:
-        SourceError, EndpointError, CheckpointError, ConfigError, PoseError: see there. Nothing stays open.
+        EndpointError, ConfigError: see Publisher, ControlServer, MetricsServer. Nothing stays open.
     """
-    source = open_source(config.source)
-    try:
-        with Publisher(publisher_options(config.publish, lockstep=config.source.pace == "lockstep")) as publisher:
-            yield Node(config, load_model(config.model), source, publisher, on_window), publisher
-    finally:
-        source.close()
+    security = load_server_security(config.security)
+    options = replace(options or NodeOptions(once=ends_by_itself(config)), on_window=on_window)
+    heard: list[Node] = []
+
+    def tell(code: str, fields: dict[str, object]) -> None:
+        for node in heard:
+            node.event(code, fields)
+
+    with ExitStack() as stack:
+        publisher = stack.enter_context(Publisher(publisher_options(config, security), tell))
+        node = Node(config, Parts(open_source=open_source, load_model=load_model), publisher, options)
+        heard.append(node)
+        if config.control.endpoint is not None:
+            wanted = ControlOptions(endpoint=config.control.endpoint, security=security)
+            stack.enter_context(ControlServer(wanted, node, lambda: node.state.label, tell))
+        if config.health.http is not None:
+            stack.enter_context(MetricsServer(config.health.http, node.health))
+        yield node, publisher
 
 
 def run_until_signal(node: Node, publisher: Publisher) -> Summary:

@@ -36,6 +36,8 @@ from gcd_node.envelope import (
 )
 from gcd_node.errors import ConfigError, StaleError
 from gcd_node.header import ViewHeader
+from gcd_node.keys import ClientKeys
+from gcd_node.security import HandshakeWatch, use_client_keys
 
 _QUEUED = 4
 
@@ -94,6 +96,7 @@ class ViewSubscriber:
     conflate: keep only the newest message, so that a slow reader never works on old ones.
     max_age_ms: what is older raises StaleError; None for no limit.
     max_payload: largest payload accepted, bytes.
+    keys: our keys and the node's, for a node that asks for them.
 
     Raises:
         ConfigError: the endpoint is none, or all views or kinds are to be conflated.
@@ -109,12 +112,13 @@ class ViewSubscriber:
         conflate: bool = True,
         max_age_ms: float | None = None,
         max_payload: int = MAX_PAYLOAD,
+        keys: ClientKeys | None = None,
     ) -> None:
         if conflate and (view is None or kind is None):
             raise ConfigError(
                 "a conflated socket keeps one message of all topics: name a view and a kind, or set conflate=False"
             )
-        self._link = _Link(resolve_endpoint(endpoint, "data"), (_key(view, kind),), conflate, max_payload)
+        self._link = _Link(resolve_endpoint(endpoint, "data"), (_key(view, kind),), conflate, max_payload, keys)
         self._suffix = "" if kind is None else f"/{kind}"
         self._max_age_ms = max_age_ms
         self._streams: dict[str, _Stream] = {}
@@ -133,6 +137,7 @@ class ViewSubscriber:
         Raises:
             StaleError: the view is older than max_age_ms. The next call goes on.
             MessageError: what came is no valid message. The next call goes on.
+            AuthError: the node asks for a key, or does not know ours; then make a new subscriber.
         """
         deadline = _deadline(timeout_ms)
         while (message := self._link.receive(deadline)) is not None:
@@ -148,7 +153,7 @@ class ViewSubscriber:
         return None
 
     def __iter__(self) -> Iterator[ReceivedView]:
-        """Views until the stream ends; stale ones are left out and counted. Raises MessageError as receive()."""
+        """Views until the stream ends; stale ones are left out and counted. Raises: as receive() else."""
         while True:
             try:
                 view = self.receive()
@@ -211,13 +216,21 @@ class ViewSubscriber:
 class NoteSubscriber:
     """Status, event and meta messages of one node; the last of each topic arrives at once. Not conflated."""
 
-    def __init__(self, endpoint: str = "ipc", topics: tuple[NoteTopic, ...] = ("status", "event", "meta")) -> None:
-        keys = tuple(topic_key(topic) for topic in topics)
-        self._link = _Link(resolve_endpoint(endpoint, "status"), keys, conflate=False, max_payload=0)
+    def __init__(
+        self,
+        endpoint: str = "ipc",
+        topics: tuple[NoteTopic, ...] = ("status", "event", "meta"),
+        keys: ClientKeys | None = None,
+    ) -> None:
+        wanted = tuple(topic_key(topic) for topic in topics)
+        self._link = _Link(resolve_endpoint(endpoint, "status"), wanted, conflate=False, max_payload=0, keys=keys)
         self._seen: dict[str, tuple[str, int]] = {}
 
     def receive(self, timeout_ms: float | None = None) -> NoteMessage | None:
-        """The next note, None after `timeout_ms`; repeats for other readers are left out. Raises MessageError."""
+        """The next note, None after `timeout_ms`; repeats for other readers are left out.
+
+        Raises: MessageError, AuthError as ViewSubscriber.receive().
+        """
         deadline = _deadline(timeout_ms)
         while (message := self._link.receive(deadline)) is not None:
             number = (message.header.boot_id, message.sequence)
@@ -249,7 +262,9 @@ class _Stream:
 class _Link:
     """A SUB socket and its context; gives decoded messages."""
 
-    def __init__(self, endpoint: str, keys: tuple[bytes, ...], conflate: bool, max_payload: int) -> None:
+    def __init__(
+        self, endpoint: str, topics: tuple[bytes, ...], conflate: bool, max_payload: int, keys: ClientKeys | None
+    ) -> None:
         self._max_payload = max_payload
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.SUB)
@@ -258,13 +273,23 @@ class _Link:
         self._socket.set(zmq.MAXMSGSIZE, PREFIX.size + MAX_HEADER + max_payload)
         self._socket.set(zmq.CONFLATE, int(conflate))
         self._socket.set(zmq.RCVHWM, _QUEUED)
-        for key in keys:
-            self._socket.set(zmq.SUBSCRIBE, key)
+        for topic in topics:
+            self._socket.set(zmq.SUBSCRIBE, topic)
+        if keys is not None:
+            use_client_keys(self._socket, keys)
+        self._watch = HandshakeWatch(self._socket, endpoint, keys)
+        self._poller = zmq.Poller()
+        for each in (self._socket, self._watch.monitor):
+            self._poller.register(each, zmq.POLLIN)
         self._socket.connect(endpoint)
 
     def receive(self, deadline: float | None) -> Message | None:
-        """The next message, None once the deadline (monotonic seconds) has passed. Raises MessageError."""
-        while self._socket.poll(_left_ms(deadline)):
+        """The next message, None once the deadline (monotonic seconds) has passed. Raises MessageError, AuthError."""
+        self._watch.check()
+        while ready := self._poller.poll(_left_ms(deadline)):
+            if self._socket not in dict(ready):
+                self._watch.check()
+                continue
             part = self._socket.recv()
             if part != WELCOME:
                 return decode(part, self._max_payload)

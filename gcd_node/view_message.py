@@ -25,10 +25,10 @@ from gcd_node.header import (
 )
 from gcd_node.jpeg import encode_frames
 from gcd_node.pictures import to_u8
+from gcd_node.preprocess import ResizePath
 from gcd_node.source_pose import stated_sphere
 from gcd_node.window import FrameWindow
 
-_STAMP_UNCERTAINTY_US = 500  # containers round stamps to a millisecond
 _HALF_PIXEL = 0.5  # ours counts from the corner of the first pixel, the wire and OpenCV from its centre
 
 
@@ -39,6 +39,7 @@ class Run:
     intrinsics: of the generated picture, None if nobody knows the field of view.
     mount: of the source camera, for a model that uses it; None if nothing was stated.
     ood: what lies outside the trained domain from the start: "fps", "hfov", "view".
+    resize: how source pictures become the model's, published as `src.resize`.
     """
 
     config: NodeConfig
@@ -48,6 +49,7 @@ class Run:
     intrinsics: Intrinsics | None
     mount: CameraMount | None
     ood: tuple[str, ...]
+    resize: ResizePath
 
     @property
     def classes(self) -> tuple[ClassRecord, ...]:
@@ -57,7 +59,8 @@ class Run:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Rendered:
-    """One view of one window. started_ns, ended_ns: of the inference, monotonic clock. steps, seed: of the sampler."""
+    """One view of one window. started_ns, ended_ns: of the inference, monotonic clock. steps, seed: of the sampler.
+    utc_offset_ns: UTC minus the monotonic clock, sampled once for the whole window."""
 
     window: FrameWindow
     view: View
@@ -67,6 +70,17 @@ class Rendered:
     ended_ns: int
     steps: int
     seed: int
+    utc_offset_ns: int
+
+
+def utc_offset_ns() -> int:
+    """UTC minus the monotonic clock, now."""
+    return time.time_ns() - time.monotonic_ns()
+
+
+def newest_ns(run: Run, window: FrameWindow) -> int:
+    """When the newest frame was captured, on the monotonic clock; of a recording, when it was played."""
+    return window.stamps_ns[-1] if run.source.clock == "realtime" else window.arrival_ns
 
 
 def messages(run: Run, rendered: Rendered) -> list[ViewMessage]:
@@ -141,7 +155,7 @@ def _class_map(header: ViewHeader, numbers: NDArray[np.uint8], classes: tuple[Cl
 def _header(run: Run, rendered: Rendered) -> ViewHeader:
     window, path = rendered.window, rendered.view.trajectory
     now_ns, monotonic_ns = time.time_ns(), time.monotonic_ns()
-    offset_ns = now_ns - monotonic_ns  # one offset for the whole window
+    offset_ns, is_live = rendered.utc_offset_ns, run.source.clock == "realtime"
     period_ms = 1000.0 * (run.config.window.stride or path.frames) / window.fps
     return ViewHeader(
         node_id=run.config.node_id,
@@ -150,12 +164,12 @@ def _header(run: Run, rendered: Rendered) -> ViewHeader:
         view_id=rendered.view_id,
         view_rev=rendered.view_rev,
         window_id=window.window_id,
-        t_capture_ns=window.stamps_ns,
-        t_capture_unc_us=_STAMP_UNCERTAINTY_US,
+        t_capture_ns=tuple(stamp_ns + offset_ns for stamp_ns in window.stamps_ns) if is_live else window.stamps_ns,
+        t_capture_unc_us=run.source.stamp_uncertainty_us,
         clock=run.source.clock,
         t_infer_start_ns=rendered.started_ns + offset_ns,
         t_infer_end_ns=rendered.ended_ns + offset_ns,
-        age_ms=(monotonic_ns - window.arrival_ns) / 1e6,
+        age_ms=(monotonic_ns - newest_ns(run, window)) / 1e6,
         valid_for_ms=round(2 * period_ms),
         src=_source(run, window),
         frame_id=f"{rendered.view_id}_optical",
@@ -211,7 +225,7 @@ def _source(run: Run, window: FrameWindow) -> SourceRecord:
         dropped=window.dropped,
         fps_in=run.source.fps_nominal,
         fps_cond=window.fps,
-        resize=run.config.source.resize,
+        resize=run.resize,
         epoch=window.epoch,
     )
 

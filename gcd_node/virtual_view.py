@@ -4,6 +4,7 @@ from dataclasses import replace
 
 from gcd_model import CameraMount, Orbit, SphericalDelta, Traits, Trajectory
 from gcd_node.config import NodeConfig, ViewConfig
+from gcd_node.live_config import Settings
 from gcd_node.source_pose import stated_sphere
 
 NANOSECONDS = 1_000_000_000
@@ -15,8 +16,16 @@ class VirtualView:
     rev: counts changes of the view; receivers drop older ones.
     """
 
-    def __init__(self, view_id: str, config: NodeConfig, traits: Traits, mount: CameraMount | None) -> None:
-        self.view_id, self.rev = view_id, 1
+    def __init__(
+        self, view_id: str, config: NodeConfig, traits: Traits, mount: CameraMount | None = None, rev: int = 1
+    ) -> None:
+        """Check that the checkpoint can give it. mount: of the source camera, None for the trained one.
+
+        Raises:
+            ViewRangeError, ViewFixedError: it cannot. OptionError: an impossible orbit, or the motion number cannot
+            be worked out and was not given.
+        """
+        self.view_id, self.rev = view_id, rev
         self._traits, self._mount, self._source = traits, mount, stated_sphere(config.source.pose)
         self._move_time = traits.move_time if config.model.move_time is None else config.model.move_time
         wanted = config.view[view_id]
@@ -26,6 +35,8 @@ class VirtualView:
         self._orbit = _orbit(wanted)
         self._newest: tuple[int, int] | None = None  # epoch and stamp of the last window
         self._check_reach()
+        if config.model.motion_bucket is None:
+            traits.motion_bucket(self.planned())
 
     def trajectory(self, stamp_ns: int, epoch: int) -> Trajectory:
         """The camera path for a window whose newest frame was captured at `stamp_ns`.
@@ -62,10 +73,20 @@ def _orbit(config: ViewConfig) -> Orbit | None:
     return Orbit(rate_deg_s=config.rate_deg_s, amplitude_deg=config.amplitude_deg, azimuth_deg=config.azimuth_deg)
 
 
-def virtual_views(config: NodeConfig, traits: Traits, mount: CameraMount | None = None) -> list[VirtualView]:
-    """The views a launch file configures. mount: of the source camera, None for the trained one.
+class VirtualViews:
+    """The views a configuration names, made anew where a command has changed one. Belongs to one thread."""
 
-    Raises:
-        ViewRangeError, ViewFixedError: the checkpoint cannot give one of them. OptionError: an impossible orbit.
-    """
-    return [VirtualView(view_id, config, traits, mount) for view_id in config.view]
+    def __init__(self, traits: Traits) -> None:
+        self._traits = traits
+        self._made: dict[str, tuple[CameraMount | None, VirtualView]] = {}
+
+    def following(self, settings: Settings, mount: CameraMount | None = None) -> list[VirtualView]:
+        """The views now; an orbit whose view has not changed goes on from where it was.
+
+        Raises: as VirtualView.
+        """
+        for view_id, rev in settings.revisions.items():
+            made = self._made.get(view_id)
+            if made is None or (made[0], made[1].rev) != (mount, rev):
+                self._made[view_id] = (mount, VirtualView(view_id, settings.config, self._traits, mount, rev))
+        return [self._made[view_id][1] for view_id in settings.revisions]

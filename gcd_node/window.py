@@ -10,8 +10,9 @@ import numpy as np
 from gcd_node.errors import ConfigError
 from gcd_node.frame import MAX_FPS, Frame, Image
 
-Reason: TypeAlias = Literal["WIN_GAP", "CLOCK_STEP", "SRC_FORMAT"]
-"""Why frames did not become a window: a hole in time, a step of the source's clock, another picture size."""
+Reason: TypeAlias = Literal["WIN_GAP", "CLOCK_STEP", "SRC_FORMAT", "SRC_LOST"]
+"""Why frames did not become a window: a hole in time, a step of the source's clock, another picture size, a source
+that was lost."""
 
 RATE_TOLERANCE = 0.01
 """Rates that differ by this part are the same: 23.976 is 24."""
@@ -27,7 +28,7 @@ class FrameWindow:
 
     images: u8 [T, H, W, 3], RGB, read-only.
     stamps_ns, seqs: of each frame, as the source gave them.
-    window_id: counts the windows of one builder from 0.
+    window_id: counts windows, from where the builder was told to begin.
     fps: the rate the network is told.
     arrival_ns: when the newest frame arrived, on the monotonic clock.
     dropped: frames the builder has thrown away so far, for a stamp that did not rise.
@@ -100,6 +101,8 @@ class WindowBuilder:
         max_skew: float = 0.5,
         source_fps: float | None = None,
         fit: Callable[[Image], Image] | None = None,
+        first_id: int = 0,
+        first_epoch: int = 0,
     ) -> None:
         """Make an empty builder.
 
@@ -110,6 +113,7 @@ class WindowBuilder:
             max_skew: how far a frame may lie from its grid point, in periods, up to 0.5.
             source_fps: nominal rate of the source, if known.
             fit: brings a picture to the network's size; called once for every frame on the grid, on arrival.
+            first_id, first_epoch: of the first window, for a builder that goes on where another one ended.
         Raises:
             ConfigError: a number out of range.
         """
@@ -130,7 +134,7 @@ class WindowBuilder:
         self._waiting: _Arrived | None = None
         self._newest: Frame | None = None
         self._skip = 0
-        self._epoch = 0
+        self._first_id, self._epoch = first_id, first_epoch
         self._totals: Counter[str] = Counter()
         self._reasons: Counter[Reason] = Counter()
 
@@ -145,6 +149,16 @@ class WindowBuilder:
             dropped=totals["dropped"],
             reasons=dict(self._reasons),
         )
+
+    @property
+    def next_id(self) -> int:
+        """What the next window will be called."""
+        return self._first_id + self._totals["built"]
+
+    @property
+    def epoch(self) -> int:
+        """Of the window being built."""
+        return self._epoch
 
     def push(self, frame: Frame, arrival_ns: int) -> list[FrameWindow]:
         """Take the next frame, and give the windows it completes; mostly none, hardly ever two.
@@ -241,7 +255,7 @@ class WindowBuilder:
             images=images,
             stamps_ns=tuple(arrived.frame.stamp_ns for arrived in placed),
             seqs=tuple(arrived.frame.seq for arrived in placed),
-            window_id=self._totals["built"],
+            window_id=self.next_id,
             fps=self.fps,
             arrival_ns=placed[-1].arrival_ns,
             dropped=self._totals["dropped"],

@@ -11,7 +11,7 @@ PACKAGES = {
     "gcd_node": ROOT / "gcd_node",
     "gcd_train": ROOT / "train" / "gcd_train",
 }
-SOCKET_FILES = {"publisher.py", "subscriber.py", "control.py", "security.py"}
+SOCKET_FILES = {"publisher.py", "subscriber.py", "control.py", "control_client.py", "security.py"}
 OPENING_CALLS = {"open", "safe_open", "save_file", "read_text", "read_bytes", "write_text", "write_bytes"}
 OPENING_LIBRARIES = {"torch", "np", "numpy", "json", "pickle", "safetensors"}  # their load and save open files
 MAY_OPEN_FILES = {"checkpoints.py", "onnx_export.py"}

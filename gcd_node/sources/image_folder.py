@@ -50,6 +50,11 @@ class ImageFolder:
         )
 
     @property
+    def corrupt(self) -> int:
+        """Always 0: a damaged picture ends the recording with an error."""
+        return 0
+
+    @property
     def info(self) -> SourceInfo:
         """Size of the first picture as shown, the given rate."""
         return self._info

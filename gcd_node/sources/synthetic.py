@@ -62,6 +62,11 @@ class SyntheticDrive:
         )
 
     @property
+    def corrupt(self) -> int:
+        """Always 0."""
+        return 0
+
+    @property
     def info(self) -> SourceInfo:
         """Size, rate, field of view."""
         return self._info

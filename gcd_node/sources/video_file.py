@@ -2,19 +2,18 @@
 
 import logging
 import math
-import os
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
 import cv2
 import numpy as np
-from cv2.utils import logging as cv2_logging
 
 from gcd_node.errors import SourceError
 from gcd_node.frame import MAX_FPS, Frame, Image, SourceInfo
 from gcd_node.picture_header import MAX_PIXELS
 from gcd_node.sources.container import check_video
+from gcd_node.sources.opencv_log import quiet_opencv
 from gcd_node.sources.pace import Pace, Pacer
 
 _LOG = logging.getLogger(__name__)
@@ -46,6 +45,11 @@ class VideoFile:
         check_video(self._path)
         with closing(_Decoder(self._path)) as decoder:
             self._info = _describe(self._path, decoder, fps)
+
+    @property
+    def corrupt(self) -> int:
+        """Always 0: the decoder passes over what is damaged and tells nobody."""
+        return 0
 
     @property
     def info(self) -> SourceInfo:
@@ -127,12 +131,8 @@ class _Decoder:
     """OpenCV's FFmpeg reader on one file, quiet on stderr."""
 
     def __init__(self, path: Path) -> None:
-        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read when the first file is opened
-        level = cv2_logging.setLogLevel(cv2_logging.LOG_LEVEL_SILENT)
-        try:
+        with quiet_opencv():
             self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-        finally:
-            cv2_logging.setLogLevel(level)
         if not self._capture.isOpened():
             raise SourceError(f"cannot open {path} as a video: truncated or damaged; copy or record it again")
         self._check_size(path)

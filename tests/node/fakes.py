@@ -20,10 +20,16 @@ from gcd_model import (
     Traits,
     Trajectory,
     View,
+    ViewSynthesizer,
 )
+from gcd_node.config import NodeConfig
 from gcd_node.envelope import EndMessage, NoteTopic, ViewMessage
-from gcd_node.frame import Frame, SourceInfo
+from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.header import OriginHeader
+from gcd_node.machinery import Parts
+from gcd_node.model_worker import WindowReport
+from gcd_node.node import Node, NodeOptions
+from gcd_node.outbox import Outbox
 from gcd_node.publisher import PublisherStats
 
 HEIGHT, WIDTH = 64, 96
@@ -106,6 +112,7 @@ class FakeSource:
         )
         self._count, self.fails, self.period_s = count, None, 0.0
         self.closed = False
+        self.corrupt = 0
 
     fails: Exception | None
 
@@ -121,6 +128,18 @@ class FakeSource:
 
     def close(self) -> None:
         self.closed = True
+
+
+def made_node(
+    config: NodeConfig,
+    synthesizer: ViewSynthesizer,
+    source: FrameSource,
+    outbox: Outbox,
+    on_window: Callable[[WindowReport], None] | None = None,
+) -> Node:
+    """A node over parts that are there already; it ends with its source."""
+    parts = Parts(open_source=lambda _: source, load_model=lambda _: synthesizer)
+    return Node(config, parts, outbox, NodeOptions(once=True, on_window=on_window))
 
 
 @dataclass

@@ -6,12 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, fake_classes, traits, warping_traits
+from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, fake_classes, made_node, traits, warping_traits
 
 from gcd_model import DRIVING_CLASSES, Traits
 from gcd_node.config import NodeConfig, parse_config
 from gcd_node.envelope import images
-from gcd_node.node import Node
 from gcd_node.publisher import Publisher, PublisherOptions
 from gcd_node.subscriber import NoteSubscriber, ReceivedView, ViewSubscriber
 from gcd_node.view_message import ontology
@@ -36,7 +35,7 @@ def config(*, samples: int = 1, encoding: str = "rgb8") -> NodeConfig:
 
 def published(made: Traits, frames: int = 28, **options: int) -> Box:
     box = Box()
-    Node(config(**options), FakeSynthesizer(made), FakeSource(frames, fps=10.0), box).run()
+    made_node(config(**options), FakeSynthesizer(made), FakeSource(frames, fps=10.0), box).run()
     return box
 
 
@@ -115,7 +114,7 @@ def test_a_reader_in_another_thread_gets_map_and_meaning_over_real_sockets(tmp_p
     with Publisher(options) as publisher:
         reader = threading.Thread(target=read, daemon=True)
         reader.start()
-        Node(config(), FakeSynthesizer(warping_traits()), FakeSource(28, fps=10.0), publisher).run()
+        made_node(config(), FakeSynthesizer(warping_traits()), FakeSource(28, fps=10.0), publisher).run()
         with NoteSubscriber(f"ipc://{tmp_path}/s", ("meta",)) as notes:
             meta = notes.receive(5000)
         reader.join(10)

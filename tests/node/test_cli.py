@@ -73,6 +73,9 @@ def launch_file(folder: Path, video_path: Path, **changes: str) -> Path:
         status = "ipc://{folder}/status"
         end_delay_ms = 10
         {changes.get("publish", "")}
+        [control]
+        endpoint = "ipc://{folder}/control"
+        {changes.get("more", "")}
     """
     path = folder / "launch.toml"
     path.write_text(text)
@@ -238,7 +241,7 @@ def test_usage_errors_are_exit_64(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_every_command_has_help() -> None:
-    for command in ([], ["run"], ["view"], ["demo"], ["synthesize"], ["weights"], ["weights", "inspect"]):
+    for command in ([], ["run"], ["check"], ["view"], ["demo"], ["synthesize"], ["weights"], ["weights", "inspect"]):
         assert run_app([*command, "--help"]) == 0
 
 

@@ -140,6 +140,8 @@ def test_view_saves_windows_and_class_maps_of_a_running_node(weights: Path, tmp_
         status = "ipc://{tmp_path}/status"
         end_delay_ms = 10
         min_subscribers = 1
+        [control]
+        endpoint = "ipc://{tmp_path}/control"
     """)
     node = subprocess.Popen([sys.executable, "-m", "gcd_node", "run", str(settings)], stderr=subprocess.DEVNULL)
     try:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, traits
+from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, made_node, traits
 
 from gcd_model import (
     Cancelled,
@@ -53,7 +53,7 @@ def config(
 
 def run(settings: NodeConfig, source: FakeSource, model: FakeSynthesizer | None = None) -> tuple[Node, Box]:
     box = Box()
-    node = Node(settings, model or FakeSynthesizer(traits()), source, box)
+    node = made_node(settings, model or FakeSynthesizer(traits()), source, box)
     node.run()
     return node, box
 
@@ -115,7 +115,7 @@ def test_single_frames_of_a_live_view_leave_at_the_windows_rhythm() -> None:
     sent_s: list[float] = []
     keep = box.send
     box.send = lambda message: (sent_s.append(time.monotonic()), keep(message))[1]  # type: ignore[method-assign]
-    Node(settings, FakeSynthesizer(traits()), FakeSource(14), box).run()
+    made_node(settings, FakeSynthesizer(traits()), FakeSource(14), box).run()
     frames = [at for at, message in zip(sent_s, box.views, strict=True) if message.topic.endswith("frm")]
     assert len(frames) == 14
     assert frames[-1] - frames[0] >= 0.9 * 13 / 24
@@ -190,7 +190,7 @@ def test_a_window_that_stays_nan_is_counted_and_not_published() -> None:
             raise NonFiniteError("NaN")
 
     box = Box()
-    summary = Node(config(), FakeSynthesizer(traits(), fail_twice), FakeSource(28), box).run()
+    summary = made_node(config(), FakeSynthesizer(traits(), fail_twice), FakeSource(28), box).run()
     assert summary.counts.nan_windows == 1
     assert [message.header.window_id for message in box.of("win")] == [1]
     assert [fields["window_id"] for topic, fields in box.notes if fields.get("code") == "MODEL_NAN"] == [0]
@@ -201,7 +201,7 @@ def test_three_nan_windows_in_a_row_fail_the_model_and_still_announce_the_end() 
         raise NonFiniteError("NaN")
 
     box = Box()
-    node = Node(config(), FakeSynthesizer(traits(), always), FakeSource(200), box)
+    node = made_node(config(), FakeSynthesizer(traits(), always), FakeSource(200), box)
     with pytest.raises(ModelFailedError, match="3 windows in a row"):
         node.run()
     assert box.views == []
@@ -219,7 +219,7 @@ def test_stop_abandons_the_window_in_work() -> None:
         raise Cancelled("stopped")
 
     box = Box()
-    node = Node(config(), FakeSynthesizer(traits(), wait_for_cancel), FakeSource(1000), box)
+    node = made_node(config(), FakeSynthesizer(traits(), wait_for_cancel), FakeSource(1000), box)
     thread = threading.Thread(target=node.run)
     thread.start()
     assert started.wait(10)
@@ -235,7 +235,7 @@ def test_a_lost_source_publishes_what_was_whole_and_then_says_so() -> None:
     source.fails = SourceError("unplugged")
     box = Box()
     with pytest.raises(SourceError, match="unplugged"):
-        Node(config(), FakeSynthesizer(traits()), source, box).run()
+        made_node(config(), FakeSynthesizer(traits()), source, box).run()
     assert len(box.of("win")) == 2
     assert box.ends
 
@@ -250,7 +250,7 @@ def test_realtime_drops_windows_and_never_frames() -> None:
         time.sleep(0.2)
 
     box = Box()
-    summary = Node(config(pace="realtime"), FakeSynthesizer(traits(), slow), FakeSource(280), box).run()
+    summary = made_node(config(pace="realtime"), FakeSynthesizer(traits(), slow), FakeSource(280), box).run()
     assert summary.frames == 280
     assert summary.dropped > 0
     assert summary.counts.windows + summary.dropped == 20
@@ -276,8 +276,10 @@ def test_overlapping_windows_follow_the_stride() -> None:
 def test_a_view_the_checkpoint_cannot_give_is_refused_before_the_first_frame(
     family: str, view: str, error: type[Exception]
 ) -> None:
+    model = FakeSynthesizer(traits(family))
     with pytest.raises(error):
-        Node(config(view), FakeSynthesizer(traits(family)), FakeSource(14, fps=10.0), Box())
+        made_node(config(view), model, FakeSource(14, fps=10.0), Box()).run()
+    assert model.clips == []
 
 
 def test_an_untrained_rate_is_flagged_and_refused_when_strict() -> None:
@@ -312,12 +314,18 @@ def test_a_still_or_black_input_is_published_and_flagged() -> None:
 
 def test_status_and_meta_describe_the_run() -> None:
     _, box = run(config(), FakeSource(28))
-    topics = [topic for topic, _ in box.notes]
-    assert topics[0] == "meta"
-    meta = box.notes[0][1]
+    told = [topic if topic == "meta" else fields.get("state") for topic, fields in box.notes]
+    assert told.index("meta") < told.index("active")
+    meta = next(fields for topic, fields in box.notes if topic == "meta")
     assert meta["weights"]["trained"] is False
     status = [fields for topic, fields in box.notes if topic == "status"]
-    assert status[-1]["state"] == "inactive"
+    states = [fields["state"] for fields in status]
+    assert list(dict.fromkeys(states[: states.index("active")])) == (
+        ["unconfigured", "configuring", "inactive", "activating"]
+    )
+    assert list(dict.fromkeys(states[states.index("active") :])) == (
+        ["active", "deactivating", "inactive", "shuttingdown", "finalized"]
+    )
     assert status[-1]["window"]["built"] == 2
     assert status[-1]["publish"]["sent"] == len(box.views)
     assert status[-1]["model"]["ms_p50"] <= status[-1]["model"]["ms_p99"]
@@ -375,7 +383,7 @@ def test_the_last_status_says_how_it_ended(
 
     camera, box = FakeSource(60), Box()
     camera.fails = fails
-    node = Node(config(), FakeSynthesizer(traits(), do), camera, box)
+    node = made_node(config(), FakeSynthesizer(traits(), do), camera, box)
     with nullcontext() if fails is act is None else pytest.raises((SourceError, ModelFailedError)):
         node.run()
     events = [fields["code"] for topic, fields in box.notes if topic == "event"]
@@ -406,8 +414,9 @@ def test_a_window_rate_above_the_sources_is_refused() -> None:
 def test_a_motion_number_that_nobody_can_know_is_asked_for_before_the_first_frame() -> None:
     unknown = replace(traits(), family=None)
     with pytest.raises(OptionError, match="motion"):
-        Node(config(), FakeSynthesizer(unknown), FakeSource(14), Box())
-    assert Node(config(model="motion_bucket = 100.0"), FakeSynthesizer(unknown), FakeSource(14), Box())
+        made_node(config(), FakeSynthesizer(unknown), FakeSource(14), Box()).run()
+    told = made_node(config(model="motion_bucket = 100.0"), FakeSynthesizer(unknown), FakeSource(14), Box())
+    assert told.run().counts.windows == 1
 
 
 def test_an_orbit_waits_where_stamps_cannot_be_compared() -> None:
@@ -434,7 +443,7 @@ def test_an_outbox_that_fails_ends_the_run_and_every_thread() -> None:
     slow.period_s = 0.001
     before = threading.active_count()
     with pytest.raises(NodeError, match="publisher stopped"):
-        Node(config(), FakeSynthesizer(traits(), lambda _: time.sleep(0.05)), slow, Broken()).run()
+        made_node(config(), FakeSynthesizer(traits(), lambda _: time.sleep(0.05)), slow, Broken()).run()
     assert threading.active_count() == before
 
 
@@ -443,7 +452,7 @@ def test_a_lockstep_node_that_nobody_reads_still_stops(tmp_path: Path) -> None:
         data=f"ipc://{tmp_path}/d", status=f"ipc://{tmp_path}/s", lockstep=True, min_subscribers=1, queue_size=2
     )
     with Publisher(options) as publisher:
-        node = Node(config(), FakeSynthesizer(traits()), FakeSource(10_000), publisher)
+        node = made_node(config(), FakeSynthesizer(traits()), FakeSource(10_000), publisher)
         thread = threading.Thread(target=node.run)
         thread.start()
         time.sleep(1.5)
@@ -471,7 +480,7 @@ def test_two_lockstep_runs_of_a_real_network_publish_identical_payloads() -> Non
     payloads: list[list[bytes]] = []
     for _ in range(2):
         box = Box()
-        Node(parsed, load_model(parsed.model), open_source(parsed.source), box).run()
+        made_node(parsed, load_model(parsed.model), open_source(parsed.source), box).run()
         payloads.append([bytes(message.payload) for message in box.of("win")])
     assert payloads[0] == payloads[1]
     assert len(payloads[0]) == 2

@@ -5,12 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fakes import WIDTH, Box, FakeSource, FakeSynthesizer, traits, warping_traits
+from fakes import WIDTH, Box, FakeSource, FakeSynthesizer, made_node, traits, warping_traits
 
 from gcd_model import CameraMount, OptionError, Traits
 from gcd_node.config import NodeConfig, SourcePose, load_config, parse_config
 from gcd_node.errors import ConfigError
-from gcd_node.node import Node
 from gcd_node.source_pose import is_foreign, require_usable, stated_mount, stated_sphere
 
 
@@ -32,7 +31,7 @@ def config(pose: str | None = None, *, source: str = "", more: str = "") -> Node
 
 def run(settings: NodeConfig, made: Traits, source: FakeSource | None = None) -> tuple[FakeSynthesizer, Box]:
     model, box = FakeSynthesizer(made), Box()
-    Node(settings, model, source or FakeSource(14, fps=10.0), box).run()
+    made_node(settings, model, source or FakeSource(14, fps=10.0), box).run()
     return model, box
 
 
@@ -139,7 +138,7 @@ def test_a_pose_in_words_the_model_does_not_know_is_refused_before_the_first_fra
 ) -> None:
     made = warping_traits() if family == "small" else traits(family)
     with pytest.raises(ConfigError, match=rf"\[source\.pose\]: fake .*{words}"):
-        Node(config(pose), FakeSynthesizer(made), FakeSource(14, fps=10.0), Box())
+        made_node(config(pose), FakeSynthesizer(made), FakeSource(14, fps=10.0), Box()).run()
 
 
 def test_the_pose_of_every_launch_file_suits_its_model() -> None:

@@ -1,0 +1,206 @@
+"""Goes through a launch file as a start would, but loads no weights: what `gcd-node check` finds. Prints nothing."""
+
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import torch
+
+from gcd_model import FAMILIES, CheckpointError, ModelError, Traits, WeightsReport, inspect_weights, load_synthesizer
+from gcd_node.config import ModelSection, NodeConfig
+from gcd_node.errors import NodeError, SourceLostError
+from gcd_node.frame import Frame, FrameSource, SourceInfo
+from gcd_node.live_config import LiveConfig
+from gcd_node.preparation import prepare_run
+from gcd_node.session import model_threads, open_session
+from gcd_node.sources import open_source
+from gcd_node.virtual_view import VirtualViews
+
+Verdict: TypeAlias = Literal["ok", "warning", "failed"]
+
+_FIRST_FRAME_S = 5.0
+_MUCH_MEMORY = 0.7
+_BYTES = {"float32": 4, "bfloat16": 2, "float16": 2}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Finding:
+    """One thing that was looked at. error: what a start would fail with, None otherwise."""
+
+    topic: str
+    verdict: Verdict
+    detail: str
+    error: Exception | None = None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Resources:
+    """What this machine has left for the model. memory: bytes free on `device`."""
+
+    device: str
+    memory: int
+
+
+@dataclass(slots=True)
+class _Known:
+    """What has been found out so far. weight_bytes: the weights in the precision they will be used in."""
+
+    info: SourceInfo | None = None
+    traits: Traits | None = None
+    weight_bytes: int = 0
+
+
+def check(config: NodeConfig, resources: Resources | None = None) -> Iterator[Finding]:
+    """Look at endpoints, source, weights, memory, views and time, in this order; each as soon as it is known.
+
+    resources: measured if left out. What follows from something that failed is left out.
+    """
+    known = _Known()
+    yield _tried("endpoints", lambda: _endpoints(config))
+    yield _tried("source", lambda: _source(config, known))
+    yield _tried("weights", lambda: _weights(config.model, known))
+    info, traits = known.info, known.traits
+    if traits is not None:
+        yield _tried("memory", lambda: _memory(traits, known.weight_bytes, resources or measured(traits.device)))
+    if traits is not None and info is not None:
+        yield _tried("views", lambda: _views(config, traits, info))
+        yield _tried("time", lambda: _time(config, traits, info))
+
+
+class _DoubtfulError(Exception):
+    """A start would go on, with a warning."""
+
+
+def _tried(topic: str, look: Callable[[], str]) -> Finding:
+    try:
+        return Finding(topic=topic, verdict="ok", detail=look())
+    except _DoubtfulError as doubt:
+        return Finding(topic=topic, verdict="warning", detail=str(doubt))
+    except (NodeError, ModelError) as error:
+        return Finding(topic=topic, verdict="failed", detail=str(error), error=error)
+
+
+def _endpoints(config: NodeConfig) -> str:
+    with open_session(config) as (_, publisher):
+        control = "no control" if config.control.endpoint is None else f"control {config.control.endpoint}"
+        return f"free: data {publisher.endpoint}, status {publisher.status_endpoint}, {control}"
+
+
+def _source(config: NodeConfig, known: _Known) -> str:
+    source = open_source(config.source)
+    try:
+        first = _first_frame(source)
+        told = known.info = source.info
+        rate = f"{told.width} x {told.height} at {told.fps_nominal:g} FPS"
+        lens = "" if told.lens is None else ", calibrated"
+        return f"{told.kind} {told.id}: {rate}{lens}; its first frame is number {first.seq}"
+    finally:
+        source.close()
+
+
+def _first_frame(source: FrameSource) -> Frame:
+    """Raises SourceLostError if none comes."""
+    found: list[Frame | Exception] = []
+
+    def look() -> None:
+        try:
+            found.extend(frame for frame, _ in zip(source.frames(), range(1), strict=False))
+        except Exception as error:  # the end of a thread
+            found.append(error)
+
+    looker = threading.Thread(target=look, name="first frame", daemon=True)
+    looker.start()
+    looker.join(_FIRST_FRAME_S)
+    if not found:
+        raise SourceLostError(f"{source.info.id} opened, and gave no frame in {_FIRST_FRAME_S:g} s; is it covered?")
+    if isinstance(found[0], Exception):
+        raise found[0]
+    return found[0]
+
+
+def _weights(section: ModelSection, known: _Known) -> str:
+    kind, _, name = section.weights.partition(":")
+    if kind == "random":
+        known.traits = load_synthesizer(section.weights, device="cpu").traits
+        raise _DoubtfulError(f"{section.weights}: these weights are random, so every picture is noise")
+    path = _packaged(name) if kind == "package" else Path(section.weights)
+    report = inspect_weights(
+        path, family=section.family, head_width=section.head_width, image_heads=section.image_heads
+    )
+    known.traits = _traits(report, section)
+    known.weight_bytes = report.parameters * _BYTES.get(known.traits.precision, 4)
+    return f"{report.name}, family {report.family or 'unknown'}, {report.parameters / 1e6:.1f} M parameters"
+
+
+def _packaged(name: str) -> Path:
+    path = Path(str(files("gcd_model").joinpath("weights", f"{name}.safetensors")))
+    if not path.is_file():
+        raise CheckpointError(f"no weights called {name!r} ship with the package; give a path, or random:driving")
+    return path
+
+
+def _traits(report: WeightsReport, section: ModelSection) -> Traits:
+    """What loading would say of the weights, without loading them."""
+    device = _device(section.device)
+    return Traits(
+        name=report.name,
+        config=report.config,
+        family=None if report.family is None else FAMILIES[report.family],
+        move_time=report.move_time,
+        sha256_12=report.sha256_12,
+        precision=section.dtype or ("bfloat16" if device != "cpu" else "float32"),
+        device=device,
+        trained=report.trained,
+    )
+
+
+def _device(wanted: str) -> str:
+    if wanted != "auto":
+        return wanted
+    return "cuda" if torch.cuda.is_available() else "cpu"
+
+
+def measured(device: str) -> Resources:
+    """What this machine has left on a device: free memory of the GPU, or what Linux calls available."""
+    if device.startswith("cuda"):
+        return Resources(device=device, memory=torch.cuda.mem_get_info(device)[0])
+    for line in Path("/proc/meminfo").read_text().splitlines():
+        name, _, rest = line.partition(":")
+        if name == "MemAvailable":
+            return Resources(device="cpu", memory=1024 * int(rest.split()[0]))
+    return Resources(device="cpu", memory=0)
+
+
+def _memory(traits: Traits, needed: int, found: Resources) -> str:
+    line = f"weights take {needed / 2**30:.2f} GiB in {traits.precision}, {found.memory / 2**30:.2f} are free on "
+    line += f"{found.device}; pictures in work come on top"
+    if needed > found.memory:
+        raise CheckpointError(f"{line}. Free some, or use bfloat16 or a smaller model")
+    if needed > _MUCH_MEMORY * found.memory:
+        raise _DoubtfulError(line)
+    return line
+
+
+def _views(config: NodeConfig, traits: Traits, info: SourceInfo) -> str:
+    run, fps = prepare_run(config, traits, info)
+    VirtualViews(traits).following(LiveConfig(config).settings(), run.mount)
+    line = f"{', '.join(config.view)}: windows of {traits.config.frames} frames at {fps:g} FPS"
+    if run.ood:
+        raise _DoubtfulError(f"{line}; outside what {traits.name} was trained with: {', '.join(run.ood)}")
+    return line
+
+
+def _time(config: NodeConfig, traits: Traits, info: SourceInfo) -> str:
+    _, fps = prepare_run(config, traits, info)
+    period_s = (config.window.stride or traits.config.frames) / fps
+    model, sampling = config.model, traits.config.sampling
+    steps = model.steps or sampling.steps
+    branches = 1 if (model.guidance or sampling.guidance) == (1.0, 1.0) else 2
+    runs = steps * branches * model.samples * len(config.view)
+    return (
+        f"a window every {period_s:.2f} s, {runs} network evaluations each, so {1000 * period_s / runs:.1f} ms for one "
+        f"if none is to be left out; {model_threads(model)} CPU threads"
+    )

@@ -1,0 +1,208 @@
+"""What is in a log, by its first seconds: which topic has the pictures, how many a second, through which lens."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+
+from gcd_node.calibration import LensModel, lens_of
+from gcd_node.errors import ConfigError, SourceError, TooShortError
+from gcd_node.frame import MAX_FPS, SourceInfo
+from gcd_node.sources.log_messages import (
+    CAMERAS,
+    PICTURES,
+    StatedCamera,
+    read_camera_message,
+    read_picture_message,
+)
+from gcd_node.sources.log_pictures import to_rgb
+from gcd_node.sources.mcap_container import LogChannel, LogMessage, McapContainer
+
+_LOG = logging.getLogger(__name__)
+_SURVEYED_NS = 5_000_000_000
+_MOST_STAMPS = 500
+_MOST_TRIES = 5
+_LISTED = 8
+_LOWEST_FPS = 0.05
+_HEADER_UNCERTAINTY_US = 10_000  # drivers stamp anything from the begin of the exposure to the picture's arrival
+
+
+@dataclass(kw_only=True, slots=True)
+class _Topic:
+    """What was seen of one picture topic. Stamps in nanoseconds; reason: why its pictures cannot be read."""
+
+    channel: LogChannel
+    header_ns: list[int] = field(default_factory=list[int])
+    published_ns: list[int] = field(default_factory=list[int])
+    frame_id: str = ""
+    size: tuple[int, int] | None = None
+    codec: str = ""
+    tries: int = 0
+    reason: str = ""
+
+    @property
+    def settled(self) -> bool:
+        """Whether enough is known: its pictures can be decoded and have a rate, or they cannot."""
+        return self.tries >= _MOST_TRIES if self.size is None else len(self.published_ns) > 1
+
+    def add(self, message: LogMessage) -> None:
+        """Count a message; pictures are decoded until one could be, a few at most. Damaged ones do not count."""
+        if len(self.published_ns) >= _MOST_STAMPS:
+            return
+        try:
+            picture = read_picture_message(self.channel.encoding, self.channel.schema, message.data)
+            if self.size is None and self.tries < _MOST_TRIES:
+                self.tries += 1
+                image, self.codec = to_rgb(picture)
+                self.size = (image.shape[1], image.shape[0])
+                self.frame_id = picture.frame_id
+        except SourceError as error:
+            self.reason = str(error)
+            return
+        self.header_ns.append(picture.stamp_ns)
+        self.published_ns.append(message.published_ns)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Survey:
+    """topic: whose pictures are played. header_stamps: their own stamps hold, else when they were sent."""
+
+    topic: str
+    header_stamps: bool
+    info: SourceInfo
+
+
+def survey(path: Path, wanted: str | None) -> Survey:
+    """Look at the first seconds of a log, or as far as it takes to find the pictures.
+
+    Args:
+        wanted: the topic; None if there is just one with pictures.
+    Raises:
+        SourceError: no MCAP; no such topic; no pictures, or on several topics; none of them can be decoded.
+        TooShortError: one picture.
+    """
+    container = McapContainer(path)
+    topics, cameras = _collect(container, wanted)
+    chosen = _choose(path, topics, wanted, container)
+    if chosen.size is None:
+        raise SourceError(f"{path}: no picture on {chosen.channel.topic} can be decoded: {chosen.reason}")
+    header_stamps = _rise(chosen.header_ns)
+    stamps = chosen.header_ns if header_stamps else chosen.published_ns
+    fps = _rate(path, chosen.channel.topic, stamps)
+    info = SourceInfo(
+        kind="mcap",
+        id=path.name,
+        width=chosen.size[0],
+        height=chosen.size[1],
+        fps_nominal=fps,
+        clock="replay",
+        codec=chosen.codec,
+        lens=_lens(path, chosen, cameras),
+        stamp_uncertainty_us=_HEADER_UNCERTAINTY_US if header_stamps else round(1e6 / fps),
+    )
+    return Survey(topic=chosen.channel.topic, header_stamps=header_stamps, info=info)
+
+
+def _collect(container: McapContainer, wanted: str | None) -> tuple[dict[str, _Topic], dict[str, StatedCamera]]:
+    """Picture topics, and the first calibration on each topic that has some."""
+    topics: dict[str, _Topic] = {}
+    cameras: dict[str, StatedCamera] = {}
+    first_ns: int | None = None
+    for message in container.messages():
+        channel = message.channel
+        kind = channel.encoding, channel.schema
+        if kind in PICTURES:
+            topics.setdefault(channel.topic, _Topic(channel=channel)).add(message)
+        elif kind in CAMERAS and channel.topic not in cameras:
+            try:
+                cameras[channel.topic] = read_camera_message(*kind, message.data)
+            except SourceError as error:
+                _LOG.warning("a calibration on %s is left out: %s", channel.topic, error)
+        first_ns = message.log_ns if first_ns is None else first_ns
+        if message.log_ns - first_ns > _SURVEYED_NS and _settled(topics, wanted):
+            break
+    return topics, cameras
+
+
+def _settled(topics: dict[str, _Topic], wanted: str | None) -> bool:
+    """Whether to look no further: the topic is known, or of all there are one is good or every one is not."""
+    found = [topic for name, topic in topics.items() if wanted in (None, name)]
+    good = any(topic.settled and topic.size is not None for topic in found)
+    return good or (bool(found) and all(topic.settled for topic in found))
+
+
+def _choose(path: Path, topics: dict[str, _Topic], wanted: str | None, container: McapContainer) -> _Topic:
+    if wanted is not None and wanted in topics:
+        return topics[wanted]
+    if wanted is not None:
+        raise SourceError(
+            f"{path} has no pictures on the topic {wanted!r}; {_listed(list(topics.values()), container)}"
+        )
+    usable = [topic for topic in topics.values() if topic.size is not None]
+    if len(usable) > 1:
+        names = ", ".join(sorted(topic.channel.topic for topic in usable)[:_LISTED])
+        raise SourceError(f"{path} has pictures on {len(usable)} topics, {names}: say which with topic in [source]")
+    if usable:
+        return usable[0]
+    if topics:
+        topic = next(iter(topics.values()))
+        raise SourceError(f"{path}: no picture on {topic.channel.topic} can be decoded: {topic.reason}")
+    raise SourceError(f"{path} holds no pictures; {_listed([], container)}")
+
+
+def _listed(topics: Sequence[_Topic], container: McapContainer) -> str:
+    if topics:
+        return f"it has pictures on {', '.join(sorted(topic.channel.topic for topic in topics)[:_LISTED])}"
+    others = sorted(f"{each.topic} ({each.schema}, {each.encoding})" for each in container.channels)[:_LISTED]
+    readable = ", ".join(f"{schema} ({encoding})" for encoding, schema in PICTURES)
+    return f"its topics are {', '.join(others) or 'none'}; readable are {readable}"
+
+
+def _rise(stamps: Sequence[int]) -> bool:
+    """Whether stamps are filled in, and go on from most pictures to the next."""
+    steps = [later - earlier for earlier, later in pairwise(stamps)]
+    return all(stamps) and 2 * sum(step > 0 for step in steps) > len(steps)
+
+
+def _rate(path: Path, topic: str, stamps: Sequence[int]) -> float:
+    steps = [later - earlier for earlier, later in pairwise(stamps) if later > earlier]
+    if not steps:
+        raise TooShortError(
+            f"TOO_SHORT n={len(stamps)}: the {len(stamps)} pictures on {topic} of {path} make no video; "
+            "give a longer log"
+        )
+    fps = 1e9 / median(steps)
+    if not _LOWEST_FPS <= fps <= MAX_FPS:
+        raise SourceError(
+            f"{path}: pictures on {topic} come {fps:g} times a second by their stamps, wanted are {_LOWEST_FPS:g} to "
+            f"{MAX_FPS:g}; is its clock right?"
+        )
+    return fps
+
+
+def _lens(path: Path, topic: _Topic, cameras: dict[str, StatedCamera]) -> LensModel | None:
+    """The calibration that belongs to the pictures, None if there is none that fits."""
+    name = _camera_topic(topic, cameras)
+    if name is None or topic.size is None:
+        return None
+    # by the conventions of image_pipeline, pictures on image_rect... are undistorted already
+    rectified = any(part.startswith("image_rect") for part in topic.channel.topic.split("/"))
+    try:
+        lens = lens_of(cameras[name].info, rectified=rectified)
+        return None if lens is None else lens.resized(*topic.size)
+    except ConfigError as error:
+        _LOG.warning(
+            "%s: the calibration on %s is not used: %s. State calibration or hfov_deg in [source]", path, name, error
+        )
+        return None
+
+
+def _camera_topic(topic: _Topic, cameras: dict[str, StatedCamera]) -> str | None:
+    """The calibration in the nearest folder above the pictures, as ROS drivers send it; else the one of that frame."""
+    place = topic.channel.topic.split("/")
+    depths = {name: name.count("/") for name in cameras if place[: name.count("/")] == name.split("/")[:-1]}
+    if depths:
+        return max(depths, key=lambda name: depths[name])
+    return next((name for name, each in cameras.items() if each.frame_id and each.frame_id == topic.frame_id), None)

@@ -1,0 +1,100 @@
+"""Live cameras that do what a test tells them, and the bench they are plugged into."""
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from gcd_node.errors import SourceAbsentError, SourceError
+from gcd_node.frame import Frame, Image, SourceInfo
+
+FPS = 24.0
+
+
+class Camera:
+    """Gives what `feed` and `shoot` put in; silent otherwise. deaf: does not even end when it is closed."""
+
+    def __init__(self, *, size: tuple[int, int] = (96, 64), fps: float = FPS, deaf: bool = False) -> None:
+        self.info = SourceInfo(
+            kind="v4l2", id="bench", width=size[0], height=size[1], fps_nominal=fps, clock="realtime"
+        )
+        self.corrupt = 0
+        self.last_s = 0.0
+        self.closed = threading.Event()
+        self._deaf, self._seq = deaf, 0
+        self._items: queue.Queue[Frame | Exception | None] = queue.Queue()
+
+    def feed(self, item: Frame | Exception | None) -> None:
+        """A frame to give, an error to raise, or None for an end."""
+        self._items.put(item)
+
+    def shoot(self, image: Image | None = None, stamp_ns: int | None = None) -> None:
+        """Take a picture now; its level is its number, so that no two are the same."""
+        width, height = self.info.width, self.info.height
+        drawn = np.full((height, width, 3), 20 + self._seq % 200, np.uint8) if image is None else image
+        at_ns = time.monotonic_ns() if stamp_ns is None else stamp_ns
+        self.last_s = time.monotonic()
+        self.feed(Frame(image=drawn, stamp_ns=at_ns, seq=self._seq))
+        self._seq += 1
+
+    def run(self, count: int, *, pause_s: float | None = None) -> None:
+        """Take pictures at the camera's rate, stamped on an even grid."""
+        start_ns, period_s = time.monotonic_ns(), 1 / self.info.fps_nominal
+        for i in range(count):
+            self.shoot(stamp_ns=start_ns + round(i * 1e9 * period_s))
+            time.sleep(period_s if pause_s is None else pause_s)
+
+    def frames(self) -> Iterator[Frame]:
+        while self._deaf or not self.closed.is_set():
+            try:
+                item = self._items.get(timeout=0.01)
+            except queue.Empty:
+                continue
+            if item is None:
+                return
+            if isinstance(item, Exception):
+                raise item
+            yield item
+
+    def close(self) -> None:
+        self.closed.set()
+        if self._deaf:
+            time.sleep(30)
+
+
+class Bench:
+    """Opens the cameras plugged in, one after another; without one it says so as a driver does."""
+
+    def __init__(self, *cameras: Camera) -> None:
+        self._plugged: queue.Queue[Camera] = queue.Queue()
+        self.opened: list[Camera] = []
+        self.tries = 0
+        for camera in cameras:
+            self.plug(camera)
+
+    def plug(self, camera: Camera) -> Camera:
+        self._plugged.put(camera)
+        return camera
+
+    def open(self) -> Camera:
+        """Raises SourceError without a camera."""
+        self.tries += 1
+        try:
+            camera = self._plugged.get_nowait()
+        except queue.Empty:
+            raise SourceAbsentError("there is no camera bench; there are: none") from None
+        self.opened.append(camera)
+        return camera
+
+
+def until(condition: Callable[[], bool], timeout_s: float = 60.0) -> None:
+    """Wait for something that other threads bring about; a hang guard, generous because machines are slow."""
+    deadline_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline_s, "it did not come about in time"
+        time.sleep(0.005)
+
+
+__all__ = ["FPS", "Bench", "Camera", "SourceError", "until"]

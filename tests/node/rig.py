@@ -1,0 +1,190 @@
+"""A whole node over real sockets in a folder of its own: its cameras and its model do what a test tells them."""
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from cameras import Bench, until
+from fakes import FakeSynthesizer, traits
+from numpy.typing import NDArray
+
+from gcd_model import ViewSynthesizer
+from gcd_node.config import ModelSection, NodeConfig, SourceConfig, parse_config
+from gcd_node.control import ControlOptions, ControlServer
+from gcd_node.control_client import ControlClient
+from gcd_node.control_message import Reply
+from gcd_node.frame import FrameSource
+from gcd_node.header import ViewHeader
+from gcd_node.machinery import Parts
+from gcd_node.node import Node, NodeOptions
+from gcd_node.publisher import Publisher
+from gcd_node.session import publisher_options
+from gcd_node.stream import Summary
+from gcd_node.subscriber import NoteSubscriber, ReceivedView, ViewSubscriber
+from gcd_node.systemd import ServiceManager
+
+CAMERA = 'kind = "v4l2"'
+_SILENCE_MS = 300
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A view that arrived; pixels [T, H, W, C] unless they were not kept."""
+
+    header: ViewHeader
+    sequence: int
+    age_ms: float
+    skipped: int
+    pixels: NDArray[np.uint8] | None
+
+
+def seen(view: ReceivedView, *, keep: bool) -> Seen:
+    return Seen(
+        header=view.header,
+        sequence=view.message.sequence,
+        age_ms=view.age_ms,
+        skipped=view.skipped,
+        pixels=view.images if keep else None,
+    )
+
+
+def rig_config(folder: Path, source: str, views: str, more: str) -> NodeConfig:
+    text = f"""
+        {more}
+        [source]
+        {source}
+        [model]
+        weights = "fake"
+        {views}
+    """
+    endpoints = [f"{name}=ipc://{folder}/{name.split('.')[-1]}" for name in ("publish.data", "publish.status")]
+    return parse_config(text.encode(), "test", [*endpoints, f"control.endpoint=ipc://{folder}/control"])
+
+
+class Rig:
+    """Use it as a context manager; at its end the node was shut down, and everything it said is still here."""
+
+    def __init__(
+        self,
+        folder: Path,
+        source: Bench | Callable[[SourceConfig], FrameSource],
+        model: ViewSynthesizer | Callable[[ModelSection], ViewSynthesizer] | None = None,
+        *,
+        config: str = CAMERA,
+        views: str = "[view.main]\nazimuth_deg = 10.0",
+        more: str = "",
+        once: bool = False,
+        service: ServiceManager | None = None,
+        watched: bool = True,
+        keep: bool = True,
+    ) -> None:
+        """watched: somebody reads the views. keep: their pixels too."""
+        self.config = rig_config(folder, config, views, more)
+        self.model = FakeSynthesizer(traits()) if model is None else model
+        loaded = self.model
+        parts = Parts(
+            open_source=(lambda _: source.open()) if isinstance(source, Bench) else source,
+            load_model=(lambda _: loaded) if hasattr(loaded, "traits") else loaded,  # type: ignore[arg-type,return-value]
+        )
+        self.publisher = Publisher(publisher_options(self.config))
+        self.node = Node(self.config, parts, self.publisher, NodeOptions(once=once, service=service))
+        self.control = ControlServer(
+            ControlOptions(endpoint=f"ipc://{folder}/control"),
+            self.node,
+            lambda: self.node.state.label,
+            self.node.event,
+        )
+        self.folder = folder
+        self.notes: list[tuple[float, str, Mapping[str, Any]]] = []
+        self.views: list[Seen] = []
+        self._keep = keep
+        self.ended: set[str] = set()
+        self.summary: Summary | None = None
+        self.failure: Exception | None = None
+        self._done = threading.Event()
+        self._watched = watched
+        targets = [self._hear, *([self._see] if watched else []), self._live]
+        self._threads = [threading.Thread(target=target, daemon=True) for target in targets]
+
+    def __enter__(self) -> "Rig":
+        self.client = ControlClient(f"ipc://{self.folder}/control", timeout_s=20.0, attempts=1)
+        for thread in self._threads[:-1]:
+            thread.start()
+        until(lambda: self.publisher.stats.subscribers >= self._watched)
+        self._threads[-1].start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.node.stop()
+        self._threads[-1].join(20)
+        alive = self._threads[-1].is_alive()
+        self.control.close()
+        self._done.set()
+        self.publisher.close()  # waits until the readers have heard everything and left
+        for thread in self._threads[:-1]:
+            thread.join(10)
+        self.client.close()
+        assert not alive, "the node did not end"
+
+    def _live(self) -> None:
+        try:
+            self.summary = self.node.run()
+        except Exception as error:
+            self.failure = error
+
+    def _hear(self) -> None:
+        with NoteSubscriber(f"ipc://{self.folder}/status") as notes:
+            while (note := notes.receive(_SILENCE_MS)) is not None or not self._done.is_set():
+                if note is not None:
+                    self.notes.append((time.monotonic(), note.topic, note.fields))
+
+    def _see(self) -> None:
+        with ViewSubscriber(f"ipc://{self.folder}/data", None, "win", conflate=False) as views:
+            while (view := views.receive(_SILENCE_MS)) is not None or not self._done.is_set():
+                if view is not None:
+                    self.views.append(seen(view, keep=self._keep))
+                elif views.ended:
+                    self.ended.add("win")
+
+    # What it said.
+
+    def events(self, code: str | None = None) -> list[Mapping[str, Any]]:
+        heard = [fields for _, topic, fields in list(self.notes) if topic == "event"]
+        return heard if code is None else [fields for fields in heard if fields["code"] == code]
+
+    def statuses(self) -> list[Mapping[str, Any]]:
+        return [fields for _, topic, fields in list(self.notes) if topic == "status"]
+
+    def metas(self) -> list[Mapping[str, Any]]:
+        return [fields for _, topic, fields in list(self.notes) if topic == "meta"]
+
+    def of(self, view: str = "main") -> list[Seen]:
+        return [each for each in list(self.views) if each.header.view_id == view]
+
+    def await_event(self, code: str, count: int = 1) -> Mapping[str, Any]:
+        until(lambda: len(self.events(code)) >= count)
+        return self.events(code)[count - 1]
+
+    def await_state(self, state: str) -> None:
+        until(lambda: self.node.state.label == state)
+
+    def await_status(self, holds: Callable[[Mapping[str, Any]], bool]) -> Mapping[str, Any]:
+        until(lambda: any(holds(status) for status in self.statuses()))
+        return next(status for status in self.statuses() if holds(status))
+
+    def await_views(self, count: int, view: str = "main") -> list[Seen]:
+        until(lambda: len(self.of(view)) >= count)
+        return self.of(view)
+
+    def ask(self, verb: str, args: Mapping[str, object] | None = None, **more: object) -> Reply:
+        return self.client.request(verb, {**(args or {}), **more})
+
+    def try_out(self, verb: str, **args: object) -> Reply:
+        return self.client.request(verb, args, dry_run=True)
+
+    def ask_at(self, view_rev: int, verb: str, **args: object) -> Reply:
+        return self.client.request(verb, args, if_view_rev=view_rev)

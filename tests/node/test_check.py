@@ -1,0 +1,176 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from media import write_video
+
+from gcd_node.check import Resources, check
+from gcd_node.cli import run_app
+from gcd_node.config import NodeConfig, load_config, parse_config
+from gcd_node.config_text import to_toml
+from gcd_node.errors import ConfigError
+from gcd_node.publisher import Publisher
+from gcd_node.publisher_options import PublisherOptions
+
+SIZE = (128, 192)  # smaller than any model takes unless it may be enlarged
+
+
+@pytest.fixture
+def launch(tmp_path: Path) -> Path:
+    frames = [np.full((*SIZE, 3), 5 * i, np.uint8) for i in range(16)]
+    write_video(tmp_path / "v.mkv", frames, 10.0)
+    path = tmp_path / "launch.toml"
+    path.write_text(f"""
+        [source]
+        path = "{tmp_path}/v.mkv"
+        allow_upscale = true
+        [model]
+        weights = "random:driving"
+        steps = 2
+        [view.main]
+        [publish]
+        data = "ipc://{tmp_path}/data"
+        status = "ipc://{tmp_path}/status"
+        [control]
+        endpoint = "ipc://{tmp_path}/control"
+    """)
+    return path
+
+
+def found(launch: Path, *changes: str, memory: int | None = None) -> dict[str, tuple[str, str]]:
+    resources = None if memory is None else Resources(device="cpu", memory=memory)
+    return {each.topic: (each.verdict, each.detail) for each in check(load_config(launch, changes), resources)}
+
+
+def test_a_good_launch_file_is_looked_at_from_end_to_end(launch: Path) -> None:
+    findings = found(launch)
+    assert list(findings) == ["endpoints", "source", "weights", "memory", "views", "time"]
+    assert {verdict for verdict, _ in findings.values()} == {"ok", "warning"}
+    assert findings["weights"][0] == "warning"  # random weights are noise
+    assert "192 x 128 at 10 FPS" in findings["source"][1]
+    assert "14 frames at 10 FPS" in findings["views"][1]
+    assert "every 1.40 s" in findings["time"][1]
+
+
+def test_nothing_stays_bound_or_open(launch: Path) -> None:
+    assert found(launch)["endpoints"] == found(launch)["endpoints"]
+    assert not (launch.parent / "data").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "topic", "code"),
+    [
+        ("source.path=/no/such.mp4", "source", 66),
+        ("model.weights=/no/such.ckpt", "weights", 65),
+        ("model.weights=package:unheard", "weights", 65),
+        ("view.main.azimuth_deg=5", "views", 64),
+        ("publish.data=tcp://0.0.0.0:5580", "endpoints", 78),
+    ],
+)
+def test_what_would_fail_is_named_and_is_the_exit_code(
+    change: str, topic: str, code: int, launch: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert found(launch, change)[topic][0] == "failed"
+    assert run_app(["check", str(launch), "--set", change]) == code
+    assert capsys.readouterr().err.strip().splitlines()[-1].startswith("error: ")
+
+
+def test_an_endpoint_in_use_is_found(launch: Path) -> None:
+    with Publisher(PublisherOptions(data=f"ipc://{launch.parent}/data", status=None, linger_ms=0)):
+        verdict, detail = found(launch)["endpoints"]
+    assert verdict == "failed"
+    assert "in use" in detail
+
+
+def test_one_failure_does_not_hide_the_next(launch: Path) -> None:
+    findings = found(launch, "source.path=/no/such.mp4", "model.weights=/no/such.ckpt")
+    assert [findings[topic][0] for topic in ("endpoints", "source", "weights")] == ["ok", "failed", "failed"]
+
+
+def test_weights_that_do_not_fit_into_memory_are_refused_before_they_are_loaded(launch: Path) -> None:
+    packaged = "model.weights=package:driving-small"
+    if found(launch, packaged)["weights"][0] == "failed":
+        pytest.skip("needs the packaged weights driving-small")
+    assert found(launch, packaged, memory=10_000)["memory"][0] == "failed"
+    assert found(launch, packaged, memory=2**40)["memory"][0] == "ok"
+
+
+# The configuration as text.
+
+
+def test_what_is_printed_is_the_same_launch_file_again(launch: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(["run", str(launch), "--set", "model.steps=7", "--print-config"]) == 0
+    printed = capsys.readouterr().out
+    again = parse_config(printed.encode(), "printed")
+    assert again == load_config(launch, ["model.steps=7"])
+    assert again.model.steps == 7
+
+
+def test_every_setting_survives_being_printed() -> None:
+    text = """
+        node_id = "a-1"
+        strict = true
+        [source]
+        kind = "oak"
+        device = 'say "hi" \\\\ \t'
+        [source.pose]
+        elevation_deg = 5.5
+        [model]
+        weights = "w"
+        guidance = [1.0, 1.5]
+        [view.a]
+        kind = "orbit"
+        rate_deg_s = 1e-3
+        amplitude_deg = 20.0
+        [view.b]
+    """
+    config = parse_config(text.encode(), "test")
+    assert parse_config(to_toml(config).encode(), "printed") == config
+
+
+@pytest.mark.parametrize(
+    ("url", "shown"),
+    [
+        ("rtsp://me:secret@host:554/a?token=secret", "rtsp://me:***@host:554/a?***"),
+        ("rtsp://host/a", "rtsp://host/a"),
+        ("rtsp://me:sec@ret@host/a", "rtsp://me:***@host/a"),
+    ],
+)
+def test_passwords_are_not_printed(url: str, shown: str) -> None:
+    text = f'[source]\nkind = "rtsp"\nurl = "{url}"\n[model]\nweights = "w"\n[view.a]\n'
+    printed = to_toml(parse_config(text.encode(), "test"))
+    assert f'url = "{shown}"' in printed
+    assert "secret" not in printed
+
+
+def changed(*changes: str) -> NodeConfig:
+    text = b'[source]\npath = "a.mp4"\n[model]\nweights = "w"\n[view.a]\n'
+    return parse_config(text, "test", changes)
+
+
+def test_changes_are_read_as_toml_and_else_as_text() -> None:
+    config = changed(
+        "model.steps=4", "source.path=b=c.mp4", "view.a.azimuth_deg = -3.5", "strict=true", "view.b.radius=1.0"
+    )
+    assert (config.model.steps, config.source.path, config.strict) == (4, "b=c.mp4", True)
+    assert (config.view["a"].azimuth_deg, config.view["b"].radius) == (-3.5, 1.0)
+    assert changed("model.guidance=[1.0, 2.0]").model.guidance == (1.0, 2.0)
+    assert changed('model.weights="4"').model.weights == "4"
+    assert changed("model.steps=4", "model.steps=5").model.steps == 5
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ("model.steps", "KEY=VALUE"),
+        ("=4", "KEY=VALUE"),
+        ("model..steps=4", "KEY=VALUE"),
+        ("model.steps.more=4", "no section"),
+        ("model.stepz=4", "did you mean `steps`"),
+        ("model.steps=zero", "int"),
+        ("model.steps=0", ">= 1"),
+    ],
+)
+def test_a_change_that_cannot_be_made_is_explained(change: str, reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        changed("model.steps=4", change)

@@ -1,0 +1,110 @@
+"""`gcd-node ctl` and `gcd-node keys` as a user types them."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+from control_fakes import Events, FakeCommands
+
+from gcd_node.allow_list import load_server_security
+from gcd_node.cli import run_app
+from gcd_node.config import SecurityConfig
+from gcd_node.control import ControlOptions, ControlServer
+from gcd_node.keys import fingerprint, read_key_pair, write_key_pair
+from gcd_node.security import new_key_pair
+
+pytestmark = pytest.mark.timeout(90)
+
+NODE = new_key_pair()
+LOOPBACK = "tcp://127.0.0.1:0"
+
+
+@pytest.fixture
+def commands() -> FakeCommands:
+    return FakeCommands()
+
+
+@pytest.fixture
+def events() -> Events:
+    return Events()
+
+
+@pytest.fixture
+def server(tmp_path: Path, commands: FakeCommands, events: Events) -> Iterator[ControlServer]:
+    with ControlServer(ControlOptions(endpoint=f"ipc://{tmp_path}/c"), commands, lambda: "active", events) as made:
+        yield made
+
+
+def test_ctl_sends_what_the_verb_wants(server: ControlServer, capsys: pytest.CaptureFixture[str]) -> None:
+    line = ["ctl", "set_view", "view=top", "azimuth_deg=30", "--endpoint", server.endpoint, "--timeout", "20"]
+    assert run_app(line) == 0
+    assert "OK (the node is active)" in capsys.readouterr().out
+
+
+def test_ctl_prints_the_reply_as_json(server: ControlServer, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(["ctl", "hello", "--json", "--endpoint", server.endpoint, "--timeout", "20"]) == 0
+    reply = json.loads(capsys.readouterr().out)
+    assert (reply["code"], reply["result"]) == ("OK", {"role": "operator"})
+
+
+def test_ctl_says_what_was_refused_and_what_is_allowed(
+    server: ControlServer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = ["ctl", "set_view", "view=top", "azimuth_deg=120", "--endpoint", server.endpoint, "--timeout", "20"]
+    assert run_app(line) == 70
+    said = capsys.readouterr().err
+    assert said.startswith("error: set_view: OUT_OF_RANGE")
+    assert "[-90,90]" in said
+
+
+def test_ctl_keeps_a_views_name_text(server: ControlServer, commands: FakeCommands) -> None:
+    line = ["ctl", "remove_view", "view=1", "--endpoint", server.endpoint, "--timeout", "20"]
+    assert run_app(line) == 0
+    assert msgspec.to_builtins(commands.heard[0][0].args) == {"view": "1"}
+
+
+@pytest.mark.parametrize("settings", [["view"], ["=top"], ["view=a", "view=b"]])
+def test_ctl_wants_key_value_once(settings: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(["ctl", "remove_view", *settings]) == 64
+    assert "KEY=VALUE" in capsys.readouterr().err
+
+
+def test_ctl_without_a_node_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(["ctl", "hello", "--endpoint", f"ipc://{tmp_path}/x", "--timeout", "0.1"]) == 70
+    assert "is the node running" in capsys.readouterr().err
+
+
+def test_keys_made_on_the_command_line_open_the_door(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], commands: FakeCommands, events: Events
+) -> None:
+    for name in ("node", "desk"):
+        assert run_app(["keys", "new", str(tmp_path / name)]) == 0
+    shown = capsys.readouterr().out
+    assert read_key_pair(tmp_path / "desk").secret not in shown
+    stanza = shown[shown.rindex("[client.NAME]") :].replace("NAME", "desk")
+    (tmp_path / "allow.toml").write_text(stanza)
+    security = load_server_security(SecurityConfig(keys=str(tmp_path / "node"), allow=str(tmp_path / "allow.toml")))
+    options = ControlOptions(endpoint=LOOPBACK, security=security)
+    with ControlServer(options, commands, lambda: "active", events) as server:
+        line = ["ctl", "hello", "--json", "--endpoint", server.endpoint, "--timeout", "20"]
+        line += ["--keys", str(tmp_path / "desk"), "--node-key", str(tmp_path / "node" / "public.key")]
+        assert run_app(line) == 0
+        assert json.loads(capsys.readouterr().out)["result"] == {"role": "viewer"}
+        assert run_app([*line[:1], "activate", *line[3:]]) == 70
+        assert "FORBIDDEN" in capsys.readouterr().err
+
+
+def test_keys_show_prints_the_fingerprint(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_key_pair(tmp_path, NODE)
+    assert run_app(["keys", "show", str(tmp_path)]) == 0
+    shown = capsys.readouterr().out
+    assert NODE.public in shown
+    assert fingerprint(NODE.public) in shown
+    assert NODE.secret not in shown
+
+
+def test_half_of_the_key_options_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(["ctl", "hello", "--keys", str(tmp_path)]) == 64
+    assert "--node-key" in capsys.readouterr().err

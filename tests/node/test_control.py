@@ -1,0 +1,408 @@
+"""The control server and its client over real sockets, and with plain ZeroMQ sockets as strangers have them."""
+
+import json
+import os
+import socket
+import stat
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import zmq
+from control_fakes import Events, FakeCommands, wait_for
+
+from gcd_node.control import Answers, ControlOptions, ControlServer
+from gcd_node.control_client import ControlClient
+from gcd_node.control_limits import FloodGuard, ReplyCache
+from gcd_node.control_message import MAX_REPLY, Code, Reply, decode_reply
+from gcd_node.errors import ConfigError, ControlError, EndpointError
+from gcd_node.header import PROTO
+from gcd_node.keys import Client
+from gcd_node.security import Socket
+
+pytestmark = pytest.mark.timeout(90)
+
+VIEWER, OPERATOR = Client(name="eye", role="viewer"), Client(name="hand", role="operator")
+
+
+@pytest.fixture
+def commands() -> FakeCommands:
+    return FakeCommands()
+
+
+@pytest.fixture
+def events() -> Events:
+    return Events()
+
+
+@pytest.fixture
+def server(tmp_path: Path, commands: FakeCommands, events: Events) -> Iterator[ControlServer]:
+    options = ControlOptions(endpoint=f"ipc://{tmp_path}/control", ignore_s=1.0)
+    with ControlServer(options, commands, lambda: "active", events) as made:
+        yield made
+
+
+@pytest.fixture
+def client(server: ControlServer) -> Iterator[ControlClient]:
+    with ControlClient(server.endpoint, timeout_s=20.0, attempts=1) as made:
+        yield made
+
+
+@pytest.fixture
+def stranger(server: ControlServer) -> Iterator[Socket]:
+    """A DEALER that knows nothing of our client."""
+    with zmq.Context() as context:
+        made = context.socket(zmq.DEALER)
+        made.set(zmq.LINGER, 0)
+        made.connect(server.endpoint)
+        yield made
+        context.destroy(linger=0)
+
+
+def wire(verb: str, request_id: str = "a1", **more: object) -> bytes:
+    return json.dumps({"proto": PROTO, "id": request_id, "verb": verb, **more}).encode()
+
+
+def asked(stranger: Socket, *parts: bytes) -> Reply:
+    stranger.send_multipart(parts)
+    assert stranger.poll(20_000), "no reply"
+    return decode_reply(stranger.recv())
+
+
+# Asking and commanding
+
+
+def test_a_reply_says_who_asked_and_in_which_state_the_node_is(client: ControlClient) -> None:
+    reply = client.request("hello", request_id="abc")
+    assert (reply.id, reply.ok, reply.code, reply.state) == ("abc", True, "OK", "active")
+    assert reply.result == {"role": "operator"}
+
+
+def test_a_command_reaches_the_node_once_and_typed(client: ControlClient, commands: FakeCommands) -> None:
+    assert client.call("set_view", {"view": "top", "azimuth_deg": 30.0}) == {"view_rev": 2}
+    assert [command.verb for command, _ in commands.heard] == ["set_view"]
+
+
+def test_a_dry_run_is_told_apart(client: ControlClient, commands: FakeCommands) -> None:
+    client.call("set_view", {"view": "top"}, dry_run=True)
+    assert [command.dry_run for command, _ in commands.heard] == [True]
+    assert commands.view_rev == 1
+
+
+def test_what_takes_long_is_accepted(client: ControlClient) -> None:
+    reply = client.request("activate")
+    assert (reply.ok, reply.code, reply.message) == (True, "ACCEPTED", "opening the source")
+
+
+def test_the_clocks_of_one_machine_agree(client: ControlClient) -> None:
+    clock = client.clock()
+    assert 0 < clock.delay_ns < 20_000_000_000
+    assert abs(clock.offset_ns) <= clock.delay_ns
+
+
+def test_time_never_waits_for_the_node(client: ControlClient, commands: FakeCommands) -> None:
+    received, left = client.call("time")["t_rx"], client.call("time")["t_tx"]
+    assert isinstance(received, list)
+    assert isinstance(left, list)
+    assert received <= left
+    assert commands.heard == []
+
+
+def test_f14_refusals_carry_the_allowed_interval_and_change_nothing(
+    client: ControlClient, commands: FakeCommands
+) -> None:
+    beyond = client.request("set_view", {"view": "top", "azimuth_deg": 120.0})
+    assert (beyond.code, beyond.result) == ("OUT_OF_RANGE", {"arg": "azimuth_deg", "allowed": [-90, 90]})
+    assert client.request("set_view", {"view": "nose"}).code == "UNKNOWN_VIEW"
+    assert client.request("set_view", {"view": "top", "azimut": 1}).code == "BAD_ARG"
+    assert client.request("set_vew", {}).code == "UNKNOWN_VERB"
+    assert commands.view_rev == 1
+
+
+def test_a_view_that_moved_on_is_left_alone(client: ControlClient, commands: FakeCommands) -> None:
+    assert client.call("set_view", {"view": "top"}, if_view_rev=1) == {"view_rev": 2}
+    late = client.request("set_view", {"view": "top"}, if_view_rev=1)
+    assert (late.code, late.result) == ("WRONG_STATE", {"view_rev": 2})
+    assert commands.view_rev == 2
+
+
+def test_call_raises_what_was_refused_with_its_code(client: ControlClient) -> None:
+    with pytest.raises(ControlError, match="UNKNOWN_VIEW: known are top") as caught:
+        client.call("set_view", {"view": "nose"})
+    assert caught.value.code == "UNKNOWN_VIEW"
+
+
+def test_an_error_of_the_node_is_internal_and_shows_no_code(client: ControlClient) -> None:
+    assert client.request("configure").message == "no model here"
+    reply = client.request("cleanup")
+    assert reply.code == "INTERNAL"
+    assert "secret" not in reply.message
+    assert client.request("hello").ok
+
+
+def test_a_node_that_cannot_say_its_state_costs_one_reply(tmp_path: Path, events: Events) -> None:
+    states = iter(["active"])  # asked a second time it raises
+    options = ControlOptions(endpoint=f"ipc://{tmp_path}/c")
+    with ControlServer(options, FakeCommands(), lambda: next(states, None) or _fail(), events) as server:
+        with ControlClient(server.endpoint, timeout_s=20.0) as client:
+            assert client.request("hello", request_id="one").ok
+        with ControlClient(server.endpoint, timeout_s=0.2) as client, pytest.raises(ControlError, match="not answer"):
+            client.request("hello", request_id="two")
+        with ControlClient(server.endpoint, timeout_s=20.0) as client:
+            assert client.request("hello", request_id="one").ok  # kept, so nobody asks for the state
+
+
+def _fail() -> str:
+    raise RuntimeError("no state")
+
+
+@pytest.mark.parametrize("result", [{"a": object()}, {"a": {1: {2: set()}, (1, 2): 3}}, {"a": 1 << 70}])
+def test_a_result_that_is_no_json_is_internal(
+    client: ControlClient, commands: FakeCommands, result: dict[str, object]
+) -> None:
+    commands.result = result
+    assert client.request("stats").code in ("INTERNAL", "OK")
+    assert client.request("hello").ok
+
+
+def test_a_result_too_large_is_internal(client: ControlClient, commands: FakeCommands) -> None:
+    commands.result = {"a": "x" * MAX_REPLY}
+    assert client.request("stats").code == "INTERNAL"
+
+
+# Repeats
+
+
+def test_the_same_request_again_is_carried_out_once(client: ControlClient, commands: FakeCommands) -> None:
+    first = client.request("set_view", {"view": "top"}, request_id="same")
+    assert client.request("set_view", {"view": "top"}, request_id="same") == first
+    assert commands.view_rev == 2
+
+
+def test_a_repeat_over_a_new_connection_gets_the_same_reply(server: ControlServer, commands: FakeCommands) -> None:
+    replies: list[Reply] = []
+    for _ in range(2):
+        with ControlClient(server.endpoint, timeout_s=20.0, attempts=1) as client:
+            replies.append(client.request("set_view", {"view": "top"}, request_id="same"))
+    assert replies[0] == replies[1]
+    assert commands.view_rev == 2
+
+
+def test_the_same_id_for_another_request_is_refused(client: ControlClient, commands: FakeCommands) -> None:
+    client.request("set_view", {"view": "top"}, request_id="same")
+    reply = client.request("set_view", {"view": "top", "azimuth_deg": 5.0}, request_id="same")
+    assert reply.code == "BAD_ARG"
+    assert "take a new one" in reply.message
+    assert commands.view_rev == 2
+
+
+def test_one_clients_id_is_not_anothers(commands: FakeCommands) -> None:
+    answers = Answers(commands, lambda: "active", keep_s=60.0)
+    part = wire("hello")
+    replies = [json.loads(answers.answer([part], who, 0).part)["result"] for who in (VIEWER, OPERATOR)]
+    assert replies == [{"role": "viewer"}, {"role": "operator"}]
+
+
+def test_a_client_that_lost_the_reply_asks_again_under_the_same_id(tmp_path: Path, commands: FakeCommands) -> None:
+    endpoint = f"ipc://{tmp_path}/control"
+    with zmq.Context() as context, ControlClient(endpoint, timeout_s=20.0, attempts=40) as client:
+        router = context.socket(zmq.ROUTER)
+        router.bind(endpoint)
+
+        def answer_the_second() -> None:
+            answers = Answers(commands, lambda: "active", keep_s=60.0)
+            replies = [router.recv_multipart() for _ in range(2)]
+            peer, part = replies[1]
+            first = answers.answer([replies[0][1]], OPERATOR, 0).part
+            assert first == answers.answer([part], OPERATOR, 0).part
+            router.send_multipart((peer, first))
+
+        thread = threading.Thread(target=answer_the_second)
+        thread.start()
+        assert client.call("set_view", {"view": "top"}) == {"view_rev": 2}
+        thread.join()
+        router.close(0)
+    assert commands.view_rev == 2
+
+
+def test_replies_are_forgotten_in_time_and_kept_within_bounds() -> None:
+    cache = ReplyCache(60.0, most=3, most_bytes=100)
+    cache.keep("a", b"?", b"1", 0.0)
+    assert cache.find("a", b"?", 59.9) == b"1"
+    assert cache.find("a", b"?", 60.0) is None
+    for i in range(5):
+        cache.keep(i, b"?", b"x", 61.0)
+    assert len(cache) == 3
+    cache.keep("big", b"?", b"x" * 99, 62.0)
+    assert len(cache) == 2
+    assert cache.find("big", b"?", 63.0) == b"x" * 99
+
+
+# Strangers
+
+
+@pytest.mark.parametrize("part", [b"", b"{", b"[]", b"\xff", b"{}" * 2, b"[" * 30_000])
+def test_f16_malformed_json_is_answered_and_the_connection_kept(stranger: Socket, part: bytes) -> None:
+    reply = asked(stranger, part)
+    assert (reply.id, reply.code, reply.state) == ("", "BAD_JSON", "active")
+    assert asked(stranger, wire("hello")).ok
+
+
+def test_f16_another_protocol_is_answered_and_the_connection_kept(stranger: Socket) -> None:
+    reply = asked(stranger, b'{"proto":"gcd/2.0","id":"z","verb":"hello"}')
+    assert (reply.id, reply.code) == ("z", "BAD_PROTO")
+    assert asked(stranger, wire("hello")).ok
+
+
+def test_f16_a_request_in_two_parts_is_refused(stranger: Socket) -> None:
+    assert asked(stranger, b"", wire("hello")).code == "BAD_JSON"
+
+
+def test_f16_a_flood_is_ignored_and_others_are_not(stranger: Socket, client: ControlClient, events: Events) -> None:
+    for _ in range(60):
+        stranger.send(b"{")
+    assert events.wait("CONTROL_FLOOD")["ignored_s"] == 1.0
+    assert client.request("hello").ok
+    while stranger.poll(100):
+        assert decode_reply(stranger.recv()).code == "BAD_JSON"
+    stranger.send(wire("hello", "ignored"))
+    assert not stranger.poll(100)
+    wait_for(lambda: _answered(stranger))
+
+
+def _answered(stranger: Socket) -> bool:
+    stranger.send(wire("hello", "later"))
+    return bool(stranger.poll(100))
+
+
+def test_f16_wrong_arguments_are_no_flood(stranger: Socket, events: Events) -> None:
+    for i in range(60):
+        assert asked(stranger, wire("set_view", str(i), args={"view": "nose"})).code == "UNKNOWN_VIEW"
+    assert events.codes() == []
+
+
+def test_f16_the_guard_counts_each_peer_by_itself_and_only_the_last_second() -> None:
+    guard = FloodGuard(20, 5.0)
+    assert not any(guard.bad(b"slow", 0.06 * i) for i in range(200))
+    assert [guard.bad(b"fast", 0.01 * i) for i in range(21)] == [False] * 20 + [True]
+    assert guard.ignores(b"fast", 5.1)
+    assert not guard.ignores(b"slow", 5.1)
+    assert not guard.ignores(b"fast", 5.21)
+
+
+def test_f16_many_peers_need_no_more_memory() -> None:
+    guard = FloodGuard(20, 5.0, most_peers=8)
+    for i in range(1000):
+        assert not guard.bad(str(i).encode(), 0.0)
+    assert len(guard) == 8
+
+
+def test_f17_an_oversize_request_drops_its_sender_alone(
+    stranger: Socket, client: ControlClient, events: Events, commands: FakeCommands
+) -> None:
+    assert asked(stranger, wire("hello", "before")).ok
+    stranger.send(wire("set_view", "big", args={"view": "top", "pad": "x" * 100_000}))
+    assert events.wait("TOO_LARGE") == {"level": 1, "channel": "control"}
+    assert client.request("hello").ok
+    wait_for(lambda: _answered(stranger))  # it reconnects by itself
+    assert commands.view_rev == 1
+
+
+def test_f17_the_largest_request_allowed_is_answered(stranger: Socket, events: Events) -> None:
+    part = wire("hello", "big")
+    assert asked(stranger, part + b" " * (64 * 1024 - len(part))).ok
+    assert events.codes() == []
+
+
+def test_f17_who_leaves_or_talks_something_else_was_not_too_large(tmp_path: Path, events: Events) -> None:
+    options = ControlOptions(endpoint="tcp://127.0.0.1:0")
+    with ControlServer(options, FakeCommands(), lambda: "active", events) as server:
+        port = int(server.endpoint.rpartition(":")[2])
+        for text in (b"", b"GET / HTTP/1.1\r\n\r\n", b"\xff" * 64):
+            socket.create_connection(("127.0.0.1", port)).sendall(text)
+        for _ in range(3):
+            with ControlClient(server.endpoint, timeout_s=20.0) as client:
+                assert client.request("hello").ok
+        time.sleep(0.3)
+    assert "TOO_LARGE" not in events.codes()
+
+
+def test_f17_the_client_refuses_before_anything_is_sent(client: ControlClient, commands: FakeCommands) -> None:
+    with pytest.raises(ControlError, match="at most 65536 bytes") as caught:
+        client.call("remove_view", {"view": "x" * 70_000})
+    assert caught.value.code == "TOO_LARGE"
+    assert client.request("hello").ok
+    assert [command.verb for command, _ in commands.heard] == ["hello"]
+
+
+def test_f19_control_beyond_this_machine_is_refused(commands: FakeCommands, events: Events) -> None:
+    with pytest.raises(ConfigError, match=r"\[security\] keys and \[security\] allow") as caught:
+        ControlServer(ControlOptions(endpoint="tcp://0.0.0.0:5582"), commands, lambda: "active", events)
+    assert caught.value.exit_code == 78
+
+
+def test_f20_an_endpoint_in_use_is_refused(server: ControlServer, commands: FakeCommands, events: Events) -> None:
+    with pytest.raises(EndpointError, match="in use") as caught:
+        ControlServer(ControlOptions(endpoint=server.endpoint), commands, lambda: "active", events)
+    assert caught.value.exit_code == 73
+
+
+# Life
+
+
+def test_the_runtime_folder_is_made_ours_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, commands: FakeCommands, events: Events
+) -> None:
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
+    with ControlServer(ControlOptions(), commands, lambda: "active", events) as server:
+        assert stat.S_IMODE(os.stat(tmp_path / "run").st_mode) == 0o700
+        with ControlClient(timeout_s=20.0) as client:
+            assert client.endpoint == server.endpoint
+            assert client.request("hello").ok
+
+
+def test_closing_lets_the_last_reply_out_and_leaves_nothing(
+    tmp_path: Path, commands: FakeCommands, events: Events
+) -> None:
+    threads = threading.active_count()
+    server = ControlServer(ControlOptions(endpoint=f"ipc://{tmp_path}/c"), commands, lambda: "active", events)
+    with ControlClient(server.endpoint, timeout_s=20.0) as client:
+        assert client.request("shutdown").ok
+        server.close()
+        server.close()
+    assert not (tmp_path / "c").exists()
+    assert threading.active_count() == threads
+
+
+def test_nobody_there_is_a_control_error(tmp_path: Path) -> None:
+    with (
+        ControlClient(f"ipc://{tmp_path}/nobody", timeout_s=0.1) as client,
+        pytest.raises(ControlError, match=r"is the node running") as caught,
+    ):
+        client.call("hello")
+    assert caught.value.code is None
+
+
+def test_connections_come_and_go_without_a_trace(server: ControlServer) -> None:
+    def handles() -> int:
+        return len(os.listdir("/proc/self/fd"))
+
+    def visit() -> None:
+        with ControlClient(server.endpoint, timeout_s=20.0) as client:
+            assert client.request("hello").ok
+
+    visit()
+    before = handles()
+    for _ in range(20):
+        visit()
+    wait_for(lambda: handles() <= before + 2)
+
+
+def test_codes_are_those_of_the_protocol() -> None:
+    named = (
+        "OK ACCEPTED BAD_JSON BAD_PROTO UNKNOWN_VERB BAD_ARG OUT_OF_RANGE VIEW_FIXED UNKNOWN_VIEW WRONG_STATE BUSY "
+        "FORBIDDEN TOO_LARGE NOT_READY INTERNAL"
+    )
+    assert [code.value for code in Code] == named.split()

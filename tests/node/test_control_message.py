@@ -1,0 +1,269 @@
+"""Requests and replies as bytes: what is read, what is refused, and that nothing else can happen."""
+
+import json
+import random
+
+import msgspec
+import pytest
+
+from gcd_node.control_message import (
+    MAX_REQUEST,
+    Code,
+    Command,
+    Outcome,
+    Reply,
+    Request,
+    RequestError,
+    decode_reply,
+    encode_request,
+    parse_command,
+    parse_request,
+    text_arguments,
+)
+from gcd_node.control_verbs import VERBS, SetParam, SetView, schemas
+from gcd_node.errors import ControlError
+from gcd_node.header import PROTO
+
+IDENTITY = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+EXAMPLES: dict[str, dict[str, object]] = {
+    "set_view": {"view": "top", "kind": "orbit", "azimuth_deg": 10, "rate_deg_s": 5, "amplitude_deg": 30},
+    "remove_view": {"view": "top"},
+    "set_param": {"steps": 5, "guidance": [1, 1.5], "seed": 7, "publish": "jpeg", "jpeg_quality": 80},
+}
+
+
+def wire(verb: str, args: object = None, **more: object) -> bytes:
+    return json.dumps({"proto": PROTO, "id": "a1", "verb": verb, "args": args or {}, **more}).encode()
+
+
+def read(part: bytes) -> Command:
+    return parse_command(parse_request(part))
+
+
+def refused(part: bytes) -> RequestError:
+    with pytest.raises(RequestError) as caught:
+        read(part)
+    return caught.value
+
+
+# Laws
+
+
+@pytest.mark.parametrize("verb", sorted(VERBS))
+def test_every_verb_is_read_as_its_own_struct(verb: str) -> None:
+    command = read(wire(verb, EXAMPLES.get(verb)))
+    assert command.verb == verb
+    assert type(command.args) is VERBS[verb].arguments
+
+
+@pytest.mark.parametrize("verb", sorted(VERBS))
+def test_every_verb_refuses_an_argument_it_does_not_know(verb: str) -> None:
+    error = refused(wire(verb, {**EXAMPLES.get(verb, {}), "viewz": 1}))
+    assert (error.code, error.request_id) == ("BAD_ARG", "a1")
+    assert "viewz" in str(error)
+
+
+def test_a_request_survives_the_way_there() -> None:
+    request = Request(proto=PROTO, id="x", verb="remove_view", args=msgspec.Raw(b'{"view":"a"}'), if_view_rev=3)
+    back = parse_request(encode_request(request))
+    assert (back.id, back.verb, bytes(back.args), back.if_view_rev) == ("x", "remove_view", b'{"view":"a"}', 3)
+
+
+def test_a_reply_survives_the_way_back() -> None:
+    reply = Reply(id="x", ok=True, code=Code.ACCEPTED, message="", state="active", result={"view_rev": 2})
+    assert decode_reply(msgspec.json.encode(reply)) == reply
+
+
+def test_a_newer_nodes_reply_may_say_more() -> None:
+    reply = {"proto": "gcd/1.7", "id": "x", "ok": True, "code": "OK", "message": "", "state": "active", "new": 1}
+    assert decode_reply(json.dumps(reply).encode()).ok
+
+
+@pytest.mark.parametrize("part", [b"", b"[]", b"{}", b"\xff", b'{"proto":"gcd/2.0"}', b"[" * 5000])
+def test_what_is_no_reply_is_a_control_error(part: bytes) -> None:
+    with pytest.raises(ControlError, match="no reply of a gcd node"):
+        decode_reply(part)
+
+
+@pytest.mark.parametrize("code", list(Code))
+def test_only_done_and_begun_are_ok(code: Code) -> None:
+    assert Outcome(code=code).ok is (code in (Code.OK, Code.ACCEPTED))
+
+
+def test_every_looking_verb_is_a_viewers_and_every_other_an_operators() -> None:
+    looking = {"hello", "describe", "state", "stats", "time", "views", "get_config", "get_calib"}
+    assert {name for name, verb in VERBS.items() if verb.role == "viewer"} == looking
+    assert len(VERBS) == 18
+
+
+# What is refused, and how it is said
+
+
+@pytest.mark.parametrize("part", [b"", b"{", b"[]", b"1", b"\xff\xfe", b"[" * 30_000, b'{"a":' + b"[" * 30_000, b"nul"])
+def test_f16_malformed_json_is_bad_json(part: bytes) -> None:
+    assert refused(part).code == "BAD_JSON"
+
+
+@pytest.mark.parametrize("proto", ["gcd/2.0", "gcd/0.9", "", "GCD/1.0", None, 1, "gcd/1.0\n"])
+def test_f16_another_protocol_is_bad_proto_and_keeps_the_id(proto: object) -> None:
+    error = refused(json.dumps({"proto": proto, "id": "a1", "verb": "hello"}).encode())
+    assert (error.code, error.request_id) == ("BAD_PROTO", "a1")
+
+
+def test_f16_a_request_without_protocol_is_bad_proto() -> None:
+    assert refused(b'{"id":"a1","verb":"hello"}').code == "BAD_PROTO"
+
+
+@pytest.mark.parametrize("request_id", ["", "a b", "x" * 65, "a\n", 7, None, ["a"], "é"])
+def test_an_id_is_short_and_printable(request_id: object) -> None:
+    error = refused(json.dumps({"proto": PROTO, "id": request_id, "verb": "hello"}).encode())
+    assert (error.code, error.request_id) == ("BAD_ARG", "")
+
+
+def test_a_misspelt_key_of_the_request_is_not_overlooked() -> None:
+    error = refused(wire("activate", dryrun=True))
+    assert error.code == "BAD_ARG"
+    assert "did you mean dry_run?" in str(error)
+
+
+def test_f14_an_unknown_verb_names_the_nearest() -> None:
+    error = refused(wire("set_veiw"))
+    assert error.code == "UNKNOWN_VERB"
+    assert "did you mean set_view?" in str(error)
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        ({}, "missing required field `view`"),
+        ({"view": "Top"}, "`view`"),
+        ({"view": "top\n"}, "`view`"),
+        ({"view": "top", "azimut_deg": 1}, "did you mean azimuth_deg?"),
+        ({"view": "top", "azimuth_deg": "30"}, "Expected `float | null`, got `str` - at `azimuth_deg`"),
+        ({"view": "top", "azimuth_deg": None}, "'azimuth_deg' is null"),
+        ({"view": "top", "kind": "spiral"}, "`kind`"),
+        ({"view": "top", "T_src_dst": IDENTITY[:15]}, "length >= 16"),
+        ({"view": "top", "T_src_dst": IDENTITY, "radius": 1}, "state one of the two"),
+        ({"view": "top", "source_from_view": IDENTITY}, "unknown argument 'source_from_view'"),
+        ({"view": "top", "kind": "orbit"}, "rate_deg_s and amplitude_deg"),
+        ({"view": "top", "rate_deg_s": 3}, "fixed view"),
+        ([], "Expected `object`, got `array`"),
+    ],
+)
+def test_f14_a_wrong_argument_is_bad_arg_and_says_what_is_wanted(args: object, says: str) -> None:
+    part = json.dumps({"proto": PROTO, "id": "a1", "verb": "set_view", "args": args}).encode()
+    error = refused(part)
+    assert error.code == "BAD_ARG"
+    assert says in str(error)
+
+
+@pytest.mark.parametrize("number", [b"NaN", b"Infinity", b"1e999", b"-1e999"])
+def test_f14_a_number_that_is_none_is_refused(number: bytes) -> None:
+    part = wire("set_view", {"view": "top", "azimuth_deg": 1}).replace(b'_deg": 1', b'_deg": ' + number)
+    assert refused(part).code in ("BAD_ARG", "BAD_JSON")
+
+
+@pytest.mark.parametrize(
+    ("args", "arg", "allowed"),
+    [
+        ({"steps": 0}, "steps", [1, 1000]),
+        ({"steps": 1001}, "steps", [1, 1000]),
+        ({"jpeg_quality": 49}, "jpeg_quality", [50, 100]),
+        ({"seed": -1}, "seed", [0, 2**53 - 1]),
+        ({"seed": 2**53}, "seed", [0, 2**53 - 1]),
+        ({"guidance": [1.0, -0.5]}, "guidance", [0, 100]),
+    ],
+)
+def test_f14_out_of_range_gives_the_allowed_interval(args: dict[str, object], arg: str, allowed: list[int]) -> None:
+    error = refused(wire("set_param", args))
+    assert (error.code, error.result) == ("OUT_OF_RANGE", {"arg": arg, "allowed": allowed})
+
+
+def test_a_limit_on_one_side_is_null_on_the_other() -> None:
+    args = {"view": "a", "kind": "orbit", "rate_deg_s": 1, "amplitude_deg": 0}
+    assert refused(wire("set_view", args)).result == {"arg": "amplitude_deg", "allowed": [0, None]}
+
+
+def test_setting_no_parameter_is_refused() -> None:
+    assert "nothing to change" in str(refused(wire("set_param")))
+
+
+def test_if_view_rev_goes_with_a_view_alone() -> None:
+    assert read(wire("remove_view", {"view": "a"}, if_view_rev=2)).if_view_rev == 2
+    assert "names no view" in str(refused(wire("activate", if_view_rev=2)))
+
+
+def test_f17_the_client_refuses_what_is_too_large() -> None:
+    args = msgspec.Raw(b'{"view":"' + b"a" * MAX_REQUEST + b'"}')
+    with pytest.raises(RequestError) as caught:
+        encode_request(Request(proto=PROTO, id="x", verb="remove_view", args=args))
+    assert caught.value.code == "TOO_LARGE"
+
+
+# Views and schemas
+
+
+def test_set_view_replaces_the_whole_view() -> None:
+    args = read(wire("set_view", {"view": "top", "azimuth_deg": 30})).args
+    assert isinstance(args, SetView)
+    view = args.to_config()
+    assert (view.kind, view.azimuth_deg, view.elevation_deg, view.radius) == ("fixed", 30.0, 0.0, 0.0)
+
+
+def test_set_view_takes_a_rigid_pose() -> None:
+    args = read(wire("set_view", {"view": "top", "T_src_dst": IDENTITY})).args
+    assert isinstance(args, SetView)
+    assert args.source_from_view == tuple(IDENTITY)
+
+
+def test_integers_are_numbers_too() -> None:
+    args = read(wire("set_param", {"guidance": [1, 2]})).args
+    assert isinstance(args, SetParam)
+    assert args.guidance == (1.0, 2.0)
+
+
+def test_schemas_are_plain_json_and_small() -> None:
+    text = msgspec.json.encode(schemas())
+    assert set(json.loads(text)) == set(VERBS)
+    assert b"T_src_dst" in text
+    assert len(text) < 32 * 1024
+
+
+def test_text_arguments_are_known() -> None:
+    assert text_arguments("set_view") == {"view", "kind"}
+    assert text_arguments("set_param") == {"publish"}
+    assert text_arguments("nonsense") == frozenset()
+
+
+# Anything at all
+
+
+def mutated(part: bytes, rng: random.Random) -> bytes:
+    """A few bytes replaced, removed, doubled or inserted."""
+    data = bytearray(part)
+    for _ in range(rng.randint(1, 6)):
+        at = rng.randrange(len(data) + 1)
+        action = rng.randrange(4)
+        if action == 0:
+            data[at : at + 1] = bytes([rng.randrange(256)])
+        elif action == 1:
+            del data[at : at + rng.randint(1, 8)]
+        elif action == 2:
+            data[at:at] = data[at : at + rng.randint(1, 40)]
+        else:
+            data[at:at] = rng.choice([b"null", b"[", b"{", b'"', b"1e999", b"-0", b"\\ud800", b"\x00", b"9" * 400])
+    return bytes(data)
+
+
+def test_mutated_requests_end_as_commands_or_documented_errors() -> None:
+    rng = random.Random(4)
+    examples = [wire(verb, EXAMPLES.get(verb), dry_run=True) for verb in VERBS]
+    codes: set[str | None] = set()
+    for _ in range(5000):
+        try:
+            codes.add(read(mutated(rng.choice(examples), rng)).verb)
+        except RequestError as error:
+            codes.add(error.code)
+            msgspec.json.encode(Reply(id=error.request_id, ok=False, code=error.reason, message=str(error), state=""))
+    assert {"BAD_JSON", "BAD_PROTO", "BAD_ARG", "UNKNOWN_VERB"} <= codes
+    assert codes & set(VERBS)

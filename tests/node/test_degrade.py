@@ -1,0 +1,102 @@
+from itertools import pairwise
+
+import pytest
+
+from gcd_node.degrade import WHOLE, Ladder, rungs
+from gcd_node.idle import IdleRule
+from gcd_node.wall_clock import WallClock
+
+
+class Hand:
+    """A clock that a test sets; seconds when called."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+    def nanoseconds(self) -> int:
+        return round(self.now * 1e9)
+
+
+def test_each_rung_keeps_what_the_ones_before_it_gave_up() -> None:
+    way = rungs(views=2, samples=2, steps=10, can_halve=True)
+    assert way[0] is WHOLE
+    assert [rung.name for rung in way[1:]] == ["views one by one", "bfloat16", "half the steps", "a single view"]
+    for upper, lower in pairwise(way):
+        assert lower.one_by_one >= upper.one_by_one
+        assert lower.half >= upper.half
+        assert lower.steps_divisor >= upper.steps_divisor
+        assert lower.single >= upper.single
+
+
+def test_rungs_that_would_change_nothing_are_left_out() -> None:
+    assert rungs(views=1, samples=1, steps=1, can_halve=False) == (WHOLE,)
+    assert [rung.name for rung in rungs(views=1, samples=1, steps=8, can_halve=False)] == ["as asked", "half the steps"]
+
+
+def test_only_three_failures_within_a_minute_at_the_bottom_are_the_end() -> None:
+    clock = Hand()
+    ladder = Ladder(rungs(views=2, samples=1, steps=1, can_halve=False), clock)
+    assert ladder.step_down()
+    assert ladder.step_down()
+    assert ladder.degraded
+    assert ladder.rung.single
+    for clock.now in (0.0, 31.0, 62.0):
+        assert ladder.step_down()
+    clock.now = 90.0
+    assert not ladder.step_down()
+
+
+def test_a_ladder_of_one_rung_fails_after_three() -> None:
+    ladder = Ladder((WHOLE,), Hand())
+    assert [ladder.step_down() for _ in range(3)] == [True, True, False]
+    assert ladder.rung is WHOLE
+    assert not ladder.degraded
+
+
+def test_a_node_rests_only_after_nobody_has_watched_for_long_enough() -> None:
+    clock = Hand()
+    rule = IdleRule(2.0, clock)
+    told = []
+    for clock.now, subscribers in ((0.0, 0), (1.9, 0), (2.1, 0), (2.2, 1), (4.1, 0), (4.3, 0)):
+        told.append(rule.rests(subscribers))
+    assert told == [False, False, True, False, False, True]
+
+
+def test_a_node_without_patience_never_rests() -> None:
+    clock = Hand()
+    rule = IdleRule(0.0, clock)
+    clock.now = 1e6
+    assert not rule.rests(0)
+
+
+@pytest.mark.parametrize(("step_s", "seen"), [(0.05, None), (-0.05, None), (3600.0, 3_600_000.0), (-2.0, -2000.0)])
+def test_a_clock_that_was_set_is_noticed_once(step_s: float, seen: float | None) -> None:
+    utc, monotonic = Hand(), Hand()
+    wall = WallClock(utc.nanoseconds, monotonic.nanoseconds)
+    utc.now = monotonic.now = 5.0
+    assert wall.step_ms() is None
+    utc.now += step_s
+    assert wall.step_ms() == seen
+    assert wall.step_ms() is None
+
+
+def test_a_clock_that_is_slewed_is_not_set() -> None:
+    utc, monotonic = Hand(), Hand()
+    wall = WallClock(utc.nanoseconds, monotonic.nanoseconds)
+    for _ in range(100):
+        monotonic.now += 1.0
+        utc.now += 1.01
+        assert wall.step_ms() is None
+
+
+def test_a_look_that_was_interrupted_is_not_trusted() -> None:
+    utc = Hand()
+    looks = iter([0, 0, 0, 400_000_000, 500_000_000, 500_000_000])
+    wall = WallClock(utc.nanoseconds, lambda: next(looks))
+    utc.now = 0.4
+    assert wall.step_ms() is None
+    utc.now = 0.5
+    assert wall.step_ms() is None

@@ -1,0 +1,610 @@
+"""Each row of the failure table as a test named after it, through real sockets; F16 to F19 are with control."""
+
+import os
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cameras import FPS, Bench, Camera, until
+from fakes import HEIGHT, WIDTH, FakeSource, FakeSynthesizer, traits
+from rig import Rig
+from wire_messages import start_reader
+
+import gcd_node
+from gcd_model import (
+    DeviceMemoryError,
+    NonFiniteError,
+    RenderOptions,
+    SourceFeatures,
+    Trajectory,
+    View,
+    ViewSynthesizer,
+)
+from gcd_node.config import ModelSection
+from gcd_node.control_message import Code
+from gcd_node.errors import ConfigError, SourceLostError, TooShortError
+from gcd_node.frame import Frame
+from gcd_node.session import load_model
+from gcd_node.sources import open_source
+from gcd_node.subscriber import ViewSubscriber
+from gcd_node.systemd import ServiceManager
+
+WAITING = "life = {autostart = false}"
+LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
+REALTIME = 'kind = "synthetic"\npace = "realtime"'
+TWO_VIEWS = "[view.main]\nazimuth_deg = 10.0\n[view.other]\nazimuth_deg = -10.0"
+SLACK_S = 3.0  # what a machine that does other things may add
+START_S = 300.0  # the same for starting or ending a process; shorter than a model hangs
+
+starts_a_process = pytest.mark.timeout(2 * START_S)
+
+
+class Steady(FakeSource):
+    """Frames at their rhythm until it is closed."""
+
+    def __init__(self, period_s: float = 0.002) -> None:
+        super().__init__(10_000_000)
+        self.period_s = period_s
+
+
+def command(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "gcd_node", *arguments]
+
+
+def environment() -> dict[str, str]:
+    tests = str(Path(__file__).parent)
+    return os.environ | {"PYTHONPATH": f"{Path(gcd_node.__file__).parent.parent}:{tests}:{os.environ['PYTHONPATH']}"}
+
+
+# F1, F2: a camera that goes, and one that is not there.
+
+
+def test_f01_a_camera_that_falls_silent_stalls_is_lost_and_comes_back_in_a_new_epoch(tmp_path: Path) -> None:
+    first, bench = Camera(), Bench()
+    bench.plug(first)
+    with Rig(tmp_path, bench) as rig:
+        rig.await_state("active")
+        first.run(20)
+        silent_s = first.last_s
+        rig.await_views(1)
+        rig.await_event("SRC_STALLED")
+        stalled_s = time.monotonic() - silent_s
+        warned = rig.await_status(lambda status: "SRC_STALLED" in status["reasons"])
+        rig.await_event("SRC_LOST")
+        lost_s = time.monotonic() - silent_s
+        failed = rig.await_status(lambda status: "SRC_LOST" in status["reasons"])
+        shown = len(rig.of())
+        assert rig.node.state.label == "active"
+        second = bench.plug(Camera())
+        until(lambda: second in bench.opened)
+        assert len(rig.of()) == shown  # nothing is ever repeated
+        second.run(30)
+        rig.await_event("SRC_BACK")
+        view = rig.await_views(shown + 1)[shown]
+    assert 0.2 <= stalled_s <= 0.2 + SLACK_S
+    assert stalled_s < lost_s <= 2.0 + SLACK_S
+    assert (warned["level"], warned["source"]["state"]) == (1, "stalled")
+    assert (failed["level"], failed["source"]["state"]) == (2, "lost")
+    assert view.header.src.epoch == 1
+    assert view.header.src.seq == tuple(range(14))  # of the second camera alone: the six frames left over are gone
+    assert rig.statuses()[-1]["source"]["reconnects"] == 1
+
+
+def test_f01_a_camera_that_does_not_come_back_is_given_up_with_exit_75(tmp_path: Path) -> None:
+    camera = Camera()
+    with Rig(tmp_path, Bench(camera), config='kind = "v4l2"\nmax_reconnects = 1') as rig:
+        rig.await_state("active")
+        camera.run(15)
+        rig.await_views(1)
+        camera.feed(SourceLostError("unplugged"))
+        rig.await_state("finalized")
+        until(lambda: rig.ended == {"win"})
+    assert isinstance(rig.failure, SourceLostError)
+    assert rig.failure.exit_code == 75
+
+
+def test_f02_without_a_camera_the_node_stays_inactive_and_says_which_there_are(tmp_path: Path) -> None:
+    bench = Bench()
+    with Rig(tmp_path, bench, more=WAITING) as rig:
+        rig.ask("configure")
+        rig.await_state("inactive")
+        assert rig.ask("activate").code is Code.ACCEPTED
+        told = rig.await_event("NOT_READY")
+        rig.await_state("inactive")
+        assert told["verb"] == "activate"
+        assert "there are: none" in told["message"]
+        bench.plug(Camera())
+        rig.ask("activate")
+        rig.await_state("active")
+
+
+def test_f02_a_node_that_starts_by_itself_takes_the_camera_once_it_is_there(tmp_path: Path) -> None:
+    bench = Bench()
+    with Rig(tmp_path, bench) as rig:
+        rig.await_event("NOT_READY")
+        camera = bench.plug(Camera())
+        rig.await_state("active")
+        camera.run(15)
+        rig.await_views(1)
+
+
+@starts_a_process
+def test_f02_check_ends_with_69_without_a_camera(tmp_path: Path) -> None:
+    launch = tmp_path / "launch.toml"
+    launch.write_text(f"""
+        [source]
+        kind = "v4l2"
+        device = "/dev/video-none"
+        [model]
+        weights = "random:driving"
+        [view.main]
+        [publish]
+        data = "ipc://{tmp_path}/data"
+        status = "ipc://{tmp_path}/status"
+        [control]
+        endpoint = "ipc://{tmp_path}/control"
+    """)
+    done = subprocess.run(command("check", str(launch)), capture_output=True, text=True, timeout=START_S)
+    assert done.returncode == 69, done.stderr
+    assert "/dev/video-none" in done.stderr
+
+
+# F3, F4: frames that are damaged, missing, or out of time.
+
+
+def test_f03_damaged_frames_are_counted_and_a_gap_rejects_its_window(tmp_path: Path) -> None:
+    camera = Camera()
+    with Rig(tmp_path, Bench(camera)) as rig:
+        rig.await_state("active")
+        period_ns, start_ns = round(1e9 / FPS), time.monotonic_ns()
+        for i in range(36):
+            if i in (5, 6, 7):
+                camera.corrupt += 1  # three arrive damaged and are not yielded
+            else:
+                camera.shoot(stamp_ns=start_ns + i * period_ns)
+            time.sleep(1 / FPS)
+        told = rig.await_event("WIN_GAP")
+        view = rig.await_views(1)[0]
+        until(lambda: rig.statuses()[-1]["source"]["corrupt"] == 3)
+    assert told["level"] == 1
+    assert view.header.src.seq == tuple(range(5, 19))  # the camera's own numbers: none for what never came
+    assert all(status["level"] < 2 for status in rig.statuses())
+
+
+def test_f03_many_damaged_frames_are_a_warning(tmp_path: Path) -> None:
+    camera = Camera()
+    with Rig(tmp_path, Bench(camera)) as rig:
+        rig.await_state("active")
+        for _ in range(20):
+            camera.corrupt += 1
+            camera.run(1)
+        status = rig.await_status(lambda status: "SRC_CORRUPT" in status["reasons"])
+    assert status["level"] == 1
+
+
+def test_f04_frames_that_do_not_rise_are_dropped_and_a_step_begins_a_new_epoch(tmp_path: Path) -> None:
+    camera = Camera()
+    with Rig(tmp_path, Bench(camera)) as rig:
+        rig.await_state("active")
+        period_ns, start_ns = round(1e9 / FPS), time.monotonic_ns()
+        stamps = [start_ns + i * period_ns for i in range(14)]
+        stamps[5:5] = [stamps[4], stamps[3]]  # one again, and one that steps back
+        stamps += [start_ns - 5_000_000_000 + i * period_ns for i in range(15)]
+        for stamp_ns in stamps:
+            camera.shoot(stamp_ns=stamp_ns)
+            time.sleep(0.5 / FPS)
+        before, after = rig.await_views(2)[:2]
+        rig.await_event("CLOCK_STEP")
+    assert before.header.src.seq == (*range(5), *range(7, 16))
+    assert (before.header.src.dropped, before.header.src.epoch) == (2, 0)
+    assert after.header.src.epoch == 1
+
+
+# F5 to F8: recordings and rates.
+
+
+def test_f05_at_the_end_of_a_file_everything_whole_is_published_and_every_view_ends(tmp_path: Path) -> None:
+    with Rig(tmp_path, lambda _: FakeSource(30), config=LOCKSTEP, views=TWO_VIEWS, once=True) as rig:
+        rig.await_event("SRC_ENDED")
+        rig.await_state("finalized")
+        until(lambda: rig.ended == {"win"})
+    assert [len(rig.of(name)) for name in ("main", "other")] == [2, 2]
+    assert rig.failure is None
+    assert "inactive" in [status["state"] for status in rig.statuses()]
+
+
+def test_f05_a_file_shorter_than_a_window_is_exit_65(tmp_path: Path) -> None:
+    with Rig(tmp_path, lambda _: FakeSource(13), config=LOCKSTEP, once=True) as rig:
+        assert "n=13" in rig.await_event("TOO_SHORT")["message"]
+        rig.await_state("finalized")
+    assert isinstance(rig.failure, TooShortError)
+    assert rig.failure.exit_code == 65
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no video at all" * 100])
+def test_f06_a_file_that_cannot_be_decoded_is_refused_and_named(content: bytes | None, tmp_path: Path) -> None:
+    path = tmp_path / "clip.mp4"
+    if content is not None:
+        path.write_bytes(content)
+    config = f'path = "{path}"\npace = "lockstep"'
+    with Rig(tmp_path, open_source, config=config, more=WAITING) as rig:
+        started_s = time.monotonic()
+        assert rig.ask("configure").code is Code.ACCEPTED
+        told = rig.await_event("BAD_ARG")
+        assert time.monotonic() - started_s < 2.0 + SLACK_S
+        rig.await_state("unconfigured")
+    assert told["verb"] == "configure"
+    assert "clip.mp4" in told["message"]
+
+
+def test_f07_another_picture_size_begins_a_new_epoch(tmp_path: Path) -> None:
+    camera = Camera(size=(192, 128))
+    with Rig(tmp_path, Bench(camera)) as rig:
+        rig.await_state("active")
+        camera.run(10)
+        start_ns = time.monotonic_ns()
+        for i in range(16):
+            image = np.full((200, 300, 3), 20 + i, np.uint8)
+            camera.shoot(image, stamp_ns=start_ns + round(i * 1e9 / FPS))
+            time.sleep(1 / FPS)
+        rig.await_event("SRC_FORMAT")
+        view = rig.await_views(1)[0]
+    assert (view.header.src.epoch, view.header.src.seq[0]) == (1, 10)
+    assert view.header.shape == (14, HEIGHT, WIDTH, 3)
+
+
+def test_f07_pictures_too_small_are_refused_unless_they_may_be_enlarged(tmp_path: Path) -> None:
+    for allowed in (False, True):
+        camera, folder = Camera(size=(48, 32)), tmp_path / str(allowed)
+        folder.mkdir()
+        with Rig(folder, Bench(camera), config=f'kind = "v4l2"\nallow_upscale = {str(allowed).lower()}') as rig:
+            if allowed:
+                rig.await_state("active")
+            else:
+                assert "allow_upscale" in rig.await_event("BAD_ARG")["message"]
+
+
+def test_f08_a_rate_below_the_trained_ones_is_flagged_and_refused_when_strict(tmp_path: Path) -> None:
+    for strict in (False, True):
+        folder = tmp_path / str(strict)
+        folder.mkdir()
+        source = FakeSource(14, fps=4.0)
+        with Rig(
+            folder, lambda _, s=source: s, config=LOCKSTEP, more=f"strict = {str(strict).lower()}", once=True
+        ) as rig:
+            rig.await_state("finalized")
+        if strict:
+            assert isinstance(rig.failure, ConfigError)
+            assert rig.views == []
+        else:
+            assert "fps" in rig.views[0].header.quality.ood
+            assert "fps" in [reason for status in rig.statuses() for reason in status["reasons"]]
+            assert max(status["level"] for status in rig.statuses()) == 1
+
+
+# F9, F10: readers that are slow, and none at all.
+
+
+@starts_a_process
+def test_f09_a_stalled_reader_disturbs_nobody(tmp_path: Path) -> None:
+    with Rig(tmp_path, lambda _: Steady(), config=REALTIME, keep=False) as rig:
+        reader = start_reader(f"ipc://{tmp_path}/data", "main")
+        try:
+            assert reader.stdout is not None
+            assert reader.stdout.readline()
+            reader.send_signal(signal.SIGSTOP)
+            begun, before_kb = len(rig.of()), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            rig.await_views(begun + 60)  # 15 MB
+            after_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            reader.send_signal(signal.SIGCONT)
+            newest = rig.of()[-1].header.window_id
+            seen = [int(reader.stdout.readline().split()[0]) for _ in range(5)]
+        finally:
+            reader.kill()
+            reader.communicate()
+        healthy = rig.of()[begun : begun + 60]
+    assert sum(view.skipped for view in healthy) == 0
+    assert sorted(view.age_ms for view in healthy)[30] < 50 + 1000 * SLACK_S
+    assert after_kb - before_kb < 64 * 1024
+    assert max(seen) >= newest  # it did not have to work off what it had slept through
+
+
+def test_f10_without_a_reader_nothing_is_rendered_until_one_comes(tmp_path: Path) -> None:
+    with Rig(tmp_path, lambda _: Steady(), config=REALTIME, more="life = {idle_s = 0.2}", watched=False) as rig:
+        rig.await_status(lambda status: "IDLE" in status["reasons"])
+        model = rig.model
+        assert isinstance(model, FakeSynthesizer)
+        asked, built = len(model.asked), rig.statuses()[-1]["window"]["built"]
+        rig.await_status(lambda status: status["window"]["built"] > built + 5)
+        assert len(model.asked) == asked
+        assert rig.statuses()[-1]["level"] == 0
+        with ViewSubscriber(f"ipc://{tmp_path}/data", "main") as views:
+            assert views.receive(20_000) is not None
+        until(lambda: "IDLE" not in rig.statuses()[-1]["reasons"])
+
+
+# F11 to F13: a model in trouble, and input it should not trust.
+
+
+class Narrow(FakeSynthesizer):
+    """A model whose device holds one view at a time."""
+
+    def render(
+        self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
+    ) -> list[View]:
+        if len(trajectories) > 1:
+            raise DeviceMemoryError("no room for two")
+        return super().render(features, trajectories, options)
+
+
+def test_f11_a_full_device_is_asked_for_less_and_goes_on(tmp_path: Path) -> None:
+    with Rig(tmp_path, lambda _: Steady(), Narrow(traits()), config=LOCKSTEP, views=TWO_VIEWS) as rig:
+        rig.await_views(2, "other")
+        told = rig.await_event("GPU_OOM")
+        status = rig.await_status(lambda status: status["model"]["state"] == "degraded")
+        assert len(rig.await_views(2)) >= 2
+    assert told["rung"] == "views one by one"
+    assert len(rig.events("GPU_OOM")) == 1
+    assert (status["level"], status["model"]["oom_count"]) == (1, 1)
+
+
+def test_f11_a_model_that_never_finds_memory_fails_and_the_node_stays(tmp_path: Path) -> None:
+    def full(_: RenderOptions) -> None:
+        raise DeviceMemoryError("out of memory")
+
+    with Rig(tmp_path, lambda _: Steady(), FakeSynthesizer(traits(), full), config=LOCKSTEP) as rig:
+        rig.await_event("MODEL_FAILED")
+        rig.await_state("inactive")
+        status = rig.await_status(lambda status: "MODEL_FAILED" in status["reasons"] and status["state"] == "inactive")
+        assert rig.ask("state").code is Code.OK
+        assert rig.ask("activate").code is Code.NOT_READY
+        assert rig.ask("cleanup").code is Code.ACCEPTED
+        rig.await_state("unconfigured")
+    assert (status["level"], status["model"]["state"]) == (2, "failed")
+    assert rig.views == []
+    assert rig.failure is None
+
+
+def test_f12_pictures_that_are_no_numbers_are_never_published(tmp_path: Path) -> None:
+    seeds: list[int] = []
+
+    def broken(options: RenderOptions) -> None:
+        seeds.append(options.seed)
+        raise NonFiniteError("NaN")
+
+    with Rig(tmp_path, lambda _: Steady(), FakeSynthesizer(traits(), broken), config=LOCKSTEP) as rig:
+        rig.await_event("MODEL_FAILED")
+        rig.await_state("inactive")
+        told = rig.events("MODEL_NAN")
+    assert [event["window_id"] for event in told] == [0, 1, 2]
+    assert [seed for event in told for seed in event["seeds"]] == seeds
+    assert len(set(seeds)) == 6  # one retry each, with another seed
+    assert told[0]["seq"] == [0, 13]
+    assert rig.views == []
+
+
+@pytest.mark.parametrize(("level", "flags"), [(0, {"exposure", "static"}), (255, {"exposure", "static"})])
+def test_f13_an_input_without_a_picture_is_published_and_flagged(level: int, flags: set[str], tmp_path: Path) -> None:
+    class Covered(FakeSource):
+        def frames(self) -> Iterator[Frame]:
+            for frame in super().frames():
+                yield replace(frame, image=np.full_like(frame.image, level))
+
+    with Rig(tmp_path, lambda _: Covered(14), config=LOCKSTEP, once=True) as rig:
+        rig.await_state("finalized")
+    assert set(rig.views[0].header.quality.ood) == flags
+
+
+# F14, F15: commands about views.
+
+
+def test_f14_an_impossible_view_is_refused_with_what_is_allowed_and_nothing_changes(tmp_path: Path) -> None:
+    with Rig(tmp_path, Bench(), more=WAITING) as rig:
+        rig.ask("configure")
+        rig.await_state("inactive")
+        before = rig.ask("views").result
+        beyond = rig.ask("set_view", view="main", azimuth_deg=95.0)
+        assert beyond.code is Code.OUT_OF_RANGE
+        assert beyond.result is not None
+        allowed = beyond.result["allowed"]
+        assert isinstance(allowed, dict)
+        assert allowed["azimuth_deg"] == [-90.0, 90.0]
+        swing = {"kind": "orbit", "rate_deg_s": 5.0, "amplitude_deg": 120.0}
+        assert rig.ask("set_view", swing, view="main").code is Code.OUT_OF_RANGE
+        assert rig.ask("set_view", view="mian", azimuth_deg=5.0).code is Code.UNKNOWN_VIEW
+        assert rig.ask("set_view", view="main", azimut_deg=5.0).code is Code.BAD_ARG
+        assert rig.ask("views").result == before
+
+
+def test_f14_a_model_with_one_fixed_view_says_so(tmp_path: Path) -> None:
+    with Rig(tmp_path, Bench(), FakeSynthesizer(traits("driving")), views="[view.main]", more=WAITING) as rig:
+        rig.ask("configure")
+        rig.await_state("inactive")
+        assert rig.ask("set_view", view="main", azimuth_deg=5.0).code is Code.VIEW_FIXED
+        assert rig.ask("set_view", view="main", T_src_dst=np.eye(4).ravel().tolist()).code is Code.VIEW_FIXED
+
+
+def test_f15_a_window_in_work_keeps_the_view_it_was_begun_with(tmp_path: Path) -> None:
+    begun, go_on = threading.Semaphore(0), threading.Semaphore(0)
+
+    def step(options: RenderOptions) -> None:
+        begun.release()
+        assert go_on.acquire(timeout=30)
+
+    with Rig(tmp_path, lambda _: Steady(), FakeSynthesizer(traits(), step), config=LOCKSTEP) as rig:
+        assert begun.acquire(timeout=30)
+        assert rig.ask("set_view", view="main", azimuth_deg=-30.0).code is Code.OK
+        go_on.release(1000)
+        first, second = rig.await_views(2)[:2]
+    assert [view.header.view_rev for view in (first, second)] == [1, 2]
+    poses = [view.header.pose[-1].az_deg for view in (first, second) if view.header.pose]
+    assert poses == [10.0, -30.0]
+
+
+# F20 to F25: the process and its surroundings.
+
+
+@starts_a_process
+def test_f20_an_endpoint_in_use_is_refused_and_a_dead_ones_file_is_cleared_away(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(str(tmp_path / "data"))  # closed below without being unlinked, as after a kill
+    with Rig(tmp_path, lambda _: Steady(), config=LOCKSTEP) as rig:
+        rig.await_views(1)
+        launch = tmp_path / "second.toml"
+        launch.write_text(f"""
+            [source]
+            kind = "synthetic"
+            [model]
+            weights = "random:driving"
+            [view.main]
+            [publish]
+            data = "ipc://{tmp_path}/data"
+            status = "ipc://{tmp_path}/other"
+        """)
+        done = subprocess.run(command("run", str(launch)), capture_output=True, text=True, timeout=START_S)
+        assert done.returncode == 73, done.stderr
+        assert f"{tmp_path}/data" in done.stderr
+        rig.await_views(len(rig.of()) + 1)  # whoever was first goes on
+
+
+def test_f21_a_model_that_hangs_is_an_error_and_the_watchdog_is_not_fed(tmp_path: Path) -> None:
+    stuck = threading.Event()
+
+    def hang(options: RenderOptions) -> None:
+        stuck.wait(60)
+
+    address = str(tmp_path / "notify")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind(address)
+        listener.setblocking(False)
+        service = ServiceManager({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "200000"})
+        model, more = FakeSynthesizer(traits(), hang), "life = {hang_s = 0.5}"
+        with Rig(tmp_path, lambda _: Steady(), model, config=LOCKSTEP, more=more, service=service) as rig:
+            rig.await_event("MODEL_HUNG")
+            status = rig.await_status(lambda status: "MODEL_HUNG" in status["reasons"])
+            heard_of(listener)
+            rig.await_status(lambda later: later["heartbeat_seq"] >= status["heartbeat_seq"] + 2)
+            assert "WATCHDOG=1" not in heard_of(listener)
+            assert rig.ask("state").code is Code.OK
+            stuck.set()
+            until(lambda: "MODEL_HUNG" not in rig.statuses()[-1]["reasons"])
+            until(lambda: "WATCHDOG=1" in heard_of(listener))
+    assert status["level"] == 2
+
+
+def heard_of(listener: socket.socket) -> list[str]:
+    lines: list[str] = []
+    while True:
+        try:
+            lines += listener.recv(4096).decode().splitlines()
+        except BlockingIOError:
+            return lines
+
+
+def test_f22_recording_is_refused_and_streaming_goes_on(tmp_path: Path) -> None:
+    with Rig(tmp_path, lambda _: Steady(), config=LOCKSTEP) as rig:
+        rig.await_views(1)
+        for verb in ("record_start", "record_stop"):
+            reply = rig.ask(verb)
+            assert reply.code is Code.WRONG_STATE
+            assert "no recorder" in reply.message
+        rig.await_views(len(rig.of()) + 1)
+
+
+@starts_a_process
+def test_f23_sigterm_ends_every_view_and_the_process_with_0(tmp_path: Path) -> None:
+    launch = tmp_path / "launch.toml"
+    launch.write_text(f"""
+        [source]
+        kind = "synthetic"
+        pace = "lockstep"
+        [model]
+        weights = "random:driving"
+        steps = 1
+        [view.main]
+        [publish]
+        data = "ipc://{tmp_path}/data"
+        status = "ipc://{tmp_path}/status"
+        min_subscribers = 1
+        [control]
+        endpoint = "ipc://{tmp_path}/control"
+    """)
+    with ViewSubscriber(f"ipc://{tmp_path}/data", "main", conflate=False) as views:
+        node = subprocess.Popen(command("run", str(launch)), stderr=subprocess.PIPE, text=True)
+        try:
+            assert views.receive(1000 * START_S) is not None
+            node.send_signal(signal.SIGTERM)
+            while views.receive(1000 * START_S) is not None:
+                pass
+            assert views.ended
+            views.close()
+            assert node.wait(START_S) == 0
+        finally:
+            node.kill()
+            node.communicate()
+
+
+@starts_a_process
+@pytest.mark.parametrize(("signals", "code"), [(1, 0), (2, -signal.SIGTERM)])
+def test_f23_a_model_that_hears_nothing_does_not_hold_up_the_end(signals: int, code: int, tmp_path: Path) -> None:
+    script = str(Path(__file__).with_name("hung_process.py"))
+    node = subprocess.Popen(
+        [sys.executable, script, str(tmp_path)], stdout=subprocess.PIPE, text=True, env=environment()
+    )
+    try:
+        assert node.stdout is not None
+        assert node.stdout.readline() == "hangs\n"
+        for i in range(signals):
+            node.send_signal(signal.SIGTERM)
+            time.sleep(0.3 if i + 1 < signals else 0)
+        assert node.wait(START_S) == code
+        assert ("left behind" in node.stdout.read()) == (code == 0)
+    finally:
+        node.kill()
+        node.communicate()
+
+
+def test_f24_ages_do_not_notice_that_somebody_set_the_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    camera, true_ns = Camera(), time.time_ns
+    with Rig(tmp_path, Bench(camera)) as rig:
+        rig.await_state("active")
+        camera.run(15)
+        before = rig.await_views(1)[0].header
+        monkeypatch.setattr(time, "time_ns", lambda: true_ns() + 3600 * 10**9)
+        told = rig.await_event("CLOCK_STEP")
+        camera.run(30)
+        after = rig.await_views(2)[-1].header
+        monkeypatch.undo()
+    assert told["clock"] == "utc"
+    assert told["step_ms"] == pytest.approx(3_600_000, abs=1000)
+    assert 0 <= after.age_ms < 1000 * SLACK_S
+    assert 0 <= before.age_ms < 1000 * SLACK_S
+    assert after.t_capture_ns[0] - before.t_capture_ns[-1] > 3000 * 10**9  # UTC is what the clock says
+    assert after.src.epoch == 0
+
+
+@pytest.mark.parametrize("content", [b"", b"<html>not found</html>", b"\x80\x04."])
+def test_f25_bad_weights_are_refused_whole(content: bytes, tmp_path: Path) -> None:
+    weights = tmp_path / "bad.ckpt"
+    weights.write_bytes(content)
+
+    def load(_: ModelSection) -> ViewSynthesizer:
+        return load_model(ModelSection(weights=str(weights)))
+
+    with Rig(tmp_path, Bench(), load, more=WAITING) as rig:
+        assert rig.ask("configure").code is Code.ACCEPTED
+        told = rig.await_event("BAD_ARG")
+        rig.await_state("unconfigured")
+        assert rig.ask("state").result is not None
+        assert rig.statuses()[-1]["model"]["state"] in ("loading", "absent")
+        until(lambda: rig.statuses()[-1]["model"]["state"] == "absent")
+    assert "bad.ckpt" in told["message"]

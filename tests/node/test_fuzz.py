@@ -1,0 +1,502 @@
+"""Whatever arrives from outside ends as something valid or as a documented error, and nothing of it stays.
+
+GCD_MUTATIONS=100000 makes as many inputs for each parser; the default is a fraction. The same for whole logs is in
+test_mcap_log.py.
+"""
+
+import gc
+import io
+import json
+import math
+import os
+import random
+import struct
+import time
+import tracemalloc
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from rich.console import Console
+from wire_messages import class_map, end, origin, pixels, view_header, window
+
+from gcd_node.allow_list import load_clients
+from gcd_node.calibration import parse_lens
+from gcd_node.config import parse_config
+from gcd_node.config_text import to_toml
+from gcd_node.control_message import (
+    Command,
+    Reply,
+    RequestError,
+    decode_reply,
+    encode_request,
+    parse_command,
+    parse_request,
+)
+from gcd_node.control_verbs import VERBS
+from gcd_node.envelope import (
+    MAGIC,
+    PREFIX,
+    Message,
+    NoteMessage,
+    ViewMessage,
+    colours,
+    decode,
+    encode,
+    images,
+    topic_key,
+    view_topic,
+)
+from gcd_node.errors import ConfigError, ControlError, MessageError, NodeError, SourceError
+from gcd_node.jpeg import decode_frames, encode_frames
+from gcd_node.load.meter import memory_mb
+from gcd_node.sources import read_picture
+from gcd_node.sources.log_messages import CodedPicture, RawPicture
+from gcd_node.sources.log_pictures import to_rgb
+from gcd_node.status_board import StatusBoard
+from gcd_node.status_table import render_status
+
+ROUNDS = int(os.environ.get("GCD_MUTATIONS", "400"))
+SETTINGS = settings(
+    max_examples=max(50, ROUNDS // 4),
+    deadline=None,
+    derandomize=True,
+    database=None,
+    suppress_health_check=list(HealthCheck),
+)
+GROWN_BYTES = 2_000_000  # tracemalloc: of Python and numpy
+GROWN_MB = 128.0  # resident: of OpenCV too, which keeps some for itself
+LAUNCH = sorted((Path(__file__).parents[2] / "launch").glob("*.toml"))
+
+pytestmark = pytest.mark.timeout(max(120, ROUNDS // 10))
+
+
+# --- a mutator ---------------------------------------------------------------------------------------------------
+
+TEXT_PIECES = (
+    b"null", b"true", b"[", b"]", b"{", b"}", b'"', b"\\", b"\\ud800", b",", b":", b"=", b"\n", b"#", b"'''", b"\0",
+    b"1e999", b"-0", b"NaN", b"9" * 400, b"\xff\xfe", b"\xed\xa0\x80", b"*a", b"&a ", b"[" * 300, b"2020-01-01",
+)  # fmt: skip
+BYTE_PIECES = (b"\0" * 8, b"\xff" * 8, b"\x7f" + b"\xff" * 7, b"\1" + b"\0" * 7, b"\xff\xd8\xff", b"\x89PNG", MAGIC)
+
+
+class Mutator:
+    """Turns bits, sets bytes to extremes, cuts out, doubles, moves, and joins one example to another."""
+
+    def __init__(self, seed: int, examples: Sequence[bytes], pieces: Sequence[bytes]) -> None:
+        self._chance, self._examples, self._pieces = random.Random(seed), examples, pieces
+
+    def next(self) -> bytes:
+        out = bytearray(self._chance.choice(self._examples))
+        for _ in range(self._chance.choice((1, 1, 1, 2, 3, 8))):
+            self._change(out)
+        return bytes(out)
+
+    def _change(self, out: bytearray) -> None:
+        chance = self._chance
+        at, span = chance.randrange(len(out) + 1), chance.choice((1, 1, 2, 4, 16, 64))
+        act = chance.randrange(8)
+        if act == 0 and at < len(out):
+            out[at] ^= 1 << chance.randrange(8)
+        elif act == 1:
+            out[at : at + 1] = bytes([chance.randrange(256)])
+        elif act == 2:
+            del out[at : at + span]
+        elif act == 3:
+            out[at:at] = out[at : at + span]
+        elif act == 4:
+            piece = chance.choice(self._pieces)
+            out[at : at + chance.choice((0, len(piece)))] = piece
+        elif act == 5:
+            there = chance.randrange(len(out) + 1)
+            out[at:at] = out[there : there + span]
+        elif act == 6:
+            other = chance.choice(self._examples)
+            out[at:] = other[at:]
+        else:
+            del out[at:]
+
+
+def outcomes(read: Callable[[bytes], str], inputs: Mutator, *refusals: type[Exception]) -> Counter[str]:
+    """Read ROUNDS inputs; how many ended how. What is no documented error fails the test, and so does growth."""
+    ended: Counter[str] = Counter()
+    few = max(1, ROUNDS // 4)
+    tracemalloc.start()
+    try:
+        _read(few, read, inputs, refusals, ended)
+        gc.collect()
+        before, before_mb = tracemalloc.get_traced_memory()[0], memory_mb()
+        _read(ROUNDS - few, read, inputs, refusals, ended)
+        gc.collect()
+        grown, grown_mb = tracemalloc.get_traced_memory()[0] - before, memory_mb() - before_mb
+    finally:
+        tracemalloc.stop()
+    assert ended.total() == ROUNDS
+    assert grown < GROWN_BYTES
+    assert grown_mb < GROWN_MB
+    return ended
+
+
+def _read(
+    count: int,
+    read: Callable[[bytes], str],
+    inputs: Mutator,
+    refusals: tuple[type[Exception], ...],
+    ended: Counter[str],
+) -> None:
+    for _ in range(count):
+        part = inputs.next()
+        try:
+            outcome, error = read(part), None
+        except refusals as known:
+            outcome, error = "refused", known
+        except Exception as other:
+            raise AssertionError(f"{type(other).__name__} for {part[:2000]!r}") from other
+        assert error is None or 0 < len(str(error)) < 2000
+        ended[outcome] += 1
+
+
+def refusal(read: Callable[[], object], *refusals: type[Exception]) -> str:
+    """What a documented error says, "accepted" without one; any other error fails the test."""
+    try:
+        read()
+    except refusals as error:
+        return str(error)
+    return "accepted"
+
+
+# --- the envelope ------------------------------------------------------------------------------------------------
+
+
+def jpeg_window() -> ViewMessage:
+    drawn = np.stack([cv2.resize(each, (24, 16)) for each in pixels(3)])
+    payload, offsets = encode_frames(drawn, 90)
+    header = replace(view_header(shape=drawn.shape), encoding="jpeg", offsets=offsets)
+    return ViewMessage(topic=view_topic("top", "win"), header=header, payload=payload)
+
+
+def note(fields: dict[str, Any]) -> NoteMessage:
+    return NoteMessage(topic="status", header=origin(), fields=fields)
+
+
+def use(message: Message) -> str:
+    """Do with a message what a reader does."""
+    again = decode(encode(message))
+    assert (again.topic, again.header, bytes(again.payload)) == (message.topic, message.header, bytes(message.payload))
+    if not isinstance(message, ViewMessage):
+        return type(message).__name__
+    try:
+        drawn = images(message)
+        assert drawn.shape == message.header.shape
+        assert colours(message).shape == (*drawn.shape[:3], 3)
+    except MessageError:
+        return "pixels refused"
+    return message.header.encoding
+
+
+def without_checksum(part: bytes) -> bytes:
+    """So that the checks behind the checksum are reached."""
+    return part if len(part) < PREFIX.size else part[:56] + bytes(4) + part[60:]
+
+
+@pytest.mark.parametrize("checked", [True, False])
+def test_mutated_messages_end_as_messages_or_message_errors(checked: bool) -> None:
+    status = note({"state": "active", "level": 0, "reasons": [], "source": {"state": "streaming", "fps": 24.0}})
+    examples = [encode(each) for each in (window(), jpeg_window(), class_map(), end(), status)]
+    inputs = Mutator(1, examples, TEXT_PIECES + BYTE_PIECES)
+    ended = outcomes(lambda part: use(decode(part if checked else without_checksum(part))), inputs, MessageError)
+    assert ended["refused"] > ROUNDS // 4
+    assert checked or ended.total() - ended["refused"] > ROUNDS // 20
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=10), inner, max_size=4),
+    max_leaves=20,
+)
+
+
+def header_of(part: bytes) -> dict[str, Any]:
+    return json.loads(part[PREFIX.size : PREFIX.size + 16 * struct.unpack_from("<H", part, 36)[0]])
+
+
+HEADER_KEYS = st.sampled_from(sorted(header_of(encode(window()))))
+NOTE_KEYS = st.sampled_from(
+    ["state", "level", "reasons", "source", "model", "stages", "views", "drops", "window", "code"]
+)
+
+
+def raw_message(topic: bytes, header: bytes, payload: bytes, flags: int) -> bytes:
+    padded = header.ljust(-(-len(header) // 16) * 16)
+    return PREFIX.pack(topic, MAGIC, len(padded) // 16, flags, len(payload), 0, 0, 0) + padded + payload
+
+
+@SETTINGS
+@given(part=st.binary(max_size=300))
+def test_any_bytes_end_as_a_message_or_a_message_error(part: bytes) -> None:
+    assert refusal(lambda: use(decode(part)), MessageError)
+
+
+@SETTINGS
+@given(
+    topic=st.sampled_from([topic_key("view/top/win"), topic_key("status"), topic_key("src/frm"), bytes(32)]),
+    changes=st.dictionaries(HEADER_KEYS | st.text(max_size=8), JSON, max_size=3),
+    payload=st.binary(max_size=200),
+    flags=st.integers(0, 15),
+)
+def test_any_header_ends_as_a_message_or_a_message_error(
+    topic: bytes, changes: dict[str, Any], payload: bytes, flags: int
+) -> None:
+    header = json.dumps({**header_of(encode(window())), **changes}).encode()
+    part = raw_message(topic, header[: 60 * 1024], payload, flags)
+    assert refusal(lambda: use(decode(part)), MessageError)
+
+
+@SETTINGS
+@given(fields=st.dictionaries(NOTE_KEYS, JSON))
+def test_any_note_can_be_shown(fields: dict[str, Any]) -> None:
+    board = StatusBoard()
+    for topic in ("status", "event", "meta"):
+        said = NoteMessage(topic=topic, header=origin(), fields=fields)
+        try:
+            received = decode(encode(said))
+        except MessageError:
+            return  # JSON has no such number
+        assert isinstance(received, NoteMessage)
+        board.add(received, time.monotonic(), time.time_ns())
+    out = io.StringIO()
+    Console(file=out, width=100).print(render_status(board, time.monotonic()))
+    assert out.getvalue().encode()
+    assert json.dumps(board.record(time.monotonic()))
+
+
+# --- the control socket ------------------------------------------------------------------------------------------
+
+ARGUMENTS: dict[str, dict[str, object]] = {
+    "set_view": {"view": "top", "azimuth_deg": 10.0, "elevation_deg": 5, "radius": 0.5},
+    "remove_view": {"view": "top"},
+    "set_param": {"steps": 4, "guidance": [1.0, 1.5], "seed": 7, "samples": 2, "jpeg_quality": 80, "publish": "jpeg"},
+}
+
+
+def request(verb: str, args: dict[str, object], **more: object) -> bytes:
+    return json.dumps({"proto": "gcd/1.0", "id": "a1", "verb": verb, "args": args, **more}).encode()
+
+
+def requests() -> list[bytes]:
+    plain = [request(verb, ARGUMENTS.get(verb, {}), dry_run=True) for verb in VERBS]
+    rigid = request("set_view", {"view": "top", "T_src_dst": [1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0]})
+    return [*plain, rigid, request("set_view", {"view": "top", "kind": "orbit", "rate_deg_s": 1.0}, if_view_rev=3)]
+
+
+def commanded(part: bytes) -> str:
+    parsed = parse_request(part)
+    command = parse_command(parsed)
+    assert isinstance(command, Command)
+    encode_request(parsed)  # what was understood can be said again
+    return command.verb
+
+
+def test_mutated_requests_end_as_commands_or_request_errors() -> None:
+    ended = outcomes(commanded, Mutator(2, requests(), TEXT_PIECES), RequestError)
+    assert ended["refused"] > ROUNDS // 4
+    assert len(ended) > 3
+
+
+@SETTINGS
+@given(verb=st.sampled_from(sorted(VERBS)) | st.text(max_size=12), args=JSON, more=st.dictionaries(st.text(), JSON))
+def test_any_json_ends_as_a_command_or_a_request_error(verb: str, args: object, more: dict[str, object]) -> None:
+    part = json.dumps({"proto": "gcd/1.0", "id": "a1", "verb": verb, "args": args, **more}).encode()
+    try:
+        assert commanded(part) in VERBS
+    except RequestError as error:
+        told = Reply(
+            id=error.request_id, ok=False, code=error.reason, message=str(error), state="", result=error.result
+        )
+        assert decode_reply(msgspec.json.encode(told)) == told  # and the refusal can be sent
+
+
+@SETTINGS
+@given(numbers=st.lists(st.floats(), min_size=3, max_size=3), view=st.text(max_size=20))
+def test_any_view_ends_as_a_command_or_a_request_error(numbers: list[float], view: str) -> None:
+    names = ("azimuth_deg", "elevation_deg", "radius")
+    part = request("set_view", {"view": view, **dict(zip(names, numbers, strict=True))})
+    finite = all(map(math.isfinite, numbers))
+    assert finite or refusal(lambda: commanded(part), RequestError) != "accepted"
+
+
+def test_mutated_replies_end_as_replies_or_control_errors() -> None:
+    reply = {"id": "a", "ok": True, "code": "OK", "message": "m", "state": "active", "result": {"x": [1, 2.5, None]}}
+    examples = [json.dumps({**reply, "proto": "gcd/1.0"}).encode()]
+    inputs = Mutator(3, examples, TEXT_PIECES)
+    ended = outcomes(lambda part: decode_reply(part).code.value, inputs, ControlError)
+    assert ended["refused"] > ROUNDS // 4
+    assert ended["OK"] > 0
+
+
+# --- files a person writes ---------------------------------------------------------------------------------------
+
+CONFIG = b"""
+node_id = "front"
+strict = true
+[source]
+kind = "rtsp"
+url = "rtsp://user:secret@camera/1"
+width = 1280
+pose = {elevation_deg = 5.0, radius = 15.0}
+[model]
+weights = "package:driving-small"
+guidance = [1.0, 1.5]
+[view.top]
+kind = "orbit"
+rate_deg_s = 5.0
+amplitude_deg = 30
+[view."side"]
+azimuth_deg = -1e1
+[publish]
+jpeg_quality = 75
+[life]
+idle_s = 2.5
+"""
+CLIENTS = b"""
+[client.desk]
+key = "rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7"
+role = "operator"
+[client.wall]
+key = "Yne@$w-vo<fVvi]a<NY6T1ed:M$fCG*[IaLV{hID"
+"""
+LENS = b"""
+image_width: 640
+image_height: 480
+camera_matrix: {rows: 3, cols: 3, data: [433.5, 0.0, 322.25, 0.0, 432.75, 241.5, 0.0, 0.0, 1.0]}
+distortion_model: plumb_bob
+distortion_coefficients:
+  data: [-0.35, 0.12, 1e-05, -2.5e-04, 0]
+"""
+
+
+def configured(part: bytes) -> str:
+    config = parse_config(part, "launch.toml")
+    again = parse_config(to_toml(config).encode(), "again")
+    assert again.digest == config.digest  # passwords are hidden, so not the whole is the same
+    return config.source.kind
+
+
+def test_mutated_launch_files_end_as_configurations_or_config_errors() -> None:
+    inputs = Mutator(4, [CONFIG, *(path.read_bytes() for path in LAUNCH)], TEXT_PIECES)
+    ended = outcomes(configured, inputs, ConfigError)
+    assert ended["refused"] > ROUNDS // 4
+    assert ended.total() - ended["refused"] > ROUNDS // 20
+
+
+@SETTINGS
+@given(
+    changes=st.lists(
+        st.text(max_size=30)
+        | st.builds(
+            "{}.{}={}".format,
+            st.sampled_from(["source", "model", "view.top", "publish", "life", "health"]),
+            st.text(max_size=8),
+            st.text(max_size=12),
+        )
+    )
+)
+def test_any_change_ends_as_a_configuration_or_a_config_error(changes: list[str]) -> None:
+    try:
+        config = parse_config(CONFIG, "launch.toml", changes)
+    except NodeError:
+        return
+    assert parse_config(to_toml(config).encode(), "again").digest == config.digest
+
+
+def test_mutated_client_lists_end_as_clients_or_config_errors(tmp_path: Path) -> None:
+    path = tmp_path / "clients.toml"
+    path.touch(mode=0o600)
+
+    def read(part: bytes) -> str:
+        path.write_bytes(part)
+        return f"{len(load_clients(path))} clients"
+
+    ended = outcomes(read, Mutator(5, [CLIENTS], TEXT_PIECES), ConfigError)
+    assert ended["refused"] > ROUNDS // 4
+
+
+def test_mutated_calibrations_end_as_lenses_or_config_errors() -> None:
+    ended = outcomes(lambda part: parse_lens(part, "lens").distortion, Mutator(6, [LENS], TEXT_PIECES), ConfigError)
+    assert ended["refused"] > ROUNDS // 4
+    assert ended["plumb_bob"] > 0
+
+
+# --- pictures ----------------------------------------------------------------------------------------------------
+
+
+def coded(suffix: str, size: tuple[int, int] = (24, 16), *options: int) -> bytes:
+    drawn = cv2.resize(pixels(5, frames=1)[0], size)
+    return cv2.imencode(suffix, drawn, list(options))[1].tobytes()
+
+
+def pictures(*suffixes: str) -> list[bytes]:
+    progressive = coded(".jpg", (24, 16), cv2.IMWRITE_JPEG_PROGRESSIVE, 1)
+    return [*(coded(suffix) for suffix in suffixes), coded(".jpg", (40, 8)), progressive]
+
+
+def test_mutated_jpegs_of_a_view_end_as_frames_or_message_errors() -> None:
+    def read(part: bytes) -> str:
+        frames = decode_frames(part, (0, len(part)), (1, 16, 24, 3))
+        assert frames.shape == (1, 16, 24, 3)
+        return "frames"
+
+    ended = outcomes(read, Mutator(7, pictures(".jpg"), BYTE_PIECES), MessageError)
+    assert min(ended["refused"], ended["frames"]) > ROUNDS // 50
+
+
+def test_mutated_pictures_of_a_log_end_as_pictures_or_source_errors() -> None:
+    def read(part: bytes) -> str:
+        picture, kind = to_rgb(CodedPicture(stamp_ns=0, frame_id="", format="jpeg", data=memoryview(part)))
+        assert picture.dtype == np.uint8
+        return kind
+
+    ended = outcomes(read, Mutator(8, pictures(".jpg", ".png", ".webp"), BYTE_PIECES), SourceError)
+    assert ended["refused"] > ROUNDS // 4
+    assert ended["jpeg"] > 0
+
+
+@SETTINGS
+@given(
+    width=st.integers(-1, 2**32),
+    height=st.integers(-1, 2**32),
+    step=st.integers(-1, 2**32) | st.just(24),
+    encoding=st.sampled_from(["rgb8", "bgr8", "mono8", "bayer_rggb8", "nv12", "yuv422", "32FC1", "", "\0"]),
+    data=st.binary(max_size=400),
+)
+def test_any_raw_picture_ends_as_a_picture_or_a_source_error(
+    width: int, height: int, step: int, encoding: str, data: bytes
+) -> None:
+    stated = RawPicture(
+        stamp_ns=0, frame_id="", width=width, height=height, encoding=encoding, step=step, data=memoryview(data)
+    )
+    try:
+        picture, _ = to_rgb(stated)
+    except SourceError:
+        return
+    assert picture.shape == (height, width, 3)
+
+
+def test_mutated_picture_files_end_as_pictures_or_source_errors(tmp_path: Path) -> None:
+    path = tmp_path / "picture"
+
+    def read(part: bytes) -> str:
+        path.write_bytes(part)
+        return f"{read_picture(path).ndim} axes"
+
+    examples = pictures(".jpg", ".png", ".bmp", ".webp", ".tiff")
+    ended = outcomes(read, Mutator(9, examples, BYTE_PIECES), SourceError)
+    assert min(ended["refused"], ended["3 axes"]) > ROUNDS // 50

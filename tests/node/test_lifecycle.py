@@ -1,0 +1,101 @@
+from itertools import product
+from typing import get_args
+
+import pytest
+
+from gcd_node.errors import ControlError
+from gcd_node.lifecycle import PATHS, Lifecycle, State, Verb
+
+VERBS: tuple[Verb, ...] = get_args(Verb)
+WAYS: dict[State, tuple[Verb, ...]] = {
+    State.UNCONFIGURED: (),
+    State.INACTIVE: ("configure",),
+    State.ACTIVE: ("configure", "activate"),
+    State.FINALIZED: ("shutdown",),
+}
+
+
+def at(state: State) -> Lifecycle:
+    life = Lifecycle()
+    for verb in WAYS[state]:
+        life.begin(verb)
+        life.succeed()
+    assert life.state is state
+    return life
+
+
+def test_the_numbers_are_those_of_ros_2() -> None:
+    assert {state.label: int(state) for state in State} == {
+        "unconfigured": 1,
+        "inactive": 2,
+        "active": 3,
+        "finalized": 4,
+        "configuring": 10,
+        "cleaningup": 11,
+        "shuttingdown": 12,
+        "activating": 13,
+        "deactivating": 14,
+        "errorprocessing": 15,
+    }
+
+
+@pytest.mark.parametrize(("verb", "state"), list(product(VERBS, WAYS)))
+def test_a_transition_leads_where_it_should_or_changes_nothing(verb: Verb, state: State) -> None:
+    life = at(state)
+    allowed, passing, goal = PATHS[verb]
+    if state not in allowed:
+        with pytest.raises(ControlError, match=state.label) as refused:
+            life.begin(verb)
+        assert refused.value.code == "WRONG_STATE"
+        assert life.state is state
+        return
+    life.begin(verb)
+    assert life.state is passing
+    assert life.succeed() is life.state is goal
+
+
+@pytest.mark.parametrize(("verb", "state"), [("configure", State.UNCONFIGURED), ("activate", State.INACTIVE)])
+def test_what_fails_goes_back_to_where_it_began(verb: Verb, state: State) -> None:
+    life = at(state)
+    life.begin(verb)
+    assert life.fail() is life.state is state
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_one_transition_at_a_time(verb: Verb) -> None:
+    life = at(State.UNCONFIGURED)
+    life.begin("configure")
+    with pytest.raises(ControlError, match="wait"):
+        life.begin(verb)
+    assert life.state is State.CONFIGURING
+
+
+def test_nothing_leads_out_of_finalized() -> None:
+    assert all(at(State.FINALIZED).refusal(verb) for verb in VERBS)
+    with pytest.raises(ControlError):
+        at(State.FINALIZED).error()
+
+
+@pytest.mark.parametrize(("cleaned", "goal"), [(True, State.UNCONFIGURED), (False, State.FINALIZED)])
+def test_after_an_error_the_node_begins_anew_or_is_finished(cleaned: bool, goal: State) -> None:
+    life = at(State.INACTIVE)
+    life.begin("activate")
+    life.error()
+    assert life.state is State.ERRORPROCESSING
+    assert all(life.refusal(verb) for verb in VERBS)
+    assert life.recover(cleaned=cleaned) is life.state is goal
+
+
+def test_outcomes_without_a_transition_are_refused() -> None:
+    for outcome in ("succeed", "fail"):
+        with pytest.raises(ControlError, match="under way"):
+            getattr(at(State.ACTIVE), outcome)()
+    with pytest.raises(ControlError, match="recovered"):
+        at(State.ACTIVE).recover(cleaned=True)
+
+
+def test_a_refusal_says_what_is_wanted_and_what_is() -> None:
+    assert at(State.UNCONFIGURED).refusal("activate") == (
+        "activate is for a node that is inactive, this one is unconfigured"
+    )
+    assert "already" in str(at(State.ACTIVE).refusal("activate"))

@@ -1,0 +1,52 @@
+import pytest
+
+from gcd_node.config import NodeConfig, ViewConfig, parse_config
+from gcd_node.live_config import LiveConfig
+
+
+def config() -> NodeConfig:
+    return parse_config(b'[source]\nkind = "synthetic"\n[model]\nweights = "w"\n[view.a]\n[view.b]\n', "test")
+
+
+def test_each_view_has_its_own_revision() -> None:
+    live = LiveConfig(config())
+    before = live.settings()
+    assert live.set_view("a", ViewConfig(azimuth_deg=5.0)) == 2
+    assert live.set_view("a", ViewConfig(azimuth_deg=6.0)) == 3
+    assert dict(live.settings().revisions) == {"a": 3, "b": 1}
+    assert live.config.view["a"].azimuth_deg == 6.0
+    assert dict(before.revisions) == {"a": 1, "b": 1}
+    assert before.config == config()
+
+
+def test_a_view_that_comes_back_goes_on_counting() -> None:
+    live = LiveConfig(config())
+    live.set_view("a", ViewConfig())
+    live.remove_view("a")
+    assert list(live.settings().revisions) == ["b"]
+    assert live.known_views == ("a", "b")
+    assert live.revision("a") == 2
+    assert live.set_view("a", ViewConfig()) == 3
+    with pytest.raises(KeyError):
+        live.remove_view("c")
+
+
+def test_the_end_of_a_removed_view_is_announced_once_unless_it_came_back() -> None:
+    live = LiveConfig(config())
+    live.remove_view("a")
+    assert live.take_removed() == [("a", 1)]
+    assert live.take_removed() == []
+    live.set_view("a", ViewConfig())
+    live.remove_view("a")
+    live.set_view("a", ViewConfig())
+    assert live.take_removed() == []
+
+
+def test_every_change_of_what_is_rendered_has_another_digest() -> None:
+    live = LiveConfig(config())
+    digests = [live.config.digest]
+    live.set_view("a", ViewConfig(azimuth_deg=5.0))
+    digests.append(live.config.digest)
+    live.remove_view("b")
+    digests.append(live.config.digest)
+    assert len(set(digests)) == 3

@@ -1,0 +1,288 @@
+import socket
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cameras import Bench, Camera, until
+from fakes import FakeSource, FakeSynthesizer, traits
+from rig import Rig
+
+from gcd_model import RenderOptions, SphericalDelta
+from gcd_node.control_message import Code
+from gcd_node.systemd import ServiceManager
+
+TWO_VIEWS = '[view.main]\nazimuth_deg = 10.0\n[view.swing]\nkind = "orbit"\nrate_deg_s = 24.0\namplitude_deg = 30.0'
+LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
+
+
+class Gate:
+    """A model that renders one window each time it is let."""
+
+    def __init__(self) -> None:
+        self.waits = threading.Semaphore(0)
+        self.begun = 0
+
+    def __call__(self, options: RenderOptions) -> None:
+        if options.steps == 1:  # the warm-up
+            return
+        self.begun += 1
+        deadline_s = time.monotonic() + 30
+        while not self.waits.acquire(timeout=0.01):
+            if options.cancel is not None and options.cancel.is_set():
+                return
+            assert time.monotonic() < deadline_s
+
+
+class Endless(FakeSource):
+    """Frames until it is closed."""
+
+    def __init__(self) -> None:
+        super().__init__(1_000_000)
+        self.period_s = 0.002
+
+
+def test_a_node_goes_through_its_life_as_it_is_asked(tmp_path: Path) -> None:
+    with Rig(tmp_path, lambda _: FakeSource(14), config=LOCKSTEP, more="life = {autostart = false}") as rig:
+        assert rig.ask("state").state == "unconfigured"
+        assert rig.ask("activate").code is Code.WRONG_STATE
+        for verb, state in (("configure", "inactive"), ("activate", "active")):
+            assert rig.ask(verb).code is Code.ACCEPTED
+            until(lambda state=state: any(event["state"] == state for event in rig.events("STATE")))
+        rig.await_event("SRC_ENDED")
+        rig.await_state("inactive")
+        assert len(rig.await_views(1)) == 1
+        rig.ask("activate")
+        rig.await_event("SRC_ENDED", 2)
+        rig.await_state("inactive")
+        assert [view.header.window_id for view in rig.await_views(2)] == [0, 1]
+        assert [view.header.src.epoch for view in rig.of()] == [0, 1]
+        assert rig.ask("cleanup").code is Code.ACCEPTED
+        rig.await_state("unconfigured")
+        assert rig.ask("configure").code is Code.ACCEPTED
+        rig.await_state("inactive")
+        assert rig.ask("shutdown").code is Code.ACCEPTED
+        rig.await_state("finalized")
+    assert rig.failure is None
+    assert len({view.header.boot_id for view in rig.views}) == 1
+    assert [view.sequence for view in rig.of()] == [0, 2]  # 1 was the end of the first stream
+
+
+def test_a_dry_run_changes_nothing(tmp_path: Path) -> None:
+    with Rig(tmp_path, Bench(), more="life = {autostart = false}") as rig:
+        assert rig.try_out("configure").code is Code.OK
+        assert rig.try_out("activate").code is Code.WRONG_STATE
+        assert rig.ask("state").state == "unconfigured"
+        rig.ask("configure")
+        rig.await_state("inactive")
+        reply = rig.try_out("set_view", view="main", azimuth_deg=5.0)
+        assert reply.code is Code.OK
+        assert rig.ask("views").result == {"main": view_told(10.0, 1)}
+        assert rig.try_out("set_param", steps=3).code is Code.OK
+        assert asked_config(rig)["model"]["steps"] is None
+
+
+def view_told(azimuth_deg: float, rev: int) -> dict[str, object]:
+    plain = {"elevation_deg": 0.0, "radius": 0.0, "rate_deg_s": None, "amplitude_deg": None, "kind": "fixed"}
+    return {**plain, "azimuth_deg": azimuth_deg, "view_rev": rev}
+
+
+def asked_config(rig: Rig) -> dict[str, Any]:
+    result = rig.ask("get_config").result
+    assert result is not None
+    config = result["config"]
+    assert isinstance(config, dict)
+    return config
+
+
+def test_several_views_come_from_one_batch_and_change_alone(tmp_path: Path) -> None:
+    gate = Gate()
+    model = FakeSynthesizer(traits(), gate)
+    with Rig(tmp_path, lambda _: Endless(), model, config=LOCKSTEP, views=TWO_VIEWS, more="") as rig:
+        gate.waits.release()
+        rig.await_views(1, "swing")
+        until(lambda: gate.begun == 2)
+        reply = rig.ask("set_view", view="main", azimuth_deg=-20.0)
+        assert (reply.code, reply.result and reply.result["view_rev"]) == (Code.OK, 2)
+        gate.waits.release(3)
+        rig.await_views(3)
+        rig.await_views(3, "swing")
+    assert [view.header.view_rev for view in rig.of()[:3]] == [1, 1, 2]
+    assert [view.header.view_rev for view in rig.of("swing")[:3]] == [1, 1, 1]
+    goals = [view.header.pose[-1].az_deg for view in rig.of() if view.header.pose][:3]
+    assert goals == [10.0, 10.0, -20.0]
+    swings = [view.header.pose[-1].az_deg for view in rig.of("swing") if view.header.pose][:3]
+    assert swings == pytest.approx([0.0, 14.0, 28.0])  # a change of its neighbour does not make it begin again
+    assert {len(paths) for paths, _ in model.asked} == {2}
+    assert len({view.header.cfg_digest for view in rig.of()[:3]}) == 2
+    assert [meta["view_revs"]["main"] for meta in rig.metas()] == [1, 2]
+
+
+def test_a_view_is_set_by_angles_by_a_rigid_pose_or_as_an_orbit(tmp_path: Path) -> None:
+    planned = traits().plan_view(SphericalDelta(azimuth_deg=25.0, elevation_deg=5.0, radius_m=1.0))
+    pose = planned.source_from_target[-1].flatten().tolist()
+    with Rig(tmp_path, Bench(), more="life = {autostart = false}") as rig:
+        rig.ask("configure")
+        rig.await_state("inactive")
+        told = rig.ask("set_view", view="main", T_src_dst=pose).result
+        assert told is not None
+        goal = told["goal"]
+        assert isinstance(goal, dict)
+        assert (goal["azimuth_deg"], goal["elevation_deg"], goal["radius"]) == pytest.approx((25.0, 5.0, 1.0), abs=1e-6)
+        assert told["rotation_error_deg"] == pytest.approx(0.0, abs=1e-3)
+        orbit = {"kind": "orbit", "rate_deg_s": 9.0, "amplitude_deg": 20.0}
+        assert rig.ask("set_view", orbit, view="main").result == {
+            "view": "main",
+            "goal": {**orbit, "azimuth_deg": 0.0, "elevation_deg": 0.0, "radius": 0.0},
+            "view_rev": 3,
+        }
+        turned = [0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]  # looks at the scene, rolled by 90 degrees
+        assert rig.ask("set_view", view="main", T_src_dst=turned).code is Code.OUT_OF_RANGE
+        assert rig.ask("set_view", view="main", T_src_dst=[2.0] * 16).code is Code.BAD_ARG
+        assert rig.ask("views").result == {"main": {**goal, **orbit, **zero_angles(), "view_rev": 3}}
+
+
+def zero_angles() -> dict[str, float]:
+    return {"azimuth_deg": 0.0, "elevation_deg": 0.0, "radius": 0.0}
+
+
+def test_a_change_meant_for_another_revision_is_refused(tmp_path: Path) -> None:
+    with Rig(tmp_path, Bench(), views=TWO_VIEWS, more="life = {autostart = false}") as rig:
+        assert rig.ask("set_view", view="main", azimuth_deg=1.0).code is Code.NOT_READY
+        rig.ask("configure")
+        rig.await_state("inactive")
+        assert rig.ask_at(1, "set_view", view="main", azimuth_deg=1.0).code is Code.OK
+        refused = rig.ask_at(1, "set_view", view="main", azimuth_deg=2.0)
+        assert (refused.code, refused.result) == (Code.WRONG_STATE, {"view_rev": 2})
+        assert rig.ask_at(1, "remove_view", view="main").code is Code.WRONG_STATE
+        assert rig.ask_at(2, "remove_view", view="main").code is Code.OK
+
+
+def test_a_removed_view_ends_and_comes_back_under_a_higher_revision(tmp_path: Path) -> None:
+    with Rig(tmp_path, lambda _: Endless(), config=LOCKSTEP, views=TWO_VIEWS) as rig:
+        rig.await_views(2)
+        assert rig.ask("remove_view", view="main").code is Code.OK
+        assert rig.ask("remove_view", view="main").code is Code.UNKNOWN_VIEW
+        last = rig.ask("remove_view", view="swing")
+        assert last.code is Code.BAD_ARG
+        assert "last view" in last.message
+        before = len(rig.of("swing"))
+        rig.await_views(before + 3, "swing")
+        gone = len(rig.of())
+        rig.await_views(before + 6, "swing")
+        assert len(rig.of()) == gone
+        assert rig.ask("set_view", view="main", azimuth_deg=3.0).code is Code.OK
+        rig.await_views(gone + 1)
+        assert rig.of()[-1].header.view_rev == 2
+    assert [event["view"] for event in rig.events("VIEW_REMOVED")] == ["main"]
+
+
+def test_parameters_change_from_the_next_window_on(tmp_path: Path) -> None:
+    with Rig(tmp_path, lambda _: Endless(), config=LOCKSTEP) as rig:
+        rig.await_views(1)
+        reply = rig.ask("set_param", steps=3, guidance=[1.0, 2.0], publish="jpeg", jpeg_quality=60)
+        assert reply.code is Code.OK
+        until(lambda: rig.of()[-1].header.encoding == "jpeg")
+        header = rig.of()[-1].header
+        assert header.quality.steps == 3
+        pixels = rig.of()[-1].pixels
+        assert pixels is not None
+        assert pixels.shape == (14, 64, 96, 3)
+        model = rig.model
+        assert isinstance(model, FakeSynthesizer)
+        assert model.asked[-1][1].guidance == (1.0, 2.0)
+        config = asked_config(rig)
+        assert (config["model"]["steps"], config["publish"]["encoding"]) == (3, "jpeg")
+        assert rig.ask("set_param", samples=2).code is Code.OK
+        until(lambda: model.asked[-1][1].samples == 2)
+
+
+def test_a_node_tells_who_it_is_and_what_it_can(tmp_path: Path) -> None:
+    with Rig(tmp_path, lambda _: Endless(), config=LOCKSTEP) as rig:
+        rig.await_views(1)
+        hello, described, calib = (rig.ask(verb).result for verb in ("hello", "describe", "get_calib"))
+        assert hello is not None
+        assert hello["boot_id"] == rig.views[0].header.boot_id
+        assert (hello["node_id"], hello["role"]) == ("gcd", "operator")
+        assert described is not None
+        assert described["limits"] == {
+            "azimuth_deg": [-90.0, 90.0],
+            "elevation_deg": [-30.0, 30.0],
+            "radius": [-3.0, 3.0],
+        }
+        assert described["fps"] == [6.0, 8.0, 12.0, 24.0]
+        assert calib is not None
+        assert calib["K"] == pytest.approx(list(rig.views[0].header.intrinsics or ()))
+        state, stats = rig.ask("state").result, rig.ask("stats").result
+        assert state is not None
+        assert (state["state"], state["source"]) == ("active", "streaming")
+        assert stats is not None
+        assert "heartbeat_seq" not in stats
+        assert rig.ask("record_start").code is Code.WRONG_STATE
+
+
+def test_a_command_is_answered_while_the_model_computes(tmp_path: Path) -> None:
+    gate = Gate()
+    with Rig(tmp_path, lambda _: Endless(), FakeSynthesizer(traits(), gate), config=LOCKSTEP) as rig:
+        until(lambda: gate.begun == 1)
+        took_s: list[float] = []
+        for i in range(20):
+            started_s = time.monotonic()
+            assert rig.ask("set_view", view="main", azimuth_deg=float(i)).code is Code.OK
+            took_s.append(time.monotonic() - started_s)
+        assert rig.views == []
+        assert sorted(took_s)[len(took_s) // 2] < 1.0  # 50 ms on a machine that does nothing else
+
+
+def test_an_operator_who_deactivates_keeps_a_node_that_would_end_with_its_source(tmp_path: Path) -> None:
+    with Rig(tmp_path, lambda _: Endless(), config=LOCKSTEP, once=True) as rig:
+        rig.await_views(1)
+        assert rig.ask("deactivate").code is Code.ACCEPTED
+        rig.await_event("STATE")
+        assert [event["code"] for event in rig.events()][-2:] == ["STOPPED", "STATE"]
+        assert rig.node.state.label == "inactive"
+        rig.ask("activate")
+        rig.await_state("active")
+        until(lambda: rig.of()[-1].header.src.epoch == 1)
+    ids = [view.header.window_id for view in rig.of()]
+    assert ids == sorted(set(ids))
+
+
+def test_live_stamps_are_utc_with_one_offset_for_all_views_of_a_window(tmp_path: Path) -> None:
+    camera = Camera()
+    with Rig(tmp_path, Bench(camera), views=TWO_VIEWS) as rig:
+        rig.await_state("active")
+        began_ns = time.time_ns()
+        camera.run(30)
+        rig.await_views(1)
+        rig.await_views(1, "swing")
+    header, other = rig.of()[0].header, rig.of("swing")[0].header
+    assert header.clock == "realtime"
+    assert header.t_capture_ns == other.t_capture_ns
+    assert began_ns - 50_000_000 <= header.t_capture_ns[0] <= header.t_capture_ns[-1] <= header.t_infer_start_ns
+    steps = {b - a for a, b in zip(header.t_capture_ns, header.t_capture_ns[1:], strict=False)}
+    assert max(steps) - min(steps) <= 1  # nanoseconds: nobody makes new stamps
+    since_ms = (header.t_publish_ns - header.t_capture_ns[-1]) / 1e6
+    assert header.age_ms == pytest.approx(since_ms, abs=20)
+
+
+def test_whoever_starts_the_node_is_told_when_it_is_ready_and_that_it_lives(tmp_path: Path) -> None:
+    address = str(tmp_path / "notify")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind(address)
+        listener.settimeout(20)
+        environment = {"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "400000"}
+        with Rig(tmp_path, lambda _: Endless(), config=LOCKSTEP, service=ServiceManager(environment)) as rig:
+            rig.await_views(1)
+            heard = [listener.recv(4096).decode() for _ in range(6)]
+        listener.settimeout(0.1)
+        try:
+            while True:
+                heard.append(listener.recv(4096).decode())
+        except TimeoutError:
+            pass
+    assert heard[0].startswith("EXTEND_TIMEOUT_USEC")
+    assert sum("READY=1" in line for line in heard) == 1
+    assert "WATCHDOG=1" in heard
+    assert sum("STOPPING=1" in line for line in heard) == 1

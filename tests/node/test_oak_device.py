@@ -1,0 +1,192 @@
+"""Which OAK is meant, and what is known of its lens, without one."""
+
+import logging
+import sys
+import time
+from contextlib import closing
+
+import pytest
+from media import HEIGHT, WIDTH
+
+from gcd_node.calibration import LensModel
+from gcd_node.config import SourceConfig
+from gcd_node.errors import SourceAbsentError, SourceError
+from gcd_node.sources.oak_camera import OakCamera, lens_in_memory, load_depthai, open_oak
+from gcd_node.sources.oak_search import find_device
+
+try:
+    import oak_pipelines as pipelines
+except SourceError as missing:
+    pytest.skip(str(missing), allow_module_level=True)
+
+import depthai as dai
+
+PATIENT_S = 30.0  # for a machine that is busy with something else
+SOCKET = dai.CameraBoardSocket.CAM_A
+
+
+# Which device.
+
+
+def device(serial: str, name: str = "1.2") -> dai.DeviceInfo:
+    info = dai.DeviceInfo(name)
+    info.deviceId = serial
+    return info
+
+
+ONE, TWO = device("18443010A1B2C3D4E5", "1.2"), device("19443010AABBCCDDEE", "192.168.1.20")
+
+
+@pytest.mark.parametrize(
+    ("wanted", "found"),
+    [(None, [ONE]), (ONE.deviceId, [ONE, TWO]), (ONE.name, [TWO, ONE])],
+    ids=["the only one", "by id", "by port"],
+)
+def test_the_device_that_is_meant_is_taken(wanted: str | None, found: list[dai.DeviceInfo]) -> None:
+    chosen = find_device(wanted, lambda: found, lambda: found)
+    assert chosen is not None
+    assert chosen.deviceId == ONE.deviceId
+
+
+def test_an_address_that_the_search_did_not_find_is_to_be_tried() -> None:
+    assert find_device("10.1.2.3", lambda: [ONE], lambda: [ONE]) is None
+
+
+@pytest.mark.parametrize(
+    ("wanted", "available", "connected", "said"),
+    [
+        (None, [], [], "wanted an OAK camera, found none"),
+        (None, [], [ONE], f"{ONE.deviceId} .* in use by another process"),
+        (None, [ONE, TWO], [ONE, TWO], f"{ONE.deviceId} .*{TWO.deviceId}.*say which with device"),
+        ("14442C", [ONE], [ONE, TWO], f"OAK 14442C, found {ONE.deviceId} .*{TWO.deviceId} .* in use"),
+    ],
+    ids=["none", "busy", "several", "another"],
+)
+def test_a_device_that_cannot_be_told_is_absent_and_the_others_are_listed(
+    wanted: str | None, available: list[dai.DeviceInfo], connected: list[dai.DeviceInfo], said: str
+) -> None:
+    with pytest.raises(SourceAbsentError, match=said):
+        find_device(wanted, lambda: available, lambda: connected)
+
+
+@pytest.fixture
+def no_device() -> None:
+    if dai.Device.getAllConnectedDevices():
+        pytest.skip("needs a machine without an OAK, found one")
+
+
+@pytest.mark.usefixtures("no_device")
+def test_no_device_is_said_within_three_seconds() -> None:
+    begin = time.monotonic()
+    with pytest.raises(SourceAbsentError, match="wanted an OAK camera, found none") as caught:
+        open_oak(SourceConfig(kind="oak", open_timeout_s=PATIENT_S))
+    assert caught.value.exit_code == 69
+    assert time.monotonic() - begin < 6  # 1.1 s on a machine that is not busy
+
+
+@pytest.mark.usefixtures("no_device")
+def test_an_address_where_nobody_answers_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DEPTHAI_SEARCH_TIMEOUT", "300")
+    with pytest.raises(SourceAbsentError, match=r"no OAK camera answers at 127\.0\.0\.1"):
+        open_oak(SourceConfig(kind="oak", device="127.0.0.1", open_timeout_s=PATIENT_S))
+
+
+def test_a_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "depthai", None)
+    with pytest.raises(SourceError, match=r"pip install 'gcd-node\[oak\]'"):
+        open_oak(SourceConfig(kind="oak"))
+
+
+def test_an_older_depthai_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(dai.Pipeline, "setDeviceStateCallback")
+    with pytest.raises(SourceError, match=r"3\.12 or newer"):
+        load_depthai()
+
+
+# The lens.
+
+
+def memory(*, width: int = 4056, height: int = 3040, coefficients: list[float], model: str) -> dai.CalibrationHandler:
+    sensor = dai.CameraInfo()
+    sensor.width, sensor.height = width, height
+    sensor.intrinsicMatrix = [[3100.0, 0.0, 2020.0], [0.0, 3101.0, 1530.0], [0.0, 0.0, 1.0]]
+    sensor.distortionCoeff = coefficients
+    sensor.cameraType = dai.CameraModel.__members__[model]
+    stored = dai.EepromData()
+    stored.version = 7
+    stored.cameraData = {SOCKET: sensor}
+    return dai.CalibrationHandler(stored)
+
+
+RATIONAL = [0.5, -0.25, 0.125, 0.0625, 2.0, 0.75, -0.5, 1.5]
+
+
+def test_the_lens_in_memory_is_scaled_and_cut_to_the_picture() -> None:
+    lens = lens_in_memory(memory(coefficients=RATIONAL + [0.0] * 6, model="Perspective"), SOCKET, 1280, 720)
+    scale = 1280 / 4056  # the width is kept, rows are cut off above and below
+    assert lens is not None
+    assert (lens.width, lens.height) == (1280, 720)
+    assert lens.fx == pytest.approx(3100 * scale, rel=1e-5)
+    assert lens.fy == pytest.approx(3101 * scale, rel=1e-5)
+    assert lens.cx == pytest.approx(2020 * scale, abs=1)
+    assert lens.cy == pytest.approx(1530 * scale - (3040 * scale - 720) / 2, abs=1)
+    assert (lens.distortion, lens.coefficients) == ("rational_polynomial", tuple(RATIONAL))
+
+
+@pytest.mark.parametrize(
+    ("coefficients", "model", "wanted"),
+    [
+        ([0.0] * 14, "Perspective", ("none", ())),
+        ([0.5, 0.25], "Perspective", ("rational_polynomial", (0.5, 0.25, *[0.0] * 6))),
+        ([*RATIONAL, 0.5, *[0.0] * 5], "Perspective", ("rational_polynomial", (*RATIONAL, 0.5, *[0.0] * 5))),
+        ([0.5, 0.25, 2.0, 4.0, *[0.0] * 10], "Fisheye", ("equidistant", (0.5, 0.25, 2.0, 4.0))),
+    ],
+    ids=["none", "short", "with prism", "fish-eye"],
+)
+def test_distortion_has_our_names(coefficients: list[float], model: str, wanted: tuple[str, tuple[float, ...]]) -> None:
+    lens = lens_in_memory(memory(coefficients=coefficients, model=model), SOCKET, 4056, 3040)
+    assert lens is not None
+    assert (lens.distortion, lens.coefficients) == wanted
+
+
+def test_a_memory_without_this_sensor_is_no_lens(caplog: pytest.LogCaptureFixture) -> None:
+    assert lens_in_memory(dai.CalibrationHandler(dai.EepromData()), SOCKET, 640, 480) is None
+    assert "no calibration for CAM_A" in caplog.text
+
+
+@pytest.mark.parametrize("broken", ["model", "axis"])
+def test_a_lens_that_makes_no_sense_is_no_lens(broken: str, caplog: pytest.LogCaptureFixture) -> None:
+    stored = memory(
+        coefficients=RATIONAL,
+        model="RadialDivision" if broken == "model" else "Perspective",
+        width=4056 if broken == "model" else 1000,
+    )
+    assert lens_in_memory(stored, SOCKET, 500, 500) is None
+    assert "uncalibrated" in caplog.text
+
+
+def test_the_lens_of_the_picture_itself_comes_before_the_memory(caplog: pytest.LogCaptureFixture) -> None:
+    first = pipelines.picture(0)
+    matrix = [[80.0, 0.0, 32.0], [0.0, 81.0, 24.0], [0.0, 0.0, 1.0]]
+    first.transformation = dai.ImgTransformation(WIDTH, HEIGHT, matrix, dai.CameraModel.Perspective, RATIONAL)
+    stored = LensModel(width=WIDTH, height=HEIGHT, fx=50.0, fy=50.0, cx=32.0, cy=24.0)
+    factory = pipelines.Scripted(pipelines.Handed(first), lens=lambda width, height: stored)
+    with caplog.at_level(logging.WARNING), closing(OakCamera(factory, open_timeout_s=PATIENT_S)) as camera:
+        lens = camera.info.lens
+    assert lens is not None
+    assert (lens.fx, lens.fy, lens.cx, lens.cy) == (80.0, 81.0, 32.0, 24.0)
+    assert lens.coefficients == tuple(RATIONAL)
+    assert "focal length is 80.0 pixels by its pictures, 50.0 by its memory" in caplog.text
+
+
+def test_the_memory_is_asked_for_the_size_of_the_picture_if_that_knows_no_lens() -> None:
+    asked: list[tuple[int, int]] = []
+
+    def lens(width: int, height: int) -> LensModel:
+        asked.append((width, height))
+        return LensModel(width=width, height=height, fx=50.0, fy=50.0, cx=32.0, cy=24.0)
+
+    factory = pipelines.Scripted(pipelines.steady(), lens=lens)
+    with closing(OakCamera(factory, open_timeout_s=PATIENT_S)) as camera:
+        assert camera.info.lens == lens(WIDTH, HEIGHT)
+    assert asked[0] == (WIDTH, HEIGHT)

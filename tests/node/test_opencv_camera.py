@@ -1,0 +1,186 @@
+"""Cameras of this machine through OpenCV, with a scripted Video4Linux device; what all OpenCV cameras share."""
+
+import logging
+import time
+from itertools import islice, pairwise
+from pathlib import Path
+
+import cv2
+import pytest
+from fake_camera import FakeVideoCapture
+from media import flat
+
+from gcd_node.config import SourceConfig
+from gcd_node.errors import SourceAbsentError, SourceError, SourceLostError
+from gcd_node.sources import open_source, v4l2_device
+from gcd_node.sources.opencv_camera import OpenCvCamera, codec_name, sane_fps
+from gcd_node.sources.opencv_log import quiet_opencv
+from gcd_node.sources.v4l2_device import V4l2Request, list_v4l2, open_v4l2
+
+RED = flat(250, 10, 20)
+GUARD_S = 20.0
+
+
+def camera(fake: FakeVideoCapture, request: V4l2Request | None = None, open_timeout_s: float = GUARD_S) -> OpenCvCamera:
+    """A Video4Linux source over a fake; /dev/null stands in for the device file."""
+    return open_v4l2("/dev/null", request or V4l2Request(), open_timeout_s=open_timeout_s, open_capture=fake.open)
+
+
+# --- a device of this machine ------------------------------------------------------------------------------------
+
+
+def test_a_device_is_opened_by_its_path_with_the_video4linux_backend() -> None:
+    fake = FakeVideoCapture(RED)
+    camera(fake).close()
+    assert fake.opened_with == ("/dev/null", cv2.CAP_V4L2)
+
+
+def test_the_pixel_format_is_set_before_the_size_and_what_differs_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    fake = FakeVideoCapture(RED, fixed={cv2.CAP_PROP_FRAME_WIDTH: 640.0})
+    with caplog.at_level(logging.WARNING):
+        source = camera(fake, V4l2Request(width=1280, height=720, fps=30.0))
+    source.close()
+    order = [prop for prop, _ in fake.calls]
+    size_and_rate = [cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS]
+    assert order == [cv2.CAP_PROP_FOURCC, *size_and_rate]
+    assert [record.getMessage() for record in caplog.records] == ["/dev/null: asked for width 1280, it gives 640"]
+    assert (source.info.codec, source.info.fps_nominal) == ("MJPG", 30.0)
+
+
+def test_nothing_is_set_that_was_not_asked_for() -> None:
+    fake = FakeVideoCapture(RED)
+    camera(fake).close()
+    assert fake.calls == []
+
+
+def test_stamps_of_the_driver_are_used() -> None:
+    fake = FakeVideoCapture(RED, stamps="driver")
+    source = camera(fake)
+    frame = next(source.frames())
+    source.close()
+    assert frame.stamp_ns in [round(stated * 1e6) for stated in fake.stated_ms]
+    assert source.info.stamp_uncertainty_us == 20_000
+
+
+@pytest.mark.parametrize("stamps", ["zero", "wall"])
+def test_stamps_of_another_clock_are_replaced_by_the_time_of_arrival(stamps: str) -> None:
+    begin_ns = time.monotonic_ns()
+    source = camera(FakeVideoCapture(RED, stamps=stamps))
+    frame = next(source.frames())
+    source.close()
+    assert begin_ns < frame.stamp_ns <= time.monotonic_ns()
+    assert source.info.stamp_uncertainty_us == 80_000
+
+
+def test_a_damaged_picture_is_counted_and_leaves_a_gap() -> None:
+    fake = FakeVideoCapture(RED, fps=50.0)
+    fake.damaged = {0, 4, 5}
+    source = camera(fake)
+    seqs: list[int] = []
+    for frame in source.frames():
+        seqs.append(frame.seq)
+        if frame.seq > 8:
+            break
+    source.close()
+    assert source.corrupt == 3
+    assert not fake.damaged & set(seqs)
+
+
+@pytest.mark.parametrize("stated", [0.0, 90_000.0, float("nan")])
+def test_a_rate_that_cannot_be_is_measured_instead(stated: float) -> None:
+    source = camera(FakeVideoCapture(RED, fps=20.0, fixed={cv2.CAP_PROP_FPS: stated}))
+    source.close()
+    assert 5.0 < source.info.fps_nominal < 22.0
+
+
+def test_an_unplugged_camera_is_lost_every_time_it_is_asked() -> None:
+    fake = FakeVideoCapture(RED)
+    source = camera(fake)
+    fake.gone = True
+    for _ in range(2):
+        with pytest.raises(SourceLostError, match="the camera /dev/null gives no more pictures; check its cable"):
+            list(source.frames())
+    assert fake.released.wait(GUARD_S)
+
+
+def test_a_read_that_never_returns_is_left_behind(caplog: pytest.LogCaptureFixture) -> None:
+    fake = FakeVideoCapture(RED)
+    source = camera(fake)
+    fake.awake.clear()
+    begin = time.monotonic()
+    with caplog.at_level(logging.INFO):
+        source.close()
+    assert time.monotonic() - begin < GUARD_S
+    assert "its thread is left behind" in caplog.text
+    assert list(source.frames()) == []
+    assert not fake.released.is_set()
+    fake.awake.set()
+    assert fake.released.wait(GUARD_S)
+
+
+def test_a_camera_that_gives_no_picture_in_time_is_absent() -> None:
+    fake = FakeVideoCapture(RED)
+    fake.awake.clear()
+    with pytest.raises(SourceAbsentError, match=r"the camera /dev/null gave no picture within 0\.2 s"):
+        camera(fake, open_timeout_s=0.2)
+    fake.awake.set()
+    assert fake.released.wait(GUARD_S)
+
+
+def test_a_camera_that_ends_before_its_first_picture_is_absent() -> None:
+    fake = FakeVideoCapture(RED)
+    fake.gone = True
+    with pytest.raises(SourceAbsentError, match="opens, but gives no picture"):
+        camera(fake)
+
+
+def test_a_device_that_another_program_uses_is_refused() -> None:
+    fake = FakeVideoCapture(RED)
+    fake.there = False
+    with pytest.raises(SourceAbsentError, match="cannot be opened; check its cable, and that no other program"):
+        camera(fake)
+
+
+def test_an_absent_camera_is_told_with_those_there_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(v4l2_device, "_DEVICES", tmp_path)
+    monkeypatch.setattr(v4l2_device, "_NAMES", tmp_path / "names")
+    for name in ("video10", "video2", "video-notes"):
+        (tmp_path / name).touch()
+    (tmp_path / "names" / "video2").mkdir(parents=True)
+    (tmp_path / "names" / "video2" / "name").write_text("Front camera\n")
+    assert list_v4l2() == [f"{tmp_path}/video2 (Front camera)", f"{tmp_path}/video10"]
+    with pytest.raises(SourceAbsentError, match=r"no camera .*/video0; there is .*video2 \(Front camera\), .*video10"):
+        open_source(SourceConfig(kind="v4l2"))
+    with pytest.raises(SourceError, match="video10 is no camera device"):
+        open_source(SourceConfig(kind="v4l2", device="10"))
+
+
+@pytest.mark.hardware
+def test_a_real_camera_gives_a_second_of_pictures() -> None:
+    if not Path("/dev/video0").exists():
+        pytest.skip("needs a camera at /dev/video0")
+    source = open_source(SourceConfig(kind="v4l2"))
+    frames = list(islice(source.frames(), 15))
+    source.close()
+    assert all(b.stamp_ns > a.stamp_ns for a, b in pairwise(frames))
+    assert 0 <= time.monotonic_ns() - frames[-1].stamp_ns < 1_000_000_000
+
+
+# --- small parts -------------------------------------------------------------------------------------------------
+
+
+def test_only_possible_rates_and_codecs_are_believed() -> None:
+    assert [sane_fps(rate) for rate in (0.0, -1.0, float("nan"), 90_000.0, 29.97)] == [None] * 4 + [29.97]
+    assert codec_name(cv2.VideoWriter.fourcc(*"MJPG")) == "MJPG"
+    assert [codec_name(code) for code in (0.0, -1.0)] == [None, None]
+
+
+def test_overlapping_silences_end_with_the_last_one() -> None:
+    level = cv2.utils.logging.getLogLevel()
+    one, two = quiet_opencv(), quiet_opencv()
+    one.__enter__()
+    two.__enter__()
+    one.__exit__(None, None, None)
+    assert cv2.utils.logging.getLogLevel() == cv2.utils.logging.LOG_LEVEL_SILENT
+    two.__exit__(None, None, None)
+    assert cv2.utils.logging.getLogLevel() == level

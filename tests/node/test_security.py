@@ -1,0 +1,348 @@
+"""Keys on disk, the list of clients, and who gets through to a secured node over tcp."""
+
+import stat
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import zmq
+from control_fakes import Events, FakeCommands, wait_for
+from wire_messages import origin, window
+
+from gcd_node.allow_list import load_server_security
+from gcd_node.config import SecurityConfig
+from gcd_node.control import ControlOptions, ControlServer
+from gcd_node.control_client import ControlClient
+from gcd_node.endpoints import check_bindable
+from gcd_node.errors import AuthError, ConfigError, ControlError, OutputError
+from gcd_node.keys import (
+    Client,
+    ClientKeys,
+    KeyPair,
+    fingerprint,
+    read_key_pair,
+    read_public_key,
+    write_key_pair,
+)
+from gcd_node.publisher import Publisher
+from gcd_node.publisher_options import PublisherOptions
+from gcd_node.security import ServerSecurity, check_pair, new_key_pair
+from gcd_node.subscriber import NoteSubscriber, ReceivedView, ViewSubscriber
+
+pytestmark = pytest.mark.timeout(90)
+
+NODE, VIEWER, OPERATOR, STRANGER = (new_key_pair() for _ in range(4))
+SECURITY = ServerSecurity(
+    keys=NODE,
+    clients={
+        VIEWER.public: Client(name="eye", role="viewer"),
+        OPERATOR.public: Client(name="hand", role="operator"),
+    },
+)
+LOOPBACK = "tcp://127.0.0.1:0"
+
+
+def keys(own: KeyPair, server: KeyPair = NODE) -> ClientKeys:
+    return ClientKeys(own=own, server=server.public)
+
+
+@pytest.fixture
+def events() -> Events:
+    return Events()
+
+
+@pytest.fixture
+def commands() -> FakeCommands:
+    return FakeCommands()
+
+
+@pytest.fixture
+def server(commands: FakeCommands, events: Events) -> Iterator[ControlServer]:
+    options = ControlOptions(endpoint=LOOPBACK, security=SECURITY)
+    with ControlServer(options, commands, lambda: "active", events) as made:
+        yield made
+
+
+@pytest.fixture
+def publisher(events: Events) -> Iterator[Publisher]:
+    options = PublisherOptions(data=LOOPBACK, status=LOOPBACK, security=SECURITY, linger_ms=100)
+    with Publisher(options, events) as made:
+        yield made
+
+
+def ask(server: ControlServer, who: ClientKeys | None, verb: str, timeout_s: float = 20.0) -> str:
+    """The code of the reply."""
+    with ControlClient(server.endpoint, keys=who, timeout_s=timeout_s) as client:
+        return client.request(verb, {"view": "top"} if verb == "set_view" else None).code
+
+
+def heard(reader: ViewSubscriber) -> ReceivedView | None:
+    """What arrives soon, None if the node does not let the reader in."""
+    try:
+        return reader.receive(200)
+    except AuthError:
+        return None
+
+
+# Who may do what
+
+
+def test_the_key_decides_the_role(server: ControlServer, commands: FakeCommands) -> None:
+    assert ask(server, keys(VIEWER), "hello") == "OK"
+    assert ask(server, keys(OPERATOR), "set_view") == "OK"
+    assert [role for _, role in commands.heard] == ["viewer", "operator"]
+
+
+def test_f18_a_viewer_is_forbidden_to_command(server: ControlServer, commands: FakeCommands) -> None:
+    with ControlClient(server.endpoint, keys=keys(VIEWER), timeout_s=20.0) as client:
+        reply = client.request("set_view", {"view": "top"})
+    assert (reply.code, reply.ok) == ("FORBIDDEN", False)
+    assert "eye is a viewer" in reply.message
+    assert commands.heard == []
+
+
+def test_f18_an_unknown_key_gets_no_reply_and_is_told_of(
+    server: ControlServer, commands: FakeCommands, events: Events
+) -> None:
+    with pytest.raises(AuthError, match=f"{fingerprint(STRANGER.public)}, is not on its list") as caught:
+        ask(server, keys(STRANGER), "hello")
+    assert caught.value.exit_code == 77
+    fields = events.wait("AUTH_DENIED")
+    assert fields == {
+        "level": 1,
+        "fingerprint": fingerprint(STRANGER.public),
+        "domain": "gcd.control",
+        "address": "127.0.0.1",
+        "suppressed": 0,
+    }
+    assert commands.heard == []
+
+
+def test_f18_a_client_without_keys_gets_no_reply(server: ControlServer, commands: FakeCommands, events: Events) -> None:
+    with pytest.raises(AuthError, match="it asks for keys, none were given"):
+        ask(server, None, "hello")
+    assert events.wait("AUTH_DENIED")["fingerprint"] is None
+    assert commands.heard == []
+
+
+def test_f18_a_client_with_the_wrong_node_key_gets_no_reply(
+    server: ControlServer, commands: FakeCommands, events: Events
+) -> None:
+    with pytest.raises(ControlError, match=f"its key really {fingerprint(STRANGER.public)}"):
+        ask(server, keys(VIEWER, server=STRANGER), "hello", timeout_s=1.0)
+    assert events.wait("AUTH_DENIED")["domain"] == "gcd.control"
+    assert commands.heard == []
+
+
+def test_f18_denials_are_limited_and_counted(server: ControlServer, events: Events) -> None:
+    for _ in range(3):
+        with pytest.raises(AuthError):
+            ask(server, keys(STRANGER), "hello")
+    for _ in range(12):
+        with pytest.raises(AuthError):
+            ask(server, keys(new_key_pair()), "hello")
+    assert 1 <= events.codes().count("AUTH_DENIED") <= 8
+    assert ask(server, keys(VIEWER), "hello") == "OK"
+
+
+@pytest.mark.parametrize("who", [None, keys(STRANGER), keys(VIEWER, server=STRANGER)], ids=["plain", "key", "node"])
+def test_f18_strangers_get_no_views_and_readers_beside_them_do(
+    publisher: Publisher, events: Events, who: ClientKeys | None
+) -> None:
+    with (
+        ViewSubscriber(publisher.endpoint, "top", keys=who) as stranger,
+        ViewSubscriber(publisher.endpoint, "top", keys=keys(VIEWER)) as reader,
+    ):
+        wait_for(lambda: publisher.stats.subscribers == 1)
+        assert events.wait("AUTH_DENIED")["domain"] == "gcd.data"
+        publisher.send(window(3))
+        received = reader.receive(20_000)
+        assert received is not None
+        assert received.header.window_id == 3
+        assert heard(stranger) is None
+        assert publisher.stats.subscribers == 1
+
+
+def test_f18_a_reader_is_told_that_it_is_not_let_in(publisher: Publisher) -> None:
+    with (
+        ViewSubscriber(publisher.endpoint, "top", keys=keys(STRANGER)) as views,
+    ):
+        for _ in range(2):  # ZeroMQ tries no more, so every call says it
+            with pytest.raises(AuthError, match="is not on its list"):
+                views.receive(20_000)
+
+
+def test_notes_travel_encrypted_too(publisher: Publisher) -> None:
+    assert publisher.status_endpoint is not None
+    publisher.note("status", origin(), {"state": "active"})
+    with NoteSubscriber(publisher.status_endpoint, ("status",), keys(VIEWER)) as notes:
+        note = notes.receive(20_000)
+    assert note is not None
+    assert note.fields["state"] == "active"
+
+
+def test_keys_for_a_node_that_uses_none_are_refused_with_a_reason(commands: FakeCommands, events: Events) -> None:
+    with ControlServer(ControlOptions(endpoint=LOOPBACK), commands, lambda: "active", events) as server:
+        with pytest.raises(AuthError, match="uses no keys"):
+            ask(server, keys(VIEWER), "hello")
+        assert events.codes() == []
+
+
+def test_ipc_beside_keys_stays_this_users(tmp_path: Path, commands: FakeCommands, events: Events) -> None:
+    options = ControlOptions(endpoint=f"ipc://{tmp_path}/c", security=SECURITY)
+    with ControlServer(options, commands, lambda: "active", events) as server:
+        assert ask(server, None, "set_view") == "OK"
+    assert [role for _, role in commands.heard] == ["operator"]
+
+
+# Where a node may be reached
+
+
+def test_f19_with_keys_and_clients_a_wider_bind_is_allowed(commands: FakeCommands, events: Events) -> None:
+    options = ControlOptions(endpoint="tcp://0.0.0.0:0", security=SECURITY)
+    with ControlServer(options, commands, lambda: "active", events) as server:
+        port = server.endpoint.rpartition(":")[2]
+        with ControlClient(f"tcp://127.0.0.1:{port}", keys=keys(VIEWER), timeout_s=20.0) as client:
+            assert client.request("hello").ok
+
+
+def test_f19_without_them_it_is_refused_and_both_settings_are_named() -> None:
+    with pytest.raises(ConfigError, match=r"\[security\] keys and \[security\] allow") as caught:
+        check_bindable("tcp://0.0.0.0:5580")
+    assert caught.value.exit_code == 78
+    check_bindable("tcp://0.0.0.0:5580", secured=True)
+
+
+def test_a_socket_whose_gate_is_gone_lets_nobody_in() -> None:
+    with zmq.Context() as context:
+        router = context.socket(zmq.ROUTER)
+        for option, value in (
+            (zmq.CURVE_SERVER, 1),
+            (zmq.CURVE_SECRETKEY, NODE.secret.encode()),
+            (zmq.ZAP_DOMAIN, b"gcd.control"),
+            (zmq.ZAP_ENFORCE_DOMAIN, 1),
+        ):
+            router.set(option, value)
+        router.bind(LOOPBACK)
+        endpoint = router.getsockopt_string(zmq.LAST_ENDPOINT)
+        with ControlClient(endpoint, keys=keys(OPERATOR), timeout_s=0.5) as client:
+            with pytest.raises((ControlError, AuthError)):
+                client.call("hello")
+            assert not router.poll(0)
+        context.destroy(linger=0)
+
+
+# Keys as files
+
+
+def test_keys_survive_the_disk_and_only_their_owner_reads_them(tmp_path: Path) -> None:
+    write_key_pair(tmp_path / "k", NODE)
+    assert read_key_pair(tmp_path / "k") == NODE
+    assert stat.S_IMODE((tmp_path / "k").stat().st_mode) == 0o700
+    assert stat.S_IMODE((tmp_path / "k" / "secret.key").stat().st_mode) == 0o600
+
+
+def test_keys_are_never_overwritten(tmp_path: Path) -> None:
+    write_key_pair(tmp_path, NODE)
+    with pytest.raises(OutputError, match="holds keys already"):
+        write_key_pair(tmp_path, STRANGER)
+    assert read_key_pair(tmp_path) == NODE
+
+
+@pytest.mark.parametrize("mode", [0o644, 0o640, 0o604, 0o620])
+def test_a_secret_others_may_read_is_refused(tmp_path: Path, mode: int) -> None:
+    write_key_pair(tmp_path, NODE)
+    (tmp_path / "secret.key").chmod(mode)
+    with pytest.raises(ConfigError, match="chmod 600"):
+        read_key_pair(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["public.key", "secret.key"])
+@pytest.mark.parametrize("text", ["", "x" * 39, "x" * 41, "~" * 40, "é" * 40])
+def test_a_damaged_key_is_refused_and_never_shown(tmp_path: Path, name: str, text: str) -> None:
+    write_key_pair(tmp_path, NODE)
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        read_key_pair(tmp_path)
+    assert name == "public.key" or not text or text not in str(caught.value)
+
+
+def test_halves_of_two_pairs_are_refused() -> None:
+    check_pair(NODE)
+    with pytest.raises(ConfigError, match="do not belong together"):
+        check_pair(KeyPair(public=NODE.public, secret=STRANGER.secret))
+
+
+def test_a_secret_key_shows_in_no_repr() -> None:
+    assert NODE.secret not in repr(SECURITY)
+    assert NODE.secret not in repr(keys(NODE))
+
+
+def test_a_public_key_is_given_as_text_file_or_folder(tmp_path: Path) -> None:
+    write_key_pair(tmp_path, NODE)
+    for given in (NODE.public, str(tmp_path / "public.key"), str(tmp_path)):
+        assert read_public_key(given) == NODE.public
+    with pytest.raises(ConfigError, match="cannot read the key"):
+        read_public_key(str(tmp_path / "absent"))
+
+
+# The list of clients
+
+
+def allow(folder: Path, text: str) -> SecurityConfig:
+    write_key_pair(folder / "keys", NODE)
+    (folder / "allow.toml").write_text(text)
+    return SecurityConfig(keys=str(folder / "keys"), allow=str(folder / "allow.toml"))
+
+
+def test_the_list_names_clients_and_roles(tmp_path: Path) -> None:
+    text = f'[client.eye]\nkey = "{VIEWER.public}"\n[client.hand]\nkey = "{OPERATOR.public}"\nrole = "operator"\n'
+    assert load_server_security(allow(tmp_path, text)) == SECURITY
+
+
+def test_no_security_section_means_none() -> None:
+    assert load_server_security(SecurityConfig()) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "client"),
+        ("[client]", "length >= 1"),
+        ("[client.a]\nkey = 'short'", "the key of a must be 40 Z85 characters"),
+        (f"[client.a]\nkey = '{VIEWER.public}'\nrole = 'root'", "role"),
+        (f"[client.a]\nkey = '{VIEWER.public}'\nrol = 'viewer'", "rol"),
+        (f"[client.'a b']\nkey = '{VIEWER.public}'", "regex"),
+        (f"[client.a]\nkey = '{VIEWER.public}'\n[client.b]\nkey = '{VIEWER.public}'", "have the same key"),
+        ("[client", "not valid TOML"),
+    ],
+)
+def test_a_wrong_list_is_refused(tmp_path: Path, text: str, says: str) -> None:
+    with pytest.raises(ConfigError, match=says):
+        load_server_security(allow(tmp_path, text))
+
+
+def test_a_list_everybody_may_write_is_refused(tmp_path: Path) -> None:
+    config = allow(tmp_path, f"[client.a]\nkey = '{VIEWER.public}'\n")
+    (tmp_path / "allow.toml").chmod(0o666)
+    with pytest.raises(ConfigError, match="chmod o-w"):
+        load_server_security(config)
+
+
+def test_a_missing_list_is_named(tmp_path: Path) -> None:
+    config = allow(tmp_path, "")
+    (tmp_path / "allow.toml").unlink()
+    with pytest.raises(ConfigError, match=r"cannot read the list of clients .*allow.toml"):
+        load_server_security(config)
+
+
+# Light
+
+
+def test_what_a_planner_imports_needs_neither_msgspec_nor_torch() -> None:
+    blocked = ("torch", "cv2", "kornia", "msgspec", "rich", "typer", "gcd_model")
+    program = f"import sys; sys.modules.update(dict.fromkeys({blocked!r})); import gcd_node.subscriber; print('ok')"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.stdout.strip(), done.stderr) == ("ok", "")

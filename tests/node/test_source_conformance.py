@@ -1,0 +1,378 @@
+"""The contract of gcd_node.frame.FrameSource, one suite over every kind of source a launch file can name.
+
+Each kind is a row of KINDS: how to open one that shows flat red, how to silence it, and what it says if it is missing.
+"""
+
+import importlib.util
+import threading
+import time
+from collections.abc import Callable, Generator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field
+from itertools import count, islice, pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, get_args
+
+import numpy as np
+import pytest
+from fake_camera import FakeVideoCapture
+from media import HEIGHT, WIDTH, flat, write_pictures, write_video
+from rtsp_server import serving, write_transport_stream
+
+from gcd_node.config import LIVE_KINDS, SourceConfig, SourceKind
+from gcd_node.errors import SourceAbsentError, SourceError
+from gcd_node.frame import Frame, FrameSource, Image
+from gcd_node.sources import SyntheticDrive, open_source
+from gcd_node.sources.v4l2_device import V4l2Request, open_v4l2
+
+if TYPE_CHECKING:
+    from gcd_node.sources.oak_camera import PipelineFactory
+    from gcd_node.sources.oak_loss import Guard
+
+COUNT = 12
+COLOUR = (200, 60, 20)
+RED = flat(*COLOUR)
+OPEN_S = 20.0
+GUARD_S = 30.0
+
+
+def nothing() -> None:
+    """A recording needs no silencing: opened slowly, it waits by itself."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Opened:
+    """A source; `hush` makes a live one silent."""
+
+    source: FrameSource
+    hush: Callable[[], None] = nothing
+
+
+def is_red(image: Image) -> None:
+    assert np.abs(image[8:-8, 8:-8].astype(int) - COLOUR).max() <= 8
+
+
+def is_street(image: Image) -> None:
+    """The sky is blue, not orange."""
+    red, _, blue = image[0, WIDTH // 2 - 4 : WIDTH // 2 + 4].astype(int).mean(axis=0)
+    assert blue > red + 40
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kind:
+    """How the suite handles one kind of source.
+
+    open: with "slow" a recording plays in real time, a frame every 2 s; else it plays in lockstep. A live one gives
+        25 FPS, whichever.
+    missing: settings for one that is not there, and the error that says so. needs: packages, and why else to skip.
+    """
+
+    open: Callable[[Path, bool], AbstractContextManager[Opened]]
+    missing: Callable[[Path], SourceConfig]
+    error: type[SourceError] = SourceError
+    check: Callable[[Image], None] = is_red
+    needs: tuple[str, ...] = field(default=())
+
+
+@contextmanager
+def closing(source: FrameSource, hush: Callable[[], None] = nothing) -> Generator[Opened]:
+    try:
+        yield Opened(source=source, hush=hush)
+    finally:
+        source.close()
+
+
+def play(kind: SourceKind, path: Path, slow: bool, fps: float | None = None) -> AbstractContextManager[Opened]:
+    pace = "realtime" if slow else "lockstep"
+    return closing(open_source(SourceConfig(kind=kind, path=str(path), pace=pace, fps=fps)))
+
+
+def open_file(folder: Path, slow: bool) -> AbstractContextManager[Opened]:
+    path = write_video(folder / "clip.mkv", [RED] * COUNT, fps=0.5 if slow else 25.0)
+    return play("file", path, slow)
+
+
+def open_folder(folder: Path, slow: bool) -> AbstractContextManager[Opened]:
+    path = write_pictures(folder / "pictures", {f"{i}.png": RED for i in range(COUNT)})
+    return play("folder", path, slow, fps=0.5 if slow else 25.0)
+
+
+def open_synthetic(folder: Path, slow: bool) -> AbstractContextManager[Opened]:
+    pace, fps = ("realtime", 0.5) if slow else ("lockstep", 25.0)
+    return closing(SyntheticDrive(width=WIDTH, height=HEIGHT, fps=fps, frames=COUNT, pace=pace))
+
+
+@contextmanager
+def open_v4l2_camera(folder: Path, slow: bool) -> Generator[Opened]:
+    fake = FakeVideoCapture(RED)
+    source = open_v4l2("/dev/null", V4l2Request(), open_timeout_s=OPEN_S, open_capture=fake.open)
+    with closing(source, fake.awake.clear) as opened:
+        yield opened
+    fake.awake.set()
+
+
+@contextmanager
+def open_rtsp(folder: Path, slow: bool) -> Generator[Opened]:
+    with serving(write_transport_stream(folder / "live.ts", [RED] * 600), burst=40) as server:
+        source = open_source(SourceConfig(kind="rtsp", url=server.url, open_timeout_s=OPEN_S))
+        with closing(source, server.stall) as opened:
+            yield opened
+
+
+@contextmanager
+def open_oak(folder: Path, slow: bool) -> Generator[Opened]:
+    """DepthAI on this host alone: a scripted node stands in for the camera."""
+    from gcd_node.sources.oak_camera import OakCamera
+
+    awake = threading.Event()
+    awake.set()
+    with closing(OakCamera(scripted_pipeline(awake), open_timeout_s=OPEN_S), awake.clear) as opened:
+        yield opened
+
+
+def scripted_pipeline(awake: threading.Event) -> "PipelineFactory":
+    import depthai as dai
+    from oak_pipelines import HostCamera, picture
+
+    from gcd_node.sources.oak_camera import OakStream
+
+    def shoot(camera: HostCamera) -> None:
+        for seq in count():
+            time.sleep(0.04)
+            if not camera.isRunning():
+                return
+            if awake.is_set():
+                camera.out.send(picture(seq, RED))
+
+    def build(guard: "Guard") -> OakStream:
+        pipeline = dai.Pipeline(createImplicitDevice=False)
+        camera = pipeline.create(HostCamera)
+        camera.body = guard(lambda: shoot(camera))
+        return OakStream(pipeline=pipeline, output=camera.out, id="scripted", fps=25.0)
+
+    return build
+
+
+def open_mcap(folder: Path, slow: bool) -> AbstractContextManager[Opened]:
+    """A ROS 2 log, written by the reference library."""
+    from robot_logs import START_NS, TOPIC, compressed, ros_log
+
+    period_ns = 2_000_000_000 if slow else 40_000_000
+    with ros_log(folder / "log.mcap") as log:
+        for i in range(COUNT):
+            stamp_ns = START_NS + i * period_ns
+            log.say(TOPIC, "sensor_msgs/msg/CompressedImage", compressed(RED, stamp_ns), log_ns=stamp_ns, sequence=i)
+    return play("mcap", folder / "log.mcap", slow)
+
+
+KINDS: dict[SourceKind, Kind] = {
+    "file": Kind(open=open_file, missing=lambda folder: SourceConfig(path=str(folder / "none.mp4"))),
+    "folder": Kind(
+        open=open_folder, missing=lambda folder: SourceConfig(kind="folder", path=str(folder / "none"), fps=5.0)
+    ),
+    "synthetic": Kind(
+        open=open_synthetic, missing=lambda folder: SourceConfig(kind="synthetic", fps=5000.0), check=is_street
+    ),
+    "mcap": Kind(
+        open=open_mcap,
+        missing=lambda folder: SourceConfig(kind="mcap", path=str(folder / "none.mcap")),
+        needs=("mcap", "mcap_ros2", "mcap_protobuf", "foxglove_schemas_protobuf"),
+    ),
+    "v4l2": Kind(
+        open=open_v4l2_camera,
+        missing=lambda folder: SourceConfig(kind="v4l2", device=str(folder / "video7")),
+        error=SourceAbsentError,
+    ),
+    "rtsp": Kind(
+        open=open_rtsp,
+        missing=lambda folder: SourceConfig(kind="rtsp", url="rtsp://127.0.0.1:1/live"),
+        error=SourceAbsentError,
+    ),
+    "oak": Kind(
+        open=open_oak,
+        missing=lambda folder: SourceConfig(kind="oak", device="14442C10NOSUCHDEVICE"),
+        error=SourceAbsentError,
+        needs=("depthai",),
+    ),
+}
+LIVE: list[SourceKind] = [kind for kind in KINDS if kind in LIVE_KINDS]
+RECORDED: list[SourceKind] = [kind for kind in KINDS if kind not in LIVE_KINDS]
+every_kind = pytest.mark.parametrize("kind", list(KINDS))
+live_kinds = pytest.mark.parametrize("kind", LIVE)
+recorded_kinds = pytest.mark.parametrize("kind", RECORDED)
+
+
+@pytest.fixture(autouse=True)
+def _installed(request: pytest.FixtureRequest) -> None:
+    callspec = getattr(request.node, "callspec", None)
+    if callspec is None:
+        return
+    for package in KINDS[callspec.params["kind"]].needs:
+        if importlib.util.find_spec(package) is None:
+            pytest.skip(f"a source of kind {callspec.params['kind']} needs the package {package}")
+
+
+@contextmanager
+def opened(kind: SourceKind, folder: Path, *, slow: bool = False) -> Generator[Opened]:
+    with KINDS[kind].open(folder, slow) as made:
+        yield made
+
+
+def test_every_kind_of_a_launch_file_is_in_this_suite() -> None:
+    assert set(KINDS) == set(get_args(SourceKind))
+
+
+# --- what is known of it -----------------------------------------------------------------------------------------
+
+
+@every_kind
+def test_a_source_says_what_it_is(kind: SourceKind, tmp_path: Path) -> None:
+    with opened(kind, tmp_path) as it:
+        info = it.source.info
+        assert (info.kind, info.live, info.clock) == (kind, kind in LIVE, "realtime" if kind in LIVE else "replay")
+        assert (info.width, info.height) == (WIDTH, HEIGHT)
+        assert info.fps_nominal == pytest.approx(25.0, rel=0.02)
+        assert info.id
+        assert "/" not in info.id
+        assert info.stamp_uncertainty_us > 0
+        next(iter(it.source.frames()))
+        assert it.source.info == info
+
+
+# --- frames ------------------------------------------------------------------------------------------------------
+
+
+@every_kind
+def test_stamps_and_sequence_numbers_rise(kind: SourceKind, tmp_path: Path) -> None:
+    with opened(kind, tmp_path) as it:
+        frames = list(islice(it.source.frames(), COUNT))
+        assert len(frames) == COUNT
+        assert all(b.stamp_ns > a.stamp_ns and b.seq > a.seq for a, b in pairwise(frames))
+        assert it.source.corrupt == 0
+
+
+@every_kind
+def test_frames_are_read_only_bytes_of_the_stated_size(kind: SourceKind, tmp_path: Path) -> None:
+    with opened(kind, tmp_path) as it:
+        for frame in islice(it.source.frames(), 3):
+            assert (frame.image.dtype, frame.image.shape) == (np.uint8, (HEIGHT, WIDTH, 3))
+            with pytest.raises(ValueError, match="read-only"):
+                frame.image[0, 0] = 0
+
+
+@every_kind
+def test_red_is_red(kind: SourceKind, tmp_path: Path) -> None:
+    with opened(kind, tmp_path) as it:
+        for frame in islice(it.source.frames(), 2):
+            KINDS[kind].check(frame.image)
+
+
+@live_kinds
+def test_live_stamps_are_of_this_host_s_monotonic_clock(kind: SourceKind, tmp_path: Path) -> None:
+    with opened(kind, tmp_path) as it:
+        begin_ns = time.monotonic_ns()
+        frame = next(frame for frame in it.source.frames() if frame.stamp_ns > begin_ns)
+        assert frame.stamp_ns <= time.monotonic_ns()
+
+
+@live_kinds
+def test_a_slow_caller_of_a_camera_gets_the_newest(kind: SourceKind, tmp_path: Path) -> None:
+    with opened(kind, tmp_path) as it:
+        frames = iter(it.source.frames())
+        first = next(frames)
+        time.sleep(0.6)
+        asked_ns = time.monotonic_ns()
+        second = next(frames)
+        assert second.seq >= first.seq + 5
+        assert second.stamp_ns > asked_ns - 400_000_000
+
+
+@recorded_kinds
+def test_a_slow_caller_of_a_recording_misses_nothing(kind: SourceKind, tmp_path: Path) -> None:
+    with opened(kind, tmp_path) as it:
+        seqs: list[int] = []
+        for frame in it.source.frames():
+            seqs.append(frame.seq)
+            time.sleep(0.01)
+        assert seqs == list(range(COUNT))
+
+
+@recorded_kinds
+def test_a_recording_begins_again_with_every_look(kind: SourceKind, tmp_path: Path) -> None:
+    with opened(kind, tmp_path) as it:
+        first, second = list(it.source.frames()), list(it.source.frames())
+        assert [(frame.stamp_ns, frame.seq) for frame in first] == [(frame.stamp_ns, frame.seq) for frame in second]
+        assert all(np.array_equal(a.image, b.image) for a, b in zip(first, second, strict=True))
+
+
+@live_kinds
+def test_a_camera_goes_on_with_every_look(kind: SourceKind, tmp_path: Path) -> None:
+    with opened(kind, tmp_path) as it:
+        first = next(iter(it.source.frames()))
+        assert next(iter(it.source.frames())).seq > first.seq
+
+
+# --- the end -----------------------------------------------------------------------------------------------------
+
+
+@every_kind
+def test_closing_from_another_thread_ends_a_blocked_look_within_a_second(kind: SourceKind, tmp_path: Path) -> None:
+    with opened(kind, tmp_path, slow=True) as it:
+        seen: list[Frame] = []
+        errors: list[Exception] = []
+        reader = threading.Thread(target=lambda: look(it.source, seen, errors), daemon=True)
+        reader.start()
+        wait_until(lambda: bool(seen))
+        it.hush()
+        time.sleep(0.2)  # what was on its way arrives
+        closer = threading.Thread(target=it.source.close, daemon=True)
+        closer.start()
+        reader.join(1.0)
+        assert not reader.is_alive()
+        closer.join(GUARD_S)
+        assert not closer.is_alive()
+        assert errors == []
+
+
+@every_kind
+def test_a_closed_source_stays_closed(kind: SourceKind, tmp_path: Path) -> None:
+    with opened(kind, tmp_path) as it:
+        next(iter(it.source.frames()))
+        it.source.close()
+        it.source.close()
+        assert list(it.source.frames()) == []
+
+
+@every_kind
+def test_a_look_that_is_given_up_can_be_closed(kind: SourceKind, tmp_path: Path) -> None:
+    with opened(kind, tmp_path) as it:
+        frames = it.source.frames()
+        next(frames)
+        it.source.close()
+        assert list(frames) == []
+
+
+@every_kind
+def test_what_is_missing_is_refused_in_one_line_and_in_time(kind: SourceKind, tmp_path: Path) -> None:
+    begin = time.monotonic()
+    with pytest.raises(SourceError) as caught:
+        open_source(KINDS[kind].missing(tmp_path))
+    assert time.monotonic() - begin < GUARD_S
+    assert type(caught.value) is KINDS[kind].error
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) > 20
+
+
+def look(source: FrameSource, seen: list[Frame], errors: list[Exception]) -> None:
+    try:
+        for frame in source.frames():
+            seen.append(frame)
+    except Exception as error:  # the end of a thread
+        errors.append(error)
+
+
+def wait_until(true: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + GUARD_S
+    while not true():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)

@@ -1,0 +1,269 @@
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from cameras import FPS, Bench, Camera, until
+from fakes import FakeSource
+
+from gcd_node.errors import ConfigError, SourceError, SourceLostError
+from gcd_node.frame import Frame, FrameSource, SourceInfo
+from gcd_node.health_report import SourceState
+from gcd_node.source_watch import Backoff, Patience, SourceWatch
+from gcd_node.window import Reason
+
+QUICK = Backoff(first_s=0.01, limit_s=0.05)
+
+
+@dataclass
+class Log:
+    """A listener that writes down what it is told, with times."""
+
+    states: list[SourceState] = field(default_factory=list)
+    times_s: list[float] = field(default_factory=list)
+    details: list[str] = field(default_factory=list)
+    told: list[str] = field(default_factory=list)
+    heard: list[Frame] = field(default_factory=list)
+    infos: list[SourceInfo] = field(default_factory=list)
+
+    def source_state(self, state: SourceState, detail: str) -> None:
+        self.states.append(state)
+        self.times_s.append(time.monotonic())
+        self.details.append(detail)
+        self.told.append(state)
+
+    def source_frame(self, frame: Frame) -> None:
+        self.heard.append(frame)
+
+    def source_broken(self, reason: Reason) -> None:
+        self.told.append(reason)
+
+    def source_opened(self, info: SourceInfo) -> None:
+        self.told.append("opened")
+        self.infos.append(info)
+
+
+class Reader:
+    """Iterates a watch in a thread, as the node does."""
+
+    def __init__(self, first: FrameSource, bench: Bench | None = None, **patience: float | None) -> None:
+        self.log = Log()
+        reopen = (bench or Bench()).open
+        self.watch = SourceWatch(first, reopen, self.log, Patience(**patience), QUICK)  # type: ignore[arg-type]
+        self.frames: list[Frame] = []
+        self.failure: Exception | None = None
+        self.thread = threading.Thread(target=self._read, daemon=True)
+        self.thread.start()
+
+    def _read(self) -> None:
+        try:
+            for frame in self.watch.frames():
+                self.frames.append(frame)
+        except Exception as error:
+            self.failure = error
+
+    def finish(self) -> "Reader":
+        self.thread.join(20)
+        assert not self.thread.is_alive()
+        return self
+
+
+def test_a_recording_passes_as_if_nobody_watched() -> None:
+    reader = Reader(FakeSource(30)).finish()
+    assert [frame.seq for frame in reader.frames] == list(range(30))
+    assert reader.log.told == ["connecting", "opened", "streaming", "ended"]
+    assert reader.log.heard == reader.frames
+
+
+def test_an_error_of_a_recording_is_not_mended() -> None:
+    source = FakeSource(3)
+    source.fails = SourceError("damaged")
+    reader = Reader(source).finish()
+    assert len(reader.frames) == 3
+    assert str(reader.failure) == "damaged"
+
+
+def test_a_silent_camera_stalls_and_goes_on() -> None:
+    camera = Camera()
+    reader = Reader(camera, stall_s=0.1)
+    camera.shoot()
+    until(lambda: "stalled" in reader.log.states)
+    camera.shoot()
+    until(lambda: len(reader.frames) == 2)
+    reader.watch.close()
+    reader.finish()
+    assert reader.log.states == ["connecting", "streaming", "stalled", "streaming"]
+    assert "SRC_LOST" not in reader.log.told
+
+
+def test_a_camera_that_stays_silent_is_let_go_and_the_next_one_taken() -> None:
+    camera, bench = Camera(), Bench()
+    reader = Reader(camera, bench, stall_s=0.1)
+    camera.shoot()
+    until(lambda: "lost" in reader.log.states)
+    stalled, lost = (reader.log.times_s[reader.log.states.index(state)] for state in ("stalled", "lost"))
+    first_s = reader.log.times_s[reader.log.states.index("streaming")]
+    assert stalled - first_s >= 0.1
+    assert lost - first_s >= 1.8
+    assert camera.closed.is_set()
+    second = bench.plug(Camera())
+    until(lambda: second in bench.opened)
+    second.shoot()
+    until(lambda: len(reader.frames) == 2)
+    reader.watch.close()
+    reader.finish()
+    assert reader.log.states == ["connecting", "streaming", "stalled", "lost", "streaming"]
+    assert reader.log.told[-4:] == ["lost", "SRC_LOST", "opened", "streaming"]
+
+
+@pytest.mark.parametrize("ending", [SourceLostError("USB said goodbye"), SourceError("torn"), None])
+def test_a_camera_that_says_it_is_gone_is_believed_at_once(ending: Exception | None) -> None:
+    camera, second = Camera(), Camera()
+    reader = Reader(camera, Bench(second))
+    camera.shoot()
+    camera.feed(ending)
+    until(lambda: "lost" in reader.log.states)
+    second.shoot()
+    until(lambda: len(reader.frames) == 2)
+    reader.watch.close()
+    reader.finish()
+    assert "stalled" not in reader.log.states
+    assert reader.log.details[reader.log.states.index("lost")] == str(ending or "the stream ended")
+
+
+def test_a_device_that_never_answers_again_is_left_behind() -> None:
+    camera, second = Camera(deaf=True), Camera()
+    reader = Reader(camera, Bench(second), stall_s=0.05)
+    camera.shoot()
+    until(lambda: len(reader.log.infos) == 2)
+    second.shoot()
+    camera.shoot()  # too late: nobody reads it any more
+    until(lambda: len(reader.frames) == 2)
+    time.sleep(0.05)
+    reader.watch.close()
+    reader.finish()
+    assert len(reader.frames) == 2
+
+
+def test_attempts_go_on_for_ever_unless_a_limit_is_set() -> None:
+    camera, bench = Camera(), Bench()
+    reader = Reader(camera, bench)
+    camera.feed(SourceLostError("gone"))
+    until(lambda: bench.tries >= 8)
+    reader.watch.close()
+    assert reader.finish().failure is None
+
+
+def test_after_so_many_failed_attempts_in_a_row_it_is_given_up() -> None:
+    camera, bench = Camera(), Bench()
+    reader = Reader(camera, bench, max_reconnects=3)
+    camera.shoot()
+    until(lambda: reader.frames != [])
+    camera.feed(SourceLostError("gone"))
+    reader.finish()
+    assert isinstance(reader.failure, SourceLostError)
+    assert "3 attempts" in str(reader.failure)
+    assert "there is no camera" in str(reader.failure)
+    assert bench.tries == 3
+
+
+def test_a_camera_that_opens_and_gives_nothing_counts_as_a_failed_attempt() -> None:
+    camera, bench = Camera(), Bench(Camera(), Camera(), Camera())
+    reader = Reader(camera, bench, max_reconnects=2, open_s=0.05, stall_s=0.01)
+    camera.shoot()
+    reader.finish()
+    assert isinstance(reader.failure, SourceLostError)
+    assert len(bench.opened) == 2
+
+
+def test_another_picture_size_is_told_before_its_first_frame() -> None:
+    camera = Camera()
+    reader = Reader(camera)
+    camera.shoot()
+    camera.shoot(np.zeros((32, 48, 3), np.uint8))
+    camera.shoot(np.zeros((32, 48, 3), np.uint8))
+    until(lambda: len(reader.frames) == 3)
+    reader.watch.close()
+    reader.finish()
+    assert [(info.width, info.height) for info in reader.log.infos] == [(96, 64), (48, 32)]
+    assert reader.log.told == ["connecting", "opened", "streaming", "SRC_FORMAT", "opened"]
+
+
+def test_what_the_listener_refuses_ends_the_frames() -> None:
+    class Strict(Log):
+        def source_opened(self, info: SourceInfo) -> None:
+            raise ConfigError("too small")
+
+    with pytest.raises(ConfigError, match="too small"):
+        next(SourceWatch(Camera(), Bench().open, Strict()).frames())
+
+
+def test_a_fault_of_ours_in_a_source_is_not_taken_for_a_lost_camera() -> None:
+    camera = Camera()
+    reader = Reader(camera, Bench(Camera()))
+    camera.feed(ZeroDivisionError("a bug"))
+    assert isinstance(reader.finish().failure, ZeroDivisionError)
+
+
+def test_a_slow_reader_gets_the_newest_frames_and_the_rest_is_counted() -> None:
+    camera = Camera()
+    watch = SourceWatch(camera, Bench().open, Log())
+    frames: Iterator[Frame] = watch.frames()
+    camera.shoot()
+    assert next(frames).seq == 0
+    for _ in range(50):
+        camera.shoot()
+    time.sleep(0.3)
+    left = [next(frames).seq for _ in range(4)]
+    watch.close()
+    assert list(frames) == []
+    assert left == [47, 48, 49, 50]
+    assert watch.skipped == 46
+
+
+def test_damaged_frames_are_counted_over_all_openings() -> None:
+    camera, second = Camera(), Camera()
+    camera.corrupt, second.corrupt = 3, 4
+    reader = Reader(camera, Bench(second))
+    assert reader.watch.corrupt == 3
+    camera.feed(None)
+    until(lambda: len(reader.log.infos) == 2)
+    assert reader.watch.corrupt == 7
+    reader.watch.close()
+    reader.finish()
+
+
+def test_closing_ends_a_silent_watch_and_one_that_looks_for_its_camera() -> None:
+    for lost in (False, True):
+        camera = Camera()
+        reader = Reader(camera, Bench())
+        if lost:
+            camera.feed(None)
+            until(lambda reader=reader: "lost" in reader.log.states)
+        started_s = time.monotonic()
+        reader.watch.close()
+        reader.finish()
+        assert time.monotonic() - started_s < 10
+        assert camera.closed.is_set()
+
+
+def test_waiting_doubles_up_to_its_limit_and_never_passes_it() -> None:
+    even = Backoff(jitter=0.0)
+    assert [even.next_s() for _ in range(7)] == [0.5, 1.0, 2.0, 4.0, 8.0, 10.0, 10.0]
+    even.reset()
+    assert even.next_s() == 0.5
+    for draw in (0.0, 1.0):
+        waits = [backoff.next_s() for backoff in [Backoff(draw=lambda draw=draw: draw)] for _ in range(6)]
+        assert waits[0] == pytest.approx(0.4 if draw == 0.0 else 0.6)
+        assert max(waits) <= 10.0
+
+
+def test_patience_follows_the_rate_and_two_seconds() -> None:
+    patience = Patience()
+    assert patience.stalled_after_s(FPS) == 0.2
+    assert patience.stalled_after_s(5.0) == pytest.approx(0.6)
+    assert patience.lost_after_s(FPS) < 2.0
+    assert patience.lost_after_s(1.0) == pytest.approx(6.0)
+    assert Patience(stall_s=0.5).stalled_after_s(FPS) == 0.5

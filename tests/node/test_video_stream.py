@@ -1,0 +1,266 @@
+"""Network cameras: a real RTSP server and a UDP sender on loopback; no password is ever repeated."""
+
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from fake_camera import FakeVideoCapture
+from media import HEIGHT, WIDTH, flat
+from rtsp_server import RtspServer, serving, split_pictures, write_transport_stream
+
+from gcd_node.config import SourceConfig
+from gcd_node.errors import ConfigError, SourceAbsentError, SourceError, SourceLostError
+from gcd_node.sources import open_source
+from gcd_node.sources.video_stream import Backlog, open_stream, parse_address
+
+RED = flat(250, 10, 20)
+GUARD_S = 20.0
+SECRET = "s3cret"
+
+
+# --- addresses ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("url", "shown"),
+    [
+        (f"rtsp://admin:{SECRET}@cam.local/stream1", "rtsp://cam.local"),
+        (f"RTSP://admin:{SECRET}@10.0.0.7:8554/x?token={SECRET}", "rtsp://10.0.0.7:8554"),
+        (f"rtsp://cam.local:554/user=admin_password={SECRET}_channel=1.sdp", "rtsp://cam.local"),
+        (f"http://[fe80::1]:8080/video?key={SECRET}", "http://[fe80::1]:8080"),
+        ("udp://@:5000", "udp://:5000"),
+    ],
+)
+def test_an_address_is_shown_without_what_may_be_secret(url: str, shown: str) -> None:
+    assert str(parse_address(url)) == shown
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        *(f"file:///etc/{SECRET}", f"/dev/{SECRET}", f"concat://{SECRET}", "", f"rtsp:{SECRET}"),
+        *(f"rtsp://u:{SECRET}/x@host/y", f"rtsp://u:{SECRET}@x@host/y", f"rtsp://u:{SECRET}@host:port/", "rtsp://"),
+        *(f"rtsp://u:{SECRET}@/y", f"rtsp://u:{SECRET}", f"http://ho st/{SECRET}", f"rtsp://host:999999/{SECRET}"),
+    ],
+)
+def test_what_is_no_address_of_a_stream_is_refused_and_not_repeated(url: str) -> None:
+    with pytest.raises(ConfigError, match="url") as caught:
+        open_source(SourceConfig(kind="rtsp", url=url))
+    assert SECRET not in str(caught.value)
+
+
+# --- pictures that piled up --------------------------------------------------------------------------------------
+
+
+def held(arrivals_ms: list[float], positions_ms: list[float]) -> list[bool]:
+    backlog = Backlog(period_ns=40_000_000)
+    pairs = zip(arrivals_ms, positions_ms, strict=True)
+    return [backlog.holds(round(arrival * 1e6), position) for arrival, position in pairs]
+
+
+def test_a_burst_at_the_start_is_old_and_what_follows_in_time_is_not() -> None:
+    arrivals = [0.0, 1.0, 2.0, 3.0, 43.0, 83.0, 90.0]
+    assert held(arrivals, [40.0 * i for i in range(7)]) == [True, True, True, True, False, False, False]
+
+
+def test_a_burst_after_a_silence_is_old_too() -> None:
+    arrivals = [0.0, 40.0, 80.0, 900.0, 901.0, 902.0, 941.0]
+    assert held(arrivals, [40.0 * i for i in range(7)]) == [True, False, False, True, True, True, False]
+
+
+def test_jitter_is_no_burst() -> None:
+    arrivals = [0.0, 40.0, 110.0, 115.0, 160.0, 239.0, 241.0]
+    assert held(arrivals, [40.0 * i for i in range(7)])[1:] == [False] * 6
+
+
+def test_without_positions_the_stated_rate_counts() -> None:
+    assert held([0.0, 5.0, 10.0, 50.0], [0.0, 0.0, 0.0, 0.0]) == [True, True, True, False]
+
+
+def test_a_stream_that_never_waits_is_believed_after_two_seconds() -> None:
+    arrivals = [10.0 * i for i in range(220)]
+    flags = held(arrivals, [40.0 * i for i in range(220)])
+    assert flags.index(False) == 201
+    assert not any(flags[201:])
+
+
+# --- streams -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """24 s whose red channel rises by 1 every 3 pictures."""
+    images = [flat(i // 3, 60, 200) for i in range(600)]
+    return write_transport_stream(tmp_path_factory.mktemp("stream") / "live.ts", images)
+
+
+@pytest.fixture
+def server(recording: Path) -> Iterator[RtspServer]:
+    with serving(recording, burst=40) as running:
+        yield running
+
+
+def test_an_rtsp_camera_gives_its_pictures_in_the_right_colours(server: RtspServer) -> None:
+    source = open_source(SourceConfig(kind="rtsp", url=server.url, open_timeout_s=GUARD_S))
+    frame = next(source.frames())
+    source.close()
+    info = source.info
+    assert (info.width, info.height, info.fps_nominal, info.clock, info.live) == (WIDTH, HEIGHT, 25.0, "realtime", True)
+    assert info.id == server.url.split("/")[2]
+    assert info.stamp_uncertainty_us == 100_000
+    assert np.abs(frame.image[20, 20, 1:].astype(int) - (60, 200)).max() <= 8
+
+
+def test_what_a_server_had_in_store_is_not_taken_for_new(server: RtspServer) -> None:
+    source = open_stream(server.url, open_timeout_s=GUARD_S)
+    first = next(source.frames())
+    source.close()
+    assert first.image[20, 20, 0] >= 40 // 3 - 3  # brightness tells the picture's place; the codec is lossy
+
+
+def test_a_silent_stream_blocks_until_its_read_timeout_and_is_lost_then(server: RtspServer) -> None:
+    source = open_stream(server.url, open_timeout_s=GUARD_S, read_timeout_s=1.0)
+    frames = source.frames()
+    next(frames)
+    server.stall()
+    begin = time.monotonic()
+    with pytest.raises(SourceLostError, match=r"the stream rtsp://127\.0\.0\.1:\d+ gives no more pictures"):
+        list(frames)
+    assert 0.5 < time.monotonic() - begin < GUARD_S
+
+
+def test_after_a_short_silence_what_piled_up_is_not_taken_for_new(server: RtspServer) -> None:
+    source = open_stream(server.url, open_timeout_s=GUARD_S, read_timeout_s=GUARD_S)
+    frames = source.frames()
+    before = next(frames)
+    server.stall()
+    time.sleep(1.5)
+    server.resume()
+    after = next(frame for frame in frames if frame.stamp_ns - before.stamp_ns > 1_400_000_000)
+    source.close()
+    assert int(after.image[20, 20, 0]) - int(before.image[20, 20, 0]) >= 1.4 * 25 / 3 - 3
+
+
+def test_a_server_that_dies_is_lost_and_found_when_it_is_back(server: RtspServer) -> None:
+    source = open_stream(server.url, open_timeout_s=GUARD_S)
+    frames = source.frames()
+    next(frames)
+    server.die()
+    with pytest.raises(SourceLostError):
+        list(frames)
+    with pytest.raises(SourceAbsentError, match="connection refused"):
+        open_stream(server.url, open_timeout_s=GUARD_S)
+    server.start()
+    again = open_stream(server.url, open_timeout_s=GUARD_S)
+    assert next(again.frames()).size == (WIDTH, HEIGHT)
+    again.close()
+
+
+def test_a_password_opens_the_stream_and_a_wrong_one_is_never_repeated(recording: Path) -> None:
+    with serving(recording, burst=40, password=SECRET) as server:
+        right = server.url.replace("//", f"//admin:{SECRET}@")
+        source = open_stream(right, open_timeout_s=GUARD_S)
+        assert next(source.frames()).size == (WIDTH, HEIGHT)
+        assert SECRET not in f"{source.info}{threading.enumerate()}"
+        source.close()
+        with pytest.raises(SourceAbsentError, match=r"the server is there, but gives none; check .*password") as caught:
+            open_stream(right.replace(SECRET, "wr0ng"), open_timeout_s=GUARD_S)
+    assert "wr0ng" not in str(caught.value)
+
+
+def test_no_password_reaches_the_terminal(recording: Path) -> None:
+    code = (
+        "import logging, sys; from gcd_node.config import SourceConfig; from gcd_node.errors import SourceError\n"
+        "from gcd_node.sources import open_source\n"
+        "logging.basicConfig(level=logging.DEBUG)\n"
+        "try: open_source(SourceConfig(kind='rtsp', url=sys.argv[1], open_timeout_s=20))\n"
+        "except SourceError as error: print('refused:', error)\n"
+    )
+    with serving(recording, password="other") as server:
+        done = run_python(code, server.url.replace("//", f"//admin:{SECRET}@"))
+    assert done.stdout.startswith("refused: no stream from rtsp://127.0.0.1")
+    assert SECRET not in done.stdout + done.stderr
+
+
+def test_a_process_ends_although_a_read_never_returns(server: RtspServer) -> None:
+    code = (
+        "import sys; from gcd_node.sources import open_stream\n"
+        "source = open_stream(sys.argv[1], open_timeout_s=20, read_timeout_s=600)\n"
+        "next(source.frames()); print('open', flush=True); sys.stdin.readline()\n"
+        "source.close(); print('closed')\n"
+    )
+    command = [sys.executable, "-c", code, server.url]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment()
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "open\n"
+        server.stall()
+        time.sleep(0.3)
+        out, errors = process.communicate("go\n", timeout=60)
+    assert (process.returncode, out, errors) == (0, "closed\n", "")
+
+
+def test_a_server_that_never_answers_is_absent_in_time() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        url = f"rtsp://127.0.0.1:{listener.getsockname()[1]}/live"
+        begin = time.monotonic()
+        with pytest.raises(SourceAbsentError, match=r"gave no picture within|gives none"):
+            open_stream(url, open_timeout_s=0.5)
+        assert time.monotonic() - begin < GUARD_S
+
+
+def test_a_udp_stream_is_read_with_the_same_code(recording: Path) -> None:
+    stop = threading.Event()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind(("127.0.0.1", 0))
+            port = probe.getsockname()[1]
+
+        def send() -> None:
+            for picture in split_pictures(recording.read_bytes()):
+                sender.sendto(picture[: 7 * 188], ("127.0.0.1", port))
+                if stop.wait(0.02):
+                    return
+
+        thread = threading.Thread(target=send, daemon=True)
+        thread.start()
+        source = open_source(SourceConfig(kind="rtsp", url=f"udp://127.0.0.1:{port}", open_timeout_s=GUARD_S))
+        assert next(source.frames()).size == (WIDTH, HEIGHT)
+        source.close()
+        stop.set()
+        thread.join(GUARD_S)
+    assert source.info.id == f"127.0.0.1:{port}"
+
+
+def test_open_and_read_timeouts_reach_the_decoder() -> None:
+    fake = FakeVideoCapture(RED)
+    open_stream("rtsp://host/x", open_timeout_s=GUARD_S, read_timeout_s=2.5, open_capture=fake.open).close()
+    url, backend, *pairs = fake.opened_with
+    given = dict(zip(pairs[::2], pairs[1::2], strict=True))
+    assert (url, backend) == ("rtsp://host/x", cv2.CAP_FFMPEG)
+    assert given[cv2.CAP_PROP_OPEN_TIMEOUT_MSEC] == 20_000
+    assert given[cv2.CAP_PROP_READ_TIMEOUT_MSEC] == 2_500
+
+
+def test_a_stream_too_large_to_decode_is_refused() -> None:
+    huge = {cv2.CAP_PROP_FRAME_WIDTH: 60_000.0, cv2.CAP_PROP_FRAME_HEIGHT: 60_000.0}
+    with pytest.raises(SourceError, match="states 60000 x 60000 pixels"):
+        open_stream("rtsp://host/x", open_timeout_s=GUARD_S, open_capture=FakeVideoCapture(RED, fixed=huge).open)
+
+
+def environment() -> dict[str, str]:
+    return os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+
+
+def run_python(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", code, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=True, env=environment())
