@@ -149,3 +149,12 @@ def fill(networks: Networks, folder: RunFolder, stage: StageName, identity: str)
 
 def _given(changes: UNetChanges | VAEChanges) -> dict[str, object]:
     return {name: value for name, value in msgspec.structs.asdict(changes).items() if value is not None}
+
+
+def copy_of(networks: Networks, *, plane_mix: bool) -> Networks:
+    """The same weights once more, on the CPU. plane_mix: keep that switch, if it is on; it is useless untrained."""
+    config = networks.config if plane_mix else msgspec.structs.replace(networks.config, plane_mix=None)
+    copy = Networks(config)
+    known = copy.state_dict()
+    copy.load_state_dict({name: value for name, value in networks.state_dict().items() if name in known})
+    return copy
