@@ -23,6 +23,7 @@ from gcd_train.model_setup import (
     family_of,
     fill,
     model_config,
+    sampled_as_trained,
     start_networks,
     weights_digest,
 )
@@ -59,7 +60,7 @@ class Trainer:
     def __init__(self, inputs: RunInputs) -> None:
         """Raises RecipeError if the recipe's model cannot be built or its device is not there."""
         self._inputs, self._recipe, self._folder = inputs, inputs.recipe, inputs.folder
-        self._config: ModelConfig = model_config(inputs.recipe.model)
+        self._config: ModelConfig = sampled_as_trained(model_config(inputs.recipe.model), inputs.recipe.unet)
         self._family = family_of(inputs.recipe.model)
         self._precision = Precision.of(inputs.recipe.compute)
         for clips in (inputs.clips, inputs.valid):
