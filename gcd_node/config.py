@@ -1,8 +1,6 @@
 """The node's settings, as a launch file states them (TOML)."""
 
-import difflib
 import hashlib
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
@@ -10,6 +8,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 import msgspec
 from msgspec import Meta
 
+from gcd_model import explain_settings_error
 from gcd_node.config_changes import with_changes
 from gcd_node.errors import ConfigError
 
@@ -281,36 +280,6 @@ def parse_config(text: bytes, name: str, changes: Sequence[str] = ()) -> NodeCon
         table = msgspec.toml.decode(text, type=dict[str, Any])
         return msgspec.convert(with_changes(table, changes), NodeConfig, strict=True)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{name}: {_explained(str(error))}") from error
+        raise ConfigError(f"{name}: {explain_settings_error(str(error), NodeConfig)}") from error
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{name} is not valid TOML: {error}") from error
-
-
-def _explained(message: str) -> str:
-    """msgspec's message, with the nearest known key where an unknown one is named."""
-    unknown = re.search(r"unknown field `([^`]+)`(?: - at `\$?\.?([^`]*)`)?", message)
-    if unknown is None:
-        return message.replace("`$.", "`")
-    key, place = unknown.group(1), unknown.group(2) or ""
-    known = _keys_at(place)
-    near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-    where = f" in [{place.replace('[...]', '.*')}]" if place else ""
-    hint = f"did you mean `{near[0]}`?" if near else f"known are {', '.join(known)}"
-    return f"unknown key `{key}`{where}; {hint}"
-
-
-def _keys_at(place: str) -> list[str]:
-    sections: dict[str, type[msgspec.Struct]] = {
-        "": NodeConfig,
-        "source": SourceConfig,
-        "source.pose": SourcePose,
-        "model": ModelSection,
-        "view": ViewConfig,
-        "window": WindowConfig,
-        "publish": PublishConfig,
-        "control": ControlConfig,
-        "security": SecurityConfig,
-        "health": HealthConfig,
-        "life": LifeConfig,
-    }
-    return list(sections[place.split("[")[0].strip(".")].__struct_fields__)

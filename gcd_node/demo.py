@@ -4,7 +4,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.resources import files
@@ -72,10 +72,10 @@ def run_demo(out: Path, on_window: Callable[[WindowReport], None]) -> DemoReport
         NodeError: the second process did not come up, or nothing arrived in it.
     """
     make_folder(out)  # to know at once
-    inputs: dict[int, Image] = {}
+    inputs: dict[int, list[Image]] = {}
 
     def remember(report: WindowReport) -> None:
-        inputs[report.window.window_id] = report.window.images
+        inputs[report.window.window_id] = list(report.window.images)
         on_window(report)
 
     with tempfile.TemporaryDirectory(prefix="gcd-demo-") as name:
@@ -89,7 +89,7 @@ def run_demo(out: Path, on_window: Callable[[WindowReport], None]) -> DemoReport
         ):
             summary = run_until_signal(node, publisher)
             publisher.close()
-            receiver.wait(_RECEIVER_TIMEOUT_S)
+            _wait_for(receiver)
         views, maps = (_arrived(folder / "received" / VIEW_ID / kind) for kind in (".", "cls"))
     (traits,) = models
     shown = moments(inputs, views, maps)
@@ -121,6 +121,17 @@ def _receiver(publisher: Publisher, folder: Path) -> Generator[subprocess.Popen[
         process.wait()
 
 
+def _wait_for(receiver: subprocess.Popen[bytes]) -> None:
+    """Until it has saved everything. Raises NodeError if it does not end by itself after the stream has."""
+    try:
+        receiver.wait(_RECEIVER_TIMEOUT_S)
+    except subprocess.TimeoutExpired as error:
+        raise NodeError(
+            f"the receiving process did not end within {_RECEIVER_TIMEOUT_S:g} s of the end of the stream; "
+            "try `gcd-node view` by hand to see why"
+        ) from error
+
+
 def _arrived(folder: Path) -> dict[int, list[Image]]:
     """Frames by window, from the pictures the receiver saved as WINDOW_FRAME.png; empty if it saved none."""
     windows: dict[int, list[Image]] = {}
@@ -130,14 +141,20 @@ def _arrived(folder: Path) -> dict[int, list[Image]]:
 
 
 def moments(
-    inputs: Mapping[int, Iterable[Image]], views: Mapping[int, Sequence[Image]], maps: Mapping[int, Sequence[Image]]
+    inputs: Mapping[int, Sequence[Image]], views: Mapping[int, Sequence[Image]], maps: Mapping[int, Sequence[Image]]
 ) -> list[list[Moment]]:
-    """Frames by window put together, in the order of the windows; if some have a class map, those without are left out.
+    """Frames by window put together, in the order of the windows. Left out: windows that were not saved whole, and, if
+    some have a class map, those without.
 
     Raises:
         NodeError: there is nothing to put together.
     """
-    windows = sorted(views.keys() & maps.keys() if maps else views.keys())
+    arrived = (views, maps) if maps else (views,)
+    windows = [
+        number
+        for number, frames in sorted(inputs.items())
+        if all(len(each.get(number, ())) == len(frames) for each in arrived)
+    ]
     if not windows:
         raise NodeError("no whole window arrived in the receiving process; run `gcd-node -v demo` to see why")
     return [

@@ -41,6 +41,7 @@ from gcd_model.geometry import (
     spherical_trajectory,
 )
 from gcd_model.loading import load_synthesizer
+from gcd_model.settings import explain_settings_error
 from gcd_model.synthesizer import Synthesizer, ViewSynthesizer, synthesize
 
 __all__ = [
@@ -83,6 +84,7 @@ __all__ = [
     "center_crop_box",
     "convert_weights",
     "driving_trajectory",
+    "explain_settings_error",
     "fitted_trajectory",
     "inspect_weights",
     "load_synthesizer",

@@ -230,7 +230,8 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
     frames: T. height, width: the trained size in pixels.
     image_encoder: None for a model without image token.
-    prediction, plane_warp, plane_mix, class_head: ours, for small models; as they are here the model is the paper's.
+    prediction, plane_warp, plane_mix, class_head, vae.patch, vae.linear, sampling.shared_noise: ours, for small models;
+        as they are here the model is the paper's.
     """
 
     frames: int = 14
@@ -279,7 +280,14 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     @property
     def is_ours(self) -> bool:
         """Whether any of the switches is on that the paper's model does not have."""
-        return self.prediction != "v" or self.plane_warp is not None or self.class_head is not None
+        return (
+            self.prediction != "v"
+            or self.plane_warp is not None
+            or self.class_head is not None
+            or self.vae.patch > 1
+            or self.vae.linear
+            or self.sampling.shared_noise
+        )
 
     @property
     def extra_condition_channels(self) -> int:

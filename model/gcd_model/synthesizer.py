@@ -86,7 +86,8 @@ def _out_of_memory_is_our_error(method: Callable[Given, Made]) -> Callable[Given
 class Synthesizer:
     """A checkpoint ready to run.
 
-    The U-Net and the encoders compute in the networks' own precision, the sampler state and the decoder in float32.
+    The U-Net and the encoders compute in the networks' own precision; the sampler state, the decoder and the plane mix
+    in float32.
     """
 
     def __init__(self, networks: Networks, traits: Traits) -> None:

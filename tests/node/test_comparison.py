@@ -74,6 +74,12 @@ def test_windows_whose_class_map_did_not_arrive_are_left_out() -> None:
     assert [(int(each.source[0, 0, 0]), len(each.columns)) for window in shown for each in window] == [(2, 3)]
 
 
+def test_a_window_that_was_saved_by_half_is_left_out() -> None:
+    pictures = {window: [flat(window), flat(window)] for window in (1, 2)}
+    shown = moments(pictures, pictures | {1: [flat(1)]}, {})
+    assert [int(each.source[0, 0, 0]) for window in shown for each in window] == [2, 2]
+
+
 @pytest.mark.parametrize("maps", [{}, {1: [flat(9)]}])
 def test_a_demo_in_which_nothing_arrived_says_so(maps: dict[int, list[Image]]) -> None:
     with pytest.raises(NodeError, match="no whole window arrived"):

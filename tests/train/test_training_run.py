@@ -19,6 +19,7 @@ from gcd_train.checkpoint import load_state
 from gcd_train.datasets.clip_source import to_network
 from gcd_train.datasets.latents import LatentClips
 from gcd_train.errors import DataError, Interrupted, RecipeError, RunError
+from gcd_train.model_setup import model_config, sampled_as_trained
 from gcd_train.recipe import Budget, Recipe, StageName
 from gcd_train.run_folder import RunFolder
 from gcd_train.stop import StopSignal
@@ -182,6 +183,24 @@ def test_a_state_of_another_seed_is_not_resumed(run: Path, tmp_path: Path) -> No
     path = folder_with(run, tmp_path / "again", "vae")
     with pytest.raises(RunError, match="another model, seed"):
         trainer(path, recipe=tiny_recipe(seed=4)).run("vae")
+
+
+def test_the_shipped_sampler_is_that_of_the_recipe() -> None:
+    recipe = tiny_recipe()
+    changed = msgspec.structs.replace(
+        recipe.unet, augmentation=0.05, noise=msgspec.structs.replace(recipe.unet.noise, shared=0.0)
+    )
+    config = model_config(recipe.model)
+    assert sampled_as_trained(config, recipe.unet).sampling == config.sampling
+    sampling = sampled_as_trained(config, changed).sampling
+    assert (sampling.augmentation, sampling.shared_noise) == (0.05, False)
+
+
+def test_a_sampler_that_starts_where_nothing_was_trained_is_refused() -> None:
+    recipe = tiny_recipe()
+    noise = msgspec.structs.replace(recipe.unet.noise, fixed_share=1.0, fixed_sigma=40.0)
+    with pytest.raises(RecipeError, match="trains sigma 40 alone"):
+        sampled_as_trained(model_config(recipe.model), msgspec.structs.replace(recipe.unet, noise=noise))
 
 
 def test_a_stage_wants_the_one_before_it(tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ from typing import Annotated, TypeVar
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gcd_model import Synthesizer, load_synthesizer
 from gcd_model.geometry import CameraMount
@@ -15,6 +14,7 @@ from gcd_train.cli_errors import errors_shown
 from gcd_train.datasets.paired import PairedClips, require_apart
 from gcd_train.errors import RecipeError
 from gcd_train.evaluation import SynthesizedViews, class_grid, evaluate, require_same_kind
+from gcd_train.progress_bar import progress_bar
 from gcd_train.report import Conditions, MountNumbers, Report, to_markdown, write_contact_sheet, write_report
 
 _LOG = Console(stderr=True)
@@ -92,6 +92,8 @@ def _conditions(
         weights=None if model is None else model.traits.name,
         sha256_12=None if model is None else model.traits.sha256_12,
         clips=len(clips),
+        first_seed=clips.seed(0),
+        last_seed=clips.seed(len(clips) - 1),
         frames=clips.frames,
         size=(clips.height, clips.width),
         grid=class_grid(clips),
@@ -104,7 +106,5 @@ def _conditions(
 
 def _watched(clips: PairedClips, name: str, work: Callable[[Callable[[int, int], None]], Made]) -> Made:
     """Do some work over clips behind a progress bar."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=_LOG, transient=True) as bar:
-        task = bar.add_task(name, total=len(clips))
-        return work(lambda done, _: bar.update(task, completed=done))
+    with progress_bar(name, len(clips)) as show:
+        return work(lambda done, _: show(done))

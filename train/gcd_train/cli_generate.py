@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gcd_model.geometry import CameraMount
 from gcd_train.cli_errors import errors_shown
+from gcd_train.progress_bar import progress_bar
 from gcd_train.scenes.contact_sheet import write_contact_sheet
 from gcd_train.scenes.driving import FPS, HFOV_DEG
 from gcd_train.scenes.film import write_film
@@ -75,8 +74,6 @@ def film(
 
 def _generate(out: Path, world: World, seeds: range, workers: int) -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, so that no worker is left behind
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task("clips", total=len(seeds))
+    with progress_bar("clips", len(seeds), keep=True) as show:
         for progress in generate(out, world, seeds, workers):
-            bar.update(task, completed=progress.done)
+            show(progress.done)

@@ -16,7 +16,7 @@ from gcd_model.networks import Networks
 from gcd_model.plane_warp import PathWarps, trained_mount
 from gcd_train.checkpoint import load_state, require_identity
 from gcd_train.errors import RecipeError, RunError
-from gcd_train.recipe import ComputeRecipe, ModelRecipe, StageName, UNetChanges, VAEChanges
+from gcd_train.recipe import ComputeRecipe, ModelRecipe, StageName, UNetChanges, UNetRecipe, VAEChanges
 from gcd_train.run_folder import RunFolder
 
 _BASES: dict[str, ModelConfig] = {"driving-small": DRIVING_SMALL, "svd-14": SVD_14, "small": SMALL}
@@ -44,6 +44,22 @@ def model_config(recipe: ModelRecipe) -> ModelConfig:
         return msgspec.json.decode(msgspec.json.encode(changed), type=ModelConfig)
     except (OptionError, msgspec.ValidationError) as error:
         raise RecipeError(f"the recipe's [model] cannot be built: {error}") from error
+
+
+def sampled_as_trained(config: ModelConfig, recipe: UNetRecipe) -> ModelConfig:
+    """The config with the sampler that suits the recipe's noise: what ships is used as it was trained.
+
+    Raises RecipeError if the sampler visits noise levels that the recipe never trains.
+    """
+    sampling, noise = config.sampling, recipe.noise
+    if noise.fixed_share == 1 and (sampling.steps, sampling.sigma_max) != (1, noise.fixed_sigma):
+        raise RecipeError(
+            f"the recipe trains sigma {noise.fixed_sigma:g} alone, the model is sampled in {sampling.steps} steps from "
+            f"{sampling.sigma_max:g}: lower unet.noise.fixed_share, or take a base model of one step from that sigma"
+        )
+    shared = sampling.shared_noise if 0 < noise.shared < 1 else noise.shared == 1
+    sampling = msgspec.structs.replace(sampling, augmentation=recipe.augmentation, shared_noise=shared)
+    return msgspec.structs.replace(config, sampling=sampling)
 
 
 def family_of(recipe: ModelRecipe) -> Family:
@@ -149,3 +165,12 @@ def fill(networks: Networks, folder: RunFolder, stage: StageName, identity: str)
 
 def _given(changes: UNetChanges | VAEChanges) -> dict[str, object]:
     return {name: value for name, value in msgspec.structs.asdict(changes).items() if value is not None}
+
+
+def copy_of(networks: Networks, *, plane_mix: bool) -> Networks:
+    """The same weights once more, on the CPU. plane_mix: keep that switch, if it is on; it is useless untrained."""
+    config = networks.config if plane_mix else msgspec.structs.replace(networks.config, plane_mix=None)
+    copy = Networks(config)
+    known = copy.state_dict()
+    copy.load_state_dict({name: value for name, value in networks.state_dict().items() if name in known})
+    return copy

@@ -1,13 +1,12 @@
 """What a training run does, as a recipe file states it (TOML): every option is named here, with its meaning."""
 
-import difflib
-import re
 from pathlib import Path
 from typing import Annotated, Literal, TypeAlias
 
 import msgspec
 from msgspec import Meta
 
+from gcd_model import explain_settings_error
 from gcd_train.errors import RecipeError
 
 Positive: TypeAlias = Annotated[float, Meta(gt=0)]
@@ -320,32 +319,6 @@ def parse_recipe(text: bytes, name: str) -> Recipe:
     try:
         return msgspec.toml.decode(text, type=Recipe)
     except msgspec.ValidationError as error:
-        raise RecipeError(f"{name}: {_explained(str(error))}") from error
+        raise RecipeError(f"{name}: {explain_settings_error(str(error), Recipe)}") from error
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise RecipeError(f"{name} is not valid TOML: {error}") from error
-
-
-def _explained(message: str) -> str:
-    """msgspec's message, with the nearest known key where an unknown one is named."""
-    unknown = re.search(r"unknown field `([^`]+)`(?: - at `\$?\.?([^`]*)`)?", message)
-    if unknown is None:
-        return message.replace("`$.", "`")
-    key, place = unknown.group(1), unknown.group(2) or ""
-    known = _keys_at(place)
-    near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-    where = f" in [{place}]" if place else ""
-    hint = f"did you mean `{near[0]}`?" if near else f"known are {', '.join(known)}"
-    return f"unknown key `{key}`{where}; {hint}"
-
-
-def _keys_at(place: str) -> list[str]:
-    struct: type[msgspec.Struct] = Recipe
-    for part in filter(None, place.split(".")):
-        struct = _struct_of_field(struct, part)
-    return list(struct.__struct_fields__)
-
-
-def _struct_of_field(struct: type[msgspec.Struct], name: str) -> type[msgspec.Struct]:
-    kind = next(field.type for field in msgspec.structs.fields(struct) if field.name == name)
-    options = (kind, *getattr(kind, "__args__", ()))
-    return next(option for option in options if isinstance(option, type) and issubclass(option, msgspec.Struct))

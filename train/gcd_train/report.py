@@ -38,15 +38,18 @@ class MountNumbers(msgspec.Struct, frozen=True, kw_only=True):
 class Conditions(msgspec.Struct, frozen=True, kw_only=True):
     """What the figures hold for.
 
-    clips: how many were measured. size, grid: height and width of pictures and of the class grid. true_mount: of the
-    source camera in the data. declared_mount: what the model and the baselines were told of it. train_clips: clips the
-    mean and the majority map were fitted on, 0 without baselines.
+    clips: how many were measured. first_seed, last_seed: of their scenes.
+    size, grid: height and width of pictures and of the class grid.
+    true_mount: of the source camera in the data. declared_mount: what the model and the baselines were told of it.
+    train_clips: clips the mean and the majority map were fitted on, 0 without baselines.
     """
 
     data: str
     weights: str | None
     sha256_12: str | None
     clips: int
+    first_seed: int
+    last_seed: int
     frames: int
     size: tuple[int, int]
     grid: tuple[int, int]
@@ -103,7 +106,8 @@ def to_markdown(report: Report) -> str:
     given = report.conditions
     height, width = given.grid
     lines = [
-        f"{given.clips} clips of `{given.data}`, frames 2-{given.frames}; value ± standard error over clips.",
+        f"{given.clips} clips of `{given.data}` (scenes {given.first_seed} to {given.last_seed}), "
+        f"frames 2-{given.frames}; value ± standard error over clips.",
         f"Source camera at {given.true_mount}; declared: {given.declared_mount}.",
         f"Class figures at {width}x{height}, in brackets at picture size. * uses the exact source depth.",
         "",

@@ -17,13 +17,22 @@ from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.loop import Loop, LoopOptions, Task
 from gcd_train.losses import class_frequency_weights
-from gcd_train.model_setup import digest_of, family_of, fill, model_config, start_networks, weights_digest
+from gcd_train.model_setup import (
+    copy_of,
+    digest_of,
+    family_of,
+    fill,
+    model_config,
+    sampled_as_trained,
+    start_networks,
+    weights_digest,
+)
 from gcd_train.objective import Weights
 from gcd_train.precision import Precision
 from gcd_train.recipe import DecoderRecipe, Recipe, StageName, UNetRecipe, VAERecipe
 from gcd_train.run_folder import RunFolder
 from gcd_train.stages.decoder import DecoderData, DecoderTask, Predictor
-from gcd_train.stages.export import export, without_plane_mix
+from gcd_train.stages.export import export
 from gcd_train.stages.latents import LatentsJob, encode_clips
 from gcd_train.stages.unet import UNetTask
 from gcd_train.stages.vae import VAETask
@@ -51,7 +60,7 @@ class Trainer:
     def __init__(self, inputs: RunInputs) -> None:
         """Raises RecipeError if the recipe's model cannot be built or its device is not there."""
         self._inputs, self._recipe, self._folder = inputs, inputs.recipe, inputs.folder
-        self._config: ModelConfig = model_config(inputs.recipe.model)
+        self._config: ModelConfig = sampled_as_trained(model_config(inputs.recipe.model), inputs.recipe.unet)
         self._family = family_of(inputs.recipe.model)
         self._precision = Precision.of(inputs.recipe.compute)
         for clips in (inputs.clips, inputs.valid):
@@ -176,7 +185,7 @@ class Trainer:
     def _export(self) -> None:
         mixes = "decoder" in self._recipe.stages
         networks = self._networks("vae", "unet", "decoder")
-        networks = networks if mixes else without_plane_mix(networks)
+        networks = networks if mixes else copy_of(networks, plane_mix=False)
         export(networks, self._folder, self._recipe.name, self._family, self._validation(plane_mix=mixes))
 
     def _validation(self, *, plane_mix: bool) -> Validation:

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import msgspec
 import torch
 from torch import Tensor
 
@@ -11,6 +10,7 @@ from gcd_model.class_head import palette
 from gcd_model.networks import Networks
 from gcd_train.datasets.clip_source import ClipSource, to_network
 from gcd_train.metrics import confusion_matrix, mean_iou, psnr
+from gcd_train.model_setup import copy_of
 from gcd_train.pictures import write_sheet
 
 _SHOWN_CLIPS = 4
@@ -53,10 +53,8 @@ class Validation:
 
     def _synthesizer(self, networks: Networks) -> Synthesizer:
         """A copy of the networks behind the door that users take."""
-        config = networks.config if self._plane_mix else msgspec.structs.replace(networks.config, plane_mix=None)
-        copy = Networks(config)
-        known = copy.state_dict()
-        copy.load_state_dict({name: value for name, value in networks.state_dict().items() if name in known})
+        copy = copy_of(networks, plane_mix=self._plane_mix)
+        config = copy.config
         device = networks.unet.stem.weight.device
         traits = Traits(
             name="validation",

@@ -11,6 +11,8 @@ from gcd_train.baselines.cameras import CameraPair, pixel_rays, to_pixels
 from gcd_train.baselines.predictor import Prediction, SourceClip, to_pictures
 from gcd_train.baselines.target_statistics import TargetStatistics
 
+# Depth and classes are picked a quarter pixel off the middle of a pixel drawn at twice the size, colours are its mean.
+# Rays through the middle are still best: 17.50 dB on 16 held-out clips, against 17.42 through where depth was picked.
 _SKY_M = 1e4
 _NEAREST_M = 0.1  # in front of the target camera
 # The two below gave the best PSNR of several on our driving world, level with looking up the exact target depth.

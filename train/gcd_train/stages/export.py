@@ -1,7 +1,5 @@
 """The weight file of a run: averaged weights of all stages, in half precision, with a card."""
 
-import msgspec
-
 from gcd_model import ModelError
 from gcd_model.checkpoints import load_weights, save_weights
 from gcd_model.families import Family
@@ -28,12 +26,3 @@ def export(networks: Networks, folder: RunFolder, name: str, family: Family, val
     values = validation.measure(loaded.networks.float(), folder.stage("export") / "samples.png")
     size = {"bytes": path.stat().st_size, "sha256_12": loaded.sha256_12}
     folder.record("export", "measured", {**size, **values})
-
-
-def without_plane_mix(networks: Networks) -> Networks:
-    """The same networks, their config saying that there is no plane mix: for a recipe without decoder stage."""
-    config = msgspec.structs.replace(networks.config, plane_mix=None)
-    plain = Networks(config)
-    known = plain.state_dict()
-    plain.load_state_dict({name: value for name, value in networks.state_dict().items() if name in known})
-    return plain
