@@ -14,7 +14,7 @@ from gcd_node.errors import ConfigError
 
 Positive: TypeAlias = Annotated[float, Meta(gt=0)]
 Count: TypeAlias = Annotated[int, Meta(ge=1)]
-ViewId: TypeAlias = Annotated[str, Meta(pattern="^[a-z0-9_]{1,16}$")]
+ViewId: TypeAlias = Annotated[str, Meta(pattern=r"^[a-z0-9_]{1,16}$(?!\n)")]
 
 
 class SourcePose(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -246,7 +246,7 @@ class NodeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     security: SecurityConfig = SecurityConfig()
     health: HealthConfig = HealthConfig()
     life: LifeConfig = LifeConfig()
-    node_id: Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{1,32}$")] = "gcd"
+    node_id: Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,32}$(?!\n)")] = "gcd"
     strict: bool = False
 
     @property
