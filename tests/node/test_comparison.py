@@ -86,8 +86,5 @@ def test_a_demo_in_which_nothing_arrived_says_so(maps: dict[int, list[Image]]) -
         moments({}, {}, maps)
 
 
-def test_the_demo_runs_trained_weights_where_they_ship() -> None:
-    from gcd_model.loading import PACKAGED
-
-    shipped = (PACKAGED / "driving-small.safetensors").is_file()
-    assert demo_weights() == ("package:driving-small" if shipped else "random:driving")
+def test_the_demo_runs_the_trained_weights_that_ship() -> None:
+    assert demo_weights() == "package:driving-small"

@@ -1,0 +1,45 @@
+"""The packaged model on scenes it has not seen: ahead of what needs no learning, and no blur."""
+
+from pathlib import Path
+
+import pytest
+from headless import needs_egl
+from typer.testing import CliRunner
+
+from gcd_model import load_synthesizer
+from gcd_model.geometry import CameraMount
+from gcd_train.baselines import driving_baselines, fit_statistics
+from gcd_train.cli import app
+from gcd_train.datasets.paired import PairedClips
+from gcd_train.evaluation import Evaluation, SynthesizedViews, evaluate
+
+pytestmark = [needs_egl, pytest.mark.timeout(600)]
+
+
+def made(folder: Path, first_seed: int, clips: int) -> PairedClips:
+    options = ["--out", str(folder), "--first-seed", str(first_seed), "--clips", str(clips)]
+    assert CliRunner().invoke(app, ["generate", "driving", *options]).exit_code == 0
+    return PairedClips.open(folder)
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Evaluation]:
+    """The model and the baselines on four held-out scenes, by name."""
+    folder = tmp_path_factory.mktemp("scenes")
+    clips, training = made(folder / "held-out", 1_000_000, 4), made(folder / "train", 0, 4)
+    model = SynthesizedViews.of(load_synthesizer("package:driving-small", device="cpu"), clips)
+    baselines = driving_baselines(fit_statistics(training), CameraMount(), len(clips.classes))
+    return {each.name: each for each in evaluate([model, *baselines], clips)}
+
+
+def test_it_is_ahead_of_the_exact_depth(found: dict[str, Evaluation]) -> None:
+    ahead = found["driving-small"].total.psnr_db - found["depth_reprojection"].total.psnr_db
+    assert ahead > 1.0
+
+
+def test_a_view_is_no_blur(found: dict[str, Evaluation]) -> None:
+    assert 0.5 < found["driving-small"].total.gradient_energy < 1.4
+
+
+def test_the_class_map_is_ahead_of_the_most_frequent_class_of_each_pixel(found: dict[str, Evaluation]) -> None:
+    assert found["driving-small"].total.miou > found["majority_map"].total.miou + 0.1
