@@ -45,7 +45,7 @@ def _without_password(url: str) -> str:
 def _write_table(table: Mapping[str, object], name: str, lines: list[str]) -> None:
     """Plain values first, then the sections in it; what is None is left out, as TOML knows none."""
     plain = {key: value for key, value in table.items() if value is not None and not isinstance(value, dict)}
-    if (name and plain) or (name and not table):
+    if name and (plain or not any(isinstance(value, dict) for value in table.values())):
         lines += ["", f"[{name}]"]
     lines += [f"{_key(key)} = {_toml(value)}" for key, value in plain.items()]
     for key, value in table.items():

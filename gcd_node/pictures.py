@@ -15,7 +15,13 @@ Image = NDArray[np.uint8]
 
 def to_u8(video: NDArray[np.float32]) -> Image:
     """[T, 3, H, W] in [0, 1] -> u8 [T, H, W, 3], rounded to the nearest level."""
-    return np.ascontiguousarray(np.rint(video.transpose(0, 2, 3, 1) * 255.0).clip(0, 255).astype(np.uint8))
+    frames, _, height, width = video.shape
+    pixels = np.empty((frames, height, width, 3), np.uint8)
+    for picture, frame in zip(pixels, np.ascontiguousarray(video), strict=True):
+        rows = frame.reshape(-1, width)  # of all three planes; what is out of range becomes 0 or 255
+        levels = cv2.addWeighted(rows, 255.0, rows, 0.0, 0.0, dtype=cv2.CV_8U).reshape(3, height, width)
+        cv2.merge(list(levels), picture)
+    return pixels
 
 
 def make_folder(folder: Path) -> None:

@@ -17,6 +17,8 @@ Resize: TypeAlias = Literal["released", "area"]
 ResizePath: TypeAlias = Literal[Resize, "remap2x_area"]
 """What is published as `src.resize`; remap2x_area: undistorted at twice the size, then averaged."""
 
+_LEVELS = np.arange(256, dtype=np.float32) / np.float32(127.5) - np.float32(1.0)
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Fit:
@@ -76,5 +78,9 @@ def to_clip_tensor(images: Image) -> NDArray[np.float32]:
     """
     if images.dtype != np.uint8 or images.ndim != 4 or images.shape[3] != 3:
         raise ConfigError(f"images must be u8 [T, H, W, 3], got {images.dtype} {list(images.shape)}")
-    planes = np.ascontiguousarray(images.transpose(0, 3, 1, 2), dtype=np.float32)
-    return planes / np.float32(127.5) - np.float32(1.0)
+    count, height, width, _ = images.shape
+    clip = np.empty((count, 3, height, width), np.float32)
+    for image, planes in zip(images, clip, strict=True):
+        for levels, plane in zip(cv2.split(image), planes, strict=True):
+            cv2.LUT(levels, _LEVELS, plane)
+    return clip

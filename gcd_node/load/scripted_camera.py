@@ -83,7 +83,7 @@ class CameraScript:
     def next_act(self) -> Act:
         """What comes next."""
         with self._lock:
-            act = next(self._acts, "steady")
+            act: Act = next(self._acts, None) or "steady"
             self.done[act] += 1
             return act
 

@@ -106,7 +106,11 @@ def test_the_command_shows_every_figure_beside_what_is_wanted(
 
 def test_the_command_prints_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     nothing = replace(REPORT, latency=Latency(count=0, p50_ms=math.nan, p99_ms=math.nan))
-    monkeypatch.setattr(cli_bench, "bench_node", lambda options, on_part: nothing)
+
+    def measured(options: BenchOptions, on_part: object) -> BenchReport:
+        return nothing
+
+    monkeypatch.setattr(cli_bench, "bench_node", measured)
     assert run_app(["bench", "node", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["latency"] == {"count": 0, "p50_ms": None, "p99_ms": None}

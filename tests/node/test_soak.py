@@ -3,7 +3,7 @@
 import json
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -66,6 +66,7 @@ def test_a_short_soak_leaves_nothing_behind_and_the_node_alive() -> None:
     assert report.memory_mb.peak > 50
     assert report.memory_mb.growth < 100
     assert report.threads.growth < 8
+    assert report.subscriptions.growth == 0
     assert report.files.growth < 40
 
 
@@ -143,7 +144,7 @@ def test_the_meter_sees_threads_files_and_memory() -> None:
 
 
 @contextmanager
-def deaf_server(path: Path) -> Iterator[str]:
+def deaf_server(path: Path) -> Generator[str]:
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as server:
         server.bind(str(path))
         server.listen()
@@ -200,7 +201,10 @@ def test_the_command_writes_the_figures_and_ends_with_1_if_something_leaks(
 def test_the_command_prints_json_and_refuses_a_file_it_cannot_write(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(cli_soak, "run_soak", lambda options, tell: GOOD)
+    def soaked(options: SoakOptions, tell: object) -> SoakReport:
+        return GOOD
+
+    monkeypatch.setattr(cli_soak, "run_soak", soaked)
     assert run_app(["soak", "--hours", "0.5", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["windows"] == 2
     assert run_app(["soak", "--report", str(tmp_path / "no" / "soak.json")]) == 73
