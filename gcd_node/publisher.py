@@ -275,14 +275,24 @@ class _DataSocket:
         self._socket = _made(context, _DATA_HWM, no_drop=options.lockstep)
         self.endpoint = gate.bind(self._socket, own_endpoint(options.data, "data"), "data")
         self.sent = self.bytes = self.subscribers = 0
+        self._topics: Counter[bytes] = Counter()
         self.ended = False
         self._last_sent = time.monotonic()
 
     def serve(self) -> None:
-        """Count subscriptions; those to the welcome message alone are none."""
+        """Count subscriptions; those to the welcome message alone are none. What nobody has asked for cannot be taken
+        back: noise on the socket can look like that, and must not make readers disappear."""
         for event in _events(self._socket):
-            if event[1:] != WELCOME[: len(event) - 1] or len(event) == 1:
-                self.subscribers += 1 if event[0] else -1
+            topic = event[1:]
+            if topic and topic == WELCOME[: len(topic)]:
+                continue
+            if event[0]:
+                self._topics[topic] += 1
+            elif self._topics[topic] > 1:
+                self._topics[topic] -= 1
+            else:
+                self._topics.pop(topic, None)
+            self.subscribers = self._topics.total()
 
     def send(self, parcel: _Parcel) -> bool:
         """Whether it left; if not, try again later."""

@@ -9,14 +9,19 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from cameras import until
 
 from gcd_node import cli_soak
 from gcd_node.cli import run_app
 from gcd_node.load.clients import hostile, reader
 from gcd_node.load.hostile import Attacker
 from gcd_node.load.meter import holding, memory_mb, open_files, percentile
+from gcd_node.load.zmtp import GREETING, message, ready
+from gcd_node.publisher import Publisher
+from gcd_node.publisher_options import PublisherOptions
 from gcd_node.soak import Sample, SoakOptions, run_soak
 from gcd_node.soak_report import Growth, SoakLimits, SoakReport, findings, growth, spread
+from gcd_node.subscriber import ViewSubscriber
 
 SECONDS = 20.0
 FLAT = Growth(first=10.0, last=10.0, peak=12.0)
@@ -170,6 +175,20 @@ def test_a_client_ends_with_whoever_started_it(tmp_path: Path) -> None:
     with hostile(nobody, nobody, nobody, 0) as attacker:
         assert attacker.alive
     assert not attacker.alive
+
+
+def test_who_takes_back_what_nobody_asked_for_makes_no_reader_disappear(tmp_path: Path) -> None:
+    options = PublisherOptions(data=f"ipc://{tmp_path}/data", status=None, linger_ms=0)
+    with Publisher(options) as publisher, ViewSubscriber(publisher.endpoint, "top"):
+        until(lambda: publisher.stats.subscribers == 1)
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as link:
+            link.connect(f"{tmp_path}/data")
+            link.sendall(GREETING)
+            link.recv(len(GREETING), socket.MSG_WAITALL)
+            link.sendall(ready("SUB"))
+            link.sendall(3 * message(b"\0never") + message(b"\1once") + message(b"\1then"))
+            until(lambda: publisher.stats.subscribers == 3)
+        until(lambda: publisher.stats.subscribers == 1)
 
 
 # --- the command -------------------------------------------------------------------------------------------------
