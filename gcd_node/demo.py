@@ -96,7 +96,7 @@ def run_demo(out: Path, on_window: Callable[[WindowReport], None]) -> DemoReport
     return DemoReport(
         summary=summary,
         model=traits.name,
-        received=len(views),
+        received=len(shown),
         noise=not traits.trained,
         columns=HEADINGS[: len(shown[0][0].columns)],
         files=tuple(_write_pictures(out, shown, ontology(traits), summary.fps)),

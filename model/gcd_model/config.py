@@ -320,7 +320,7 @@ SMALL = ModelConfig(
     ),
     sampling=SamplingConfig(steps=2),
 )
-"""The same model at widths a CPU runs in a second: for the demo until trained weights ship, and for tests."""
+"""The same model at widths a CPU runs in a second: for `random:FAMILY`, and for tests."""
 
 DRIVING_CLASSES = (
     SemanticClass(name="sky", colour=(122, 176, 230)),

@@ -60,7 +60,7 @@ def packaged_weights(name: str) -> Path:
         return path
     there = ", ".join(sorted(file.stem for file in PACKAGED.glob("*.safetensors")))
     raise CheckpointError(
-        f"no weights called {name!r} ship with the package; there are: {there or 'none yet'}. "
+        f"no weights called {name!r} ship with the package; there are: {there or 'none'}. "
         "Give a path, or random:kubric90 to try things out with random weights"
     )
 

@@ -104,7 +104,7 @@ def test_random_networks_are_the_same_every_time() -> None:
 
 def test_packaged_weights_are_found_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loading, "PACKAGED", tmp_path)
-    with pytest.raises(CheckpointError, match=r"no weights called 'small' ship .* none yet"):
+    with pytest.raises(CheckpointError, match=r"no weights called 'small' ship .* none"):
         load_synthesizer("package:small")
     card = Card(name="small", config=SMALL_GCD, family="kubric90", move_time=13)
     save_weights(filled(), tmp_path / "small.safetensors", card)

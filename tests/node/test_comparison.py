@@ -1,5 +1,7 @@
 """The demo's picture: every column in its place, class colours kept, and what the colours mean."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from wire_messages import CLASSES, numbers
@@ -88,3 +90,8 @@ def test_a_demo_in_which_nothing_arrived_says_so(maps: dict[int, list[Image]]) -
 
 def test_the_demo_runs_the_trained_weights_that_ship() -> None:
     assert demo_weights() == "package:driving-small"
+
+
+def test_without_trained_weights_the_demo_runs_random_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gcd_node.demo.files", lambda _: tmp_path)
+    assert demo_weights() == "random:driving"

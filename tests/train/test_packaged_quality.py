@@ -42,4 +42,4 @@ def test_a_view_is_no_blur(found: dict[str, Evaluation]) -> None:
 
 
 def test_the_class_map_is_ahead_of_the_most_frequent_class_of_each_pixel(found: dict[str, Evaluation]) -> None:
-    assert found["driving-small"].total.miou > found["majority_map"].total.miou + 0.1
+    assert found["driving-small"].total.miou > max(0.4, found["majority_map"].total.miou)

@@ -102,7 +102,7 @@ class Trainer:
         if stage == "unet":
             shape = digest_of(config.unet, config.prediction, config.plane_warp, seed)
             return f"{_autoencoder_digest(networks)}-{shape}"
-        mix = digest_of(config.plane_warp, config.plane_mix)
+        mix = digest_of(config.plane_warp, config.plane_mix, config.sampling)
         return f"{weights_digest(networks.unet.state_dict())}-{digest_of(seed)}-{mix}"
 
     def _loop(
