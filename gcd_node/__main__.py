@@ -1,5 +1,5 @@
 """`python -m gcd_node` is `gcd-node`."""
 
-from gcd_node.cli import main
+from gcd_node.cli.main import main
 
 main()

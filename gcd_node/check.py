@@ -13,11 +13,11 @@ from gcd_model import FAMILIES, CheckpointError, ModelError, Traits, WeightsRepo
 from gcd_node.config import ModelSection, NodeConfig
 from gcd_node.errors import NodeError, SourceLostError
 from gcd_node.frame import Frame, FrameSource, SourceInfo
-from gcd_node.live_config import LiveConfig
-from gcd_node.preparation import prepare_run
+from gcd_node.life.live_config import LiveConfig
+from gcd_node.rendering.preparation import prepare_run
+from gcd_node.rendering.virtual_view import VirtualViews
 from gcd_node.session import model_threads, open_session
 from gcd_node.sources import open_source
-from gcd_node.virtual_view import VirtualViews
 
 Verdict: TypeAlias = Literal["ok", "warning", "failed"]
 

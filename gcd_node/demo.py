@@ -11,19 +11,19 @@ from importlib.resources import files
 from pathlib import Path
 
 from gcd_model import Traits
-from gcd_node.comparison import Moment, comparison
 from gcd_node.config import ControlConfig, ModelSection, NodeConfig, PublishConfig, SourceConfig, ViewConfig
 from gcd_node.errors import NodeError
 from gcd_node.frame import Image
-from gcd_node.header import ClassRecord
-from gcd_node.model_worker import WindowReport
+from gcd_node.life.stream import Summary
 from gcd_node.node import NodeOptions
-from gcd_node.pictures import make_folder, spread, write_png, write_video
+from gcd_node.pictures.comparison import Moment, comparison
+from gcd_node.pictures.files import make_folder, spread, write_png, write_video
 from gcd_node.publisher import Publisher
+from gcd_node.rendering.model_worker import WindowReport
 from gcd_node.session import open_session, run_until_signal
 from gcd_node.sources import read_picture
-from gcd_node.stream import Summary
-from gcd_node.view_message import ontology
+from gcd_node.wire.header import ClassRecord
+from gcd_node.wire.view_message import ontology
 
 VIEW_ID = "topdown"
 HEADINGS = ("input: the packaged drive", "generated view from above", "generated class map")

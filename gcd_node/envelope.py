@@ -17,10 +17,10 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_node.class_colours import paint
 from gcd_node.errors import ConfigError, MessageError
-from gcd_node.header import EndHeader, OriginHeader, ViewHeader, check_version
-from gcd_node.record_json import dump, from_json, parse, to_json
+from gcd_node.wire.class_colours import paint
+from gcd_node.wire.header import EndHeader, OriginHeader, ViewHeader, check_version
+from gcd_node.wire.record_json import dump, from_json, parse, to_json
 
 PREFIX = struct.Struct("<32s4sHHQQII")
 """topic, magic, header length / 16, flags, payload length, sequence, CRC32, reserved."""
@@ -186,7 +186,7 @@ def images(message: ViewMessage) -> NDArray[np.uint8]:
     if header.offsets is None:
         return np.frombuffer(message.payload, np.uint8).reshape(header.shape)
     try:
-        from gcd_node.jpeg import decode_frames  # needs cv2, which readers of rgb8 can do without
+        from gcd_node.wire.jpeg import decode_frames  # needs cv2, which readers of rgb8 can do without
     except ImportError as error:
         remedy = 'install opencv-python-headless here, or let the node publish encoding = "rgb8"'
         raise ConfigError(f"this view is JPEG and cv2 cannot be imported ({error}); {remedy}") from error

@@ -7,9 +7,9 @@ from typing import Literal, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_node.calibration import LensModel
 from gcd_node.config import LIVE_KINDS, SourceKind
 from gcd_node.errors import SourceError
+from gcd_node.optics.calibration import LensModel
 
 Image: TypeAlias = NDArray[np.uint8]
 """u8 [H, W, 3], RGB."""

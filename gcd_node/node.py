@@ -10,23 +10,23 @@ from dataclasses import dataclass
 
 from gcd_model import ModelError, Traits
 from gcd_node.config import NodeConfig
-from gcd_node.control_message import Code, Command, Outcome
+from gcd_node.control.message import Code, Command, Outcome
 from gcd_node.envelope import new_boot_id
 from gcd_node.errors import ControlError, NodeError, SourceAbsentError, SourceError, SourceLostError
-from gcd_node.health import Health
-from gcd_node.health_report import Level
-from gcd_node.keys import Role
-from gcd_node.lifecycle import Lifecycle, State, Verb
-from gcd_node.live_config import LiveConfig
-from gcd_node.machinery import Links, Machinery, Parts
-from gcd_node.model_worker import WindowReport
-from gcd_node.node_commands import NodeCommands
-from gcd_node.node_status import Announcer
-from gcd_node.outbox import Outbox
-from gcd_node.source_watch import Backoff
-from gcd_node.stream import Summary
-from gcd_node.systemd import ServiceManager
-from gcd_node.vigil import Vigil
+from gcd_node.health.announcer import Announcer
+from gcd_node.health.monitor import Health
+from gcd_node.health.report import Level
+from gcd_node.health.systemd import ServiceManager
+from gcd_node.health.vigil import Vigil
+from gcd_node.life.commands import NodeCommands
+from gcd_node.life.lifecycle import Lifecycle, State, Verb
+from gcd_node.life.live_config import LiveConfig
+from gcd_node.life.machinery import Links, Machinery, Parts
+from gcd_node.life.source_watch import Backoff
+from gcd_node.life.stream import Summary
+from gcd_node.publishing.outbox import Outbox
+from gcd_node.rendering.model_worker import WindowReport
+from gcd_node.security.keys import Role
 
 _LOG = logging.getLogger(__name__)
 _TICK_S = 0.1

@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 
 from gcd_model import Clip, Intrinsics, Traits
-from gcd_node.array_file import read_npy
 from gcd_node.errors import SourceError, TooShortError, UsageError
 from gcd_node.frame import Image
-from gcd_node.preprocess import Fit, to_clip_tensor
+from gcd_node.optics.preprocess import Fit, to_clip_tensor
+from gcd_node.pictures.array_file import read_npy
 from gcd_node.sources.image_folder import SUFFIXES, ImageFolder, read_picture
 from gcd_node.sources.video_file import VideoFile
 

@@ -18,12 +18,12 @@ from typing import Any
 
 import zmq
 
-from gcd_node.endpoints import own_endpoint
 from gcd_node.envelope import TOPIC_BYTES, WELCOME, EndMessage, NoteMessage, NoteTopic, ViewMessage, encode
 from gcd_node.errors import EndpointError, NodeError
-from gcd_node.header import OriginHeader
-from gcd_node.publisher_options import PublisherOptions, PublisherStats
-from gcd_node.security import Context, EventSink, Gate, Socket, unbind
+from gcd_node.publishing.options import PublisherOptions, PublisherStats
+from gcd_node.security.gate import Context, EventSink, Gate, Socket, unbind
+from gcd_node.wire.endpoints import own_endpoint
+from gcd_node.wire.header import OriginHeader
 
 _LOG = logging.getLogger(__name__)
 _IDLE_S = 0.01

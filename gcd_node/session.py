@@ -11,19 +11,19 @@ from types import FrameType
 import torch
 
 from gcd_model import OptionError, ViewSynthesizer, load_synthesizer
-from gcd_node.allow_list import load_server_security
 from gcd_node.config import LIVE_KINDS, ModelSection, NodeConfig
-from gcd_node.control import ControlOptions, ControlServer
+from gcd_node.control.server import ControlOptions, ControlServer
 from gcd_node.errors import ConfigError
-from gcd_node.machinery import Parts
-from gcd_node.metrics_server import MetricsServer
-from gcd_node.model_worker import WindowReport
+from gcd_node.health.metrics_server import MetricsServer
+from gcd_node.life.machinery import Parts
+from gcd_node.life.stream import Summary
 from gcd_node.node import Node, NodeOptions
 from gcd_node.publisher import Publisher
-from gcd_node.publisher_options import PublisherOptions
-from gcd_node.security import ServerSecurity
+from gcd_node.publishing.options import PublisherOptions
+from gcd_node.rendering.model_worker import WindowReport
+from gcd_node.security.allow_list import load_server_security
+from gcd_node.security.gate import ServerSecurity
 from gcd_node.sources import open_source
-from gcd_node.stream import Summary
 
 _LOG = logging.getLogger(__name__)
 

@@ -16,7 +16,6 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from gcd_node.endpoints import is_ipv6, resolve_endpoint
 from gcd_node.envelope import (
     MAX_HEADER,
     MAX_PAYLOAD,
@@ -35,9 +34,10 @@ from gcd_node.envelope import (
     view_topic,
 )
 from gcd_node.errors import ConfigError, StaleError
-from gcd_node.header import ViewHeader
-from gcd_node.keys import ClientKeys
-from gcd_node.security import HandshakeWatch, use_client_keys
+from gcd_node.security.gate import HandshakeWatch, use_client_keys
+from gcd_node.security.keys import ClientKeys
+from gcd_node.wire.endpoints import is_ipv6, resolve_endpoint
+from gcd_node.wire.header import ViewHeader
 
 _QUEUED = 4
 

@@ -17,15 +17,25 @@ from gcd_model import (
     View,
     ViewSynthesizer,
 )
-from gcd_node.array_file import read_npy, read_npz, write_npz
-from gcd_node.class_colours import paint
-from gcd_node.comparison import legend
 from gcd_node.config import SourcePose
 from gcd_node.errors import OutputError, SourceError, UsageError
-from gcd_node.header import ClassRecord
 from gcd_node.offline_clip import OfflineClip
-from gcd_node.pictures import Image, heat, side_by_side, spread, strip, to_u8, write_frames, write_png, write_video
-from gcd_node.source_pose import stated_sphere
+from gcd_node.optics.source_pose import stated_sphere
+from gcd_node.pictures.array_file import read_npy, read_npz, write_npz
+from gcd_node.pictures.comparison import legend
+from gcd_node.pictures.files import (
+    Image,
+    heat,
+    side_by_side,
+    spread,
+    strip,
+    to_u8,
+    write_frames,
+    write_png,
+    write_video,
+)
+from gcd_node.wire.class_colours import paint
+from gcd_node.wire.header import ClassRecord
 
 _STRIP_FRAMES = 7
 

@@ -5,8 +5,8 @@ import time
 from array import array
 from collections import Counter, deque
 
-from gcd_node.control_client import ControlClient
-from gcd_node.control_message import Code, Reply
+from gcd_node.control.client import ControlClient
+from gcd_node.control.message import Code, Reply
 from gcd_node.errors import ControlError
 from gcd_node.load.rig import VIEW, Rig
 

@@ -16,14 +16,14 @@ from gcd_node.config import (
     ViewConfig,
     WindowConfig,
 )
-from gcd_node.control import ControlOptions, ControlServer
+from gcd_node.control.server import ControlOptions, ControlServer
 from gcd_node.errors import NodeError
+from gcd_node.life.machinery import Parts
 from gcd_node.load.scripted_camera import CameraScript
 from gcd_node.load.stand_in import StandInModel
-from gcd_node.machinery import Parts
-from gcd_node.model_worker import WindowReport
 from gcd_node.node import Node, NodeOptions
 from gcd_node.publisher import Publisher
+from gcd_node.rendering.model_worker import WindowReport
 from gcd_node.session import publisher_options
 
 VIEW = "load"

@@ -9,7 +9,7 @@ import numpy as np
 
 from gcd_node.errors import SourceError
 from gcd_node.frame import MAX_FPS, Frame, Image, SourceInfo
-from gcd_node.picture_header import MAX_PIXELS, PictureHeader, read_header
+from gcd_node.pictures.picture_header import MAX_PIXELS, PictureHeader, read_header
 from gcd_node.sources.pace import Pace, Pacer
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TypeAlias
 
-from gcd_node.calibration import CameraInfo
 from gcd_node.errors import SourceError
+from gcd_node.optics.calibration import CameraInfo
 from gcd_node.sources.byte_cursor import ByteCursor
 
 _MOST_FIELDS = 1000

@@ -9,7 +9,7 @@ import numpy as np
 
 from gcd_node.errors import SourceError
 from gcd_node.frame import Image
-from gcd_node.picture_header import MAX_PIXELS, parse_header
+from gcd_node.pictures.picture_header import MAX_PIXELS, parse_header
 from gcd_node.sources.log_messages import CodedPicture, Picture, RawPicture
 
 _CODECS = ("jpeg", "png", "webp")

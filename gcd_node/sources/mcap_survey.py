@@ -7,9 +7,9 @@ from itertools import pairwise
 from pathlib import Path
 from statistics import median
 
-from gcd_node.calibration import LensModel, lens_of
 from gcd_node.errors import ConfigError, SourceError, TooShortError
 from gcd_node.frame import MAX_FPS, SourceInfo
+from gcd_node.optics.calibration import LensModel, lens_of
 from gcd_node.sources.log_messages import (
     CAMERAS,
     PICTURES,

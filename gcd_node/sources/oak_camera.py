@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, TypeAlias
 import cv2
 import numpy as np
 
-from gcd_node.calibration import LensModel
 from gcd_node.config import SourceConfig
 from gcd_node.errors import SourceAbsentError, SourceError
 from gcd_node.frame import Frame, Image, SourceInfo
+from gcd_node.optics.calibration import LensModel
 from gcd_node.sources.oak_lens import better_lens, to_lens
 from gcd_node.sources.oak_loss import Guard, Loss
 from gcd_node.sources.oak_search import find_device

@@ -3,8 +3,8 @@
 import logging
 from collections.abc import Sequence
 
-from gcd_node.calibration import Distortion, LensModel
 from gcd_node.errors import ConfigError
+from gcd_node.optics.calibration import Distortion, LensModel
 
 _LOG = logging.getLogger(__name__)
 _LENSES_DIFFER = 0.02

@@ -11,7 +11,7 @@ import numpy as np
 
 from gcd_node.errors import SourceError
 from gcd_node.frame import MAX_FPS, Frame, Image, SourceInfo
-from gcd_node.picture_header import MAX_PIXELS
+from gcd_node.pictures.picture_header import MAX_PIXELS
 from gcd_node.sources.container import check_video
 from gcd_node.sources.opencv_log import quiet_opencv
 from gcd_node.sources.pace import Pace, Pacer

@@ -11,7 +11,7 @@ import cv2
 
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError
 from gcd_node.frame import Image
-from gcd_node.picture_header import MAX_PIXELS
+from gcd_node.pictures.picture_header import MAX_PIXELS
 from gcd_node.sources.opencv_camera import (
     CameraPort,
     CameraTraits,

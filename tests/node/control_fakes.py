@@ -4,10 +4,10 @@ import threading
 import time
 from collections.abc import Callable
 
-from gcd_node.control_message import Code, Command, Outcome, RequestError
-from gcd_node.control_verbs import SetView
+from gcd_node.control.message import Code, Command, Outcome, RequestError
+from gcd_node.control.verbs import SetView
 from gcd_node.errors import NodeError
-from gcd_node.keys import Role
+from gcd_node.security.keys import Role
 
 
 class FakeCommands:

@@ -25,12 +25,12 @@ from gcd_model import (
 from gcd_node.config import NodeConfig
 from gcd_node.envelope import EndMessage, NoteTopic, ViewMessage
 from gcd_node.frame import Frame, FrameSource, SourceInfo
-from gcd_node.header import OriginHeader
-from gcd_node.machinery import Parts
-from gcd_node.model_worker import WindowReport
+from gcd_node.life.machinery import Parts
 from gcd_node.node import Node, NodeOptions
-from gcd_node.outbox import Outbox
 from gcd_node.publisher import PublisherStats
+from gcd_node.publishing.outbox import Outbox
+from gcd_node.rendering.model_worker import WindowReport
+from gcd_node.wire.header import OriginHeader
 
 HEIGHT, WIDTH = 64, 96
 

@@ -12,7 +12,7 @@ from fakes import FakeSource, FakeSynthesizer, traits
 from rig import rig_config
 
 from gcd_model import RenderOptions
-from gcd_node.machinery import Parts
+from gcd_node.life.machinery import Parts
 from gcd_node.node import Node, NodeOptions
 from gcd_node.publisher import Publisher
 from gcd_node.session import publisher_options, run_until_signal

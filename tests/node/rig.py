@@ -14,18 +14,18 @@ from numpy.typing import NDArray
 
 from gcd_model import ViewSynthesizer
 from gcd_node.config import ModelSection, NodeConfig, SourceConfig, parse_config
-from gcd_node.control import ControlOptions, ControlServer
-from gcd_node.control_client import ControlClient
-from gcd_node.control_message import Reply
+from gcd_node.control.client import ControlClient
+from gcd_node.control.message import Reply
+from gcd_node.control.server import ControlOptions, ControlServer
 from gcd_node.frame import FrameSource
-from gcd_node.header import ViewHeader
-from gcd_node.machinery import Parts
+from gcd_node.health.systemd import ServiceManager
+from gcd_node.life.machinery import Parts
+from gcd_node.life.stream import Summary
 from gcd_node.node import Node, NodeOptions
 from gcd_node.publisher import Publisher
 from gcd_node.session import publisher_options
-from gcd_node.stream import Summary
 from gcd_node.subscriber import NoteSubscriber, ReceivedView, ViewSubscriber
-from gcd_node.systemd import ServiceManager
+from gcd_node.wire.header import ViewHeader
 
 CAMERA = 'kind = "v4l2"'
 _SILENCE_MS = 300

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import pytest
 
-from gcd_node import cli_bench
-from gcd_node.bench_node import (
+from gcd_node.cli import bench as cli_bench
+from gcd_node.cli.main import run_app
+from gcd_node.load.bench import (
     BenchOptions,
     BenchReport,
     Latency,
@@ -16,7 +17,6 @@ from gcd_node.bench_node import (
     StalledReader,
     bench_node,
 )
-from gcd_node.cli import run_app
 
 SMALL = BenchOptions(windows=4, slow_windows=3, stall_s=2.0, returns=1, outage_s=0.2, width=96, height=64)
 REPORT = BenchReport(

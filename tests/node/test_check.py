@@ -5,12 +5,12 @@ import pytest
 from media import write_video
 
 from gcd_node.check import Resources, check
-from gcd_node.cli import run_app
+from gcd_node.cli.main import run_app
 from gcd_node.config import NodeConfig, load_config, parse_config
 from gcd_node.config_text import to_toml
 from gcd_node.errors import ConfigError
 from gcd_node.publisher import Publisher
-from gcd_node.publisher_options import PublisherOptions
+from gcd_node.publishing.options import PublisherOptions
 
 SIZE = (128, 192)  # smaller than any model takes unless it may be enlarged
 

@@ -13,7 +13,7 @@ from gcd_node.config import NodeConfig, parse_config
 from gcd_node.envelope import images
 from gcd_node.publisher import Publisher, PublisherOptions
 from gcd_node.subscriber import NoteSubscriber, ReceivedView, ViewSubscriber
-from gcd_node.view_message import ontology
+from gcd_node.wire.view_message import ontology
 
 pytestmark = pytest.mark.timeout(30)
 

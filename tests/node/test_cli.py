@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gcd_node.cli import run_app
+from gcd_node.cli.main import run_app
 from gcd_node.config import load_config
 from gcd_node.demo import demo_weights
-from gcd_node.pictures import write_png, write_video
+from gcd_node.pictures.files import write_png, write_video
 from gcd_node.publisher import Publisher
-from gcd_node.publisher_options import PublisherOptions
+from gcd_node.publishing.options import PublisherOptions
 from gcd_node.session import open_session
 
 SIZE = (128, 192)  # of the small random model

@@ -15,9 +15,9 @@ from gcd_model import DRIVING_CLASSES, DRIVING_SMALL, CameraMount
 from gcd_model.checkpoints import save_weights
 from gcd_model.networks import random_networks
 from gcd_model.own_format import Card
-from gcd_node import cli_synthesize
-from gcd_node.cli import run_app
-from gcd_node.pictures import write_video
+from gcd_node.cli import synthesize as cli_synthesize
+from gcd_node.cli.main import run_app
+from gcd_node.pictures.files import write_video
 
 HEIGHT, WIDTH = 64, 96
 UNET = replace(DRIVING_SMALL.unet, width=16, head_width=16, embedding_width=32)

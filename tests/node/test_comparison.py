@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from wire_messages import CLASSES, numbers
 
-from gcd_node.class_colours import paint
-from gcd_node.comparison import Moment, comparison, legend
 from gcd_node.demo import demo_weights, moments
 from gcd_node.errors import NodeError
-from gcd_node.pictures import Image
+from gcd_node.pictures.comparison import Moment, comparison, legend
+from gcd_node.pictures.files import Image
+from gcd_node.wire.class_colours import paint
 
 HEIGHT, WIDTH = 24, 36
 HEADINGS = ("input", "view", "classes")

@@ -13,14 +13,14 @@ import pytest
 import zmq
 from control_fakes import Events, FakeCommands, wait_for
 
-from gcd_node.control import Answers, ControlOptions, ControlServer
-from gcd_node.control_client import ControlClient
-from gcd_node.control_limits import FloodGuard, ReplyCache
-from gcd_node.control_message import MAX_REPLY, Code, Reply, decode_reply
+from gcd_node.control.client import ControlClient
+from gcd_node.control.limits import FloodGuard, ReplyCache
+from gcd_node.control.message import MAX_REPLY, Code, Reply, decode_reply
+from gcd_node.control.server import Answers, ControlOptions, ControlServer
 from gcd_node.errors import ConfigError, ControlError, EndpointError
-from gcd_node.header import PROTO
-from gcd_node.keys import Client
-from gcd_node.security import Socket
+from gcd_node.security.gate import Socket
+from gcd_node.security.keys import Client
+from gcd_node.wire.header import PROTO
 
 pytestmark = pytest.mark.timeout(90)
 

@@ -6,7 +6,7 @@ import random
 import msgspec
 import pytest
 
-from gcd_node.control_message import (
+from gcd_node.control.message import (
     MAX_REQUEST,
     Code,
     Command,
@@ -20,9 +20,9 @@ from gcd_node.control_message import (
     parse_request,
     text_arguments,
 )
-from gcd_node.control_verbs import VERBS, SetParam, SetView, schemas
+from gcd_node.control.verbs import VERBS, SetParam, SetView, schemas
 from gcd_node.errors import ControlError
-from gcd_node.header import PROTO
+from gcd_node.wire.header import PROTO
 
 IDENTITY = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 EXAMPLES: dict[str, dict[str, object]] = {

@@ -2,9 +2,9 @@ from itertools import pairwise
 
 import pytest
 
-from gcd_node.degrade import WHOLE, Ladder, rungs
-from gcd_node.idle import IdleRule
-from gcd_node.wall_clock import WallClock
+from gcd_node.health.wall_clock import WallClock
+from gcd_node.rendering.degrade import WHOLE, Ladder, rungs
+from gcd_node.rendering.idle import IdleRule
 
 
 class Hand:

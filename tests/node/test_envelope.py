@@ -29,7 +29,7 @@ from gcd_node.envelope import (
     view_topic,
 )
 from gcd_node.errors import MessageError
-from gcd_node.jpeg import encode_frames
+from gcd_node.wire.jpeg import encode_frames
 
 PLANNER_FILES = ("envelope", "header", "class_colours", "record_json", "subscriber", "endpoints", "errors", "jpeg")
 

@@ -30,13 +30,13 @@ from gcd_model import (
     ViewSynthesizer,
 )
 from gcd_node.config import ModelSection
-from gcd_node.control_message import Code
+from gcd_node.control.message import Code
 from gcd_node.errors import ConfigError, SourceLostError, TooShortError
 from gcd_node.frame import Frame
+from gcd_node.health.systemd import ServiceManager
 from gcd_node.session import load_model
 from gcd_node.sources import open_source
 from gcd_node.subscriber import ViewSubscriber
-from gcd_node.systemd import ServiceManager
 
 WAITING = "life = {autostart = false}"
 LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'

@@ -28,11 +28,9 @@ from hypothesis import strategies as st
 from rich.console import Console
 from wire_messages import class_map, end, origin, pixels, view_header, window
 
-from gcd_node.allow_list import load_clients
-from gcd_node.calibration import parse_lens
 from gcd_node.config import parse_config
 from gcd_node.config_text import to_toml
-from gcd_node.control_message import (
+from gcd_node.control.message import (
     Command,
     Reply,
     RequestError,
@@ -41,7 +39,7 @@ from gcd_node.control_message import (
     parse_command,
     parse_request,
 )
-from gcd_node.control_verbs import VERBS
+from gcd_node.control.verbs import VERBS
 from gcd_node.envelope import (
     MAGIC,
     PREFIX,
@@ -56,13 +54,15 @@ from gcd_node.envelope import (
     view_topic,
 )
 from gcd_node.errors import ConfigError, ControlError, MessageError, NodeError, SourceError
-from gcd_node.jpeg import decode_frames, encode_frames
 from gcd_node.load.meter import memory_mb
+from gcd_node.optics.calibration import parse_lens
+from gcd_node.security.allow_list import load_clients
 from gcd_node.sources import read_picture
 from gcd_node.sources.log_messages import CodedPicture, RawPicture
 from gcd_node.sources.log_pictures import to_rgb
-from gcd_node.status_board import StatusBoard
-from gcd_node.status_table import render_status
+from gcd_node.watching.status_board import StatusBoard
+from gcd_node.watching.status_table import render_status
+from gcd_node.wire.jpeg import decode_frames, encode_frames
 
 ROUNDS = int(os.environ.get("GCD_MUTATIONS", "400"))
 SETTINGS = settings(

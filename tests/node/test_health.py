@@ -11,10 +11,10 @@ from typing import get_args
 import pytest
 
 from gcd_node.envelope import NoteMessage, decode, encode
-from gcd_node.header import OriginHeader
-from gcd_node.health import IDLE, Health
-from gcd_node.health_report import HOPS, STAGES, Hop, Level, ModelState, SourceState, Stage
-from gcd_node.stage_times import RecentShare, StageTimes, quantile
+from gcd_node.health.monitor import IDLE, Health
+from gcd_node.health.report import HOPS, STAGES, Hop, Level, ModelState, SourceState, Stage
+from gcd_node.health.stage_times import RecentShare, StageTimes, quantile
+from gcd_node.wire.header import OriginHeader
 
 MS = 1_000_000
 S = 1_000_000_000

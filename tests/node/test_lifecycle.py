@@ -4,7 +4,7 @@ from typing import get_args
 import pytest
 
 from gcd_node.errors import ControlError
-from gcd_node.lifecycle import PATHS, Lifecycle, State, Verb
+from gcd_node.life.lifecycle import PATHS, Lifecycle, State, Verb
 
 VERBS: tuple[Verb, ...] = get_args(Verb)
 WAYS: dict[State, tuple[Verb, ...]] = {

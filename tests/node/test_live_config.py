@@ -1,7 +1,7 @@
 import pytest
 
 from gcd_node.config import NodeConfig, ViewConfig, parse_config
-from gcd_node.live_config import LiveConfig
+from gcd_node.life.live_config import LiveConfig
 
 
 def config() -> NodeConfig:

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from gcd_node.logs import JsonLines, log_json_lines
+from gcd_node.health.logs import JsonLines, log_json_lines
 
 
 @pytest.fixture
@@ -134,7 +134,7 @@ def test_the_whole_process_switches_to_json_lines() -> None:
     """In a process of its own: warnings, errors of threads and the last error of all are lines too."""
     code = """
 import logging, sys, threading, warnings
-from gcd_node.logs import log_json_lines
+from gcd_node.health.logs import log_json_lines
 logging.basicConfig(level="INFO", format="%(message)s", stream=sys.stderr)
 log_json_lines()
 logging.getLogger("gcd_node.x").info("hello")

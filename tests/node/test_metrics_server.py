@@ -17,9 +17,9 @@ from typing import Any
 import pytest
 
 from gcd_node.errors import ConfigError, EndpointError
-from gcd_node.health import Health
-from gcd_node.health_report import Level
-from gcd_node.metrics_server import MetricsServer, loopback_address
+from gcd_node.health.metrics_server import MetricsServer, loopback_address
+from gcd_node.health.monitor import Health
+from gcd_node.health.report import Level
 
 prometheus = pytest.importorskip("prometheus_client", reason="needs the extra `metrics`")
 from prometheus_client.openmetrics.parser import (  # noqa: E402
@@ -190,7 +190,7 @@ def test_the_server_does_not_say_what_it_runs_on(server: MetricsServer) -> None:
 def test_callers_that_say_nothing_neither_grow_the_node_nor_lock_probes_out_for_good(
     server: MetricsServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gcd_node.metrics_server._Handler.timeout", 0.5)
+    monkeypatch.setattr("gcd_node.health.metrics_server._Handler.timeout", 0.5)
     host, port = loopback_address(server.url.removeprefix("http://"))
     before = threading.active_count()
     silent = [socket.create_connection((host, port), timeout=20) for _ in range(30)]
@@ -265,7 +265,7 @@ def test_without_the_extra_the_error_names_it(health: Health, monkeypatch: pytes
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
         return real(name, *args, **kwargs)
 
-    monkeypatch.delitem(sys.modules, "gcd_node.metrics", raising=False)
+    monkeypatch.delitem(sys.modules, "gcd_node.health.metrics", raising=False)
     monkeypatch.setattr(builtins, "__import__", blocked)
     with pytest.raises(ConfigError, match=r"prometheus_client.*gcd-node\[metrics\]"):
         MetricsServer("127.0.0.1:0", health)
@@ -274,7 +274,8 @@ def test_without_the_extra_the_error_names_it(health: Health, monkeypatch: pytes
 def test_the_core_imports_without_the_extra() -> None:
     code = (
         "import sys; sys.modules['prometheus_client'] = None\n"
-        "import gcd_node.health, gcd_node.metrics_server, gcd_node.cli_status, gcd_node.logs, gcd_node.systemd\n"
+        "import gcd_node.health.monitor, gcd_node.health.metrics_server, gcd_node.health.logs\n"
+        "import gcd_node.health.systemd, gcd_node.cli.status\n"
         "print('imported')"
     )
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=50, check=False)

@@ -23,12 +23,12 @@ from gcd_node.config import NodeConfig, parse_config
 from gcd_node.envelope import NoteTopic, images
 from gcd_node.errors import ConfigError, ModelFailedError, NodeError, SourceError, TooShortError
 from gcd_node.frame import Frame
-from gcd_node.header import OriginHeader
 from gcd_node.node import Node
 from gcd_node.publisher import Publisher
-from gcd_node.publisher_options import PublisherOptions
+from gcd_node.publishing.options import PublisherOptions
 from gcd_node.session import load_model
 from gcd_node.sources import open_source
+from gcd_node.wire.header import OriginHeader
 
 
 def config(

@@ -8,9 +8,9 @@ from contextlib import closing
 import pytest
 from media import HEIGHT, WIDTH
 
-from gcd_node.calibration import LensModel
 from gcd_node.config import SourceConfig
 from gcd_node.errors import SourceAbsentError, SourceError
+from gcd_node.optics.calibration import LensModel
 from gcd_node.sources.oak_camera import OakCamera, lens_in_memory, load_depthai, open_oak
 from gcd_node.sources.oak_search import find_device
 

@@ -7,7 +7,7 @@ from fakes import HEIGHT, WIDTH, traits
 from gcd_model import OptionError
 from gcd_node.errors import SourceError, TooShortError, UsageError
 from gcd_node.offline_clip import ClipRequest, OfflineClip, read_clip
-from gcd_node.pictures import write_png, write_video
+from gcd_node.pictures.files import write_png, write_video
 
 
 def numbered(count: int, height: int = 2 * HEIGHT, width: int = 2 * WIDTH) -> list[np.ndarray]:

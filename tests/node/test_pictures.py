@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from gcd_node.errors import OutputError
-from gcd_node.pictures import heat, side_by_side, spread, strip, to_u8, write_frames, write_png, write_video
+from gcd_node.pictures.files import heat, side_by_side, spread, strip, to_u8, write_frames, write_png, write_video
 
 
 def gradient(red: int = 200) -> np.ndarray:

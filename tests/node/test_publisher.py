@@ -14,11 +14,11 @@ import pytest
 import zmq
 from wire_messages import OTHER_BOOT, end, lines_of, origin, pixels, start_reader, window
 
-from gcd_node.endpoints import runtime_folder
 from gcd_node.envelope import NoteMessage, decode, topic_key
 from gcd_node.errors import ConfigError, EndpointError, MessageError, NodeError
 from gcd_node.publisher import Publisher, PublisherOptions
 from gcd_node.subscriber import NoteSubscriber, ViewSubscriber
+from gcd_node.wire.endpoints import runtime_folder
 
 pytestmark = pytest.mark.timeout(30)
 

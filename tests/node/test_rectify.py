@@ -13,13 +13,13 @@ from fakes import traits
 from numpy.typing import NDArray
 
 from gcd_model import Intrinsics
-from gcd_node.calibration import LensModel
 from gcd_node.config import NodeConfig, parse_config
 from gcd_node.errors import ConfigError
 from gcd_node.frame import Image, SourceInfo
-from gcd_node.preparation import fit_of, prepare_run
-from gcd_node.preprocess import Fit
-from gcd_node.rectify import Rectifier, project, widest_camera
+from gcd_node.optics.calibration import LensModel
+from gcd_node.optics.preprocess import Fit
+from gcd_node.optics.rectify import Rectifier, project, widest_camera
+from gcd_node.rendering.preparation import fit_of, prepare_run
 
 BARREL = LensModel(
     width=1280,

@@ -11,13 +11,15 @@ import zmq
 from control_fakes import Events, FakeCommands, wait_for
 from wire_messages import origin, window
 
-from gcd_node.allow_list import load_server_security
 from gcd_node.config import SecurityConfig
-from gcd_node.control import ControlOptions, ControlServer
-from gcd_node.control_client import ControlClient
-from gcd_node.endpoints import check_bindable
+from gcd_node.control.client import ControlClient
+from gcd_node.control.server import ControlOptions, ControlServer
 from gcd_node.errors import AuthError, ConfigError, ControlError, OutputError
-from gcd_node.keys import (
+from gcd_node.publisher import Publisher
+from gcd_node.publishing.options import PublisherOptions
+from gcd_node.security.allow_list import load_server_security
+from gcd_node.security.gate import ServerSecurity, check_pair, new_key_pair
+from gcd_node.security.keys import (
     Client,
     ClientKeys,
     KeyPair,
@@ -26,10 +28,8 @@ from gcd_node.keys import (
     read_public_key,
     write_key_pair,
 )
-from gcd_node.publisher import Publisher
-from gcd_node.publisher_options import PublisherOptions
-from gcd_node.security import ServerSecurity, check_pair, new_key_pair
 from gcd_node.subscriber import NoteSubscriber, ReceivedView, ViewSubscriber
+from gcd_node.wire.endpoints import check_bindable
 
 pytestmark = pytest.mark.timeout(90)
 

@@ -11,16 +11,16 @@ from pathlib import Path
 import pytest
 from cameras import until
 
-from gcd_node import cli_soak
-from gcd_node.cli import run_app
+from gcd_node.cli import soak as cli_soak
+from gcd_node.cli.main import run_app
 from gcd_node.load.clients import hostile, reader
 from gcd_node.load.hostile import Attacker
 from gcd_node.load.meter import holding, memory_mb, open_files, percentile
+from gcd_node.load.soak import Sample, SoakOptions, run_soak
+from gcd_node.load.soak_report import Growth, SoakLimits, SoakReport, findings, growth, spread
 from gcd_node.load.zmtp import GREETING, message, ready
 from gcd_node.publisher import Publisher
-from gcd_node.publisher_options import PublisherOptions
-from gcd_node.soak import Sample, SoakOptions, run_soak
-from gcd_node.soak_report import Growth, SoakLimits, SoakReport, findings, growth, spread
+from gcd_node.publishing.options import PublisherOptions
 from gcd_node.subscriber import ViewSubscriber
 
 SECONDS = 20.0

@@ -10,7 +10,7 @@ from fakes import WIDTH, Box, FakeSource, FakeSynthesizer, made_node, traits, wa
 from gcd_model import CameraMount, OptionError, Traits
 from gcd_node.config import NodeConfig, SourcePose, load_config, parse_config
 from gcd_node.errors import ConfigError
-from gcd_node.source_pose import is_foreign, require_usable, stated_mount, stated_sphere
+from gcd_node.optics.source_pose import is_foreign, require_usable, stated_mount, stated_sphere
 
 
 def config(pose: str | None = None, *, source: str = "", more: str = "") -> NodeConfig:

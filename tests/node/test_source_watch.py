@@ -10,8 +10,8 @@ from fakes import FakeSource
 
 from gcd_node.errors import ConfigError, SourceError, SourceLostError
 from gcd_node.frame import Frame, FrameSource, SourceInfo
-from gcd_node.health_report import SourceState
-from gcd_node.source_watch import Backoff, Patience, SourceWatch
+from gcd_node.health.report import SourceState
+from gcd_node.life.source_watch import Backoff, Patience, SourceWatch
 from gcd_node.window import Reason
 
 QUICK = Backoff(first_s=0.01, limit_s=0.05)

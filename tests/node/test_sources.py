@@ -20,7 +20,7 @@ from media import HEIGHT, WIDTH, flat, ramp, write_pictures, write_video
 from gcd_node.config import SourceConfig
 from gcd_node.errors import SourceError
 from gcd_node.frame import Frame, FrameSource
-from gcd_node.picture_header import read_header
+from gcd_node.pictures.picture_header import read_header
 from gcd_node.sources import (
     ImageFolder,
     SyntheticDrive,

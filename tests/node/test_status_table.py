@@ -14,18 +14,18 @@ import pytest
 from rich.console import Console
 from wire_messages import BOOT, OTHER_BOOT, origin
 
-from gcd_node.cli import run_app
+from gcd_node.cli.main import run_app
 from gcd_node.envelope import NoteMessage, NoteTopic
 from gcd_node.errors import ConfigError, StaleError
-from gcd_node.header import OriginHeader
-from gcd_node.health import Health
-from gcd_node.health_report import Level
-from gcd_node.keys import Client, write_key_pair
+from gcd_node.health.monitor import Health
+from gcd_node.health.report import Level
 from gcd_node.publisher import Publisher
-from gcd_node.publisher_options import PublisherOptions
-from gcd_node.security import ServerSecurity, new_key_pair
-from gcd_node.status_board import StatusBoard
-from gcd_node.status_table import StatusRequest, render_status, watch_status
+from gcd_node.publishing.options import PublisherOptions
+from gcd_node.security.gate import ServerSecurity, new_key_pair
+from gcd_node.security.keys import Client, write_key_pair
+from gcd_node.watching.status_board import StatusBoard
+from gcd_node.watching.status_table import StatusRequest, render_status, watch_status
+from gcd_node.wire.header import OriginHeader
 
 pytestmark = pytest.mark.timeout(60)
 WALL_NS = 1_800_000_000_000_000_000

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from gcd_node.systemd import ServiceManager, service_manager
+from gcd_node.health.systemd import ServiceManager, service_manager
 
 
 class Clock:
@@ -148,7 +148,7 @@ def test_a_full_socket_does_not_hold_up_the_node(path: str, receive: Receive) ->
 
 
 def test_the_environment_of_the_process_is_what_counts(path: str, receive: Receive) -> None:
-    code = "from gcd_node.systemd import service_manager; print(service_manager().ready('from a child'))"
+    code = "from gcd_node.health.systemd import service_manager; print(service_manager().ready('from a child'))"
     environment = os.environ | {"NOTIFY_SOCKET": path}
     command = [sys.executable, "-c", code]
     ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=50, check=False)

@@ -14,7 +14,7 @@ from gcd_node.envelope import ViewMessage
 from gcd_node.errors import OutputError
 from gcd_node.publisher import Publisher, PublisherOptions
 from gcd_node.subscriber import ReceivedView
-from gcd_node.viewing import ViewSaver, ViewTable, WatchReport, WatchRequest, render, watch
+from gcd_node.watching.views import ViewSaver, ViewTable, WatchReport, WatchRequest, render, watch
 
 pytestmark = pytest.mark.timeout(30)
 

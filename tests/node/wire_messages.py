@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 import gcd_node
 from gcd_node.envelope import EndMessage, ViewKind, ViewMessage, payload_of, view_topic
-from gcd_node.header import (
+from gcd_node.wire.header import (
     ClassRecord,
     EndHeader,
     ModelRecord,

@@ -1,0 +1,124 @@
+"""`gcd-node ctl` and `gcd-node keys`: commands for a running node, and the keys to reach it from elsewhere."""
+
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+import msgspec
+import typer
+from rich.console import Console
+from rich.pretty import Pretty
+from typer import Argument, Option
+
+from gcd_node.control.client import ControlClient
+from gcd_node.control.message import Reply, text_arguments
+from gcd_node.control.verbs import VERBS
+from gcd_node.errors import ControlError, UsageError
+from gcd_node.security.gate import check_pair, new_key_pair
+from gcd_node.security.keys import ClientKeys, fingerprint, read_key_pair, read_public_key, write_key_pair
+
+keys = typer.Typer(no_args_is_help=True, help="CURVE keys, for nodes that are reached over a network.")
+
+VerbName: TypeAlias = Annotated[str, Argument(metavar="VERB", help=f"One of {', '.join(VERBS)}.")]
+Settings: TypeAlias = Annotated[list[str] | None, Argument(metavar="[KEY=VALUE]...", help="The verb's arguments.")]
+Endpoint: TypeAlias = Annotated[str, Option(help="The node's control endpoint: ipc, ipc://PATH or tcp://HOST:PORT.")]
+AsJson: TypeAlias = Annotated[bool, Option("--json", help="Print the whole reply as one line of JSON.")]
+DryRun: TypeAlias = Annotated[bool, Option("--dry-run", help="Check everything, change nothing.")]
+IfViewRev: TypeAlias = Annotated[int | None, Option(min=0, help="Only if the view still has this revision.")]
+KeyFolder: TypeAlias = Annotated[Path | None, Option("--keys", help="Our key folder, as `gcd-node keys new` makes it.")]
+NodeKey: TypeAlias = Annotated[str | None, Option(help="The node's public key, or its file.")]
+Timeout: TypeAlias = Annotated[float, Option(min=0.1, help="Seconds to wait for a reply.")]
+NewFolder: TypeAlias = Annotated[Path, Argument(metavar="FOLDER", help="Where the keys go; must hold none yet.")]
+OldFolder: TypeAlias = Annotated[Path, Argument(metavar="FOLDER", help="A key folder.")]
+
+
+def ctl(
+    verb: VerbName,
+    settings: Settings = None,
+    endpoint: Endpoint = "ipc",
+    json: AsJson = False,
+    dry_run: DryRun = False,
+    if_view_rev: IfViewRev = None,
+    key_folder: KeyFolder = None,
+    node_key: NodeKey = None,
+    timeout: Timeout = 2.0,
+) -> None:
+    """Send one request to a running node: `gcd-node ctl set_view view=top azimuth_deg=30`."""
+    arguments = parse_settings(verb, settings or [])
+    own = client_keys(key_folder, node_key)
+    with ControlClient(endpoint, keys=own, timeout_s=timeout) as node:
+        reply = node.request(verb, arguments, dry_run=dry_run, if_view_rev=if_view_rev)
+    if json:
+        typer.echo(msgspec.json.encode(reply).decode())
+    else:
+        _show(reply)
+    if not reply.ok:
+        allowed = "" if reply.result is None else f" ({msgspec.json.encode(reply.result).decode()})"
+        raise ControlError(f"{verb}: {reply.code}: {reply.message}{allowed}", reply.code)
+
+
+@keys.command("new")
+def new_keys(folder: NewFolder) -> None:
+    """Make a key pair, for a node or for a client."""
+    write_key_pair(folder, new_key_pair())
+    _describe(folder)
+
+
+@keys.command("show")
+def show_keys(folder: OldFolder) -> None:
+    """Show the public half of a key pair, and how to allow it."""
+    _describe(folder)
+
+
+def parse_settings(verb: str, settings: list[str]) -> dict[str, object]:
+    """KEY=VALUE as arguments: text where the verb wants text, else JSON if it is any, else text.
+
+    Raises:
+        UsageError: no `=`, or a key twice.
+    """
+    wanted_text = text_arguments(verb)
+    found: dict[str, object] = {}
+    for each in settings:
+        key, equals, value = each.partition("=")
+        if not equals or not key or key in found:
+            raise UsageError(f"an argument is KEY=VALUE, each key once, got {each!r}")
+        found[key] = value if key in wanted_text else _value(value)
+    return found
+
+
+def client_keys(folder: Path | None, node_key: str | None) -> ClientKeys | None:
+    """The keys that options name; None if they name none.
+
+    Raises:
+        UsageError: one without the other. ConfigError: they cannot be read.
+    """
+    if folder is None and node_key is None:
+        return None
+    if folder is None or node_key is None:
+        raise UsageError("give both --keys, our own key folder, and --node-key, the node's public key, or neither")
+    return ClientKeys(own=read_key_pair(folder), server=read_public_key(node_key))
+
+
+def _value(text: str) -> object:
+    try:
+        return msgspec.json.decode(text.encode())
+    except (msgspec.DecodeError, RecursionError, UnicodeError):
+        return text
+
+
+def _show(reply: Reply) -> None:
+    if not reply.ok:
+        return
+    console = Console()
+    said = f": {reply.message}" if reply.message else ""
+    console.print(f"{reply.code}{said} (the node is {reply.state})", markup=False, soft_wrap=True)
+    if reply.result:
+        console.print(Pretty(reply.result, expand_all=True))
+
+
+def _describe(folder: Path) -> None:
+    pair = read_key_pair(folder)
+    check_pair(pair)
+    typer.echo(f"public key   {pair.public}")
+    typer.echo(f"fingerprint  {fingerprint(pair.public)}")
+    typer.echo("\nTo allow it, write into the node's list of clients ([security] allow):\n")
+    typer.echo(f'[client.NAME]\nkey = "{pair.public}"\nrole = "viewer"  # or "operator"')

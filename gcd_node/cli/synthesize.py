@@ -1,0 +1,239 @@
+"""`gcd-node synthesize`: one clip, one view, offline."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from typer import Argument, Option
+
+from gcd_model import Augmentation, RenderOptions, SphericalDelta, ViewSynthesizer, load_synthesizer
+from gcd_node.cli.weights import FamilyOption, HeadWidth, ImageHeads
+from gcd_node.config import SourcePose
+from gcd_node.errors import UsageError
+from gcd_node.offline_clip import ClipRequest, read_clip
+from gcd_node.optics.source_pose import require_usable, stated_mount
+from gcd_node.synthesize import (
+    InjectedNoise,
+    ViewRequest,
+    plan,
+    read_noise,
+    render,
+    require_input,
+    save_arrays,
+    write_view,
+)
+from gcd_node.wire.view_message import ontology
+
+_VIEW, _CLIP, _SAMPLING, _MODEL = "The view", "The clip", "Sampling", "The model"
+_MOUNT = "The camera's mount; what is left out is as the model was trained"
+
+Input: TypeAlias = Annotated[
+    Path,
+    Argument(metavar="INPUT", help="A video, a folder of pictures, a still, or .npy: float32 [T, H, W, 3] in 0..1."),
+]
+Weights: TypeAlias = Annotated[
+    str, Option(help="A checkpoint, a diffusers folder, package:NAME, or random:FAMILY (noise).")
+]
+Out: TypeAlias = Annotated[Path, Option(help="Folder for frames, video and pictures.")]
+Azimuth: TypeAlias = Annotated[
+    float | None, Option(help="Destination minus source, to the camera's right.", rich_help_panel=_VIEW)
+]
+Elevation: TypeAlias = Annotated[float | None, Option(help="Destination minus source, up.", rich_help_panel=_VIEW)]
+Radius: TypeAlias = Annotated[float | None, Option(help="Destination minus source, away.", rich_help_panel=_VIEW)]
+Poses: TypeAlias = Annotated[
+    Path | None, Option(help="The whole path instead: .npy of [T, 4, 4], source-from-target.", rich_help_panel=_VIEW)
+]
+PathKind: TypeAlias = Annotated[
+    str | None, Option(help="gradual or direct; else as the checkpoint was trained.", rich_help_panel=_VIEW)
+]
+MoveTime: TypeAlias = Annotated[int | None, Option(help="Frame in which the goal is reached.", rich_help_panel=_VIEW)]
+SourceElevation: TypeAlias = Annotated[
+    float | None, Option(help="Where the source camera stands; with --poses. Else 5.", rich_help_panel=_VIEW)
+]
+SourceRadius: TypeAlias = Annotated[
+    float | None, Option(help="Its distance to the scene's centre. Else 15.", rich_help_panel=_VIEW)
+]
+MountHeight: TypeAlias = Annotated[
+    float | None,
+    Option(help="Camera above the ground, metres, for models that use its mount.", rich_help_panel=_MOUNT),
+]
+MountForward: TypeAlias = Annotated[
+    float | None, Option(help="Camera ahead of the vehicle's origin, metres.", rich_help_panel=_MOUNT)
+]
+MountLeft: TypeAlias = Annotated[float | None, Option(help="And to its left, metres.", rich_help_panel=_MOUNT)]
+MountTilt: TypeAlias = Annotated[
+    float | None, Option(help="How far the camera looks down, degrees.", rich_help_panel=_MOUNT)
+]
+FieldOfView: TypeAlias = Annotated[
+    float | None, Option(help="Horizontal field of view of the input, degrees.", rich_help_panel=_MOUNT)
+]
+Start: TypeAlias = Annotated[int, Option(help="First frame of the input.", rich_help_panel=_CLIP)]
+Stride: TypeAlias = Annotated[int, Option(help="Take every so-many-th frame.", rich_help_panel=_CLIP)]
+Fps: TypeAlias = Annotated[
+    float | None, Option(help="Frame rate the network is told; else the clip's own.", rich_help_panel=_CLIP)
+]
+Height: TypeAlias = Annotated[int | None, Option(help="Instead of the trained height.", rich_help_panel=_CLIP)]
+Width: TypeAlias = Annotated[int | None, Option(help="Instead of the trained width.", rich_help_panel=_CLIP)]
+Steps: TypeAlias = Annotated[int | None, Option(help="Denoising steps.", rich_help_panel=_SAMPLING)]
+Guidance: TypeAlias = Annotated[
+    tuple[float, float] | None,
+    Option(metavar="FIRST LAST", help="Scale of the first and the last frame.", rich_help_panel=_SAMPLING),
+]
+Seed: TypeAlias = Annotated[int, Option(help="Of all random draws.", rich_help_panel=_SAMPLING)]
+Samples: TypeAlias = Annotated[
+    int, Option(help="Draws of the view; with several, a picture shows where they differ.", rich_help_panel=_SAMPLING)
+]
+MotionBucket: TypeAlias = Annotated[
+    float | None, Option(help="The motion number; else by the formula.", rich_help_panel=_SAMPLING)
+]
+CondAug: TypeAlias = Annotated[
+    float | None,
+    Option(help="Strength of the noise on the conditioning frames; else the model's.", rich_help_panel=_SAMPLING),
+]
+Noise: TypeAlias = Annotated[
+    Path | None, Option(help=".npz with `initial` and `augmentation` instead of draws.", rich_help_panel=_SAMPLING)
+]
+Save: TypeAlias = Annotated[
+    Path | None, Option(help=".npz to write `latents` and `frames` to.", rich_help_panel=_SAMPLING)
+]
+Device: TypeAlias = Annotated[str, Option(help="auto, cpu, cuda, cuda:1, ...", rich_help_panel=_MODEL)]
+Dtype: TypeAlias = Annotated[str | None, Option(help="float32, bfloat16 or float16.", rich_help_panel=_MODEL)]
+
+
+def synthesize(
+    input_path: Input,
+    weights: Weights,
+    out: Out,
+    azimuth_deg: Azimuth = None,
+    elevation_deg: Elevation = None,
+    radius: Radius = None,
+    poses: Poses = None,
+    trajectory: PathKind = None,
+    move_time: MoveTime = None,
+    source_elevation_deg: SourceElevation = None,
+    source_radius: SourceRadius = None,
+    mount_height: MountHeight = None,
+    mount_forward: MountForward = None,
+    mount_left: MountLeft = None,
+    mount_tilt: MountTilt = None,
+    hfov_deg: FieldOfView = None,
+    start: Start = 0,
+    stride: Stride = 1,
+    fps: Fps = None,
+    height: Height = None,
+    width: Width = None,
+    steps: Steps = None,
+    guidance: Guidance = None,
+    seed: Seed = 0,
+    samples: Samples = 1,
+    motion_bucket: MotionBucket = None,
+    cond_aug: CondAug = None,
+    noise: Noise = None,
+    save: Save = None,
+    family: FamilyOption = None,
+    device: Device = "auto",
+    dtype: Dtype = None,
+    head_width: HeadWidth = None,
+    image_heads: ImageHeads = None,
+) -> None:
+    """See one clip from another camera, offline.
+
+    Writes frames, a video, an input-above-view strip and, if the model makes one, the class map; with several samples
+    also where they differ.
+    """
+    clip = ClipRequest(start=start, stride=stride, fps=fps, height=height, width=width, hfov_deg=hfov_deg)
+    source = _pose((source_elevation_deg, source_radius), (mount_height, mount_forward, mount_left, mount_tilt))
+    delta = _delta(azimuth_deg, elevation_deg, radius)
+    wanted = ViewRequest(delta=delta, poses=poses, trajectory=trajectory, move_time=move_time, source=source)
+    injected = InjectedNoise() if noise is None else read_noise(noise)
+    options = RenderOptions(steps=steps, guidance=guidance, samples=samples, seed=seed, motion_bucket=motion_bucket)
+    options = replace(options, initial_noise=injected.initial)
+    _require_possible(input_path, save, samples)
+    heads = {"head_width": head_width, "image_heads": image_heads}
+    with Console(stderr=True).status(f"loading {weights}"):
+        model = load_synthesizer(weights, family=family, device=device, dtype=dtype, **heads)
+    augmentation = Augmentation(strength=cond_aug, seed=seed, noise=injected.augmentation)
+    _run(_Order(model, input_path, clip, wanted, options, augmentation), out, save)
+
+
+def _require_possible(input_path: Path, save: Path | None, samples: int) -> None:
+    """What is cheaper to know before the weights are loaded."""
+    if save is not None and samples != 1:
+        raise UsageError("--save holds one sample; leave out --samples")
+    require_input(input_path)
+
+
+@dataclass(frozen=True, slots=True)
+class _Order:
+    model: ViewSynthesizer
+    input_path: Path
+    clip: ClipRequest
+    view: ViewRequest
+    options: RenderOptions
+    augmentation: Augmentation
+
+
+def _run(order: _Order, out: Path, save: Path | None) -> None:
+    traits = order.model.traits
+    require_usable(order.view.source, traits)
+    if order.clip.hfov_deg is not None and traits.mount is None:
+        raise UsageError(f"{traits.name} has no use for --hfov-deg; leave it out")
+    source = read_clip(order.input_path, order.clip, traits)
+    mount = stated_mount(order.view.source, source.hfov_deg, traits)
+    source = replace(source, clip=replace(source.clip, mount=mount))
+    path = plan(order.model, order.view, mount)
+    with _progress() as progress:
+        options = replace(order.options, progress=_Steps(progress))
+        view = render(order.model, source, path, options, order.augmentation)
+    console = Console()
+    if not traits.trained:
+        console.print(f"{traits.name}: these weights are random, so the picture is noise.")
+    for written in write_view(out, source, view, ontology(traits)):
+        console.print(f"wrote {written}", soft_wrap=True)
+    if save is not None:
+        save_arrays(save, view)
+        console.print(f"wrote {save}", soft_wrap=True)
+
+
+def _delta(azimuth_deg: float | None, elevation_deg: float | None, radius: float | None) -> SphericalDelta | None:
+    if azimuth_deg is None and elevation_deg is None and radius is None:
+        return None
+    return SphericalDelta(azimuth_deg=azimuth_deg or 0.0, elevation_deg=elevation_deg or 0.0, radius_m=radius or 0.0)
+
+
+def _pose(sphere: tuple[float | None, ...], mount: tuple[float | None, ...]) -> SourcePose | None:
+    if all(number is None for number in (*sphere, *mount)):
+        return None
+    elevation_deg, radius = sphere
+    height_m, forward_m, left_m, tilt_deg = mount
+    try:
+        return SourcePose(
+            elevation_deg=elevation_deg,
+            radius=radius,
+            height_m=height_m,
+            forward_m=forward_m,
+            left_m=left_m,
+            tilt_deg=tilt_deg,
+        )
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+
+
+def _progress() -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
+    console = Console(stderr=True)
+    return Progress(*columns, TimeElapsedColumn(), console=console, transient=True, disable=not console.is_terminal)
+
+
+class _Steps:
+    """Shows encoding first, then denoising steps."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self._task = progress.add_task("encoding", total=None)
+
+    def __call__(self, done: int, steps: int) -> None:
+        """As RenderOptions.progress."""
+        self._progress.update(self._task, description="denoising", completed=done, total=steps)

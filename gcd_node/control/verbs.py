@@ -1,0 +1,188 @@
+"""The verbs of the control socket: what each takes, and who may say it (wire protocol, section 5)."""
+
+import types
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Literal, TypeAlias
+
+import msgspec
+from msgspec import Meta
+
+from gcd_node.config import ViewConfig
+from gcd_node.security.keys import Role
+from gcd_node.wire.record_json import LARGEST_INTEGER
+
+ViewName: TypeAlias = Annotated[str, Meta(pattern=r"^[a-z0-9_]{1,16}$(?!\n)")]
+
+
+class Hello(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Who answers: node, boot, version, and the role of who asks."""
+
+
+class Describe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Verbs and their arguments, the views this checkpoint allows, limits."""
+
+
+class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """State of the node, of its source and of its model."""
+
+
+class Stats(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The status message, now."""
+
+
+class Time(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The node's clock when the request came and when the reply left."""
+
+
+class Views(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Every view with its pose and revision."""
+
+
+class GetConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The configuration in force, without passwords."""
+
+
+class GetCalib(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Intrinsics of the source and of the views."""
+
+
+class Configure(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Check the configuration and load the model."""
+
+
+class Activate(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Open the source and publish views."""
+
+
+class Deactivate(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Close the source, keep the model."""
+
+
+class Cleanup(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Let go of the model."""
+
+
+class Shutdown(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """End the process in order."""
+
+
+class SetView(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Replace a view as a whole: as in a launch file, what is left out has its default, whatever it was before.
+
+    view: its id. kind, azimuth_deg, elevation_deg, radius, rate_deg_s, amplitude_deg: as in [view.*].
+    source_from_view: 16 numbers, row-major 4x4, rigid, instead of the three differences; `T_src_dst` on the wire.
+    """
+
+    view: ViewName
+    kind: Literal["fixed", "orbit"] = "fixed"
+    azimuth_deg: float | None = None
+    elevation_deg: float | None = None
+    radius: float | None = None
+    source_from_view: Annotated[tuple[float, ...], Meta(min_length=16, max_length=16)] | None = msgspec.field(
+        default=None, name="T_src_dst"
+    )
+    rate_deg_s: float | None = None
+    amplitude_deg: Annotated[float, Meta(gt=0)] | None = None
+
+    def __post_init__(self) -> None:
+        angles = (self.azimuth_deg, self.elevation_deg, self.radius)
+        if self.source_from_view is not None and angles != (None, None, None):
+            raise ValueError("a goal is T_src_dst, or azimuth_deg, elevation_deg and radius: state one of the two")
+        self.to_config()
+
+    def to_config(self) -> ViewConfig:
+        """The view as a launch file states it; its differences are 0 if `source_from_view` is given instead.
+
+        Raises:
+            ValueError: an orbit without rate or amplitude, or a fixed view with them.
+        """
+        return ViewConfig(
+            kind=self.kind,
+            azimuth_deg=self.azimuth_deg or 0.0,
+            elevation_deg=self.elevation_deg or 0.0,
+            radius=self.radius or 0.0,
+            rate_deg_s=self.rate_deg_s,
+            amplitude_deg=self.amplitude_deg,
+        )
+
+
+class RemoveView(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Stop publishing a view."""
+
+    view: ViewName
+
+
+class SetParam(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Change how views are drawn and sent; what is left out stays.
+
+    steps, guidance, seed, samples: as in [model]. jpeg_quality: as in [publish]. publish: its `encoding`.
+    """
+
+    steps: Annotated[int, Meta(ge=1, le=1000)] | None = None
+    guidance: tuple[Annotated[float, Meta(ge=0, le=100)], Annotated[float, Meta(ge=0, le=100)]] | None = None
+    seed: Annotated[int, Meta(ge=0, le=LARGEST_INTEGER)] | None = None
+    samples: Annotated[int, Meta(ge=1, le=64)] | None = None
+    jpeg_quality: Annotated[int, Meta(ge=50, le=100)] | None = None
+    publish: Literal["rgb8", "jpeg"] | None = None
+
+    def __post_init__(self) -> None:
+        if all(getattr(self, name) is None for name in self.__struct_fields__):
+            raise ValueError(f"nothing to change; name one of {', '.join(self.__struct_fields__)}")
+
+
+class RecordStart(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Begin to record."""
+
+
+class RecordStop(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Finish the recording."""
+
+
+Arguments: TypeAlias = (
+    Hello | Describe | State | Stats | Time | Views | GetConfig | GetCalib
+    | Configure | Activate | Deactivate | Cleanup | Shutdown
+    | SetView | RemoveView | SetParam | RecordStart | RecordStop
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Verb:
+    """What a verb takes, who may say it, and whether `if_view_rev` goes with it."""
+
+    arguments: type[Arguments]
+    role: Role
+    names_view: bool = False
+
+
+VERBS: Mapping[str, Verb] = types.MappingProxyType(
+    {
+        "hello": Verb(arguments=Hello, role="viewer"),
+        "describe": Verb(arguments=Describe, role="viewer"),
+        "state": Verb(arguments=State, role="viewer"),
+        "stats": Verb(arguments=Stats, role="viewer"),
+        "time": Verb(arguments=Time, role="viewer"),
+        "views": Verb(arguments=Views, role="viewer"),
+        "get_config": Verb(arguments=GetConfig, role="viewer"),
+        "get_calib": Verb(arguments=GetCalib, role="viewer"),
+        "configure": Verb(arguments=Configure, role="operator"),
+        "activate": Verb(arguments=Activate, role="operator"),
+        "deactivate": Verb(arguments=Deactivate, role="operator"),
+        "cleanup": Verb(arguments=Cleanup, role="operator"),
+        "shutdown": Verb(arguments=Shutdown, role="operator"),
+        "set_view": Verb(arguments=SetView, role="operator", names_view=True),
+        "remove_view": Verb(arguments=RemoveView, role="operator", names_view=True),
+        "set_param": Verb(arguments=SetParam, role="operator"),
+        "record_start": Verb(arguments=RecordStart, role="operator"),
+        "record_stop": Verb(arguments=RecordStop, role="operator"),
+    }
+)
+"""Every verb. A viewer's verbs change nothing; an operator may say all of them."""
+
+
+def schemas() -> dict[str, object]:
+    """Role and JSON schema of every verb's arguments, for `describe`."""
+    return {
+        name: {"role": verb.role, "args": msgspec.json.schema(verb.arguments), "if_view_rev": verb.names_view}
+        for name, verb in VERBS.items()
+    }

@@ -1,0 +1,94 @@
+"""What the node tells of itself: status, events and metadata (wire protocol, section 4)."""
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+
+from gcd_node.health.monitor import Health
+from gcd_node.health.report import Level
+from gcd_node.life.live_config import Settings
+from gcd_node.publishing.outbox import Outbox
+from gcd_node.wire.header import OriginHeader
+from gcd_node.wire.record_json import to_json
+from gcd_node.wire.view_message import Run, camera_matrix
+
+_PERIOD_S = 1.0
+
+
+class Announcer:
+    """Sends notes; every method may be called from any thread. Raises what the outbox raises."""
+
+    def __init__(
+        self,
+        node_id: str,
+        boot_id: str,
+        outbox: Outbox,
+        health: Health,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """clock: monotonic seconds."""
+        self.boot_id, self.node_id = boot_id, node_id
+        self._outbox, self._health, self._clock = outbox, health, clock
+        self._next_s = clock()
+        self._meta: Mapping[str, object] | None = None
+        self._order = threading.Lock()
+
+    def event(self, code: str, level: Level, fields: Mapping[str, object] | None = None) -> None:
+        """Something has happened. code: stable, for programs; fields: plain JSON, a `message` for people."""
+        self._outbox.note("event", self._origin(), {**(fields or {}), "code": code, "level": int(level)})
+
+    def status(self) -> None:
+        """Say how it is, now."""
+        with self._order:
+            self._next_s = self._clock() + _PERIOD_S
+            sent = self._outbox.stats
+            self._health.sent(sent.sent, sent.subscribers, sent.bytes)
+            self._health.dropped("queue", sent.dropped)
+            self._outbox.note("status", self._origin(), self._health.report())
+
+    def status_if_due(self) -> None:
+        """The same once a second, and as soon as something that matters has changed."""
+        if self._clock() >= self._next_s or self._health.changed():
+            self.status()
+
+    def meta(self, fields: Mapping[str, object]) -> None:
+        """Say what views are made of, if it is not what was said last."""
+        with self._order:
+            if fields == self._meta:
+                return
+            self._meta = dict(fields)
+            self._outbox.note("meta", self._origin(), fields)
+
+    def _origin(self) -> OriginHeader:
+        return OriginHeader(node_id=self.node_id, boot_id=self.boot_id, t_publish_ns=time.time_ns())
+
+
+def metadata(run: Run, settings: Settings, fps: float) -> dict[str, object]:
+    """Weights, views, cameras, classes: what changes only when somebody changes it. fps: of a window."""
+    traits = run.traits
+    return {
+        "weights": {
+            "name": traits.name,
+            "family": "unknown" if traits.family is None else traits.family.name,
+            "sha256_12": traits.sha256_12,
+            "trained": traits.trained,
+        },
+        "views": list(settings.revisions),
+        "view_revs": dict(settings.revisions),
+        **calibration(run),
+        "classes": [to_json(each) for each in run.classes],
+        "size": [traits.config.width, traits.config.height],
+        "fps": fps,
+        "cfg_digest": settings.config.digest,
+    }
+
+
+def calibration(run: Run) -> dict[str, object]:
+    """The camera of the views, and how the source camera is mounted; None for what nobody knows."""
+    camera, mount, pose = run.intrinsics, run.mount or run.traits.mount, run.config.source.pose
+    assumed = pose is None or not pose.on_vehicle
+    return {
+        "K": None if camera is None else list(camera_matrix(camera)),
+        "mount": None if mount is None else {**asdict(mount), "assumed": assumed},
+    }

@@ -1,0 +1,1 @@
+"""The node's life: states and commands, and one activation from an open source to its end."""

@@ -1,0 +1,1 @@
+"""Lenses and pictures on their way to the network: calibration, undistortion, crop, resize, mount."""

@@ -1,0 +1,1 @@
+"""From rendered views to the publisher: order, rhythm, and what a publisher is told."""

@@ -1,0 +1,292 @@
+"""The model thread: takes windows, renders every view of each, hands the messages over. Owns the device."""
+
+import hashlib
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import torch
+
+from gcd_model import Augmentation, Cancelled, Clip, DeviceMemoryError, NonFiniteError, RenderOptions, View
+from gcd_node.capture import Newest
+from gcd_node.health.announcer import Announcer
+from gcd_node.health.monitor import IDLE, Health
+from gcd_node.health.report import Level
+from gcd_node.life.live_config import LiveConfig, Settings
+from gcd_node.optics.preprocess import to_clip_tensor
+from gcd_node.publishing.dispatcher import Dispatcher
+from gcd_node.publishing.outbox import Outbox
+from gcd_node.rendering.degrade import WHOLE, Rung, rungs
+from gcd_node.rendering.idle import IdleRule
+from gcd_node.rendering.model_slot import ModelSlot
+from gcd_node.rendering.setbacks import Setbacks
+from gcd_node.rendering.virtual_view import VirtualView, VirtualViews
+from gcd_node.window import FrameWindow
+from gcd_node.wire.view_message import Rendered, Run, end_messages, messages, newest_ns, utc_offset_ns
+
+_LOG = logging.getLogger(__name__)
+_KEPT = 1000  # a node runs for weeks
+
+
+@dataclass(slots=True)
+class WorkCounts:
+    """What the model thread has done. render_s: inference times of the latest windows. age_ms: theirs, at publish."""
+
+    windows: int = 0
+    nan_windows: int = 0
+    last_window_id: int = -1
+    render_s: deque[float] = field(default_factory=lambda: deque[float](maxlen=_KEPT))
+    age_ms: deque[float] = field(default_factory=lambda: deque[float](maxlen=_KEPT))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class WindowReport:
+    """A window that was just published, for whoever watches. render_s, age_ms: see WorkCounts."""
+
+    window: FrameWindow
+    render_s: float
+    age_ms: float
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class WorkerParts:
+    """What a model thread works with."""
+
+    model: ModelSlot
+    live: LiveConfig
+    outbox: Outbox
+    health: Health
+    announcer: Announcer
+    on_window: Callable[[WindowReport], None] | None = None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class _Job:
+    """One window and everything that was decided for it when it was taken."""
+
+    window: FrameWindow
+    settings: Settings
+    run: Run
+    views: list[VirtualView]
+
+
+class ModelWorker:
+    """Renders windows until there are no more, it is cancelled, or the model has failed."""
+
+    def __init__(self, parts: WorkerParts, run_of: Callable[[int], Run]) -> None:
+        """run_of: what is known of the source in an epoch; -1 for now."""
+        self.counts = WorkCounts()
+        self.warm = threading.Event()  # the first window may come
+        self._parts, self._run_of = parts, run_of
+        config = parts.live.config
+        self._realtime = config.source.pace == "realtime"
+        self._dispatcher = Dispatcher(parts.outbox, paced=self._realtime)
+        self._views = VirtualViews(parts.model.traits)
+        self._idle = IdleRule(config.life.idle_s if self._realtime else 0.0)
+        self._setbacks = Setbacks(parts.health, parts.announcer)
+        self._cancel = threading.Event()
+        self._beat_s: float | None = None
+
+    @property
+    def silent_s(self) -> float:
+        """How long the model has been at one step; 0 while it waits for windows."""
+        beat_s = self._beat_s
+        return 0.0 if beat_s is None else time.monotonic() - beat_s
+
+    def cancel(self) -> None:
+        """Abandon the window in work at its next denoising step; from any thread."""
+        self._cancel.set()
+
+    def work(self, newest: Newest[FrameWindow]) -> None:
+        """Take windows and publish their views.
+
+        Raises:
+            ModelFailedError: three windows in a row could not be used, or there is no memory however little is asked.
+            whatever the source failed with, once its last window is done.
+        """
+        try:
+            if self._realtime:
+                self._warm_up()
+            self._ready()
+            self.warm.set()
+            while (window := newest.take()) is not None:
+                self._announce_removed()
+                if not self._rests():
+                    self._beat()
+                    self._parts.health.stage("window", (time.monotonic_ns() - window.arrival_ns) / 1e9)
+                    self._render_or_count(self._job(window))
+                self._ready()
+            self._announce_removed()
+        except Cancelled:
+            _LOG.info("the window in work was abandoned")
+        finally:
+            self._beat_s = None
+            self.warm.set()
+            self._dispatcher.finish(abandon=self._cancel.is_set())
+
+    def _beat(self) -> None:
+        self._beat_s = time.monotonic()
+        self._parts.health.model("degraded" if self._rung is not WHOLE else "busy")
+
+    def _ready(self) -> None:
+        self._beat_s = None
+        self._parts.health.model("degraded" if self._rung is not WHOLE else "ready")
+
+    @property
+    def _rung(self) -> Rung:
+        return self._setbacks.rung
+
+    def _rests(self) -> bool:
+        """Whether nobody would see this window."""
+        rests = self._idle.rests(self._parts.outbox.stats.subscribers)
+        if rests:
+            self._parts.health.raise_reason(IDLE, Level.OK)
+        else:
+            self._parts.health.clear_reason(IDLE)
+        return rests
+
+    def _job(self, window: FrameWindow) -> _Job:
+        """A command that comes from here on is for the next window."""
+        settings = self._parts.live.settings()
+        known = self._run_of(window.epoch)
+        run = replace(known, config=settings.config, traits=self._parts.model.traits)
+        views = self._views.following(settings, run.mount)
+        return _Job(window=window, settings=settings, run=run, views=views[:1] if self._rung.single else views)
+
+    def _announce_removed(self) -> None:
+        for view_id, rev in self._parts.live.take_removed():
+            for message in end_messages(self._run_of(-1), view_id, rev, self.counts.last_window_id):
+                self._parts.outbox.end(message, delay_ms=0)
+
+    def _warm_up(self) -> None:
+        """Render a grey clip in one step, so that the first window does not pay for what happens only once."""
+        self._parts.health.model("warming")
+        self._beat_s = time.monotonic()
+        settings, run, synthesizer = self._parts.live.settings(), self._run_of(-1), self._parts.model.synthesizer
+        config = run.traits.config
+        video = torch.zeros(config.frames, 3, config.height, config.width)
+        grey = Clip(video=video, fps=run.traits.fps, mount=run.mount)
+        paths = [view.planned() for view in self._views.following(settings, run.mount)]
+        try:
+            synthesizer.render(synthesizer.encode(grey), paths, self._options(settings, 0, steps=1))
+        except (NonFiniteError, DeviceMemoryError) as error:
+            _LOG.warning("the warm-up came to nothing: %s", error)  # windows are dealt with one by one
+
+    def _options(self, settings: Settings, seed: int, *, steps: int | None) -> RenderOptions:
+        model = settings.config.model
+        return RenderOptions(
+            steps=steps,
+            guidance=model.guidance,
+            samples=1 if self._rung.single else model.samples,
+            seed=seed,
+            motion_bucket=model.motion_bucket,
+            progress=lambda done, steps: self._beat(),
+            cancel=self._cancel,
+        )
+
+    def _render_or_count(self, job: _Job) -> None:
+        """One retry, with another seed or with less asked; a window that fails again is counted and not published."""
+        failure: Exception | None = None
+        seeds = [window_seed(job.run.config.digest, job.window.window_id, attempt) for attempt in (0, 1)]
+        for seed in seeds:
+            try:
+                self._publish(job, seed)
+            except NonFiniteError as error:
+                failure = error
+                _LOG.warning("window %d: %s", job.window.window_id, error)
+            except DeviceMemoryError as error:
+                failure = error
+                self._give_up_more(job, error)
+                job = self._job(job.window)
+            else:
+                self._setbacks.none()
+                return
+        self._parts.health.drop("model")
+        if isinstance(failure, NonFiniteError):
+            self._count_nan(job, seeds)
+
+    def _give_up_more(self, job: _Job, error: DeviceMemoryError) -> None:
+        """Step down the ladder, which is laid by what is asked when it is first needed."""
+        model, samples = self._parts.model, job.run.config.model.samples
+        way = rungs(views=len(job.views), samples=samples, steps=self._asked_steps(job), can_halve=model.can_halve)
+        self._setbacks.out_of_memory(job.window.window_id, error, way)
+        if self._rung.half and model.can_halve:
+            model.halve()
+
+    def _count_nan(self, job: _Job, seeds: list[int]) -> None:
+        self.counts.nan_windows += 1
+        window = job.window
+        self._setbacks.not_a_number(
+            {
+                "window_id": window.window_id,
+                "seeds": seeds,
+                "seq": [window.seqs[0], window.seqs[-1]],
+                "view_revs": dict(job.settings.revisions),
+                "cfg_digest": job.run.config.digest,
+            }
+        )
+
+    def _asked_steps(self, job: _Job) -> int:
+        return job.run.config.model.steps or job.run.traits.config.sampling.steps
+
+    def _publish(self, job: _Job, seed: int) -> None:
+        started_ns = time.monotonic_ns()
+        steps = max(1, self._asked_steps(job) // self._rung.steps_divisor)
+        drawn = self._draw(job, seed, steps if self._rung.steps_divisor > 1 else job.run.config.model.steps)
+        ended_ns, offset_ns = time.monotonic_ns(), utc_offset_ns()
+        for virtual, view in zip(job.views, drawn, strict=True):
+            rendered = Rendered(
+                window=job.window,
+                view=view,
+                view_id=virtual.view_id,
+                view_rev=virtual.rev,
+                started_ns=started_ns,
+                ended_ns=ended_ns,
+                steps=steps,
+                seed=seed,
+                utc_offset_ns=offset_ns,
+            )
+            self._dispatcher.send(messages(job.run, rendered), job.window.fps)
+            age_s = (time.monotonic_ns() - newest_ns(job.run, job.window)) / 1e9
+            self._parts.health.published(virtual.view_id, age_s)
+        self._parts.health.stage("publish", (time.monotonic_ns() - ended_ns) / 1e9)
+        self._count(job, (ended_ns - started_ns) / 1e9)
+
+    def _draw(self, job: _Job, seed: int, steps: int | None) -> list[View]:
+        synthesizer, health = self._parts.model.synthesizer, self._parts.health
+        started_s = time.monotonic()
+        video = torch.from_numpy(to_clip_tensor(job.window.images))
+        clip = Clip(video=video, fps=job.window.fps, mount=job.run.mount)
+        features = synthesizer.encode(clip, Augmentation(strength=job.run.config.model.cond_aug, seed=seed))
+        encoded_s = time.monotonic()
+        health.stage("encode", encoded_s - started_s)
+        self._beat()
+        paths = [view.trajectory(job.window.stamps_ns[-1], job.window.epoch) for view in job.views]
+        options = self._options(job.settings, seed, steps=steps)
+        if self._rung.one_by_one:
+            drawn = [synthesizer.render(features, [path], options)[0] for path in paths]
+        else:
+            drawn = synthesizer.render(features, paths, options)
+        health.stage("render", time.monotonic() - encoded_s)
+        self._beat()
+        return drawn
+
+    def _count(self, job: _Job, seconds: float) -> None:
+        self.counts.windows += 1
+        self.counts.last_window_id = job.window.window_id
+        self.counts.render_s.append(seconds)
+        age_ms = (time.monotonic_ns() - newest_ns(job.run, job.window)) / 1e6
+        self.counts.age_ms.append(age_ms)
+        if self._parts.model.traits.device.startswith("cuda"):
+            self._parts.health.model_load(gpu_mem_mb=torch.cuda.memory_allocated() / 1e6)
+        if self._parts.on_window is not None:
+            self._parts.on_window(WindowReport(window=job.window, render_s=seconds, age_ms=age_ms))
+
+
+def window_seed(config_digest: str, window_id: int, attempt: int) -> int:
+    """The seed of a window: the same in every run of a configuration, below 2^48 so that JSON holds it."""
+    text = f"{config_digest}/{window_id}/{attempt}"
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:6], "big")

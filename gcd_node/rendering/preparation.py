@@ -1,0 +1,135 @@
+"""What can be said of a run before its first frame: frame rate, cameras, and what lies outside the trained domain."""
+
+import logging
+from pathlib import Path
+
+from gcd_model import CameraMount, Intrinsics, OptionError, Traits
+from gcd_node.config import NodeConfig
+from gcd_node.envelope import new_boot_id
+from gcd_node.errors import ConfigError
+from gcd_node.frame import SourceInfo
+from gcd_node.optics.calibration import LensModel, load_lens
+from gcd_node.optics.preprocess import Fit
+from gcd_node.optics.rectify import Rectifier
+from gcd_node.optics.source_pose import is_foreign, require_usable, stated_mount
+from gcd_node.window import RATE_TOLERANCE, choose_fps
+from gcd_node.wire.view_message import Run
+
+_LOG = logging.getLogger(__name__)
+_HFOV_TOLERANCE_DEG = 2.0
+_WORDS = {"fps": "frame rate", "hfov": "field of view", "view": "camera mount"}
+
+
+def prepare_run(config: NodeConfig, traits: Traits, source: SourceInfo) -> tuple[Run, float]:
+    """Everything that can be said before the first frame, and the frame rate windows will have.
+
+    Raises:
+        ConfigError: a frame rate the source cannot give; a source pose in words the model does not know; pictures the
+            model cannot be given, see fit_of(); in strict mode, a rate, field of view or mount the model was not
+            trained for.
+    """
+    fps, foreign_rate = config.window.fps, False
+    if fps is None:
+        fps, foreign_rate = choose_fps(source.fps_nominal, traits.rates)
+    elif fps > source.fps_nominal * (1 + RATE_TOLERANCE):
+        raise ConfigError(f"[window] fps {fps:g} is more than the {source.fps_nominal:g} the source gives; lower it")
+    elif traits.rates:
+        foreign_rate = fps not in traits.rates
+    fit = fit_of(config, traits, source)
+    camera = _source_camera(config, source, fit)
+    mount = _mount(config, traits, camera)
+    foreign = {"fps": foreign_rate, "hfov": _is_foreign_field(camera, traits), "view": is_foreign(mount, traits)}
+    ood = tuple(name for name, is_so in foreign.items() if is_so)
+    _refuse_or_warn(ood, strict=config.strict, fps=fps, model=traits.name)
+    run = Run(
+        config=config,
+        traits=traits,
+        source=source,
+        boot_id=new_boot_id(),
+        intrinsics=_view_camera(camera, traits),
+        mount=mount,
+        ood=ood,
+        resize=fit.resize,
+    )
+    return run, fps
+
+
+def _refuse_or_warn(ood: tuple[str, ...], *, strict: bool, fps: float, model: str) -> None:
+    found = [_WORDS[name] for name in ood]
+    if found and strict:
+        raise ConfigError(
+            f"strict: {' and '.join(found)} of the source ({fps:g} FPS) lie outside what {model} was trained "
+            "with; use another source or [window] fps, or leave strict out to have views flagged"
+        )
+    for words in found:
+        _LOG.warning("the %s of the source lies outside what %s was trained with: views are flagged", words, model)
+
+
+def _mount(config: NodeConfig, traits: Traits, camera: Intrinsics | None) -> CameraMount | None:
+    try:
+        require_usable(config.source.pose, traits)
+        return stated_mount(config.source.pose, None if camera is None else camera.hfov_deg, traits)
+    except OptionError as error:
+        raise ConfigError(f"[source.pose]: {error}") from error
+
+
+def _source_camera(config: NodeConfig, source: SourceInfo, fit: Fit | Rectifier) -> Intrinsics | None:
+    """The camera of the picture the model is given; None if nobody states a field of view."""
+    if isinstance(fit, Rectifier):
+        return fit.camera
+    stated = config.source.hfov_deg or source.hfov_deg
+    if stated is None:
+        return None
+    return fit.intrinsics(Intrinsics.from_hfov(stated, source.width, source.height))
+
+
+def _view_camera(camera: Intrinsics | None, traits: Traits) -> Intrinsics | None:
+    """The generated picture's camera: the source's again, or the trained one if that is unknown, or if the model draws
+    for one camera whatever the source is."""
+    trained = _trained_hfov_deg(traits)
+    if camera is not None and traits.mount is None:
+        return camera
+    return None if trained is None else Intrinsics.from_hfov(trained, traits.config.width, traits.config.height)
+
+
+def _is_foreign_field(camera: Intrinsics | None, traits: Traits) -> bool:
+    trained = _trained_hfov_deg(traits)
+    return camera is not None and trained is not None and abs(camera.hfov_deg - trained) > _HFOV_TOLERANCE_DEG
+
+
+def _trained_hfov_deg(traits: Traits) -> float | None:
+    if traits.mount is not None:
+        return traits.mount.hfov_deg
+    return None if traits.family is None else traits.family.hfov_deg
+
+
+def fit_of(config: NodeConfig, traits: Traits, source: SourceInfo) -> Fit | Rectifier:
+    """How the source's pictures become the model's: undistorted and cut to its field of view if there is a
+    calibration, else cropped to its shape.
+
+    Raises:
+        ConfigError: they are too small, the calibration is unusable or for other pictures, or it contradicts hfov_deg.
+    """
+    width, height = traits.config.width, traits.config.height
+    lens = _lens(config, source)
+    if lens is not None:
+        return Rectifier(
+            lens.resized(source.width, source.height),
+            width=width,
+            height=height,
+            hfov_deg=_trained_hfov_deg(traits),
+            allow_upscale=config.source.allow_upscale,
+        )
+    fit = Fit(width=width, height=height, resize=config.source.resize, allow_upscale=config.source.allow_upscale)
+    fit.crop_box(source.width, source.height)
+    return fit
+
+
+def _lens(config: NodeConfig, source: SourceInfo) -> LensModel | None:
+    """The stated calibration, else what the source itself knows, unless a stated hfov_deg overrides that."""
+    stated = config.source
+    if stated.calibration is None:
+        return source.lens if stated.hfov_deg is None else None
+    if stated.hfov_deg is not None:
+        raise ConfigError("[source] calibration and hfov_deg say the same thing twice; leave one of them out")
+    return load_lens(Path(stated.calibration).expanduser())

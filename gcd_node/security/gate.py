@@ -1,0 +1,329 @@
+"""CURVE on sockets, and the gate in front of bound ones: who may connect, and who was turned away.
+
+Encryption alone lets everybody in; so every secured socket also asks this gate, over ZeroMQ's authentication protocol
+(ZAP), in a domain of its own. What ZeroMQ does without a word, the gate hears from the sockets' monitors.
+Standard library and pyzmq only, Python 3.10 syntax: planners import this.
+"""
+
+import logging
+import os
+import socket as stream
+import stat
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeAlias
+
+import zmq
+from zmq.utils import z85
+from zmq.utils.monitor import parse_monitor_message
+
+from gcd_node.errors import AuthError, ConfigError, EndpointError
+from gcd_node.security.keys import Client, ClientKeys, KeyPair, fingerprint
+from gcd_node.wire.endpoints import Channel, check_bindable, free_ipc_path, is_ipv6
+
+_LOG = logging.getLogger(__name__)
+
+EventSink: TypeAlias = Callable[[str, dict[str, object]], None]
+"""Takes an event's code and its fields; called from threads of sockets, so it must not wait."""
+
+Socket: TypeAlias = "zmq.Socket[bytes]"
+Context: TypeAlias = "zmq.Context[zmq.Socket[bytes]]"
+
+_ZAP_ENDPOINT = "inproc://zeromq.zap.01"
+_TICK_MS = 100
+_FAILED = zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+_HEARD = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED | _FAILED
+_REFUSED = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+_MOST_CONNECTIONS = 256
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ServerSecurity:
+    """A node's own keys, and its clients by their public keys (Z85)."""
+
+    keys: KeyPair
+    clients: Mapping[str, Client]
+
+    def named(self, name: str) -> Client | None:
+        """The client of this name."""
+        return next((each for each in self.clients.values() if each.name == name), None)
+
+
+def new_key_pair() -> KeyPair:
+    """Fresh CURVE keys."""
+    public, secret = zmq.curve_keypair()
+    return KeyPair(public=public.decode(), secret=secret.decode())
+
+
+def check_pair(pair: KeyPair) -> None:
+    """Raises ConfigError if the public key is not that of the secret one."""
+    if zmq.curve_public(pair.secret.encode()) != pair.public.encode():
+        raise ConfigError("public.key and secret.key do not belong together; make new ones with `gcd-node keys new`")
+
+
+def use_client_keys(socket: Socket, keys: ClientKeys) -> None:
+    """Encrypt a client's socket; before it connects."""
+    check_pair(keys.own)
+    socket.set(zmq.CURVE_SERVERKEY, keys.server.encode())
+    socket.set(zmq.CURVE_PUBLICKEY, keys.own.public.encode())
+    socket.set(zmq.CURVE_SECRETKEY, keys.own.secret.encode())
+
+
+def unbind(socket: Socket, endpoint: str, linger_ms: int) -> None:
+    """Close; an ipc file goes first, while it is still ours: ZeroMQ leaves it behind."""
+    if endpoint.startswith("ipc://"):
+        Path(endpoint.removeprefix("ipc://")).unlink(missing_ok=True)
+    socket.close(linger_ms)
+
+
+class HandshakeWatch:
+    """Tells a client why nothing comes: of a refused connection ZeroMQ itself says nothing, and it tries no more."""
+
+    def __init__(self, socket: Socket, endpoint: str, keys: ClientKeys | None) -> None:
+        self.monitor: Socket = socket.get_monitor_socket(_REFUSED)
+        self._endpoint, self._keys = endpoint, keys
+        self._heard = 0
+
+    def check(self) -> None:
+        """Raises AuthError if the connection was refused, now or before."""
+        while self.monitor.poll(0):
+            self._heard |= int(parse_monitor_message(self.monitor.recv_multipart())["event"])
+        if self._heard & _REFUSED:
+            raise AuthError(f"{self._endpoint} does not let us in: {self._reason()}")
+
+    def _reason(self) -> str:
+        if self._keys is None:
+            return "it asks for keys, none were given; make some with `gcd-node keys new` and have them allowed there"
+        if self._heard & zmq.EVENT_HANDSHAKE_FAILED_AUTH:
+            mark = fingerprint(self._keys.own.public)
+            return f"our key, fingerprint {mark}, is not on its list; have it allowed there (`gcd-node keys show`)"
+        return "it uses no keys here; leave ours out"
+
+
+class Gate:
+    """In front of the bound sockets of one context. Bind through it, then `start`; `close` it after the sockets.
+
+    Until started, who connects to a secured socket waits. on_event gets AUTH_DENIED and TOO_LARGE; rare by themselves
+    or limited here, so that a hostile client cannot flood with them.
+    """
+
+    def __init__(self, context: Context, security: ServerSecurity | None, on_event: EventSink | None) -> None:
+        self._security = security
+        self._denials = _Denials(on_event or _unheard)
+        self._on_event = on_event or _unheard
+        self._monitors: dict[Socket, _Monitored] = {}
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._serve, name="gate", daemon=True)
+        self._zap: Socket | None = None
+        if security is not None:
+            self._zap = context.socket(zmq.REP)
+            self._zap.set(zmq.LINGER, 0)
+            self._zap.bind(_ZAP_ENDPOINT)
+
+    def bind(self, socket: Socket, endpoint: str, channel: Channel) -> str:
+        """Bind a socket: tcp with keys if there are any, ipc guarded by its folder.
+
+        Returns:
+            The endpoint, with the port that was chosen if 0 was asked for.
+        Raises:
+            ConfigError: others than this machine could reach it without keys. EndpointError: in use, or impossible.
+        """
+        secured = self._security is not None and endpoint.startswith("tcp://")
+        check_bindable(endpoint, secured=secured)
+        if endpoint.startswith("ipc://"):  # ZeroMQ itself would take a live endpoint away without a word
+            free_ipc_path(Path(endpoint.removeprefix("ipc://")))
+        if secured:
+            self._secure(socket, channel)
+        if secured or channel == "control":
+            self._monitors[socket.get_monitor_socket(_HEARD)] = _Monitored(channel=channel, secured=secured)
+        socket.set(zmq.IPV6, int(is_ipv6(endpoint)))
+        try:
+            socket.bind(endpoint)
+        except zmq.ZMQError as error:
+            message = f"cannot bind {endpoint}: {error.strerror}; stop who uses it or choose another"
+            raise EndpointError(message) from error
+        return socket.getsockopt_string(zmq.LAST_ENDPOINT)
+
+    def client(self, user: str) -> Client | None:
+        """Who a message's ZeroMQ user id belongs to; None if nobody was asked to name himself."""
+        return None if self._security is None else self._security.named(user)
+
+    def start(self) -> None:
+        """Begin to let clients in."""
+        if self._zap is not None or self._monitors:
+            self._thread.start()
+
+    def close(self) -> None:
+        """Stop; a second call does nothing."""
+        self._closing.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _secure(self, socket: Socket, channel: Channel) -> None:
+        if self._security is None:
+            return
+        socket.set(zmq.CURVE_SERVER, 1)
+        socket.set(zmq.CURVE_SECRETKEY, self._security.keys.secret.encode())
+        socket.set(zmq.ZAP_DOMAIN, f"gcd.{channel}".encode())
+        socket.set(zmq.ZAP_ENFORCE_DOMAIN, 1)  # closed to all, not open to all, should the gate ever be gone
+
+    # What follows runs in the gate's thread alone.
+
+    def _serve(self) -> None:
+        poller = zmq.Poller()
+        for each in (*self._monitors, *([self._zap] if self._zap else [])):
+            poller.register(each, zmq.POLLIN)
+        try:
+            while not self._closing.is_set():
+                for ready, _ in poller.poll(_TICK_MS):
+                    self._hear(ready, poller)
+        finally:
+            for each, monitored in self._monitors.items():
+                monitored.connections.forget()
+                each.close(0)
+            if self._zap is not None:
+                self._zap.close(0)
+
+    def _hear(self, ready: object, poller: zmq.Poller) -> None:
+        try:
+            if self._zap is not None and ready is self._zap:
+                self._judge(self._zap)
+                return
+            for monitor, monitored in self._monitors.items():
+                if monitor is ready and not self._notice(monitor, monitored):
+                    poller.unregister(monitor)
+        except Exception:
+            _LOG.exception("the gate goes on after an error of its own")
+
+    def _judge(self, zap: Socket) -> None:
+        """Answer one ZAP request: version, id, domain, address, identity, mechanism, key."""
+        request = zap.recv_multipart()
+        known = self._known(request)
+        verdict = (b"400", b"not allowed", b"", b"") if known is None else (b"200", b"OK", known.name.encode(), b"")
+        zap.send_multipart((b"1.0", request[1] if len(request) > 1 else b"", *verdict))
+        if known is None:
+            self._denials.tell(_key_of(request), _text(request, 2), _text(request, 3))
+
+    def _known(self, request: list[bytes]) -> Client | None:
+        key = _key_of(request)
+        return None if self._security is None or key is None else self._security.clients.get(key)
+
+    def _notice(self, monitor: Socket, monitored: "_Monitored") -> bool:
+        """One event of a bound socket; False once the socket is closed."""
+        heard = parse_monitor_message(monitor.recv_multipart())
+        event, handle, connections = int(heard["event"]), int(heard["value"]), monitored.connections
+        if event & _FAILED:
+            connections.failed()
+        if event & _FAILED and monitored.secured:  # no keys, or the wrong one for this node
+            self._denials.tell(None, f"gcd.{monitored.channel}", "")
+        if event == zmq.EVENT_ACCEPTED:
+            connections.accepted(handle)
+        if event == zmq.EVENT_DISCONNECTED and connections.cut_off(handle) and monitored.channel == "control":
+            _LOG.warning("TOO_LARGE: dropped a control client that sent more than a request may have")
+            self._on_event("TOO_LARGE", {"level": 1, "channel": monitored.channel})
+        return event != zmq.EVENT_MONITOR_STOPPED
+
+
+class _Connections:
+    """Tells a client that was dropped from one that left; the monitor's events are the same for both.
+
+    A second handle on each connection stays when ZeroMQ closes its own: where the other end is still there, or has
+    sent what nobody read, it was not the client who hung up. After a handshake, ZeroMQ hangs up on oversize alone.
+    A failed handshake names no connection, but the next one to end is always its own.
+    """
+
+    def __init__(self) -> None:
+        self._kept: dict[int, stream.socket] = {}
+        self._failed = False
+
+    def accepted(self, handle: int) -> None:
+        """Keep a second handle; a connection already gone, or too many of them, and it goes unnoticed."""
+        self._forget(handle)
+        if len(self._kept) >= _MOST_CONNECTIONS:
+            return
+        try:
+            if stat.S_ISSOCK(os.fstat(handle).st_mode):
+                self._kept[handle] = stream.socket(fileno=os.dup(handle))
+        except OSError as error:
+            _LOG.debug("a connection was gone before it could be looked at: %s", error)
+
+    def failed(self) -> None:
+        """A handshake came to nothing."""
+        self._failed = True
+
+    def cut_off(self, handle: int) -> bool:
+        """Whether this end hung up on a client it had welcomed; lets go of the connection."""
+        welcomed, self._failed = not self._failed, False
+        kept = self._kept.get(handle)
+        if kept is None:
+            return False
+        try:
+            return kept.recv(1, stream.MSG_PEEK | stream.MSG_DONTWAIT) != b"" and welcomed
+        except BlockingIOError:
+            return welcomed
+        except OSError:
+            return False  # the other end died
+        finally:
+            self._forget(handle)
+
+    def forget(self) -> None:
+        """Let go of all."""
+        for handle in tuple(self._kept):
+            self._forget(handle)
+
+    def _forget(self, handle: int) -> None:
+        kept = self._kept.pop(handle, None)
+        if kept is not None:
+            kept.close()
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Monitored:
+    """A bound socket that is listened to."""
+
+    channel: Channel
+    secured: bool
+    connections: _Connections = field(default_factory=_Connections)
+
+
+class _Denials:
+    """AUTH_DENIED events, limited: one for each key and socket in 10 s, and at most 8 in all in that time."""
+
+    SPAN_S = 10.0
+    MOST = 8
+
+    def __init__(self, on_event: EventSink) -> None:
+        self._on_event = on_event
+        self._told_s: dict[tuple[str | None, str], float] = {}
+        self._suppressed = 0
+
+    def tell(self, key: str | None, domain: str, address: str) -> None:
+        now_s = time.monotonic()
+        self._told_s = {each: told for each, told in self._told_s.items() if now_s - told < self.SPAN_S}
+        if (key, domain) in self._told_s or len(self._told_s) >= self.MOST:
+            self._suppressed += 1
+            return
+        self._told_s[key, domain] = now_s
+        mark = None if key is None else fingerprint(key)
+        _LOG.warning("AUTH_DENIED on %s: %s", domain, "no valid handshake" if mark is None else f"key {mark}")
+        fields: dict[str, object] = {"level": 1, "fingerprint": mark, "domain": domain, "address": address}
+        self._on_event("AUTH_DENIED", fields | {"suppressed": self._suppressed})
+        self._suppressed = 0
+
+
+def _key_of(request: list[bytes]) -> str | None:
+    """The client's public key of a ZAP request in Z85; None if it speaks of anything else than CURVE."""
+    if len(request) != 7 or request[5] != b"CURVE" or len(request[6]) != 32:
+        return None
+    return z85.encode(request[6]).decode()
+
+
+def _text(request: list[bytes], index: int) -> str:
+    return request[index].decode("ascii", "backslashreplace")[:64] if len(request) > index else ""
+
+
+def _unheard(code: str, fields: dict[str, object]) -> None:
+    """Nobody wants to hear of events; the log has them."""

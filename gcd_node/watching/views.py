@@ -1,0 +1,259 @@
+"""Watches a node's views: a live table, and pictures on disk. What `gcd-node view` does between its options and its
+screen; nothing here prints."""
+
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+import cv2
+from rich.table import Table
+
+from gcd_node.envelope import ViewKind
+from gcd_node.errors import MessageError, OutputError
+from gcd_node.pictures.array_file import write_npy
+from gcd_node.pictures.comparison import legend
+from gcd_node.pictures.files import video_writer, write_png
+from gcd_node.subscriber import ReceivedView, ViewSubscriber
+from gcd_node.wire.header import ClassRecord, ViewHeader
+
+_REFRESH_MS = 250
+_RATE_SPAN = 10
+_LEGEND_WIDTH = 384
+
+_STYLES = {"live": "green", "expired": "yellow", "ended": "dim"}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ViewRow:
+    """One line of the table, for one topic.
+
+    shape: [T, H, W, C]. age_ms: of the newest input frame, now. rate_hz: messages a second, 0 until two came.
+    missed: messages published but not received. bytes: payload received in total. state: live, expired or ended.
+    """
+
+    topic: str
+    window_id: int
+    shape: tuple[int, ...]
+    age_ms: float
+    rate_hz: float
+    missed: int
+    bytes: int
+    state: str
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class WatchRequest:
+    """What to watch.
+
+    view: one view's id, None for all. kind: as in ViewSubscriber, None for all. save: folder for pictures, or None.
+    limit: stop after this many messages. timeout_s: stop when nothing came for so long. None for no bound.
+    """
+
+    endpoint: str = "ipc"
+    view: str | None = None
+    kind: ViewKind | None = "win"
+    save: Path | None = None
+    limit: int | None = None
+    timeout_s: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class WatchReport:
+    """How it went. ended: the node said that the stream ended. damaged: messages that were no valid ones.
+    restarts: how often the node was started anew. files: what was written."""
+
+    rows: tuple[ViewRow, ...]
+    received: int
+    ended: bool
+    damaged: int
+    restarts: int
+    files: int
+
+
+class ViewTable:
+    """The live model behind the table; times are monotonic seconds, given by the caller."""
+
+    def __init__(self) -> None:
+        self._tracks: dict[str, _Track] = {}
+
+    def add(self, view: ReceivedView, now_s: float) -> None:
+        """Take note of a message that arrived now."""
+        track = self._tracks.setdefault(view.message.topic, _Track(last=view))
+        track.last = view
+        track.arrivals.append(now_s)
+        track.missed += view.skipped
+        track.bytes += len(view.message.payload)
+
+    def rows(self, now_s: float, *, ended: bool = False) -> list[ViewRow]:
+        """The table as it stands now, by topic; `ended` if the stream has ended."""
+        return [self._tracks[topic].row(now_s, ended) for topic in sorted(self._tracks)]
+
+
+class ViewSaver:
+    """Writes each window's frames as `<view>/<window>_<frame>.png`, and all of a view as lossless `<view>.mkv`.
+
+    What is no window goes to a folder of its kind: `<view>/<kind>/<window>_<frame>.png`, `<view>/<kind>.mkv`. Single
+    frames, of which a window may give many, are numbered as the source did. Class maps are shown in the colours of
+    their ontology, with a `legend.png`; the class numbers themselves are in `<window>.npy`, u8 [T, H, W].
+
+    Raises:
+        OutputError: a file cannot be written, or a view changes its size.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._videos: dict[Path, tuple[cv2.VideoWriter, tuple[int, ...]]] = {}
+        self._legends: set[Path] = set()
+        self.files = 0
+
+    def add(self, view: ReceivedView) -> None:
+        """Write one message's frames."""
+        header, frames = view.header, view.colours
+        kind = view.message.topic.rpartition("/")[2]
+        folder = self._folder / header.view_id
+        folder = folder if kind == "win" else folder / kind
+        single = kind == "frm"  # many of these share a window
+        for index, frame in enumerate(frames):
+            number = f"{header.src.seq[0]:06d}" if single else f"{index:02d}"
+            write_png(folder / f"{header.window_id:06d}_{number}.png", frame)
+        self.files += len(frames)
+        if header.classes is not None:
+            self._keep_classes(folder, view, header.classes)
+        video = self._video(folder.with_suffix(".mkv"), header)
+        for frame in frames:
+            video.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+
+    def close(self) -> None:
+        """Finish the videos; until then they may lack their end."""
+        for video, _ in self._videos.values():
+            video.release()
+        self._videos.clear()
+
+    def __enter__(self) -> "ViewSaver":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        self.close()
+
+    def _keep_classes(self, folder: Path, view: ReceivedView, classes: Sequence[ClassRecord]) -> None:
+        write_npy(folder / f"{view.header.window_id:06d}.npy", view.images[..., 0])
+        self.files += 1
+        path = folder / "legend.png"
+        if path not in self._legends:
+            write_png(path, legend(classes, _LEGEND_WIDTH))
+            self._legends.add(path)
+            self.files += 1
+
+    def _video(self, path: Path, header: ViewHeader) -> cv2.VideoWriter:
+        size = header.shape[1:3]
+        if path not in self._videos:
+            self._videos[path] = (video_writer(path, size[1], size[0], header.src.fps_cond), size)
+            self.files += 1
+        video, first = self._videos[path]
+        if first != size:
+            raise OutputError(f"view {header.view_id} was {first} (height, width), now {size}; save to a new folder")
+        return video
+
+
+def watch(request: WatchRequest, on_change: Callable[[Sequence[ViewRow]], None]) -> WatchReport:
+    """Receive until the limit, the timeout or the end of the stream; `on_change` gets the rows as they change, and
+    four times a second in between, so that ages grow on the screen.
+
+    Raises:
+        ConfigError, MessageError: the endpoint or the view id is none. OutputError: a picture cannot be written.
+    """
+    with ViewSubscriber(request.endpoint, request.view, request.kind, conflate=False) as views:
+        if request.save is None:
+            return _Watch(request, views, None).run(on_change)
+        with ViewSaver(request.save) as saver:
+            return _Watch(request, views, saver).run(on_change)
+
+
+def render(rows: Sequence[ViewRow]) -> Table:
+    """The rows as a table for rich."""
+    table = Table(title="Virtual views: generated pixels, never evidence of free space", title_style="dim")
+    for name in ("topic", "window", "shape", "age ms", "rate Hz", "missed", "MB", "state"):
+        table.add_column(name, justify="left" if name in ("topic", "state") else "right", no_wrap=True)
+    for row in rows:
+        shape = "x".join(map(str, row.shape))
+        numbers = (f"{row.age_ms:.0f}", f"{row.rate_hz:.2f}", str(row.missed), f"{row.bytes / 1e6:.1f}")
+        state = f"[{_STYLES[row.state]}]{row.state}[/]"
+        table.add_row(row.topic, str(row.window_id), shape, *numbers, state)
+    return table
+
+
+class _Watch:
+    """One run of watch()."""
+
+    def __init__(self, request: WatchRequest, views: ViewSubscriber, saver: ViewSaver | None) -> None:
+        self._request, self._views, self._saver = request, views, saver
+        self._table = ViewTable()
+        self._damaged = 0
+        self._heard_s = time.monotonic()
+
+    def run(self, on_change: Callable[[Sequence[ViewRow]], None]) -> WatchReport:
+        while not self._over():
+            self._step()
+            on_change(self._table.rows(time.monotonic(), ended=self._views.ended))
+        return self._report()
+
+    def _step(self) -> None:
+        try:
+            view = self._views.receive(_REFRESH_MS)
+            if view is not None:
+                self._table.add(view, time.monotonic())
+                if self._saver is not None:
+                    self._saver.add(view)
+                self._heard_s = time.monotonic()
+        except MessageError:
+            self._damaged += 1
+
+    def _over(self) -> bool:
+        limit, timeout_s = self._request.limit, self._request.timeout_s
+        enough = limit is not None and self._views.stats.received >= limit
+        silent = timeout_s is not None and time.monotonic() - self._heard_s >= timeout_s
+        return self._views.ended or enough or silent
+
+    def _report(self) -> WatchReport:
+        stats = self._views.stats
+        rows = tuple(self._table.rows(time.monotonic(), ended=self._views.ended))
+        return WatchReport(
+            rows=rows,
+            received=stats.received,
+            ended=self._views.ended,
+            damaged=self._damaged,
+            restarts=stats.restarts,
+            files=0 if self._saver is None else self._saver.files,
+        )
+
+
+class _Track:
+    """What is known of one topic."""
+
+    def __init__(self, *, last: ReceivedView) -> None:
+        self.last = last
+        self.arrivals: deque[float] = deque(maxlen=_RATE_SPAN)
+        self.missed = 0
+        self.bytes = 0
+
+    def row(self, now_s: float, ended: bool) -> ViewRow:
+        header = self.last.header
+        since_ms = (now_s - self.arrivals[-1]) * 1000
+        expired = self.last.expired or since_ms > header.valid_for_ms
+        return ViewRow(
+            topic=self.last.message.topic,
+            window_id=header.window_id,
+            shape=header.shape,
+            age_ms=self.last.age_ms + since_ms,
+            rate_hz=self._rate_hz(),
+            missed=self.missed,
+            bytes=self.bytes,
+            state="ended" if ended else "expired" if expired else "live",
+        )
+
+    def _rate_hz(self) -> float:
+        span = self.arrivals[-1] - self.arrivals[0]
+        return (len(self.arrivals) - 1) / span if span > 0 else 0.0
