@@ -2,11 +2,13 @@
 #   make demo    replay the packaged drive through the model and over ZeroMQ into a second process
 #   make test    the default tests            make check   format, lint, types
 #   make slow    full-size tests (minutes, about 10 GB of memory)
+# WORKERS test processes run beside each other, on a thread each.
 # TORCH_INDEX names another package index for torch, for example a CPU-only or CUDA one.
 
 PYTHON ?= python3
 VENV ?= .venv
 TORCH_INDEX ?=
+WORKERS ?= 2
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install -q -c constraints.txt
@@ -18,7 +20,7 @@ demo: $(VENV)/.core
 	$(BIN)/gcd-node demo
 
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 slow: $(VENV)/.dev
 	$(BIN)/python -m pytest -m slow -s

@@ -318,6 +318,7 @@ def test_no_security_section_means_none() -> None:
         (f"[client.a]\nkey = '{VIEWER.public}'\n[client.b]\nkey = '{VIEWER.public}'", "have the same key"),
         ("[client", "not valid TOML"),
     ],
+    ids=["nobody", "empty", "short key", "no such role", "misspelt", "bad name", "twice", "no TOML"],  # keys are random
 )
 def test_a_wrong_list_is_refused(tmp_path: Path, text: str, says: str) -> None:
     with pytest.raises(ConfigError, match=says):
