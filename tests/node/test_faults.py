@@ -61,8 +61,8 @@ def command(*arguments: str) -> list[str]:
 
 
 def environment() -> dict[str, str]:
-    tests = str(Path(__file__).parent)
-    return os.environ | {"PYTHONPATH": f"{Path(gcd_node.__file__).parent.parent}:{tests}:{os.environ['PYTHONPATH']}"}
+    ours = [str(Path(gcd_node.__file__).parent.parent), str(Path(__file__).parent)]
+    return os.environ | {"PYTHONPATH": os.pathsep.join([*ours, *sys.path])}
 
 
 # F1, F2: a camera that goes, and one that is not there.

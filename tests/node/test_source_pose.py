@@ -147,7 +147,8 @@ def test_the_pose_of_every_launch_file_suits_its_model() -> None:
     for path in paths:
         settings = load_config(path)
         kind, _, name = settings.model.weights.partition(":")
-        require_usable(settings.source.pose, traits(name) if kind == "random" else warping_traits())
+        family = name if kind == "random" else settings.model.family
+        require_usable(settings.source.pose, warping_traits() if family is None else traits(family))
 
 
 def test_a_pose_that_says_nothing_suits_every_model() -> None:

@@ -1,0 +1,429 @@
+"""The C++ subscriber, built with the address and undefined-behaviour sanitizers, against a live node and worse.
+
+GCD_MUTATIONS=100000 sends it as many mutated messages.
+"""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import threading
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zmq
+from fakes import HEIGHT, WIDTH, FakeSynthesizer, made_node, traits
+from media import write_video
+from mutations import BYTE_PIECES, ROUNDS, TEXT_PIECES, Mutator
+from numpy.typing import NDArray
+from wire_messages import OTHER_BOOT, class_map, end, pixels, window
+
+from gcd_node.config import NodeConfig, parse_config
+from gcd_node.envelope import MAGIC, PREFIX, ViewMessage, decode, encode
+from gcd_node.errors import MessageError
+from gcd_node.publisher import Publisher
+from gcd_node.session import publisher_options
+from gcd_node.sources import open_source
+from gcd_node.subscriber import ReceivedView, ViewSubscriber
+from gcd_node.wire.jpeg import encode_frames
+
+SOURCE = Path(__file__).parents[2] / "launch" / "clients" / "subscriber.cpp"
+FLAGS = ["-std=c++17", "-g", "-Wall", "-Wextra", "-Werror", "-fsanitize=address,undefined"]
+FLAGS += ["-fno-sanitize-recover=undefined"]
+PATIENCE_S = max(60, ROUNDS // 50)
+pytestmark = pytest.mark.timeout(2 * PATIENCE_S)
+TOPIC = b"view/top/win".ljust(32, b"\0")
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    compiler = shutil.which("g++")
+    if compiler is None or not _has_zmq_header(compiler):
+        pytest.skip("needs g++ and libzmq3-dev: apt install g++ libzmq3-dev")
+    built = tmp_path_factory.mktemp("cpp") / "gcd-subscriber"
+    command = [compiler, *FLAGS, str(SOURCE), "-lzmq", "-o", str(built)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+    assert done.returncode == 0, done.stderr
+    return built
+
+
+def _has_zmq_header(compiler: str) -> bool:
+    look = [compiler, "-E", "-x", "c++", "-include", "zmq.h", "/dev/null"]
+    return subprocess.run(look, capture_output=True, timeout=60, check=False).returncode == 0
+
+
+@dataclass
+class Sender:
+    """Publishes whatever bytes it is told to, and loses none."""
+
+    endpoint: str
+    socket: "zmq.Socket[bytes]"
+
+    def wait_for_readers(self, count: int = 1) -> None:
+        while count:
+            assert self.socket.poll(1000 * PATIENCE_S), "nobody subscribed"
+            count -= self.socket.recv() == b"\1" + TOPIC
+
+    def send(self, *parts: bytes) -> None:
+        for part in parts:
+            self.socket.send(part)
+
+
+@pytest.fixture
+def sender(tmp_path: Path) -> Iterator[Sender]:
+    context = zmq.Context()
+    socket = context.socket(zmq.XPUB)
+    socket.set(zmq.SNDHWM, 0)
+    socket.set(zmq.XPUB_VERBOSE, 1)
+    socket.bind(f"ipc://{tmp_path}/data")
+    yield Sender(f"ipc://{tmp_path}/data", socket)
+    context.destroy(linger=0)
+
+
+def start(client: Path, endpoint: str, *options: str, view: str = "top") -> "subprocess.Popen[str]":
+    """The client, its two outputs in one; every line leaves at once, so that their order is kept."""
+    command = [str(client), "--endpoint", endpoint, "--view", view, *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def lines_of(process: "subprocess.Popen[str]", code: int = 0) -> list[str]:
+    out, _ = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == code, out  # a sanitizer ends with a report and a code of its own
+    return out.splitlines()
+
+
+def fields_of(line: str) -> dict[str, str]:
+    return dict(word.partition("=")[::2] for word in line.split())
+
+
+def sent(message: ViewMessage, sequence: int) -> bytes:
+    return encode(replace(message, sequence=sequence))
+
+
+def ending(sequence: int = 1000) -> bytes:
+    return encode(replace(end(), sequence=sequence))
+
+
+def heard(client: Path, sender: Sender, parts: Sequence[bytes], *options: str, code: int = 0) -> list[str]:
+    """What the client says of all these messages, the end of the stream left out."""
+    process = start(client, sender.endpoint, "--every", *options)
+    sender.wait_for_readers()
+    sender.send(*parts, ending())
+    lines = lines_of(process, code)
+    assert lines[-1] == "end view=top kind=win window=0"
+    return lines[:-1]
+
+
+# Against the live node.
+
+
+def config_of(folder: Path) -> NodeConfig:
+    frames = [np.random.default_rng(i).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8) for i in range(86)]
+    write_video(folder / "v.mkv", frames, 10.0)
+    text = f"""
+        [source]
+        path = "{folder}/v.mkv"
+        pace = "lockstep"
+        [window]
+        fps = 5.0
+        stride = 20        # valid for 8 s: a slow machine must not let them expire
+        [model]
+        weights = "fake"
+        [view.top]
+        [publish]
+        data = "ipc://{folder}/data"
+        status = "ipc://{folder}/status"
+        min_subscribers = 3
+    """
+    return parse_config(text.encode(), "test")
+
+
+def read_all(endpoint: str, into: list[ReceivedView]) -> None:
+    with ViewSubscriber(endpoint, "top", conflate=False) as views:
+        into.extend(views)
+
+
+def fnv(image: NDArray[np.uint8]) -> str:
+    number = 0xCBF29CE484222325
+    for byte in image.tobytes():
+        number = (number ^ byte) * 0x100000001B3 % 2**64
+    return f"{number:016x}"
+
+
+def test_both_languages_read_the_same_from_a_live_node(client: Path, tmp_path: Path) -> None:
+    config, views = config_of(tmp_path), list[ReceivedView]()
+    (tmp_path / "pictures").mkdir()
+    endpoint = config.publish.data
+    with Publisher(publisher_options(config)) as publisher:
+        every = start(client, endpoint, "--every", "--ppm", str(tmp_path / "pictures"))
+        newest = start(client, endpoint)
+        reader = threading.Thread(target=read_all, args=(endpoint, views), daemon=True)
+        reader.start()
+        made_node(config, FakeSynthesizer(traits("driving")), open_source(config.source), publisher).run()
+    reader.join(PATIENCE_S)
+    assert len(views) == 2
+    lines = lines_of(every)
+    assert [fields_of(line) | {"age_ms": ""} for line in lines[:-1]] == [expected(view) for view in views]
+    assert all(float(fields_of(line)["age_ms"]) >= view.header.age_ms - 0.1 for line, view in zip(lines, views))  # noqa: B905  the end comes last
+    assert lines[-1] == "end view=top kind=win window=1"
+    newest_lines = lines_of(newest)
+    assert newest_lines[-1] == lines[-1]
+    assert fields_of(newest_lines[-2])["hash"] == fnv(views[-1].images[-1])  # a conflated reader has the last window
+    for view in views:
+        for number, image in enumerate(view.images):
+            path = tmp_path / "pictures" / f"top_win_{view.header.window_id:06}_{number:02}.ppm"
+            assert path.read_bytes() == b"P6\n%d %d\n255\n" % (WIDTH, HEIGHT) + image.tobytes()
+
+
+def expected(view: ReceivedView) -> dict[str, str]:
+    """What the client must say of a view that Python has received; without the age."""
+    header = view.header
+    return {
+        "view": "top",
+        "kind": "win",
+        "window": str(header.window_id),
+        "seq": str(view.message.sequence),
+        "rev": str(header.view_rev),
+        "skipped": "0",
+        "age_ms": "",
+        "shape": "x".join(map(str, header.shape)),
+        "encoding": "rgb8",
+        "mean": ",".join(f"{level:.2f}" for level in view.images.mean(axis=(0, 1, 2))),
+        "hash": fnv(view.images[-1]),
+        "roles": "in_transit*13,at_goal*1",
+        "synthetic": "true",
+    }
+
+
+# What it remembers, and what it leaves out.
+
+
+def test_gaps_restarts_and_old_revisions_are_noticed(client: Path, sender: Sender) -> None:
+    parts = [
+        sent(window(0, view_rev=3), 10),
+        sent(window(1, view_rev=3), 14),
+        sent(window(1, view_rev=3), 14),
+        sent(window(2, view_rev=2), 15),
+        sent(window(3, boot_id=OTHER_BOOT), 0),
+    ]
+    lines = heard(client, sender, parts)
+    assert [line.split()[0] for line in lines] == [
+        "view=top",
+        "view=top",
+        "dropped",
+        "dropped",
+        "restarted",
+        "view=top",
+    ]
+    assert [fields_of(lines[i])["skipped"] for i in (0, 1, 5)] == ["0", "3", "0"]
+    assert lines[2].endswith("rule=sequence seen before")
+    assert lines[3].endswith("rule=older revision of the view")
+    assert lines[4] == f"restarted boot_id={OTHER_BOOT}"
+
+
+def test_what_is_too_old_is_left_out_and_a_clock_ahead_makes_nothing_younger(client: Path, sender: Sender) -> None:
+    ahead, long_ago = window(1, age_ms=5000.0), window(2)
+    ahead = replace(ahead, header=replace(ahead.header, t_publish_ns=ahead.header.t_publish_ns + 3_600_000_000_000))
+    long_ago = replace(long_ago, header=replace(long_ago.header, t_publish_ns=1_700_000_000_000_000_000))
+    lines = heard(client, sender, [sent(ahead, 1), sent(long_ago, 2), sent(window(3, age_ms=50_000_000.0), 3)])
+    assert fields_of(lines[0])["age_ms"] == "5000.0"
+    assert lines[1].endswith("rule=expired: valid_for_ms is over")
+    assert float(fields_of(lines[2])["age_ms"]) >= 50_000_000
+    lines = heard(client, sender, [sent(window(4, age_ms=50_000_000.0), 4)], "--max-age-ms", "40000000")
+    assert lines[0].endswith("rule=older than --max-age-ms")
+
+
+def test_jpeg_is_written_as_it_came(client: Path, sender: Sender, tmp_path: Path) -> None:
+    message = jpeg_window()
+    lines = heard(client, sender, [sent(message, 0)], "--ppm", str(tmp_path))
+    told = fields_of(lines[0])
+    assert (told["encoding"], told["mean"], told["hash"]) == ("jpeg", "-", "-")
+    written = b"".join((tmp_path / f"top_win_000000_0{i}.jpg").read_bytes() for i in range(2))
+    assert written == message.payload
+
+
+def test_a_class_map_is_written_as_grey(client: Path, sender: Sender, tmp_path: Path) -> None:
+    process = start(client, sender.endpoint, "--every", "--kind", "cls", "--limit", "1", "--ppm", str(tmp_path))
+    assert sender.socket.poll(1000 * PATIENCE_S)
+    assert sender.socket.recv() == b"\1" + b"view/top/cls".ljust(32, b"\0")
+    message = class_map(5)
+    sender.send(encode(message))
+    assert fields_of(lines_of(process)[0])["shape"] == "2x4x6x1"
+    assert (tmp_path / "top_cls_000005_01.pgm").read_bytes() == b"P5\n6 4\n255\n" + bytes(message.payload[24:])
+
+
+def test_a_picture_that_cannot_be_written_ends_it(client: Path, sender: Sender, tmp_path: Path) -> None:
+    process = start(client, sender.endpoint, "--every", "--ppm", str(tmp_path / "missing"))
+    sender.wait_for_readers()
+    sender.send(sent(window(), 0))
+    assert "does the folder exist" in lines_of(process, 73)[-1]
+
+
+def jpeg_window() -> ViewMessage:
+    payload, offsets = encode_frames(pixels(0))
+    made = window()
+    return ViewMessage(topic=made.topic, header=replace(made.header, encoding="jpeg", offsets=offsets), payload=payload)
+
+
+# Messages somebody has tampered with.
+
+
+def header_of(part: bytes) -> bytes:
+    return part[64 : 64 + 16 * int.from_bytes(part[36:38], "little")]
+
+
+def joined(header: bytes, payload: bytes, *, flags: int = 5, sequence: int = 0) -> bytes:
+    """A message whose sizes are right, whatever the header says; without a checksum."""
+    padded = header.ljust(-(-len(header) // 16) * 16)
+    return PREFIX.pack(TOPIC, MAGIC, len(padded) // 16, flags, len(payload), sequence, 0, 0) + padded + payload
+
+
+GOOD = encode(window())
+PIXELS = GOOD[64 + len(header_of(GOOD)) :]
+
+
+def edited(changes: dict[str, object], *, without: str = "", flags: int = 5) -> bytes:
+    header = {key: value for key, value in json.loads(header_of(GOOD)).items() if key != without}
+    return joined(json.dumps(header | changes).encode(), PIXELS, flags=flags)
+
+
+BROKEN = {
+    "1: shorter": GOOD[:63],
+    "1: no message": GOOD[:32] + b"GCD2" + GOOD[36:],
+    "2: lengths": GOOD + b"x",
+    "2: the payload is too long": GOOD[:40] + b"\xff" * 8 + GOOD[48:],
+    "3: wrong checksum": GOOD[:-1] + bytes([GOOD[-1] ^ 1]),
+    "5: header is no JSON": joined(b"{]", b""),
+    "5: header goes on": joined(b"{}{}", b""),
+    "5: header is nested": joined(b'{"a":' + b"[" * 1000 + b"]" * 1000 + b"}", b""),
+    "5: another protocol": edited({"proto": "gcd/2.0"}),
+    "6: the header lacks age_ms": edited({}, without="age_ms"),
+    "6: a number was wanted": edited({"age_ms": "40"}),
+    "6: an integer was wanted": edited({"view_rev": 1.5}),
+    "6: an integer is not below": edited({"window_id": 2**53}),
+    "6: a number is not finite": joined(header_of(GOOD).replace(b"40.5", b"1e999"), PIXELS),
+    "6: boot_id": edited({"boot_id": "0123"}),
+    "6: a time": edited({"t_publish": [1, 2, 3]}),
+    "6: nanosec": edited({"t_publish": [1, 10**9]}),
+    "6: shape is out of range": edited({"shape": [0, 4, 6, 3]}),
+    "6: unknown encoding": edited({"encoding": "png"}),
+    "6: unknown frame_role": edited({"frame_role": ["at_goal", "lost"]}),
+    "6: unknown layout": edited({"layout": "TCHW"}),
+    "7: view_id": edited({"view_id": "other"}),
+    "7: flags and clock": edited({}, flags=1),
+    "7: flags say neither": edited({}, flags=7),
+    "7: shape and payload": edited({"shape": [65535, 65535, 65535, 3]}),
+    "7: frame_role": edited({"frame_role": ["at_goal"]}),
+    "7: offsets belong": edited({"offsets": [0, 10, 144]}),
+    "7: offsets do not rise": edited({"encoding": "jpeg", "offsets": [0, 144, 144]}),
+    "7: offsets do not start": edited({"encoding": "jpeg", "offsets": [1, 10, 144]}),
+    "7: encoding and channels": edited({"encoding": "mono8"}),
+    "7: an end of stream with": edited({}, flags=6),
+}
+
+
+def test_each_rule_of_the_protocol_drops_its_message_in_both_languages(client: Path, sender: Sender) -> None:
+    lines = heard(client, sender, [*BROKEN.values(), GOOD])
+    assert [line.partition("rule=")[2].startswith(rule) for line, rule in zip(lines[:-1], BROKEN, strict=True)] == [
+        True
+    ] * len(BROKEN), lines
+    assert lines[-1].startswith("view=top")
+    for part in BROKEN.values():
+        with pytest.raises(MessageError):
+            decode(part)
+
+
+def test_a_message_in_parts_is_none_and_what_follows_is_read(client: Path, sender: Sender) -> None:
+    process = start(client, sender.endpoint, "--every")
+    sender.wait_for_readers()
+    sender.socket.send_multipart([GOOD, sent(window(1), 1)])
+    sender.send(sent(window(2), 2), ending())
+    lines = lines_of(process)
+    assert [line.partition("rule=")[2] for line in lines[:2]] == ["1: a message of several parts"] * 2
+    assert fields_of(lines[2])["window"] == "2"
+
+
+def test_hundreds_of_mutated_messages_crash_nothing_and_what_python_accepts_is_accepted(
+    client: Path, sender: Sender
+) -> None:
+    parts = [*mutated_messages(ROUNDS // 2), *mutated_headers(ROUNDS // 2)]
+    lines = [line for line in heard(client, sender, parts) if not line.startswith("restarted")]
+    assert len(lines) == len(parts)
+    accepted = 0
+    for part, line in zip(parts, lines, strict=True):
+        dropped = line.partition("rule=")[2][:2] in {f"{rule}:" for rule in range(1, 8)}
+        if accepted_here(part):
+            accepted += 1
+            assert not dropped, (line, part)
+        elif part[56:60] != b"\0\0\0\0":  # with a checksum, both look at the same bytes
+            assert dropped, (line, part)
+    assert accepted > ROUNDS // 20
+
+
+def accepted_here(part: bytes) -> bool:
+    try:
+        return isinstance(decode(part), ViewMessage)
+    except MessageError:
+        return False
+
+
+def mutated_messages(count: int) -> Iterator[bytes]:
+    """Changed anywhere; only those that reach a subscriber of the topic, and none that may end the stream."""
+    inputs = Mutator(1, [GOOD, encode(jpeg_window())], BYTE_PIECES)
+    while count:
+        part = inputs.next()
+        if part[:32] == TOPIC and not (part[38:39] or b"\0")[0] & 2:
+            count -= 1
+            yield part
+
+
+def mutated_headers(count: int) -> Iterator[bytes]:
+    """Changed in the header alone; sizes are right, so that it is read."""
+    examples = [GOOD, encode(jpeg_window())]
+    payloads = {len(header_of(part)): part[64 + len(header_of(part)) :] for part in examples}
+    inputs = Mutator(2, [header_of(part) for part in examples], TEXT_PIECES)
+    for sequence in range(count):
+        header = inputs.next()
+        payload = payloads[min(payloads, key=lambda size: abs(size - len(header)))]
+        yield joined(header, payload, sequence=sequence)
+
+
+# Its options.
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--view", "Top"], "--view wants"),
+        (["--kind", "png"], "--kind wants"),
+        (["--limit", "none"], "--limit wants a positive number"),
+        (["--limit"], "without its value"),
+        (["--unheard", "1"], "unknown option: --unheard"),
+        (["--endpoint", "nowhere"], "cannot connect to nowhere"),
+    ],
+)
+def test_a_wrong_option_is_named(client: Path, options: list[str], said: str) -> None:
+    done = subprocess.run([client, *options], capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    assert done.returncode == 64
+    assert said in done.stderr
+    assert "usage:" in done.stderr
+
+
+def test_silence_ends_it_if_wanted_and_the_runtime_folder_is_found(client: Path, tmp_path: Path) -> None:
+    environment = os.environ | {"RUNTIME_DIRECTORY": f"{tmp_path}:/other"}
+    command = [client, "--timeout", "0.2"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, env=environment, check=False)
+    assert done.returncode == 69
+    assert done.stderr.startswith(f"nothing from ipc://{tmp_path}/data")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_in_order(client: Path, sender: Sender, number: signal.Signals) -> None:
+    process = start(client, sender.endpoint)
+    sender.wait_for_readers()
+    process.send_signal(number)
+    assert lines_of(process) == []

@@ -1,0 +1,276 @@
+"""What ships in launch/: every launch file is a good one, the unit and the container files say what the node does."""
+
+import os
+import re
+import shutil
+import signal
+import socket
+import stat
+import subprocess
+import sys
+from collections.abc import Mapping
+from fnmatch import fnmatch
+from pathlib import Path
+
+import msgspec
+import pytest
+import yaml
+from typer.main import get_command
+
+from gcd_node import check as checking
+from gcd_node.check import Resources, check
+from gcd_node.cli.main import app
+from gcd_node.config import NodeConfig, load_config
+from gcd_node.errors import ConfigError, SourceError, TooShortError, UsageError
+
+ROOT = Path(__file__).parents[2]
+LAUNCH = ROOT / "launch"
+TOMLS = sorted(LAUNCH.glob("*.toml"))
+UNIT = LAUNCH / "systemd" / "gcd-node@.service"
+INSTALLED = "/opt/gcd-node/bin/gcd-node"
+PATIENCE_S = 60
+SHIPPED = {"demo.toml", "orbit.toml", "oak-topdown.toml", "oak-orbit.toml", "rtsp.toml", "log-replay.toml"}
+
+
+# Launch files.
+
+
+def rehearsed(config: NodeConfig, folder: Path) -> NodeConfig:
+    """As it is, but with frames of our own instead of a camera or a log, endpoints here, and random weights where a
+    checkpoint must be downloaded."""
+    source = msgspec.structs.replace(
+        config.source, kind="synthetic", path=None, url=None, device=None, topic=None, loop=False, frames=1
+    )
+    here = {name: f"ipc://{folder}/{name}" for name in ("data", "status", "control")}
+    model = config.model
+    if model.weights.startswith("/"):
+        assert model.family is not None
+        model = msgspec.structs.replace(model, weights=f"random:{model.family}", family=None, device="cpu")
+    return msgspec.structs.replace(
+        config,
+        source=source,
+        model=model,
+        publish=msgspec.structs.replace(config.publish, data=here["data"], status=here["status"]),
+        control=msgspec.structs.replace(config.control, endpoint=here["control"]),
+    )
+
+
+def test_the_launch_files_that_are_promised_are_there() -> None:
+    assert {path.name for path in TOMLS} >= SHIPPED
+
+
+@pytest.mark.parametrize("path", TOMLS, ids=lambda path: path.name)
+def test_a_launch_file_passes_every_check_that_needs_no_hardware(path: Path, tmp_path: Path) -> None:
+    config = rehearsed(load_config(path), tmp_path)
+    findings = {each.topic: each for each in check(config, Resources(device="cpu", memory=2**36))}
+    assert list(findings) == ["endpoints", "source", "weights", "memory", "views", "time"]
+    errors = {topic: str(each.error) for topic, each in findings.items() if each.error is not None}
+    assert errors == {}
+    random = config.model.weights.startswith("random:")
+    assert findings["weights"].verdict == ("warning" if random else "ok")
+
+
+@pytest.mark.parametrize("path", TOMLS, ids=lambda path: path.name)
+def test_a_launch_file_is_short_and_says_what_it_is_for(path: Path) -> None:
+    lines = path.read_text().splitlines()
+    assert lines[0].startswith("# ")
+    assert len(lines) < 50
+
+
+def test_weights_nobody_has_here_are_named_before_anything_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = load_config(LAUNCH / "oak-orbit.toml")
+    monkeypatch.setattr(checking, "open_session", _nothing)
+    monkeypatch.setattr(checking, "open_source", _nothing)
+    findings = {each.topic: each for each in check(config)}
+    assert "kubric_gradual_max90.ckpt" in findings["weights"].detail
+    assert findings["weights"].verdict == "failed"
+
+
+def _nothing(*_: object) -> None:
+    raise ConfigError("none here")
+
+
+def test_every_file_of_the_folder_is_in_its_table() -> None:
+    table = (LAUNCH / "README.md").read_text()
+    files = [path for path in LAUNCH.rglob("*") if path.is_file() and "__pycache__" not in path.parts]
+    assert [str(path) for path in files if f"`{path.relative_to(LAUNCH)}`" not in table] == [str(LAUNCH / "README.md")]
+    named = re.findall(r"`([\w.@/-]+/[\w.@-]+|[\w-]+\.toml)`", table)
+    assert [name for name in named if not (LAUNCH / name).exists()] == ["/etc/gcd"]
+
+
+# systemd and udev.
+
+
+def settings_of(text: str) -> dict[str, list[str]]:
+    """The assignments of a unit, by key; of one that is made again all values."""
+    found: dict[str, list[str]] = {}
+    for line in text.splitlines():
+        if line and line[0] not in "#;[":
+            key, _, value = line.partition("=")
+            found.setdefault(key, []).append(value)
+    return found
+
+
+def unit() -> Mapping[str, list[str]]:
+    return settings_of(UNIT.read_text())
+
+
+def analyze(*arguments: str) -> "subprocess.CompletedProcess[str]":
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("needs systemd-analyze: apt install systemd")
+    command = ["systemd-analyze", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+
+
+def verified(folder: Path, text: str) -> str:
+    path = folder / UNIT.name
+    path.write_text(text.replace(INSTALLED, sys.executable))  # which is there: else that is all it says
+    done = analyze("verify", "--man=no", str(path))
+    return done.stdout + done.stderr
+
+
+def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path: Path) -> None:
+    text = UNIT.read_text()
+    assert INSTALLED in text
+    assert verified(tmp_path, text) == ""
+    assert "RestartSecs" in verified(tmp_path, text.replace("RestartSec=", "RestartSecs="))
+
+
+def test_the_unit_is_confined() -> None:
+    done = analyze("security", "--offline=true", "--threshold=25", str(UNIT))
+    assert done.returncode == 0, done.stdout
+    said = unit()
+    assert said["NoNewPrivileges"] == ["yes"]
+    assert said["ProtectSystem"] == ["strict"]
+    assert said["DevicePolicy"] == ["closed"]
+    assert said["DeviceAllow"] == ["char-usb_device rw", "char-video4linux rw"]
+    assert "PrivateDevices" not in said  # it would hide the cameras
+
+
+def test_a_restart_is_for_what_a_restart_can_mend() -> None:
+    said = unit()
+    assert (said["Type"], said["Restart"], said["RestartSec"]) == (["notify"], ["on-failure"], ["2"])
+    assert (said["StartLimitIntervalSec"], said["StartLimitBurst"]) == (["60"], ["5"])
+    (codes,) = said["RestartPreventExitStatus"]
+    hopeless = {each.exit_code for each in (UsageError, TooShortError, SourceError, ConfigError)}
+    assert set(map(int, codes.split())) == hopeless == {64, 65, 66, 78}
+
+
+def test_the_user_is_made_by_sysusers(tmp_path: Path) -> None:
+    if shutil.which("systemd-sysusers") is None:
+        pytest.skip("needs systemd-sysusers: apt install systemd")
+    shutil.copytree(LAUNCH / "systemd", tmp_path / "etc" / "sysusers.d")
+    command = ["systemd-sysusers", f"--root={tmp_path}"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "gcd:" in (tmp_path / "etc" / "passwd").read_text()
+    assert "gcd:" in (tmp_path / "etc" / "group").read_text()
+    assert (unit()["User"], unit()["Group"]) == (["gcd"], ["gcd"])
+
+
+def test_the_node_does_under_the_units_settings_what_the_unit_says(tmp_path: Path) -> None:
+    runtime, said = tmp_path / "run", unit()
+    runtime.mkdir()
+    runtime.chmod(int(said["RuntimeDirectoryMode"][0], 8))
+    launch = tmp_path / "waiting.toml"
+    launch.write_text(
+        '[source]\nkind = "synthetic"\n[model]\nweights = "random:driving"\n[view.a]\n[life]\nautostart = false\n'
+    )
+    arguments = said["ExecStart"][0].replace("/etc/gcd/%i.toml", str(launch)).split()[1:]
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.settimeout(PATIENCE_S)
+        environment = os.environ | {
+            "NOTIFY_SOCKET": str(tmp_path / "notify"),
+            "WATCHDOG_USEC": str(int(said["WatchdogSec"][0]) * 1_000_000),
+            "RUNTIME_DIRECTORY": str(runtime),
+        }
+        command = [sys.executable, "-m", "gcd_node", *arguments]
+        with subprocess.Popen(
+            command, env=environment, umask=int(said["UMask"][0], 8), stdout=subprocess.PIPE, text=True
+        ) as node:
+            heard = [manager.recv(4096).decode() for _ in range(2)]
+            assert {line.split("=")[0] for line in heard} == {"READY", "WATCHDOG"}
+            for name in ("data", "status", "control"):  # the group may connect, others may not
+                assert stat.S_IMODE((runtime / name).stat().st_mode) == 0o770
+            node.send_signal(signal.SIGTERM)
+            assert manager.recv(4096).decode().startswith("STOPPING=1")
+            assert node.wait(PATIENCE_S) == 0
+    assert (runtime.exists(), list(runtime.iterdir())) == (True, [])
+
+
+def test_the_udev_rule_gives_the_camera_to_the_services_group_and_nobody_else() -> None:
+    lines = (LAUNCH / "udev" / "80-oak.rules").read_text().splitlines()
+    (rule,) = [line for line in lines if line and not line.startswith("#")]
+    terms = dict(re.fullmatch(r'([\w{}]+(?:\{\w+\})?)(==?"[^"]*")', term).groups() for term in rule.split(", "))  # type: ignore[union-attr]
+    assert terms == {
+        "SUBSYSTEM": '=="usb"',
+        "ENV{DEVTYPE}": '=="usb_device"',
+        "ATTR{idVendor}": '=="03e7"',
+        "MODE": '="0660"',
+        "GROUP": f'="{unit()["Group"][0]}"',
+    }
+
+
+# Containers.
+
+
+def instructions() -> list[tuple[str, str]]:
+    text = re.sub(r"^#.*\n", "", (LAUNCH / "docker" / "Dockerfile").read_text(), flags=re.MULTILINE)
+    lines = text.replace("\\\n", " ").splitlines()
+    return [(name, rest) for name, _, rest in (line.partition(" ") for line in lines) if name]
+
+
+def all_of(name: str) -> list[str]:
+    return [rest for each, rest in instructions() if each == name]
+
+
+def test_what_the_container_copies_is_there_and_not_left_out_of_the_build() -> None:
+    ignore = (LAUNCH / "docker" / "Dockerfile.dockerignore").read_text().splitlines()
+    assert ignore[1] == "*"
+    let_in = {line[1:] for line in ignore if line.startswith("!")}
+    copied = {source for rest in all_of("COPY") for source in rest.split()[:-1]}
+    assert copied == let_in
+    assert [source for source in copied if not (ROOT / source).exists()] == []
+    assert not any(fnmatch(source, pattern) for source in copied for pattern in ignore[2:] if pattern[0] not in "!#")
+
+
+def test_the_container_installs_what_the_project_names() -> None:
+    project = msgspec.toml.decode((ROOT / "pyproject.toml").read_bytes())
+    torch, whole = [rest for rest in all_of("RUN") if rest.startswith("pip ")]
+    assert '--index-url "$TORCH_INDEX"' in torch
+    assert sum(line.startswith("torch==") for line in (ROOT / "constraints.txt").read_text().splitlines()) == 1
+    (extras,) = re.findall(r"'\.\[([\w,]+)\]'", whole)
+    assert set(extras.split(",")) <= set(project["project"]["optional-dependencies"])
+    assert project["project"]["readme"] in " ".join(all_of("COPY"))
+    (base,) = all_of("FROM")
+    assert base == "python:3.11-slim"
+    assert project["project"]["requires-python"] == ">=3.11"
+
+
+def test_the_container_runs_as_nobody_special_and_calls_commands_that_exist() -> None:
+    commands = get_command(app).commands  # type: ignore[attr-defined]
+    (health,), (start,), (entry,) = all_of("HEALTHCHECK"), all_of("CMD"), all_of("ENTRYPOINT")
+    tested = msgspec.json.decode(health.partition("CMD ")[2], type=list[str])
+    assert tested == ["gcd-node", "status", "--once"]
+    assert "--once" in {option for each in commands["status"].params for option in each.opts}
+    first, config = msgspec.json.decode(start, type=list[str])
+    assert first in commands
+    assert f"launch/{Path(config).name}" in " ".join(all_of("COPY"))
+    assert msgspec.json.decode(entry, type=list[str]) == ["tini", "--", "gcd-node"]
+    assert all_of("USER") == ["10001:10001"]
+    assert all_of("STOPSIGNAL") == ["SIGTERM"]
+
+
+def test_compose_builds_that_container_and_hands_it_the_usb_bus() -> None:
+    node = yaml.safe_load((LAUNCH / "docker" / "compose.yaml").read_text())["services"]["node"]
+    context = (LAUNCH / "docker" / node["build"]["context"]).resolve()
+    assert context == ROOT
+    assert (context / node["build"]["dockerfile"]).is_file()
+    assert set(node["build"]["args"]) == {"TORCH_INDEX"}
+    assert node["device_cgroup_rules"] == ["c 189:* rmw"]
+    assert "/dev/bus/usb:/dev/bus/usb" in node["volumes"]
+    assert f"launch/{Path(node['command'][1]).name}" in " ".join(all_of("COPY"))
+    folders = {volume.split(":")[1] for volume in node["volumes"]}
+    (volumes,) = all_of("VOLUME")
+    assert set(msgspec.json.decode(volumes, type=list[str])) <= folders
