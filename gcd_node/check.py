@@ -18,6 +18,7 @@ from gcd_node.rendering.preparation import prepare_run
 from gcd_node.rendering.virtual_view import VirtualViews
 from gcd_node.session import model_threads, open_session
 from gcd_node.sources import open_source
+from gcd_node.wire.endpoints import resolve_endpoint
 
 Verdict: TypeAlias = Literal["ok", "warning", "failed"]
 
@@ -85,7 +86,8 @@ def _tried(topic: str, look: Callable[[], str]) -> Finding:
 
 def _endpoints(config: NodeConfig) -> str:
     with open_session(config) as (_, publisher):
-        control = "no control" if config.control.endpoint is None else f"control {config.control.endpoint}"
+        wanted = config.control.endpoint
+        control = "no control" if wanted is None else f"control {resolve_endpoint(wanted, 'control')}"
         return f"free: data {publisher.endpoint}, status {publisher.status_endpoint}, {control}"
 
 
@@ -176,7 +178,7 @@ def measured(device: str) -> Resources:
 
 def _memory(traits: Traits, needed: int, found: Resources) -> str:
     line = f"weights take {needed / 2**30:.2f} GiB in {traits.precision}, {found.memory / 2**30:.2f} are free on "
-    line += f"{found.device}; pictures in work come on top"
+    line += f"{found.device}; what the model needs to compute comes on top and is not counted"
     if needed > found.memory:
         raise CheckpointError(f"{line}. Free some, or use bfloat16 or a smaller model")
     if needed > _MUCH_MEMORY * found.memory:

@@ -1,4 +1,7 @@
-"""The node's settings, as a launch file states them (TOML)."""
+"""The node's settings, as a launch file states them (TOML).
+
+Longer than most files: one page with every section of a launch file.
+"""
 
 import hashlib
 from collections.abc import Sequence
@@ -8,13 +11,13 @@ from typing import Annotated, Any, Literal, TypeAlias
 import msgspec
 from msgspec import Meta
 
-from gcd_model import explain_settings_error
 from gcd_node.config_changes import with_changes
 from gcd_node.errors import ConfigError
 
 Positive: TypeAlias = Annotated[float, Meta(gt=0)]
 Count: TypeAlias = Annotated[int, Meta(ge=1)]
-ViewId: TypeAlias = Annotated[str, Meta(pattern=r"^[a-z0-9_]{1,16}$(?!\n)")]
+_LEAST_ROTATE_MB, _LEAST_ROTATE_S = 0.1, 1.0
+ViewId: TypeAlias = Annotated[str, Meta(pattern=r"^(?!src$)[a-z0-9_]{1,16}$(?!\n)")]  # src is the input
 
 
 class SourcePose(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -60,16 +63,26 @@ class SourceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     """Where frames come from.
 
     path: a video file, a folder of images or an MCAP log; `package:drive.mp4` is the clip that ships.
-    device: of `v4l2` a number or a path such as /dev/video0; of `oak` a device id, left out if there is just one.
+    device: of `v4l2` a number or a path such as /dev/video0 (left out, 0); one in /dev/v4l/by-id stays the same when
+        cables move. Of `oak` an id, USB port or address; left out, the only one there is, and that one again when it
+        was lost.
     url: of `rtsp`: rtsp://, or http:// and udp:// streams of the same decoder. May hold a password: never logged.
     topic: of `mcap`: where the pictures are; left out if the log has just one such topic.
-    width, height: what a live camera is asked for; it may give something else, which is then used and said.
+    width, height: what a camera of this machine is asked for; it may give something else, which is then used and said.
+        `oak`: left out, 1280 x 720.
     pace: "realtime" plays at the recorded speed; "lockstep" waits for the model and skips nothing.
-    fps: of an image folder, which cannot say; otherwise leave it out.
-    hfov_deg: horizontal field of view of the source picture, if known; published as intrinsics, and part of the
-        mount for models that warp by known planes.
-    resize: "released" is the bilinear resize the checkpoints were trained with, "area" averages (less aliasing).
-    frames: stop a synthetic source after this many.
+    loop: begin a recording again at its end.
+    fps: of an image folder, which cannot say. `v4l2` and `oak` are asked for it (`oak`: left out, 30); of `rtsp` it
+        counts instead of what the stream states, of a video file instead of its stamps; a synthetic drive has it (left
+        out, 10). Not for a log, whose pictures have stamps.
+    hfov_deg: horizontal field of view of the source picture, if known; then no lens the source itself knows is used.
+        What is wider than the model was trained with is cut off, if enough pixels are left. Published as intrinsics,
+        and part of the mount for models that warp by known planes.
+    resize: "released" is the bilinear resize the checkpoints were trained with, "area" averages (less aliasing). Where
+        there is a calibration neither: pictures are undistorted at twice the size and averaged.
+    allow_upscale: enlarge pictures that are smaller than the model takes, instead of refusing them.
+    frames, seed: of a synthetic drive: stop after so many; which street.
+    pose: where the camera stands, see there.
     calibration: a ROS camera_info YAML file; left out, what the source itself knows (OAK memory, CameraInfo in a log).
         With one, pictures are undistorted and cut to the field of view the model was trained with.
     open_timeout_s: how long a live camera may take to open.
@@ -114,7 +127,7 @@ class SourceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 class WindowConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How frames become windows.
 
-    fps: frame rate of a window; left out, the nearest trained rate the source can give.
+    fps: frame rate of a window; left out, the highest trained rate the source can give, or its own if there is none.
     stride: grid frames from one window to the next; left out, as many as a window holds (no overlap).
     max_skew: how far, in frame periods, a frame may lie from its place in time.
     """
@@ -234,6 +247,52 @@ class LifeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     nice: Annotated[int, Meta(ge=0, le=19)] = 0
 
 
+class RecordConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is kept on disk, and where. Needs the extra `record`.
+
+    folder: every recording gets a folder of its own in it; left out, nothing can be recorded.
+    what: "inputs" is what the camera saw, "views" what was made of it. Everything else is small and always kept.
+    input_encoding: of inputs; "raw" loses nothing and takes about ten times as much.
+    jpeg_quality: of inputs, and of views that are published as rgb8.
+    notes: headers, events, status, metadata and commands are JSON: as "ros2" inside std_msgs/String, which ROS 2 can
+        play; as "json" on channels with a JSON schema, which viewers can plot and `ros2 bag play` refuses.
+    rotate_mb, rotate_s: begin a new file after so much, or so long; 0 never.
+    max_total_mb: what all recordings in `folder` may take; 0 without a limit. keep_free_mb: what its disk must keep
+        free. Recording stops before either is passed; nothing is ever deleted.
+    autostart: record from the first moment; else wait for record_start.
+    """
+
+    folder: str | None = None
+    what: tuple[Literal["inputs", "views"], ...] = ("inputs", "views")
+    input_encoding: Literal["jpeg", "raw"] = "jpeg"
+    jpeg_quality: Annotated[int, Meta(ge=50, le=100)] = 90
+    notes: Literal["ros2", "json"] = "ros2"
+    rotate_mb: Annotated[float, Meta(ge=0)] = 500.0
+    rotate_s: Annotated[float, Meta(ge=0)] = 0.0
+    max_total_mb: Annotated[float, Meta(ge=0)] = 0.0
+    keep_free_mb: Annotated[float, Meta(ge=0)] = 500.0
+    autostart: bool = False
+
+    def __post_init__(self) -> None:
+        if self.autostart and self.folder is None:
+            raise ValueError("to record from the start, state the folder that recordings go to")
+        if 0 < self.rotate_mb < _LEAST_ROTATE_MB or 0 < self.rotate_s < _LEAST_ROTATE_S:
+            raise ValueError(
+                f"a file of a recording takes at least {_LEAST_ROTATE_MB:g} MB and {_LEAST_ROTATE_S:g} s (0: no limit)"
+            )
+
+
+class ViewerConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A page to look at the node in a browser.
+
+    http: "127.0.0.1:8470" or another port of this machine; left out, none. Loopback only.
+    keys: the page's own client keys, as `gcd-node keys new` makes them; for a node with [security] on tcp endpoints.
+    """
+
+    http: str | None = None
+    keys: str | None = None
+
+
 class NodeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A whole launch file. strict: refuse what would only be flagged as out of the trained domain."""
 
@@ -246,6 +305,8 @@ class NodeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     security: SecurityConfig = SecurityConfig()
     health: HealthConfig = HealthConfig()
     life: LifeConfig = LifeConfig()
+    record: RecordConfig = RecordConfig()
+    viewer: ViewerConfig = ViewerConfig()
     node_id: Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,32}$(?!\n)")] = "gcd"
     strict: bool = False
 
@@ -282,6 +343,8 @@ def parse_config(text: bytes, name: str, changes: Sequence[str] = ()) -> NodeCon
         table = msgspec.toml.decode(text, type=dict[str, Any])
         return msgspec.convert(with_changes(table, changes), NodeConfig, strict=True)
     except msgspec.ValidationError as error:
+        from gcd_model import explain_settings_error  # only now: it brings torch, and clients of a node need none
+
         raise ConfigError(f"{name}: {explain_settings_error(str(error), NodeConfig)}") from error
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(f"{name} is not valid TOML: {error}") from error

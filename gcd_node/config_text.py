@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping
+from pathlib import PurePath
 from urllib.parse import urlsplit, urlunsplit
 
 import msgspec
@@ -18,6 +19,11 @@ def to_toml(config: NodeConfig) -> str:
     lines: list[str] = []
     _write_table(without_secrets(config), "", lines)
     return "\n".join(lines).strip() + "\n"
+
+
+def to_change(key: str, value: object) -> str:
+    """A change to a launch file as with_changes() takes it, such as `model.steps=4`. value: what TOML can say."""
+    return f"{key}={_toml(str(value) if isinstance(value, PurePath) else value)}"
 
 
 def without_secrets(config: NodeConfig) -> Table:

@@ -10,14 +10,25 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
+from msgspec.structs import replace
+
 from gcd_model import Traits
-from gcd_node.config import ControlConfig, ModelSection, NodeConfig, PublishConfig, SourceConfig, ViewConfig
+from gcd_node.config import (
+    ControlConfig,
+    ModelSection,
+    NodeConfig,
+    PublishConfig,
+    SourceConfig,
+    SourcePose,
+    ViewConfig,
+    ViewerConfig,
+)
 from gcd_node.errors import NodeError
 from gcd_node.frame import Image
 from gcd_node.life.stream import Summary
 from gcd_node.node import NodeOptions
 from gcd_node.pictures.comparison import Moment, comparison
-from gcd_node.pictures.files import make_folder, spread, write_png, write_video
+from gcd_node.pictures.files import make_folder, scaled, spread, write_animation, write_png, write_video
 from gcd_node.publisher import Publisher
 from gcd_node.rendering.model_worker import WindowReport
 from gcd_node.session import open_session, run_until_signal
@@ -30,8 +41,10 @@ HEADINGS = ("input: the packaged drive", "generated view from above", "generated
 """Columns of the demo's pictures."""
 
 _TRAINED = "driving-small"
+_MOUNT = SourcePose(height_m=1.55, forward_m=1.6, left_m=0.0, tilt_deg=0.0)
 _RECEIVER_TIMEOUT_S = 60.0
 _ROWS = 4
+_PAGE_WIDTH = 760
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -65,8 +78,27 @@ def demo_config(folder: Path) -> NodeConfig:
     )
 
 
+def open_demo_config(folder: Path) -> NodeConfig:
+    """The same in a loop, for somebody who watches: with a page, and steered through it."""
+    config = demo_config(folder)
+    return replace(
+        config,
+        source=replace(config.source, loop=True, pose=_MOUNT if config.model.weights.startswith("package:") else None),
+        control=ControlConfig(endpoint=f"ipc://{folder}/control"),
+        viewer=ViewerConfig(http="127.0.0.1:0"),
+    )
+
+
+def run_open_demo(on_viewer: Callable[[str], None]) -> Summary:
+    """Run the drive in a loop, in real time, until SIGINT or SIGTERM. on_viewer: told the page's address."""
+    with tempfile.TemporaryDirectory(prefix="gcd-demo-") as name:
+        config = open_demo_config(Path(name))
+        with open_session(config, options=NodeOptions(), on_viewer=on_viewer) as (node, publisher):
+            return run_until_signal(node, publisher)
+
+
 def run_demo(out: Path, on_window: Callable[[WindowReport], None]) -> DemoReport:
-    """Run it all; writes side_by_side.mp4 and side_by_side.png into `out`.
+    """Run it all; writes side_by_side.mp4, .webp and .png into `out`.
 
     Raises:
         NodeError: the second process did not come up, or nothing arrived in it.
@@ -169,10 +201,12 @@ def moments(
 
 
 def _write_pictures(out: Path, shown: list[list[Moment]], classes: Sequence[ClassRecord], fps: float) -> list[Path]:
-    """The video of all windows, and a picture of a few moments of the last one."""
-    video, still = out / "side_by_side.mp4", out / "side_by_side.png"
+    """The video of all windows, the same small for a page, and a picture of a few moments of the last window."""
+    video, moving, still = (out / f"side_by_side.{kind}" for kind in ("mp4", "webp", "png"))
     headings = HEADINGS[: len(shown[0][0].columns)]
-    write_video(video, [comparison([moment], classes, headings) for window in shown for moment in window], fps)
+    frames = [comparison([moment], classes, headings) for window in shown for moment in window]
+    write_video(video, frames, fps)
+    write_animation(moving, [scaled(frame, _PAGE_WIDTH) for frame in frames], fps)
     last = shown[-1]
     write_png(still, comparison([last[i] for i in spread(len(last), _ROWS)], classes, headings))
-    return [video, still]
+    return [video, moving, still]

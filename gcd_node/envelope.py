@@ -32,6 +32,12 @@ MAX_PAYLOAD = 64 * 1024 * 1024
 WELCOME = bytes(PREFIX.size)
 """What a publisher sends to each new subscriber; not a message."""
 
+PREVIEW_ID = "src"
+"""What stands for the input where a view's id is asked for; no view has this id."""
+
+PREVIEW_TOPIC = f"{PREVIEW_ID}/frm"
+"""The preview of the input."""
+
 ViewKind: TypeAlias = Literal["win", "frm", "std", "cls"]
 NoteTopic: TypeAlias = Literal["status", "event", "meta"]
 Buffer: TypeAlias = bytes | memoryview
@@ -136,14 +142,15 @@ class NoteMessage:
 Message: TypeAlias = ViewMessage | EndMessage | NoteMessage
 
 
-def encode(message: Message) -> bytes:
+def encode(message: Message, *, checksum: bool = True) -> bytes:
     """One ZeroMQ part. The join is the only copy of the payload. See decode().
 
+    checksum: False leaves it out, for bytes that go through this machine's memory alone; it takes longer than the way.
     Raises:
         MessageError: the header is not plain JSON, or longer than 64 KiB.
     """
     header = _header_bytes(message)
-    crc = zlib.crc32(message.payload, zlib.crc32(header))
+    crc = zlib.crc32(message.payload, zlib.crc32(header)) if checksum else 0
     size = len(message.payload)
     key = topic_key(message.topic)
     prefix = PREFIX.pack(key, MAGIC, len(header) // 16, message.flags, size, message.sequence, crc, 0)
@@ -211,9 +218,17 @@ def payload_of(pixels: NDArray[np.uint8]) -> memoryview:
 
 
 def view_topic(view_id: str, kind: ViewKind) -> str:
-    """The topic of a view. Raises MessageError for an id that is not [a-z0-9_]{1,16}."""
+    """The topic of a view, or of the preview of the input ("src", "frm").
+
+    Raises:
+        MessageError: an id that is not [a-z0-9_]{1,16}, or another kind of the input.
+    """
     if not _VIEW_ID.fullmatch(view_id):
         raise MessageError(f"a view id is 1 to 16 of a-z, 0-9 and _, got {view_id!r}")
+    if view_id == PREVIEW_ID:
+        if kind != "frm":
+            raise MessageError(f"of the input there is {PREVIEW_TOPIC} alone, got {view_id}/{kind}; ask for kind frm")
+        return PREVIEW_TOPIC
     return f"view/{view_id}/{kind}"
 
 

@@ -10,8 +10,9 @@
     ├── StaleError 69         a view arrived too old to be used
     ├── EndpointError 73      an endpoint is in use or cannot be bound
     ├── OutputError 73        a result cannot be written
+    ├── DamagedRunError 65    the folder of a replay is incomplete, damaged or none
     ├── ModelFailedError 70   the model keeps producing unusable views
-    ├── ControlError 70       a command was refused, or nobody answers it
+    ├── ControlError 70       a command was refused; 69 if nobody answers it
     ├── AuthError 77          a node does not let us in
     └── ConfigError 78        a launch file or a setting is wrong
 
@@ -80,6 +81,12 @@ class OutputError(NodeError):
     exit_code = 73
 
 
+class DamagedRunError(NodeError):
+    """The folder of a replay is incomplete, damaged or none."""
+
+    exit_code = 65
+
+
 class ModelFailedError(NodeError):
     """The model keeps producing unusable views."""
 
@@ -94,6 +101,7 @@ class ControlError(NodeError):
     def __init__(self, message: str, code: "str | None" = None) -> None:
         super().__init__(message)
         self.code = code
+        self.exit_code = 70 if code is not None else 69
 
 
 class AuthError(NodeError):

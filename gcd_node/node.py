@@ -1,11 +1,14 @@
-"""The node: lives from configure to shutdown, does what it is asked, and says how it is."""
+"""The node: lives from configure to shutdown, does what it is asked, and says how it is.
+
+Longer than most files: its life is one loop, and everything in it waits for the same events.
+"""
 
 import contextlib
 import logging
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from gcd_model import ModelError, Traits
@@ -25,12 +28,16 @@ from gcd_node.life.machinery import Links, Machinery, Parts
 from gcd_node.life.source_watch import Backoff
 from gcd_node.life.stream import Summary
 from gcd_node.publishing.outbox import Outbox
+from gcd_node.recording.recorder import Recorder
+from gcd_node.recording.tap import RecordedOutbox
 from gcd_node.rendering.model_worker import WindowReport
 from gcd_node.security.keys import Role
 
 _LOG = logging.getLogger(__name__)
 _TICK_S = 0.1
-_PATIENCE_S = 4.0
+_PATIENCE_S = 3.0  # of the 5 s an end may take; the rest is for what is still to be sent
+_LEAST_PATIENCE_S = 0.1
+_LEAST_RECORD_S = 0.5
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -62,19 +69,22 @@ class Node:
     handler too. Transitions are worked through in a thread of their own, so that status and commands go on."""
 
     def __init__(self, config: NodeConfig, parts: Parts, outbox: Outbox, options: NodeOptions | None = None) -> None:
-        """Nothing is opened or loaded before `run`."""
-        self._config, self._outbox, self._options = config, outbox, options or NodeOptions()
-        self.health = Health()
-        self._announcer = Announcer(config.node_id, new_boot_id(), outbox, self.health)
+        """Nothing is opened or loaded before `run`. Raises ConfigError: see Recorder."""
+        self._config, self._options = config, options or NodeOptions()
+        self.health, live, boot_id = Health(), LiveConfig(config), new_boot_id()
+        self.recorder = Recorder(config, boot_id, lambda: live.config, self._say)
+        self._outbox = RecordedOutbox(outbox, self.recorder)
+        self._announcer = Announcer(config.node_id, boot_id, self._outbox, self.health)
         links = Links(
-            outbox=outbox,
+            outbox=self._outbox,
             health=self.health,
             announcer=self._announcer,
             on_over=self._notice_over,
             on_window=self._options.on_window,
+            tap=self.recorder,
         )
-        self._machinery = Machinery(LiveConfig(config), parts, links)
-        self._commands = NodeCommands(self._machinery, self._announcer, self.health, self.ask)
+        self._machinery = Machinery(live, parts, links)
+        self._commands = NodeCommands(self._machinery, self._announcer, self.health, self.ask, self.recorder)
         self._life, self._order = Lifecycle(), threading.Lock()
         self._inbox: queue.SimpleQueue[_Done | str] = queue.SimpleQueue()
         self._work: threading.Thread | None = None
@@ -104,9 +114,13 @@ class Node:
         """Carry a command out, or begin to; see Commands."""
         return self._commands.handle(command, role)
 
+    def _say(self, code: str, level: Level, fields: Mapping[str, object]) -> None:
+        self._announcer.event(code, level, fields)
+
     def event(self, code: str, fields: dict[str, object]) -> None:
-        """Publish what another part of the process has noticed, as a warning."""
-        self._announcer.event(code, Level.WARN, fields)
+        """Publish what another part of the process has noticed; a warning if it gives no `level`."""
+        level = fields.get("level")
+        self._announcer.event(code, Level(level) if isinstance(level, int) else Level.WARN, fields)
 
     def ask(self, verb: Verb, dry_run: bool) -> Outcome:
         """Begin a transition; an event tells how it ends."""
@@ -114,9 +128,9 @@ class Node:
             return Outcome(code=Code.NOT_READY, message="the model has failed; cleanup and configure load it anew")
         if verb == "activate" and self._machinery.left_behind:
             return Outcome(code=Code.NOT_READY, message="a thread of the last activation hangs; restart the process")
-        refusal = self._life.refusal(verb)
-        if refusal is not None:
-            return Outcome(code=Code.WRONG_STATE, message=refusal)
+        refusal, busy = self._life.refusal(verb), not self.state.settled
+        if refusal is not None and not (verb == "shutdown" and busy):
+            return Outcome(code=Code.BUSY if busy else Code.WRONG_STATE, message=refusal)
         if dry_run:
             return Outcome(message=f"{verb} would begin")
         if verb == "shutdown":
@@ -125,7 +139,7 @@ class Node:
         try:
             self._begin(verb, asked=True)
         except ControlError as error:  # somebody else was faster
-            return Outcome(code=Code.WRONG_STATE, message=str(error))
+            return Outcome(code=Code.BUSY, message=str(error))
         self._on_its_own &= verb not in ("deactivate", "cleanup")
         return Outcome(code=Code.ACCEPTED, message=f"{verb} has begun; an event tells how it ends")
 
@@ -137,6 +151,7 @@ class Node:
             failed with.
         """
         try:
+            self.recorder.start_if_wanted()
             self._turn()
             if self._on_its_own:
                 self._begin("configure")
@@ -148,8 +163,9 @@ class Node:
         finally:
             self._machinery.interrupt()
             if self._work is not None:
-                self._work.join(0.0 if self._overdue() else _PATIENCE_S)
-            self._machinery.close()
+                self._work.join(self._left_s())
+            self._machinery.close(self._left_s())
+            self.recorder.close(self._record_patience_s())
         if self._failure is not None:
             raise self._failure
         return self._machinery.summary
@@ -175,6 +191,7 @@ class Node:
         if stream is not None:
             stream.tick()
         self._vigil.look(0.0 if stream is None else stream.worker.silent_s)
+        self.health.recording(self.recorder.report())
         if self._retry_s is not None and time.monotonic() >= self._retry_s and self.state is State.INACTIVE:
             self._retry_s = None
             self._try("activate")
@@ -192,6 +209,16 @@ class Node:
     def _overdue(self) -> bool:
         """Whether the end is wanted and something holds it up for too long."""
         return self._stop_s is not None and time.monotonic() - self._stop_s > _PATIENCE_S
+
+    def _left_s(self) -> float:
+        """How long the end may still wait for a thread."""
+        since_s = 0.0 if self._stop_s is None else time.monotonic() - self._stop_s
+        return max(_LEAST_PATIENCE_S, _PATIENCE_S - since_s)
+
+    def _record_patience_s(self) -> float:
+        """How long the end may wait for the disk, so that all of it fits into the 5 s of F23."""
+        since_s = 0.0 if self._stop_s is None else time.monotonic() - self._stop_s
+        return max(_LEAST_RECORD_S, _PATIENCE_S - since_s)
 
     # Transitions.
 
@@ -247,7 +274,7 @@ class Node:
         self._after_failure(done.error, done.verb)
 
     def _recover(self, *, final: bool) -> None:
-        self._machinery.close()
+        self._machinery.close(_PATIENCE_S)
         self.health.model("absent")
         with self._order:
             self._life.recover(cleaned=not final)

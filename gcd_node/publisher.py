@@ -10,7 +10,7 @@ import logging
 import queue
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import TracebackType
@@ -18,9 +18,19 @@ from typing import Any
 
 import zmq
 
-from gcd_node.envelope import TOPIC_BYTES, WELCOME, EndMessage, NoteMessage, NoteTopic, ViewMessage, encode
+from gcd_node.envelope import (
+    PREVIEW_TOPIC,
+    TOPIC_BYTES,
+    WELCOME,
+    EndMessage,
+    NoteMessage,
+    NoteTopic,
+    ViewMessage,
+    encode,
+)
 from gcd_node.errors import EndpointError, NodeError
 from gcd_node.publishing.options import PublisherOptions, PublisherStats
+from gcd_node.publishing.subscriptions import Subscriptions
 from gcd_node.security.gate import Context, EventSink, Gate, Socket, unbind
 from gcd_node.wire.endpoints import own_endpoint
 from gcd_node.wire.header import OriginHeader
@@ -30,6 +40,7 @@ _IDLE_S = 0.01
 _RETRY_MS = 3
 _DATA_HWM = 4
 _STATUS_HWM = 100
+_LEAST_LINGER_MS = 100
 _MAX_SUBSCRIPTION = 4096
 
 
@@ -55,12 +66,13 @@ class Publisher:
         self._options = options
         self._queue: queue.Queue[_Parcel] = queue.Queue(options.queue_size)
         self._notes: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._preview: deque[bytes] = deque(maxlen=1)
         self._sequences: Counter[tuple[str, str]] = Counter()
         self._hand_over, self._note_order = threading.Lock(), threading.Lock()
         self._hurried = threading.Event()
         self._closing, self._abandoned, self._closed = threading.Event(), threading.Event(), threading.Event()
         self._failure: Exception | None = None
-        self._dropped = 0
+        self._dropped, self._closing_s = 0, 0.0
         self._context = zmq.Context()
         try:
             self._gate = Gate(self._context, options.security, on_event)
@@ -76,7 +88,8 @@ class Publisher:
     def send(self, message: ViewMessage) -> bool:
         """Number, encode and hand over one message; its own `sequence` is replaced.
 
-        Realtime never waits: with a full queue the message is dropped and counted. Lockstep waits for room.
+        Realtime never waits: with a full queue the message is dropped and counted. Lockstep waits for room. Previews
+        of the input wait in a place of their own, the newest wins: they never take the room of a view, nor wait.
 
         Returns:
             Whether it was accepted.
@@ -85,10 +98,14 @@ class Publisher:
         """
         with self._hand_over:
             self.check()
+            if message.topic == PREVIEW_TOPIC:
+                self._preview.append(self._encoded(message))
+                return True
             if self._queue.full() and not self._options.lockstep:
                 self._dropped += 1
                 return False
             self._put(_Parcel(part=self._encoded(message)))
+        time.sleep(0)  # lets the thread begin now, instead of when the caller has time
         return True
 
     def end(self, message: EndMessage, *, delay_ms: int | None = None) -> None:
@@ -124,7 +141,13 @@ class Publisher:
     def stats(self) -> PublisherStats:
         """Counters since the start."""
         data = self._data
-        return PublisherStats(sent=data.sent, dropped=self._dropped, subscribers=data.subscribers, bytes=data.bytes)
+        return PublisherStats(
+            sent=data.sent,
+            dropped=self._dropped,
+            subscribers=data.readers.now.total,
+            bytes=data.bytes,
+            readers=data.readers.now,
+        )
 
     @property
     def endpoint(self) -> str:
@@ -161,7 +184,8 @@ class Publisher:
 
     def _encoded(self, message: ViewMessage | EndMessage | NoteMessage) -> bytes:
         key = (message.header.boot_id, message.topic)
-        part = encode(replace(message, sequence=self._sequences[key]))
+        numbered = replace(message, sequence=self._sequences[key])
+        part = encode(numbered, checksum=isinstance(message, NoteMessage) or not self._data.local)
         self._sequences[key] += 1
         return part
 
@@ -188,6 +212,7 @@ class Publisher:
         if self._closed.is_set():
             return
         self._closed.set()
+        self._closing_s = time.monotonic()
         self._closing.set()
         self._thread.join()
         self._gate.close()
@@ -200,8 +225,8 @@ class Publisher:
         try:
             self._run()
             if not self._abandoned.is_set():
-                linger_ms = self._patience_ms
                 self._see_off()
+                linger_ms = max(_LEAST_LINGER_MS, round(1000 * self._left_s(time.monotonic())))
         except Exception as error:
             self._failure = error
         finally:
@@ -223,7 +248,7 @@ class Publisher:
             elif not closing:
                 progress = time.monotonic()
                 self._data.wait(_RETRY_MS)
-            elif time.monotonic() - progress > self._patience_ms / 1000:
+            elif self._left_s(progress) < 0:
                 if self._hurried.is_set():
                     return
                 raise EndpointError(self._undelivered())
@@ -233,20 +258,24 @@ class Publisher:
     def _see_off(self) -> None:
         """Wait until readers have left. ZeroMQ's linger ends when its last batch of bytes is on its way, and loses it
         to a reader too slow to take it at once; who leaves has the end-of-stream message."""
-        until = time.monotonic() + self._patience_ms / 1000
-        while self._data.ended and self._data.subscribers > 0 and time.monotonic() < until:
+        until = time.monotonic() + self._left_s(time.monotonic())
+        while self._data.ended and self._data.readers.now.total > 0 and time.monotonic() < until:
             self._serve_sockets()
             self._data.wait(_RETRY_MS)
             if self._abandoned.is_set():
                 return
 
-    @property
-    def _patience_ms(self) -> int:
-        waits = self._options.lockstep and not self._hurried.is_set()
-        return self._options.drain_ms if waits else self._options.linger_ms
+    def _left_s(self, progress_s: float) -> float:
+        """How much longer to wait for readers at the end, after the last progress. A node that was told to stop has
+        linger_ms for all of it, so that slow readers cannot stretch the end one message at a time."""
+        hurried, options = self._hurried.is_set(), self._options
+        patience_ms = options.drain_ms if options.lockstep and not hurried else options.linger_ms
+        return (self._closing_s if hurried else progress_s) + patience_ms / 1000 - time.monotonic()
 
     def _serve_sockets(self) -> None:
         self._data.serve()
+        while self._preview:
+            self._data.try_send(self._preview.pop())  # what finds no room is lost, in lockstep too
         while not self._notes.empty():
             part = self._notes.get()
             if self._status is not None:
@@ -262,7 +291,7 @@ class Publisher:
 
     def _undelivered(self) -> str:
         count, seconds = self._queue.qsize() + 1, self._options.drain_ms / 1000
-        have, wanted = self._data.subscribers, self._options.min_subscribers
+        have, wanted = self._data.readers.now.watchers, self._options.min_subscribers
         readers = f"{have} subscribers, wanted {wanted}"
         return f"{count} messages were not taken within {seconds:g} s at {self.endpoint} ({readers}); start the reader"
 
@@ -274,41 +303,38 @@ class _DataSocket:
         self._options = options
         self._socket = _made(context, _DATA_HWM, no_drop=options.lockstep)
         self.endpoint = gate.bind(self._socket, own_endpoint(options.data, "data"), "data")
-        self.sent = self.bytes = self.subscribers = 0
-        self._topics: Counter[bytes] = Counter()
-        self.ended = False
+        self.local = self.endpoint.startswith("ipc://")
+        self.sent = self.bytes = 0
+        self.readers = Subscriptions()
+        self._begun = self.ended = False
         self._last_sent = time.monotonic()
 
     def serve(self) -> None:
-        """Count subscriptions; those to the welcome message alone are none. What nobody has asked for cannot be taken
-        back: noise on the socket can look like that, and must not make readers disappear."""
+        """Count who comes and goes."""
         for event in _events(self._socket):
-            topic = event[1:]
-            if topic and topic == WELCOME[: len(topic)]:
-                continue
-            if event[0]:
-                self._topics[topic] += 1
-            elif self._topics[topic] > 1:
-                self._topics[topic] -= 1
-            else:
-                self._topics.pop(topic, None)
-            self.subscribers = self._topics.total()
+            self.readers.hear(event)
 
     def send(self, parcel: _Parcel) -> bool:
         """Whether it left; if not, try again later."""
-        if self._options.lockstep and self.sent == 0 and self.subscribers < self._options.min_subscribers:
+        if self._options.lockstep and not self._begun and self.readers.now.watchers < self._options.min_subscribers:
             return False
         if parcel.follow_s is not None and time.monotonic() < self._last_sent + parcel.follow_s:
             return False
+        if not self.try_send(parcel.part):
+            return False
+        self._begun, self.ended = True, parcel.follow_s is not None
+        if not self.ended:
+            self._last_sent = time.monotonic()
+        return True
+
+    def try_send(self, part: bytes) -> bool:
+        """Whether it left."""
         try:
-            self._socket.send(parcel.part, zmq.NOBLOCK)
+            self._socket.send(part, zmq.NOBLOCK, copy=False)  # a copy would cost more than all the rest
         except zmq.Again:
             return False
         self.sent += 1
-        self.bytes += len(parcel.part)
-        self.ended = parcel.follow_s is not None
-        if not self.ended:
-            self._last_sent = time.monotonic()
+        self.bytes += len(part)
         return True
 
     def wait(self, timeout_ms: int) -> None:
@@ -339,6 +365,12 @@ class _StatusSocket:
 
     def close(self, linger_ms: int) -> None:
         unbind(self._socket, self.endpoint, linger_ms)
+
+
+def begin_zero_copy() -> None:
+    """Start what lets go of messages once they have left. It begins with the first one otherwise, once a process, and
+    stays: for whoever counts threads and sockets."""
+    zmq.Frame(bytes(zmq.COPY_THRESHOLD), copy=False)
 
 
 def _events(socket: Socket) -> list[bytes]:

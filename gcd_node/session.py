@@ -16,6 +16,7 @@ from gcd_node.control.server import ControlOptions, ControlServer
 from gcd_node.errors import ConfigError
 from gcd_node.health.metrics_server import MetricsServer
 from gcd_node.life.machinery import Parts
+from gcd_node.life.memory import settle_process
 from gcd_node.life.stream import Summary
 from gcd_node.node import Node, NodeOptions
 from gcd_node.publisher import Publisher
@@ -24,6 +25,8 @@ from gcd_node.rendering.model_worker import WindowReport
 from gcd_node.security.allow_list import load_server_security
 from gcd_node.security.gate import ServerSecurity
 from gcd_node.sources import open_source
+from gcd_node.viewer.hub import NodeEndpoints
+from gcd_node.viewer.server import ViewerOptions, ViewerServer, own_keys
 
 _LOG = logging.getLogger(__name__)
 
@@ -73,14 +76,19 @@ def ends_by_itself(config: NodeConfig) -> bool:
 
 @contextmanager
 def open_session(
-    config: NodeConfig, on_window: Callable[[WindowReport], None] | None = None, options: NodeOptions | None = None
+    config: NodeConfig,
+    on_window: Callable[[WindowReport], None] | None = None,
+    options: NodeOptions | None = None,
+    on_viewer: Callable[[str], None] | None = None,
 ) -> Generator[tuple[Node, Publisher]]:
-    """A node ready to run, and its publisher, already bound; its control and health sockets too, if it has any.
+    """A node ready to run, and its publisher, already bound; its control and health sockets and its page too, if it
+    has any. on_viewer: told the page's address, with the token that makes an operator.
 
     Raises:
-        EndpointError, ConfigError: see Publisher, ControlServer, MetricsServer. Nothing stays open.
+        EndpointError, ConfigError: see Publisher, ControlServer, MetricsServer, Recorder, ViewerServer. Nothing stays
+            open.
     """
-    security = load_server_security(config.security)
+    settle_process()
     options = replace(options or NodeOptions(once=ends_by_itself(config)), on_window=on_window)
     heard: list[Node] = []
 
@@ -88,16 +96,39 @@ def open_session(
         for node in heard:
             node.event(code, fields)
 
+    security = load_server_security(config.security, tell)
     with ExitStack() as stack:
         publisher = stack.enter_context(Publisher(publisher_options(config, security), tell))
         node = Node(config, Parts(open_source=open_source, load_model=load_model), publisher, options)
         heard.append(node)
+        control: str | None = None
         if config.control.endpoint is not None:
             wanted = ControlOptions(endpoint=config.control.endpoint, security=security)
-            stack.enter_context(ControlServer(wanted, node, lambda: node.state.label, tell))
+            control = stack.enter_context(
+                ControlServer(wanted, node, lambda: node.state.label, tell, node.recorder.command)
+            ).endpoint
         if config.health.http is not None:
             stack.enter_context(MetricsServer(config.health.http, node.health))
+        if config.viewer.http is not None:
+            viewer = stack.enter_context(_viewer(config, publisher, control, security))
+            if on_viewer is not None:
+                on_viewer(viewer.operator_url)
         yield node, publisher
+
+
+def _viewer(
+    config: NodeConfig, publisher: Publisher, control: str | None, security: ServerSecurity | None
+) -> ViewerServer:
+    """The page of a node whose sockets are bound; it reaches them from outside, as any client."""
+    bound = (publisher.endpoint, publisher.status_endpoint or config.publish.status, control)
+    secured = security is not None and any(each is not None and each.startswith("tcp://") for each in bound)
+    node = NodeEndpoints(
+        data=bound[0],
+        status=bound[1],
+        control=control,
+        keys=own_keys(config.viewer.keys, security if secured else None),
+    )
+    return ViewerServer(ViewerOptions(http=config.viewer.http or "", node=node))
 
 
 def run_until_signal(node: Node, publisher: Publisher) -> Summary:

@@ -20,6 +20,7 @@ from gcd_node.envelope import (
     MAX_HEADER,
     MAX_PAYLOAD,
     PREFIX,
+    PREVIEW_ID,
     WELCOME,
     EndMessage,
     Message,
@@ -90,7 +91,8 @@ class ViewSubscriber:
     """Views of one node.
 
     endpoint: "ipc" for the node on this machine, or ipc://PATH, tcp://HOST:PORT.
-    view: the view's id; None for all views, which needs conflate=False.
+    view: the view's id, or "src" (of kind "frm") for the preview of the input; None for all views, which needs
+        conflate=False.
     kind: "win" for windows, "frm" for frames at the goal pose, "std" for standard deviations, "cls" for class maps;
         None for all kinds, which needs conflate=False.
     conflate: keep only the newest message, so that a slow reader never works on old ones.
@@ -290,8 +292,8 @@ class _Link:
             if self._socket not in dict(ready):
                 self._watch.check()
                 continue
-            part = self._socket.recv()
-            if part != WELCOME:
+            part = self._socket.recv(copy=False).buffer  # stays ZeroMQ's memory until nobody looks at it any more
+            if part.nbytes != len(WELCOME) or bytes(part) != WELCOME:
                 return decode(part, self._max_payload)
         return None
 
@@ -303,8 +305,9 @@ def _key(view: str | None, kind: ViewKind | None) -> bytes:
     """What to subscribe to: one topic, all topics of a view, or all views; the rest is left out on arrival."""
     if view is None:
         return b"view/"
-    topic = view_topic(view, kind or "win")
-    return topic.removesuffix("win").encode() if kind is None else topic_key(topic)
+    if kind is None and view != PREVIEW_ID:
+        return view_topic(view, "win").removesuffix("win").encode()
+    return topic_key(view_topic(view, kind or "frm"))
 
 
 def _deadline(timeout_ms: float | None) -> float | None:

@@ -6,9 +6,12 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gcd_node.errors import ConfigError
 from gcd_node.frame import MAX_FPS, Frame, Image
+from gcd_node.time_grid import TimeGrid
+from gcd_node.window_pixels import WindowPixels
 
 Reason: TypeAlias = Literal["WIN_GAP", "CLOCK_STEP", "SRC_FORMAT", "SRC_LOST"]
 """Why frames did not become a window: a hole in time, a step of the source's clock, another picture size, a source
@@ -27,6 +30,7 @@ class FrameWindow:
     """T frames at an even rate, still with their stamps.
 
     images: u8 [T, H, W, 3], RGB, read-only.
+    clip: the same as the network takes them, float32 [T, 3, H, W] in [-1, 1]; not to be changed either.
     stamps_ns, seqs: of each frame, as the source gave them.
     window_id: counts windows, from where the builder was told to begin.
     fps: the rate the network is told.
@@ -36,6 +40,7 @@ class FrameWindow:
     """
 
     images: Image
+    clip: NDArray[np.float32]
     stamps_ns: tuple[int, ...]
     seqs: tuple[int, ...]
     window_id: int
@@ -63,6 +68,15 @@ class WindowCounts:
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Arrived:
     frame: Frame
+    arrival_ns: int
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Placed:
+    """A frame on the grid; its pixels are among those of the next window."""
+
+    stamp_ns: int
+    seq: int
     arrival_ns: int
 
 
@@ -117,20 +131,13 @@ class WindowBuilder:
         Raises:
             ConfigError: a number out of range.
         """
-        stride = frames if stride is None else stride
-        if frames < 1 or stride < 1 or not 0 < fps <= MAX_FPS or not 0 < max_skew <= 0.5:
-            raise ConfigError(
-                f"a window needs frames >= 1, 0 < fps <= {MAX_FPS:g}, stride >= 1 and 0 < max_skew <= 0.5, "
-                f"got {frames}, {fps:g}, {stride} and {max_skew:g}"
-            )
         self.frames = frames
-        self.fps = fps
-        self._stride = stride
-        self._skew_ns = max_skew * 1e9 / fps
+        self._stride = frames if stride is None else stride
+        self._max_skew = max_skew
         self._fit = fit
-        follows = source_fps is not None and abs(source_fps / fps - 1) <= RATE_TOLERANCE
-        self._grid = _Grid(fps=fps, follow=_FOLLOW if follows else 0.0)
-        self._placed: deque[_Arrived] = deque()
+        self.run_at(fps, source_fps)
+        self._placed: deque[_Placed] = deque()
+        self._pixels = WindowPixels(frames)
         self._waiting: _Arrived | None = None
         self._newest: Frame | None = None
         self._skip = 0
@@ -199,6 +206,24 @@ class WindowBuilder:
         self._newest = None
         self._skip = 0
 
+    def run_at(self, fps: float, source_fps: float | None) -> None:
+        """Another rate of the grid from here on; only before the first frame, or the first after `restart`.
+
+        Args:
+            fps, source_fps: as of a new builder.
+        Raises:
+            ConfigError: a number out of range.
+        """
+        if self.frames < 1 or self._stride < 1 or not 0 < fps <= MAX_FPS or not 0 < self._max_skew <= 0.5:
+            raise ConfigError(
+                f"a window needs frames >= 1, 0 < fps <= {MAX_FPS:g}, stride >= 1 and 0 < max_skew <= 0.5, "
+                f"got {self.frames}, {fps:g}, {self._stride} and {self._max_skew:g}"
+            )
+        self.fps = fps
+        self._skew_ns = self._max_skew * 1e9 / fps
+        follows = source_fps is not None and abs(source_fps / fps - 1) <= RATE_TOLERANCE
+        self._grid = TimeGrid(fps=fps, follow=_FOLLOW if follows else 0.0)
+
     def _is_clock_step(self, step_ns: int) -> bool:
         """Backwards by over a second, or forwards by over a second and a whole window."""
         return step_ns < -_LONGEST_STEP_NS or step_ns > max(_LONGEST_STEP_NS, self.frames * 1e9 / self.fps)
@@ -242,19 +267,19 @@ class WindowBuilder:
         if self._skip > 0:
             self._skip -= 1
             return []
-        image = arrived.frame.image if self._fit is None else self._fit(arrived.frame.image)
-        fitted = Frame(image=image, stamp_ns=arrived.frame.stamp_ns, seq=arrived.frame.seq)
-        self._placed.append(_Arrived(frame=fitted, arrival_ns=arrived.arrival_ns))
+        frame = arrived.frame
+        self._pixels.put(len(self._placed), frame.image if self._fit is None else self._fit(frame.image))
+        self._placed.append(_Placed(stamp_ns=frame.stamp_ns, seq=frame.seq, arrival_ns=arrived.arrival_ns))
         return [self._window()] if len(self._placed) == self.frames else []
 
     def _window(self) -> FrameWindow:
         placed = list(self._placed)
-        images = np.stack([arrived.frame.image for arrived in placed])
-        images.setflags(write=False)
+        images, clip = self._pixels.hand_over()
         window = FrameWindow(
             images=images,
-            stamps_ns=tuple(arrived.frame.stamp_ns for arrived in placed),
-            seqs=tuple(arrived.frame.seq for arrived in placed),
+            clip=clip,
+            stamps_ns=tuple(each.stamp_ns for each in placed),
+            seqs=tuple(each.seq for each in placed),
             window_id=self.next_id,
             fps=self.fps,
             arrival_ns=placed[-1].arrival_ns,
@@ -266,26 +291,3 @@ class WindowBuilder:
         for _ in range(min(self._stride, self.frames)):
             self._placed.popleft()
         return window
-
-
-class _Grid:
-    """Points in time, evenly spaced; with `follow` > 0 each is drawn that part of the way to the frame it took."""
-
-    def __init__(self, *, fps: float, follow: float) -> None:
-        self.period_ns = 1e9 / fps
-        self.next_ns = 0
-        self._follow = follow
-        self._start_ns = 0
-        self._index = 0
-
-    def start(self, stamp_ns: int) -> None:
-        """Put the first point here."""
-        self._start_ns = self.next_ns = stamp_ns
-        self._index = 0
-
-    def advance(self, taken_ns: int | None) -> None:
-        """Go to the next point; taken_ns is the stamp of the frame this one took, None for a hole."""
-        if taken_ns is not None and self._follow > 0:
-            self._start_ns += round(self._follow * (taken_ns - self.next_ns))
-        self._index += 1
-        self.next_ns = self._start_ns + round(self._index * self.period_ns)

@@ -30,9 +30,9 @@ def check_launch(config: ConfigPath, changes: Changes = None, print_config: Prin
     if print_config:
         typer.echo(to_toml(settings), nl=False)
         return
-    with Console(stderr=True).status("looking"):
+    with Console(stderr=True, markup=False).status("looking"):
         findings = list(check(settings))
-    Console().print(_table(findings))
+    Console(markup=False).print(_table(findings))
     for finding in findings:
         if finding.error is not None:
             raise finding.error

@@ -12,6 +12,7 @@ from gcd_node.cli.control import KeyFolder, NodeKey, client_keys
 from gcd_node.envelope import NoteMessage
 from gcd_node.watching.status_board import STALE_AFTER_S, StatusBoard
 from gcd_node.watching.status_table import StatusRequest, render_status, watch_status
+from gcd_node.wire.endpoints import resolve_endpoint
 
 Endpoint: TypeAlias = Annotated[str, Argument(metavar="ENDPOINT", help="ipc, ipc://PATH or tcp://HOST:PORT.")]
 Once: TypeAlias = Annotated[bool, Option("--once", help="Print one status and end; 69 if none comes.")]
@@ -66,10 +67,23 @@ def _print_table(board: StatusBoard) -> None:
 
 
 def _show_live(request: StatusRequest) -> None:
-    with Live(console=Console(), auto_refresh=False) as live:
+    """Over itself on a terminal; into a file or a pipe, where nothing can be taken back, one table a status."""
+    console = Console()
+    if not console.is_terminal:
+        printed: list[object] = [None]
+
+        def append(board: StatusBoard) -> None:
+            if board.known and board.fields is not printed[0]:
+                printed[0] = board.fields
+                console.print(render_status(board, time.monotonic()))
+
+        watch_status(request, append, _ignore)
+        return
+    endpoint = resolve_endpoint(request.endpoint, "status")
+    with Live(console=console, auto_refresh=False) as live:
 
         def show(board: StatusBoard) -> None:
-            live.update(render_status(board, time.monotonic()), refresh=True)
+            live.update(render_status(board, time.monotonic(), endpoint), refresh=True)
 
         watch_status(request, show, _ignore)
 

@@ -152,7 +152,7 @@ def synthesize(
     options = replace(options, initial_noise=injected.initial)
     _require_possible(input_path, save, samples)
     heads = {"head_width": head_width, "image_heads": image_heads}
-    with Console(stderr=True).status(f"loading {weights}"):
+    with Console(stderr=True, markup=False).status(f"loading {weights}"):
         model = load_synthesizer(weights, family=family, device=device, dtype=dtype, **heads)
     augmentation = Augmentation(strength=cond_aug, seed=seed, noise=injected.augmentation)
     _run(_Order(model, input_path, clip, wanted, options, augmentation), out, save)
@@ -187,7 +187,7 @@ def _run(order: _Order, out: Path, save: Path | None) -> None:
     with _progress() as progress:
         options = replace(order.options, progress=_Steps(progress))
         view = render(order.model, source, path, options, order.augmentation)
-    console = Console()
+    console = Console(markup=False)
     if not traits.trained:
         console.print(f"{traits.name}: these weights are random, so the picture is noise.")
     for written in write_view(out, source, view, ontology(traits)):
@@ -223,7 +223,7 @@ def _pose(sphere: tuple[float | None, ...], mount: tuple[float | None, ...]) -> 
 
 def _progress() -> Progress:
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
-    console = Console(stderr=True)
+    console = Console(stderr=True, markup=False)
     return Progress(*columns, TimeElapsedColumn(), console=console, transient=True, disable=not console.is_terminal)
 
 

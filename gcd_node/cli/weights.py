@@ -37,8 +37,8 @@ def inspect(
     full_digest: Annotated[bool, Option(help="Digest every byte, also of large files.")] = False,
 ) -> None:
     """Say what a checkpoint holds: architecture, family, sizes, and what will be left out. Loads no weights."""
-    console = Console()
-    with Console(stderr=True).status(f"reading {file}"):
+    console = Console(markup=False)
+    with Console(stderr=True, markup=False).status(f"reading {file}"):
         report = inspect_weights(
             file, family=family, head_width=head_width, image_heads=image_heads, full_digest=full_digest
         )
@@ -56,7 +56,7 @@ def convert(
     overwrite: Annotated[bool, Option("--overwrite", help="Replace OUT if it is there.")] = False,
 ) -> None:
     """Strip a checkpoint to what inference needs, with its configuration inside. OUT appears whole or not at all."""
-    errors = Console(stderr=True)
+    errors = Console(stderr=True, markup=False)
     with Progress(console=errors, transient=True, disable=not errors.is_terminal) as progress:
         task = progress.add_task("converting", total=None)
 
@@ -73,7 +73,7 @@ def convert(
             overwrite=overwrite,
             progress=advance,
         )
-    console = Console()
+    console = Console(markup=False)
     _show(console, report)
     console.print(f"wrote {out}", soft_wrap=True)
 

@@ -146,7 +146,8 @@ def parse_command(request: Request) -> Command:
     """What a request asks for.
 
     Raises:
-        RequestError: UNKNOWN_VERB, BAD_ARG, OUT_OF_RANGE; `result` names the argument and the allowed interval.
+        RequestError: UNKNOWN_VERB, BAD_ARG, OUT_OF_RANGE; `result` says what is allowed:
+            {"allowed": {NAME: [least, most]}}.
     """
     verb = VERBS.get(request.verb)
     if verb is None:
@@ -208,7 +209,7 @@ def _refused(error: Exception, kind: type[msgspec.Struct], request_id: str) -> R
     if beyond is None:
         return RequestError(_explained(error, kind), Code.BAD_ARG, request_id)
     name = beyond.group(1)
-    result: dict[str, object] = {"arg": name, "allowed": _interval(kind, name)}
+    result: dict[str, object] = {"allowed": {name: _interval(kind, name)}}
     return RequestError(_explained(error, kind), Code.OUT_OF_RANGE, request_id, result)
 
 

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import msgspec
 import zmq
@@ -40,6 +40,10 @@ _LINGER_MS = 500
 _QUEUED = 64
 _SECOND_NS = 1_000_000_000
 _LOCAL = Client(name="", role="operator")
+
+
+AnswerSink: TypeAlias = Callable[[bytes, bytes, Client], None]
+"""Gets every request, its reply as it was sent, and who asked; called in the control thread, returns at once."""
 
 
 class Commands(Protocol):
@@ -72,7 +76,7 @@ class ControlServer:
     """Answers requests until closed. Use it as a context manager.
 
     state: the node's lifecycle state, for every reply. on_event: gets AUTH_DENIED, TOO_LARGE and CONTROL_FLOOD, each
-    with its fields. All are called from threads of this server.
+    with its fields. on_answer: see AnswerSink. All are called from threads of this server.
 
     Raises:
         EndpointError: the endpoint is in use or cannot be bound.
@@ -80,9 +84,14 @@ class ControlServer:
     """
 
     def __init__(
-        self, options: ControlOptions, commands: Commands, state: Callable[[], str], on_event: EventSink
+        self,
+        options: ControlOptions,
+        commands: Commands,
+        state: Callable[[], str],
+        on_event: EventSink,
+        on_answer: AnswerSink | None = None,
     ) -> None:
-        self._on_event = on_event
+        self._on_event, self._on_answer = on_event, on_answer
         self._answers = Answers(commands, state, options.keep_s)
         self._flood = FloodGuard(options.bad_per_s, options.ignore_s)
         self._ignore_s = options.ignore_s
@@ -147,9 +156,11 @@ class ControlServer:
             self._on_event("CONTROL_FLOOD", {"level": 1, "client": client.name, "ignored_s": self._ignore_s})
             return
         self._socket.send_multipart((peer.bytes, answer.part), zmq.NOBLOCK)  # to a peer that left: thrown away
+        if self._on_answer is not None:
+            self._on_answer(parts[0].bytes, answer.part, client)
 
     def _client(self, frame: zmq.Frame) -> Client | None:
-        """Who sent this, by his key; None if the key was taken off the list since, which cannot happen yet."""
+        """Who sent this, by his key; None if the key was taken off the list since."""
         return self._gate.client(str(frame.get("User-Id"))) if self._named else _LOCAL
 
 

@@ -1,5 +1,6 @@
 """What the node tells of itself: status, events and metadata (wire protocol, section 4)."""
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -13,7 +14,9 @@ from gcd_node.wire.header import OriginHeader
 from gcd_node.wire.record_json import to_json
 from gcd_node.wire.view_message import Run, camera_matrix
 
+_LOG = logging.getLogger(__name__)
 _PERIOD_S = 1.0
+_LOG_PERIOD_S = 10.0  # of one code: a camera that loses a frame a second fills no disk
 
 
 class Announcer:
@@ -32,11 +35,18 @@ class Announcer:
         self._outbox, self._health, self._clock = outbox, health, clock
         self._next_s = clock()
         self._meta: Mapping[str, object] | None = None
+        self._logged_s: dict[str, float] = {}
         self._order = threading.Lock()
 
     def event(self, code: str, level: Level, fields: Mapping[str, object] | None = None) -> None:
-        """Something has happened. code: stable, for programs; fields: plain JSON, a `message` for people."""
-        self._outbox.note("event", self._origin(), {**(fields or {}), "code": code, "level": int(level)})
+        """Something has happened. code: stable, for programs; fields: plain JSON, a `message` for people. Warnings and
+        worse are logged too, each code at most once in ten seconds."""
+        told = {**(fields or {}), "code": code, "level": int(level)}
+        self._outbox.note("event", self._origin(), told)
+        if level >= Level.WARN and self._clock() >= self._logged_s.get(code, 0.0):
+            self._logged_s[code] = self._clock() + _LOG_PERIOD_S
+            at = logging.ERROR if level is Level.ERROR else logging.WARNING
+            _LOG.log(at, "%s %s", code, _words(fields or {}), extra={"event": told})
 
     def status(self) -> None:
         """Say how it is, now."""
@@ -92,3 +102,9 @@ def calibration(run: Run) -> dict[str, object]:
         "K": None if camera is None else list(camera_matrix(camera)),
         "mount": None if mount is None else {**asdict(mount), "assumed": assumed},
     }
+
+
+def _words(fields: Mapping[str, object]) -> str:
+    """The message first, then the rest."""
+    rest = ", ".join(f"{name}: {value}" for name, value in fields.items() if name != "message")
+    return " ".join(part for part in (str(fields.get("message", "")), f"({rest})" if rest else "") if part)

@@ -24,6 +24,7 @@ from gcd_node.health.report import (
     Level,
     ModelState,
     PublishHealth,
+    RecordHealth,
     SourceState,
     Stage,
 )
@@ -54,6 +55,7 @@ class Health:
         self._built = 0
         self._reason_counts: dict[str, int] = {}
         self._publish = PublishHealth()
+        self._rec = RecordHealth()
         self._raised: dict[str, Level] = {}
         self._views: dict[str, int | None] = {}
         self._window_s: float | None = None
@@ -138,6 +140,11 @@ class Health:
         with self._lock:
             self._publish = PublishHealth(sent=count, subscribers=subscribers, bytes=size_bytes)
 
+    def recording(self, now: RecordHealth) -> None:
+        """How the recording does."""
+        with self._lock:
+            self._rec = now
+
     def out_of_memory(self) -> None:
         """The model found no memory for a window."""
         with self._lock:
@@ -211,6 +218,7 @@ class Health:
             overdue=self._overdue(now_ns),
             raised=dict(self._raised),
             missing=self._missing(now_ns),
+            rec=self._rec,
         )
 
     def _missing(self, now_ns: int) -> tuple[str, ...]:
@@ -247,4 +255,4 @@ class Health:
 def _essence(report: HealthReport) -> tuple[object, ...]:
     """What of a report is worth a note at once."""
     model = "ready" if report.model.state == "busy" else report.model.state
-    return report.state, tuple(report.findings.items()), report.source.state, model, report.missing
+    return report.state, tuple(report.findings.items()), report.source.state, model, report.missing, report.rec.state

@@ -2,13 +2,14 @@
 
 import enum
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 from gcd_node.health.stage_times import StageSummary
 
 SourceState: TypeAlias = Literal["closed", "connecting", "streaming", "stalled", "lost", "ended"]
 ModelState: TypeAlias = Literal["absent", "loading", "warming", "ready", "busy", "degraded", "failed"]
+RecordState: TypeAlias = Literal["off", "recording", "stopping", "failed"]
 
 Stage: TypeAlias = Literal["capture_gap", "window", "encode", "render", "publish", "age"]
 """capture_gap: between the stamps of two frames. window: from the arrival of a window's newest frame until the model
@@ -82,6 +83,29 @@ class PublishHealth:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class RecordHealth:
+    """The recording under way, or the last one.
+
+    state: "failed" is one that ended by itself. file: the one written to now or last, below the folder of recordings.
+    bytes: on the disk, all files together. written: messages. dropped: frames, windows and notes that found no room in
+        the queue, by topic.
+    """
+
+    state: RecordState = "off"
+    file: str | None = None
+    bytes: int = 0
+    written: int = 0
+    dropped: Mapping[str, int] = field(default_factory=dict[str, int])
+
+    def to_status(self) -> dict[str, object]:
+        """The field `rec` of a status note."""
+        status: dict[str, object] = {"state": self.state}
+        if self.file is not None:
+            status |= {"file": self.file, "bytes": self.bytes, "written": self.written, "dropped": dict(self.dropped)}
+        return status
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class HealthReport:
     """A node's health at one moment.
 
@@ -104,6 +128,7 @@ class HealthReport:
     overdue: bool
     raised: Mapping[str, Level]
     missing: tuple[str, ...]
+    rec: RecordHealth = field(default_factory=RecordHealth)
 
     @property
     def findings(self) -> dict[str, Level]:
@@ -116,6 +141,7 @@ class HealthReport:
             MODEL_FAILED    ERROR   the model was given up
             MODEL_DEGRADED  WARN    it runs with less than was asked for
             VIEWS_OVERDUE   WARN    frames come, nobody is idle, and still no view was published for too long
+            REC_FAILED      WARN    a recording has ended by itself
 
         and whatever the node raised itself.
         """
@@ -128,6 +154,7 @@ class HealthReport:
             (self.model.state == "failed", "MODEL_FAILED", Level.ERROR),
             (self.model.state == "degraded", "MODEL_DEGRADED", Level.WARN),
             (self.overdue, "VIEWS_OVERDUE", Level.WARN),
+            (self.rec.state == "failed", "REC_FAILED", Level.WARN),
         )
         found |= {code: level for holds, code, level in rules if holds}
         return dict(sorted(found.items(), key=lambda each: (-each[1], each[0])))
@@ -170,6 +197,7 @@ class HealthReport:
                 for name, stage in self.stages.items()
             },
             "views": {view_id: {} if ago is None else {"last_ms": round(ago)} for view_id, ago in self.views.items()},
+            "rec": self.rec.to_status(),
             "heartbeat_seq": heartbeat,
         }
 

@@ -19,6 +19,7 @@ from gcd_node.health.report import Level
 from gcd_node.life.lifecycle import Verb
 from gcd_node.life.machinery import Machinery
 from gcd_node.optics.source_pose import stated_sphere
+from gcd_node.recording.recorder import Recorder
 from gcd_node.rendering.virtual_view import VirtualView
 from gcd_node.security.keys import Role
 from gcd_node.wire.header import PROTO
@@ -32,8 +33,11 @@ Ask: TypeAlias = Callable[[Verb, bool], Outcome]
 class NodeCommands:
     """Answers for one node; called from the control thread alone."""
 
-    def __init__(self, machinery: Machinery, announcer: Announcer, health: Health, ask: Ask) -> None:
+    def __init__(
+        self, machinery: Machinery, announcer: Announcer, health: Health, ask: Ask, recorder: Recorder
+    ) -> None:
         self._machinery, self._announcer, self._health, self._ask = machinery, announcer, health, ask
+        self._recorder = recorder
         self._told: dict[str, Callable[[], dict[str, object]]] = {
             "describe": self._describe,
             "state": self._state,
@@ -53,7 +57,7 @@ class NodeCommands:
             case "configure" | "activate" | "deactivate" | "cleanup" | "shutdown":
                 return self._ask(command.verb, command.dry_run)
             case "record_start" | "record_stop":
-                return Outcome(code=Code.WRONG_STATE, message="this version has no recorder; record what it publishes")
+                return self._record(begin=command.verb == "record_start", dry_run=command.dry_run)
             case _:
                 return self._change(command)
 
@@ -185,6 +189,22 @@ class NodeCommands:
             self._machinery.live.change(model, publish)
             self._after_change("PARAM_SET", told)
         return Outcome(result=told)
+
+    def _record(self, *, begin: bool, dry_run: bool) -> Outcome:
+        """Begin to record, or to end that; an event tells how it went."""
+        recorder = self._recorder
+        if begin and not recorder.available:
+            message = "there is nowhere to record to: state folder in [record] of the launch file"
+            return Outcome(code=Code.NOT_READY, message=message)
+        if recorder.busy == begin:
+            message = "a recording is under way: stop it first" if begin else "nothing is being recorded"
+            return Outcome(code=Code.WRONG_STATE, message=message)
+        if dry_run:
+            return Outcome(message="it would be done")
+        done = recorder.start() if begin else recorder.stop()
+        if not done:  # somebody, or the disk, was faster
+            return Outcome(code=Code.WRONG_STATE, message="the recording has just begun or ended; look at its state")
+        return Outcome(code=Code.ACCEPTED, message="an event tells when it has")
 
     def _after_change(self, code: str, told: dict[str, object]) -> None:
         stream = self._machinery.stream

@@ -2,6 +2,7 @@
 the transitions of its life, one at a time."""
 
 import logging
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -11,15 +12,19 @@ from gcd_node.frame import FrameSource, SourceInfo
 from gcd_node.health.announcer import Announcer
 from gcd_node.health.monitor import Health
 from gcd_node.life.live_config import LiveConfig
-from gcd_node.life.stream import Begin, Stream, Summary
+from gcd_node.life.memory import give_back_memory
+from gcd_node.life.stream import Begin, FrameTap, Stream, Summary
 from gcd_node.publishing.outbox import Outbox
 from gcd_node.rendering.model_slot import LoadModel, ModelSlot
 from gcd_node.rendering.model_worker import WindowReport, WorkerParts
 from gcd_node.rendering.preparation import prepare_run
 from gcd_node.rendering.virtual_view import VirtualViews
+from gcd_node.sources.same_camera import same_camera
 from gcd_node.wire.view_message import Run
 
 _LOG = logging.getLogger(__name__)
+_LOOK_S = 0.1
+_HURRY_S = 2.0
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -35,13 +40,14 @@ class Parts:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Links:
-    """Through what a node speaks. on_over: called when a stream has ended."""
+    """Through what a node speaks. on_over: called when a stream has ended. tap: sees every frame."""
 
     outbox: Outbox
     health: Health
     announcer: Announcer
     on_over: Callable[[], None]
     on_window: Callable[[WindowReport], None] | None = None
+    tap: FrameTap | None = None
 
 
 class Machinery:
@@ -63,8 +69,7 @@ class Machinery:
         """Of the last activation."""
         self.failure: Exception | None = None
         """What the last activation ended with, None if it ended well."""
-        self.left_behind = False
-        """Whether a thread did not end when it should."""
+        self._stuck: list[Stream] = []
 
     @property
     def is_live(self) -> bool:
@@ -80,6 +85,12 @@ class Machinery:
     def source_info(self) -> SourceInfo | None:
         """Of the source in use, or used last."""
         return self._info if self._stream is None else self._stream.run.source
+
+    @property
+    def left_behind(self) -> bool:
+        """Whether a thread that should have ended still has not."""
+        self._stuck = [stream for stream in self._stuck if not stream.join(0.0)]
+        return bool(self._stuck)
 
     @property
     def stream(self) -> Stream | None:
@@ -142,17 +153,20 @@ class Machinery:
             return
         if not stream.over:
             stream.interrupt()
-        if not stream.join():
+        if not self._has_ended(stream):
             _LOG.error("a thread of the stream does not end; it is left behind")
-            self.left_behind = True
+            self._stuck.append(stream)
         self._stream = None
         self._info, self.summary, self.failure = stream.run.source, stream.summary(), stream.failure
         self._begin, self._said = stream.end, stream.reasons
         stream.announce_end()
+        del stream
+        give_back_memory()
 
     def cleanup(self) -> None:
         """Let go of the model."""
         self._release()
+        give_back_memory()
         self._links.health.model("absent")
 
     def interrupt(self) -> None:
@@ -162,13 +176,22 @@ class Machinery:
         if stream is not None:
             stream.interrupt()
 
-    def close(self) -> None:
-        """Let everything go, in whatever state, without a word."""
+    def close(self, patience_s: float) -> None:
+        """Let everything go, in whatever state, without a word. patience_s: for threads to end."""
         stream, self._stream = self._stream, None
         if stream is not None:
             stream.interrupt()
-            self.left_behind |= not stream.join()
+            if not stream.join(patience_s):
+                self._stuck.append(stream)
         self._release()
+
+    def _has_ended(self, stream: Stream) -> bool:
+        """Wait for its threads: as long as a step of the model may take, or less while the node is told to stop."""
+        begun_s = time.monotonic()
+        while not stream.join(_LOOK_S):
+            if time.monotonic() - begun_s > (_HURRY_S if self._interrupted else self.live.config.life.hang_s):
+                return False
+        return True
 
     def _release(self) -> None:
         source, self._source, self._model = self._source, None, None
@@ -201,7 +224,9 @@ class Machinery:
         prepared, self._prepared = self._prepared, None
         if prepared is None:
             prepared = prepare_run(self.live.config, model.traits, source.info)
-        return Stream(worker, source, prepared, reopen=self._reopen, begin=self._begin, on_over=links.on_over)
+        return Stream(
+            worker, source, prepared, reopen=self._reopen, begin=self._begin, on_over=links.on_over, tap=links.tap
+        )
 
-    def _reopen(self) -> FrameSource:
-        return self._parts.open_source(self.live.config.source)
+    def _reopen(self, before: SourceInfo) -> FrameSource:
+        return self._parts.open_source(same_camera(self.live.config.source, before))

@@ -1,21 +1,22 @@
 """Keeps frames coming: notices silence, lets a lost camera go and opens it again (wire protocol, section 7, F1 to F4).
 
-A `SourceWatch` is itself a source. Around a recording it changes nothing. Around a live source it reads in a thread of
-its own, so that a `read` that never returns is left behind with its thread instead of holding up the node.
+A `SourceWatch` is itself a source. Around a recording it changes nothing. Around a live source it reads and opens in
+threads of their own, so that a call that never returns is left behind with its thread instead of holding up the node.
 """
 
 import logging
-import queue
 import random
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator
-from dataclasses import dataclass, field, replace
+from concurrent.futures import wait
+from dataclasses import dataclass, replace
 from typing import Protocol, TypeAlias
 
 from gcd_node.errors import SourceError, SourceLostError
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.health.report import SourceState
+from gcd_node.life.camera_threads import Reading, close_in_time, leave, open_aside
 from gcd_node.window import Reason
 
 _LOG = logging.getLogger(__name__)
@@ -23,11 +24,9 @@ _STALL_PERIODS = 3
 _LEAST_STALL_S = 0.2
 _LOST_S = 1.8
 _LOOK_S = 0.02
-_CLOSE_S = 1.0
-_QUEUED = 4
 
-Opener: TypeAlias = Callable[[], FrameSource]
-"""Opens the source again; raises SourceError if it cannot be, within its own time-out."""
+Opener: TypeAlias = Callable[[SourceInfo], FrameSource]
+"""Opens again what was open before; raises SourceError if it cannot be, within its own time-out."""
 
 
 class Backoff:
@@ -93,9 +92,10 @@ class WatchListener(Protocol):
         """The stream was interrupted: frames of before and after do not belong together."""
         ...
 
-    def source_opened(self, info: SourceInfo) -> None:
-        """What comes next is of this source: the first, one opened again, or one that changed its format. Whatever
-        this raises ends `frames`."""
+    def source_opened(self, info: SourceInfo) -> bool:
+        """What comes next is of this source: the first, one opened again, or one that changed its format. Whether its
+        frames are wanted: else they are told of, and not yielded, until the format changes again. Whatever this raises
+        ends `frames`."""
         ...
 
 
@@ -117,7 +117,7 @@ class SourceWatch:
         """Watch a source that is already open.
 
         Args:
-            reopen: opens it again; called in the thread that iterates `frames`.
+            reopen: opens it again; called in threads of their own, one at a time.
             clock: monotonic seconds.
         """
         self._current: FrameSource = first
@@ -128,8 +128,9 @@ class SourceWatch:
         self._state: SourceState = "connecting"
         self._corrupt_before = 0
         self._failed_in_a_row = 0
+        self._wanted = True
         self.skipped = 0
-        """Live frames replaced by newer ones before they were taken."""
+        """Live frames replaced by newer ones before they were taken, and frames of a format nobody wanted."""
 
     @property
     def info(self) -> SourceInfo:
@@ -148,7 +149,7 @@ class SourceWatch:
             SourceLostError: given up. SourceError: of a recording. What the listener raises.
         """
         self._turn("connecting")
-        self._listener.source_opened(self._info)
+        self._wanted = self._listener.source_opened(self._info)
         while not self._closing.is_set():
             if not self._info.live:
                 yield from self._recorded()
@@ -163,19 +164,19 @@ class SourceWatch:
         """End `frames` within a second, from any thread, for good."""
         if not self._closing.is_set():
             self._closing.set()
-            _close_in_time(self._current)
+            close_in_time(self._current)
 
     def _recorded(self) -> Iterator[Frame]:
         for frame in self._current.frames():
-            self._arrived(frame)
-            yield frame
+            if self._arrived(frame):
+                yield frame
         if not self._closing.is_set():
             self._turn("ended")
 
     def _live(self) -> Generator[Frame, None, str]:
         """Frames of one opening, until it is silent for too long, ends or fails; gives the reason."""
-        opening = _Opening(source=self._current, since_s=self._clock())
-        threading.Thread(target=opening.read, name="camera", daemon=True).start()
+        opening = Reading(source=self._current, since_s=self._clock())
+        opening.start()
         stall_s = self._patience.stalled_after_s(self._info.fps_nominal)
         lost_s = self._patience.lost_after_s(self._info.fps_nominal)
         last_s, allowed_s = opening.since_s, max(stall_s, self._patience.open_s)
@@ -185,8 +186,8 @@ class SourceWatch:
                 now_s = self._clock()
                 if frame is not None:
                     last_s, allowed_s = now_s, stall_s
-                    self._arrived(frame)
-                    yield frame
+                    if self._arrived(frame):
+                        yield frame
                 elif opening.exhausted:
                     return opening.reason()
                 elif now_s - last_s > max(lost_s, allowed_s):
@@ -198,26 +199,25 @@ class SourceWatch:
             self.skipped += opening.skipped
         return "closed"
 
-    def _arrived(self, frame: Frame) -> None:
+    def _arrived(self, frame: Frame) -> bool:
+        """Tell of a frame; whether it is wanted."""
         if self._state != "streaming":
             self._failed_in_a_row = 0
             self._backoff.reset()
             self._turn("streaming")
-        self._tell(frame)
-
-    def _tell(self, frame: Frame) -> None:
-        """Of a frame; a picture of another size is another camera, as far as windows go."""
-        if frame.size != (self._info.width, self._info.height):
+        if frame.size != (self._info.width, self._info.height):  # another camera, as far as windows go
             self._info = replace(self._info, width=frame.size[0], height=frame.size[1])
             self._listener.source_broken("SRC_FORMAT")
-            self._listener.source_opened(self._info)
+            self._wanted = self._listener.source_opened(self._info)
         self._listener.source_frame(frame)
+        self.skipped += not self._wanted
+        return self._wanted
 
     def _let_go(self, reason: str) -> None:
         self._failed_in_a_row += self._state not in ("streaming", "stalled")  # opened, and never gave a frame
         self._turn("lost", reason)
         self._listener.source_broken("SRC_LOST")
-        _close_in_time(self._current)
+        close_in_time(self._current)
 
     def _open_again(self, reason: str) -> None:
         """Try until it opens or the watch is closed. Raises SourceLostError."""
@@ -231,91 +231,35 @@ class SourceWatch:
             if self._closing.wait(self._backoff.next_s()):
                 return
             try:
-                source = self._reopen()
+                source = self._attempt()
             except SourceError as error:
                 self._failed_in_a_row += 1
                 reason = str(error)
                 _LOG.info("not back yet: %s", error)
                 continue
-            self._take_over(source)
+            if source is not None:
+                self._take_over(source)
             return
+
+    def _attempt(self) -> FrameSource | None:
+        """The source, open again; None if the watch was closed meanwhile. Raises SourceError."""
+        before = self._info
+        opening = open_aside(lambda: self._reopen(before))
+        while not opening.done():
+            if self._closing.is_set():
+                leave(opening)
+                return None
+            wait({opening}, timeout=_LOOK_S)
+        return opening.result()
 
     def _take_over(self, source: FrameSource) -> None:
         self._corrupt_before += self._current.corrupt
         self._current, self._info = source, source.info
         if self._closing.is_set():
-            _close_in_time(source)  # closed while it was being opened
+            close_in_time(source)  # closed while it was being opened
             return
-        self._listener.source_opened(self._info)
+        self._wanted = self._listener.source_opened(self._info)
 
     def _turn(self, state: SourceState, detail: str = "") -> None:
         self._state = state
         self._listener.source_state(state, detail)
-
-
-@dataclass(eq=False, kw_only=True, slots=True)
-class _Opening:
-    """One opening of a live source, read in its own thread until that ends or is left behind."""
-
-    source: FrameSource
-    since_s: float
-    over: threading.Event = field(default_factory=threading.Event)
-    abandoned: threading.Event = field(default_factory=threading.Event)
-    skipped: int = 0
-    _frames: "queue.Queue[Frame]" = field(default_factory=lambda: queue.Queue[Frame](_QUEUED))
-    _error: Exception | None = None
-
-    def read(self) -> None:
-        """The camera thread."""
-        try:
-            for frame in self.source.frames():
-                if self.abandoned.is_set():
-                    return
-                self._put(frame)
-        except Exception as error:  # the end of a thread: the watch is told
-            self._error = error
-        finally:
-            self.over.set()
-
-    def take(self, timeout_s: float) -> Frame | None:
-        """The next frame; None if none came in time."""
-        try:
-            return self._frames.get(timeout=timeout_s)
-        except queue.Empty:
-            return None
-
-    @property
-    def exhausted(self) -> bool:
-        """Whether it is over and every frame was taken."""
-        return self.over.is_set() and self._frames.empty()
-
-    def reason(self) -> str:
-        """Why it is over. Raises what is no fault of the source."""
-        if self._error is None:
-            return "the stream ended"
-        if not isinstance(self._error, SourceError):
-            raise self._error
-        return str(self._error)
-
-    def _put(self, frame: Frame) -> None:
-        while True:
-            try:
-                return self._frames.put_nowait(frame)
-            except queue.Full:
-                self._make_room()
-
-    def _make_room(self) -> None:
-        try:
-            self._frames.get_nowait()
-        except queue.Empty:
-            return
-        self.skipped += 1
-
-
-def _close_in_time(source: FrameSource) -> None:
-    """Close; a device that does not even answer that is left to a thread of its own."""
-    closer = threading.Thread(target=source.close, name="camera close", daemon=True)
-    closer.start()
-    closer.join(_CLOSE_S)
-    if closer.is_alive():
-        _LOG.warning("%s %s does not answer to being closed; it is left behind", source.info.kind, source.info.id)

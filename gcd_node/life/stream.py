@@ -4,23 +4,27 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 from gcd_node.capture import Newest, read
 from gcd_node.config import NodeConfig
-from gcd_node.errors import ConfigError, EndpointError, SourceError, TooShortError
-from gcd_node.frame import Frame, FrameSource, Image, SourceInfo
+from gcd_node.errors import ConfigError
+from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.health.announcer import metadata
 from gcd_node.health.report import Level, SourceState
+from gcd_node.life.ending import LASTING, ending
+from gcd_node.life.known_source import KnownSource
+from gcd_node.life.memory import give_back_memory
 from gcd_node.life.source_watch import Opener, Patience, SourceWatch
+from gcd_node.optics.calibration import LensModel
+from gcd_node.publishing.input_preview import InputPreview
 from gcd_node.rendering.model_worker import ModelWorker, WorkCounts, WorkerParts
-from gcd_node.rendering.preparation import fit_of, prepare_run
 from gcd_node.rendering.virtual_view import VirtualViews
 from gcd_node.window import FrameWindow, Reason, WindowBuilder
-from gcd_node.wire.view_message import Run, end_messages
+from gcd_node.wire.input_preview import Shot
+from gcd_node.wire.view_message import Run
 
-_JOIN_S = 2.0
 _STOP_DELAY_MS = 100
-_LASTING = ("TOO_SHORT", "SRC_REFUSED", "NOT_DELIVERED")  # reasons that stay until the next activation
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -44,6 +48,18 @@ class Begin:
     epoch: int = 0
 
 
+class FrameTap(Protocol):
+    """Who else is shown what arrives; called in the reader thread, returns at once."""
+
+    def source(self, info: SourceInfo, lens: LensModel | None) -> None:
+        """Frames are of this source from here on. lens: the calibration in use for its pictures."""
+        ...
+
+    def frame(self, frame: Frame) -> None:
+        """A frame has arrived."""
+        ...
+
+
 class Stream:
     """Source, reader thread and model thread, started and stopped together. Implements WatchListener."""
 
@@ -56,6 +72,7 @@ class Stream:
         reopen: Opener,
         begin: Begin,
         on_over: Callable[[], None],
+        tap: FrameTap | None = None,
     ) -> None:
         """Check everything that can be checked without a frame.
 
@@ -63,31 +80,29 @@ class Stream:
             worker: what the model thread works with.
             source: open. prepared: what prepare_run() says of it. reopen: opens it again when it is lost.
             on_over: called when the last window was dealt with, whatever the reason, from the model thread.
+            tap: see FrameTap.
         Raises:
             ConfigError, OptionError, PoseError: see fit_of() and VirtualView.
         """
-        self._parts, self._on_over = worker, on_over
+        self._parts, self._on_over, self._tap = worker, on_over, tap
         config = worker.live.config
-        self._runs: list[tuple[int, Run]] = []
-        run, self._fps = self._ours(prepared[0]), prepared[1]
-        self._fit = fit_of(config, worker.model.traits, source.info)
-        VirtualViews(worker.model.traits).following(worker.live.settings(), run.mount)
-        frames = worker.model.traits.config.frames
+        traits, boot_id = worker.model.traits, worker.announcer.boot_id
+        self._known = KnownSource(worker.live, traits, prepared, boot_id=boot_id, epoch=begin.epoch)
+        VirtualViews(traits).following(worker.live.settings(), self.run.mount)
         self._builder = WindowBuilder(
-            frames=frames,
-            fps=self._fps,
+            frames=traits.config.frames,
+            fps=self._known.fps,
             stride=config.window.stride,
             max_skew=config.window.max_skew,
             source_fps=source.info.fps_nominal,
-            fit=self._fitted,
+            fit=self._known.image,
             first_id=begin.window_id,
             first_epoch=begin.epoch,
         )
-        self._runs.append((begin.epoch, run))
-        self._window_s = (config.window.stride or frames) / self._fps
         self._newest = Newest[FrameWindow](lossless=config.source.pace == "lockstep")
         self._watch = SourceWatch(source, reopen, self, _patience(config))
-        self.worker = ModelWorker(worker, self._run_of)
+        self._preview = InputPreview(worker.outbox, lambda: self.run)
+        self.worker = ModelWorker(worker, self._known.of)
         self._threads = [
             threading.Thread(target=self._work, name="model", daemon=True),
             threading.Thread(target=self._read, name="reader", daemon=True),
@@ -102,7 +117,7 @@ class Stream:
     @property
     def run(self) -> Run:
         """What is known of the source now."""
-        return self._runs[-1][1]
+        return self._known.run
 
     @property
     def end(self) -> Begin:
@@ -112,12 +127,11 @@ class Stream:
     @property
     def reasons(self) -> tuple[str, ...]:
         """What it raised of the node's health, to be cleared when another source is used."""
-        return (*self.run.ood, *_LASTING)
+        return (*self.run.ood, *LASTING)
 
     def start(self) -> None:
         """Begin; frames are read once the model is warm."""
-        for code in self.run.ood:
-            self._parts.health.raise_reason(code, Level.WARN)
+        self._raise_flags((), self.run.ood)
         self.notice_change()
         for thread in self._threads:
             thread.start()
@@ -128,19 +142,26 @@ class Stream:
         self._parts.health.expect(self._parts.live.settings().revisions, self._window_s if realtime else None)
         self._tell_meta()
 
+    @property
+    def _window_s(self) -> float:
+        """From one window to the next."""
+        return (self._parts.live.config.window.stride or self._builder.frames) / self._known.fps
+
     def interrupt(self) -> None:
         """End soon: no new window begins, the one in work is abandoned at its next step. Does not wait."""
         self.stopped = True
         self.worker.cancel()
         self._newest.close()
         self._watch.close()
+        self._preview.close()
 
-    def join(self) -> bool:
-        """Wait for the threads, for a few seconds; whether all have ended."""
-        until_s = time.monotonic() + _JOIN_S
+    def join(self, patience_s: float) -> bool:
+        """Wait for the threads; whether all have ended."""
+        until_s = time.monotonic() + patience_s
         for thread in self._threads:
             if thread.ident is not None:
                 thread.join(max(0.0, until_s - time.monotonic()))
+        self._preview.join(max(0.0, until_s - time.monotonic()))
         return not any(thread.is_alive() for thread in self._threads)
 
     def tick(self) -> None:
@@ -167,31 +188,30 @@ class Stream:
         """Send the metadata if anything of it has changed."""
         settings = self._parts.live.settings()
         run = replace(self.run, config=settings.config, traits=self._parts.model.traits)
-        self._parts.announcer.meta(metadata(run, settings, self._fps))
+        self._parts.announcer.meta(metadata(run, settings, self._known.fps))
 
     def announce_end(self) -> None:
         """Say how it ended, and the end of every view. After `join`."""
         self.tick()
-        code, source = self._ending()
-        health, settings = self._parts.health, self._parts.live.settings()
+        code, source = ending(self.failure, stopped=self.stopped)
+        health = self._parts.health
         failed = self.failure is not None
         health.source(source)
         health.model("failed" if code == "MODEL_FAILED" else "ready")
-        if code in _LASTING:
+        if code in LASTING:
             health.raise_reason(code, Level.ERROR)
         fields = {"message": str(self.failure)} if failed else {}
         self._parts.announcer.event(code, Level.ERROR if failed else Level.OK, fields)
-        run = replace(self.run, config=settings.config)
-        for view_id, rev in settings.revisions.items():
-            for message in end_messages(run, view_id, rev, self.worker.counts.last_window_id):
-                self._parts.outbox.end(message, delay_ms=_STOP_DELAY_MS if self.stopped else None)
+        delay_ms = _STOP_DELAY_MS if self.stopped else None
+        self.worker.announce_end(delay_ms=delay_ms)
+        self._preview.announce_end(delay_ms=delay_ms)
 
     def summary(self) -> Summary:
         """What it came to so far."""
         built = self._builder.counts
         return Summary(
             counts=self.worker.counts,
-            fps=self._fps,
+            fps=self._known.fps,
             dropped=self._newest.dropped,
             frames=built.frames,
             rejected={str(reason): count for reason, count in built.reasons.items()},
@@ -210,39 +230,54 @@ class Stream:
             self._parts.announcer.event("SRC_STALLED", Level.WARN, fields)
         elif state == "lost":
             self._parts.announcer.event("SRC_LOST", Level.ERROR, fields)
+            give_back_memory()
         elif state == "streaming" and was in ("stalled", "lost"):
             self._parts.announcer.event("SRC_BACK", Level.OK, fields | {"epoch": self._builder.epoch})
 
     def source_frame(self, frame: Frame) -> None:
-        """Count; see WatchListener."""
-        self._parts.health.frame(frame.stamp_ns, time.monotonic_ns())
+        """Count, and show; see WatchListener."""
+        now_ns = time.monotonic_ns()
+        self._parts.health.frame(frame.stamp_ns, now_ns)
+        if self._tap is not None:
+            self._tap.frame(frame)
+        self._preview.offer(Shot(frame=frame, arrival_ns=now_ns, epoch=self._builder.epoch))
 
     def source_broken(self, reason: Reason) -> None:
         """Begin a new epoch; see WatchListener."""
         self._builder.restart(reason)
 
-    def source_opened(self, info: SourceInfo) -> None:
-        """Work out anew what is known of the source; see WatchListener. Raises SourceError if its rate is another."""
-        if info == self.run.source:
-            return
-        run, fps = prepare_run(self._parts.live.config, self._parts.model.traits, info)
-        if fps != self._fps:
-            raise SourceError(f"{info.id} came back at a rate that makes windows of {fps:g} FPS, not {self._fps:g}")
-        self._fit = fit_of(self._parts.live.config, self._parts.model.traits, info)
-        self._runs = [*self._runs[-7:], (self._builder.epoch, self._ours(run))]
-        self._tell_meta()
+    def source_opened(self, info: SourceInfo) -> bool:
+        """Work out anew what is known of the source; see WatchListener. False if the model cannot be given what it
+        gives now: no windows then, until that changes."""
+        health = self._parts.health
+        try:
+            if info != self.run.source:
+                self._adapt(info)
+        except ConfigError as error:
+            health.raise_reason("SRC_REFUSED", Level.ERROR)
+            self._parts.announcer.event("SRC_REFUSED", Level.ERROR, {"message": str(error), "source": info.id})
+            return False
+        else:
+            health.clear_reason("SRC_REFUSED")
+            return True
+        finally:
+            if self._tap is not None:
+                self._tap.source(info, self._known.lens(info))
 
-    def _run_of(self, epoch: int) -> Run:
-        """What was known of the source in an epoch; -1 for now."""
-        runs = self._runs
-        return next((run for since, run in reversed(runs) if since <= epoch), runs[-1][1])
+    def _adapt(self, info: SourceInfo) -> None:
+        """To another size, rate or camera. Raises ConfigError, and changes nothing then."""
+        before = self.run.ood
+        self._known.adapt(info, self._builder.epoch)
+        self._builder.run_at(self._known.fps, info.fps_nominal)
+        self._raise_flags(before, self.run.ood)
+        self.notice_change()
 
-    def _ours(self, run: Run) -> Run:
-        """With the id of this life of the node."""
-        return replace(run, boot_id=self._parts.announcer.boot_id)
-
-    def _fitted(self, image: Image) -> Image:
-        return self._fit.image(image)
+    def _raise_flags(self, before: tuple[str, ...], now: tuple[str, ...]) -> None:
+        """What lies outside the trained domain, in the node's health."""
+        for code in set(before) - set(now):
+            self._parts.health.clear_reason(code)
+        for code in now:
+            self._parts.health.raise_reason(code, Level.WARN)
 
     def _read(self) -> None:
         self.worker.warm.wait()
@@ -256,22 +291,9 @@ class Stream:
         finally:
             self._newest.close()
             self._watch.close()
+            self._preview.close()
             self.over = True
             self._on_over()
-
-    def _ending(self) -> tuple[str, SourceState]:
-        """Event code, and the state of the source at the end."""
-        if isinstance(self.failure, TooShortError):
-            return "TOO_SHORT", "ended"
-        if isinstance(self.failure, SourceError):
-            return "SRC_LOST", "lost"
-        if isinstance(self.failure, ConfigError):
-            return "SRC_REFUSED", "closed"
-        if isinstance(self.failure, EndpointError):
-            return "NOT_DELIVERED", "closed"
-        if self.failure is not None:
-            return "MODEL_FAILED", "closed"
-        return ("STOPPED", "closed") if self.stopped else ("SRC_ENDED", "ended")
 
 
 def _patience(config: NodeConfig) -> Patience:

@@ -1,6 +1,8 @@
 """How fast everything around the model is: the way of a frame into another process, a slow model, a stalled reader, a
-camera that comes back. The model is a stand-in, the readers are real processes, the sockets are ipc."""
+camera that comes back, a process that starts. The model is a stand-in but for the last, the readers are real processes,
+the sockets are ipc."""
 
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -9,6 +11,7 @@ from dataclasses import dataclass
 
 from gcd_node.errors import NodeError
 from gcd_node.load.clients import Arrival, Client, reader
+from gcd_node.load.first_view import FirstView, first_view
 from gcd_node.load.meter import memory_mb, percentile
 from gcd_node.load.rig import VIEW, Rig, running_node
 from gcd_node.load.scripted_camera import Act, CameraScript, Return
@@ -27,6 +30,7 @@ class BenchOptions:
 
     windows: for the latency, and again beside a healthy reader before another one stalls. slow_windows: of the slow
     model. stall_s: how long a reader does not read. returns: how often the camera comes back; outage_s: gone each time.
+    starts: processes with the packaged model.
     width, height: of the views. fps: of the camera; one the stand-in was "trained" with.
     """
 
@@ -35,6 +39,7 @@ class BenchOptions:
     stall_s: float = 60.0
     returns: int = 3
     outage_s: float = 1.0
+    starts: int = 3
     width: int = 384
     height: int = 256
     fps: float = 24.0
@@ -97,8 +102,10 @@ class SourceBack:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class BenchReport:
-    """Everything measured. stages_ms: p50 of the node's own stages for the latency, ms: see health.report.Stage."""
+    """Everything measured. stages_ms: p50 of the node's own stages for the latency, ms: see health.report.Stage.
+    machine_load: the load average of the last minute before: what else there was to do."""
 
+    machine_load: float
     frames: int
     width: int
     height: int
@@ -107,6 +114,7 @@ class BenchReport:
     slow_model: SlowModel
     stalled_reader: StalledReader
     source_back: SourceBack
+    first_view: FirstView
 
 
 def bench_node(options: BenchOptions, on_part: Callable[[str], None]) -> BenchReport:
@@ -115,6 +123,7 @@ def bench_node(options: BenchOptions, on_part: Callable[[str], None]) -> BenchRe
     Raises:
         NodeError: a node or a reader did not come up, or nothing arrives.
     """
+    machine_load = os.getloadavg()[0]
     on_part("frame to view")
     latency, stages_ms = _latency(options)
     on_part("a model twice too slow")
@@ -123,7 +132,10 @@ def bench_node(options: BenchOptions, on_part: Callable[[str], None]) -> BenchRe
     stalled_reader = _stalled_reader(options)
     on_part("a camera that comes back")
     source_back = _source_back(options)
+    on_part("a process that starts")
+    first = first_view(options.starts)
     return BenchReport(
+        machine_load=machine_load,
         frames=_model(options).traits.config.frames,
         width=options.width,
         height=options.height,
@@ -132,6 +144,7 @@ def bench_node(options: BenchOptions, on_part: Callable[[str], None]) -> BenchRe
         slow_model=slow_model,
         stalled_reader=stalled_reader,
         source_back=source_back,
+        first_view=first,
     )
 
 

@@ -19,6 +19,7 @@ from gcd_node.config import (
 from gcd_node.control.server import ControlOptions, ControlServer
 from gcd_node.errors import NodeError
 from gcd_node.life.machinery import Parts
+from gcd_node.life.memory import settle_process
 from gcd_node.load.scripted_camera import CameraScript
 from gcd_node.load.stand_in import StandInModel
 from gcd_node.node import Node, NodeOptions
@@ -85,6 +86,7 @@ def running_node(
     Raises:
         EndpointError: its sockets cannot be bound. NodeError: at the end, if the node does not end.
     """
+    settle_process()
     with tempfile.TemporaryDirectory(prefix="gcd-load-") as name:
         config = rig_config(Path(name), stride)
         parts = Parts(open_source=lambda _: script.open(), load_model=lambda _: model)

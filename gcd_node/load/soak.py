@@ -16,6 +16,7 @@ from gcd_node.load.rig import VIEW, Rig, running_node
 from gcd_node.load.scripted_camera import ACTS, Act, CameraScript
 from gcd_node.load.soak_report import SoakReport, growth, spread
 from gcd_node.load.stand_in import StandInModel
+from gcd_node.publisher import begin_zero_copy
 from gcd_node.rendering.model_worker import WindowReport
 
 _STEP_S = 0.1
@@ -233,6 +234,7 @@ class _Before:
     """What this process held before there was a node."""
 
     def __init__(self) -> None:
+        begin_zero_copy()
         self._threads = set(threading.enumerate())
         self._files = open_files()
 

@@ -85,8 +85,9 @@ class StandInModel:
 
 
 def _picture(frames: int, height: int, width: int) -> torch.Tensor:
-    """[1, T, 3, H, W] in whole grey levels: smooth patches of colour, so that it compresses as pictures do."""
+    """u8 [1, T, 3, H, W], in memory as it is sent: smooth patches of colour, so that it compresses as pictures do."""
     chance = torch.Generator().manual_seed(0)
     coarse = torch.rand(frames, 3, height // _COARSE, width // _COARSE, generator=chance)
     drawn = interpolate(coarse, size=(height, width), mode="bilinear")
-    return (drawn * 255).round()[None] / 255
+    levels = (drawn * 255).round().to(torch.uint8)
+    return levels.permute(0, 2, 3, 1).contiguous().permute(0, 3, 1, 2)[None]

@@ -74,6 +74,10 @@ class LensModel:
         """[3, 3], from camera axes (x right, y down, z ahead) to homogeneous pixels of the undistorted picture."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
+    def fits(self, width: int, height: int) -> bool:
+        """Whether it is known where the lens is in pictures of that size: they must be of the same shape."""
+        return min(width, height) > 0 and abs(width / self.width * self.height / height - 1) <= _SHAPE_TOLERANCE
+
     def resized(self, width: int, height: int) -> "LensModel":
         """The same lens for the same picture at another size.
 
@@ -84,12 +88,12 @@ class LensModel:
             raise ConfigError(
                 f"a calibration cannot be for {width} x {height} pictures: are its binning numbers right?"
             )
-        across, along = width / self.width, height / self.height
-        if abs(across / along - 1) > _SHAPE_TOLERANCE:
+        if not self.fits(width, height):
             raise ConfigError(
                 f"the calibration is for {self.width} x {self.height} pictures, the source gives {width} x {height}, "
                 "which is another shape; calibrate at the size you run"
             )
+        across, along = width / self.width, height / self.height
         return LensModel(
             width=width,
             height=height,

@@ -25,6 +25,7 @@ class Fit:
     """How pictures of any size become `width` x `height`: the largest centred crop of that shape, resized.
 
     resize: the name published as `src.resize`.
+    share: how much of the picture's width may be used; less than 1 narrows the field of view.
     allow_upscale: enlarge pictures that are too small instead of refusing them.
     Source: Generative Camera Dolly, loading of custom videos, as released; wire protocol, section 7, F7.
     """
@@ -32,9 +33,12 @@ class Fit:
     width: int
     height: int
     resize: Resize = "released"
+    share: float = 1.0
     allow_upscale: bool = False
 
     def __post_init__(self) -> None:
+        if not 0 < self.share <= 1:
+            raise ConfigError(f"the share of a picture that is used must lie above 0 and up to 1, got {self.share:g}")
         if self.width < 1 or self.height < 1:
             raise ConfigError(f"frames must be fitted to at least 1 x 1 pixels, got {self.width} x {self.height}")
 
@@ -44,8 +48,9 @@ class Fit:
         Raises:
             ConfigError: it would have to be enlarged, and `allow_upscale` is not set.
         """
+        beside = round(width * (1 - self.share) / 2)
         try:
-            left, top, wide, high = center_crop_box(width, height, self.width / self.height)
+            left, top, wide, high = center_crop_box(max(1, width - 2 * beside), height, self.width / self.height)
         except ShapeError as error:
             raise ConfigError(str(error)) from error
         if not self.allow_upscale and (wide < self.width or high < self.height):
@@ -53,7 +58,7 @@ class Fit:
                 f"a {width} x {height} picture (cropped to {wide} x {high}) is smaller than the {self.width} x "
                 f"{self.height} the model takes; use a larger one or set allow_upscale"
             )
-        return left, top, wide, high
+        return left + beside, top, wide, high
 
     def image(self, image: Image) -> Image:
         """Crop and resize one picture: u8 [H, W, 3] to [height, width, 3]. Raises ConfigError as `crop_box`."""
@@ -81,6 +86,11 @@ def to_clip_tensor(images: Image) -> NDArray[np.float32]:
     count, height, width, _ = images.shape
     clip = np.empty((count, 3, height, width), np.float32)
     for image, planes in zip(images, clip, strict=True):
-        for levels, plane in zip(cv2.split(image), planes, strict=True):
-            cv2.LUT(levels, _LEVELS, plane)
+        write_planes(image, planes)
     return clip
+
+
+def write_planes(image: Image, planes: NDArray[np.float32]) -> None:
+    """One picture, u8 [H, W, 3] in 0..255, into float32 [3, H, W] in [-1, 1], contiguous."""
+    for levels, plane in zip(cv2.split(image), planes, strict=True):
+        cv2.LUT(levels, _LEVELS, plane)

@@ -40,12 +40,20 @@ def comparison(moments: Sequence[Moment], classes: Sequence[ClassRecord], headin
     rows = [side_by_side(*_enlarged(moment)) for moment in moments]
     width = rows[0].shape[1]
     line = np.full((4, width, 3), _PAPER, np.uint8)
-    parts = [_heading_line(headings, width)]
+    parts = [heading_line(headings, width)]
     for row in rows:
         parts += [row, line]
     if classes:
         parts.append(legend(classes, width))
     return np.concatenate(parts, axis=0)
+
+
+def heading_line(headings: Sequence[str], width: int) -> Image:
+    """One line of `width` pixels with a heading above each of as many equal columns: [22, width, 3]."""
+    picture = _paper(_LINE, width)
+    for index, heading in enumerate(headings):
+        _write(picture, heading, _GAP + index * width // len(headings), 0)
+    return picture
 
 
 def legend(classes: Sequence[ClassRecord], width: int) -> Image:
@@ -68,13 +76,6 @@ def _enlarged(moment: Moment) -> list[Image]:
         np.asarray(cv2.resize(picture, size, interpolation=how), np.uint8)
         for picture, how in zip(moment.columns, hows, strict=False)
     ]
-
-
-def _heading_line(headings: Sequence[str], width: int) -> Image:
-    picture = _paper(_LINE, width)
-    for index, heading in enumerate(headings):
-        _write(picture, heading, _GAP + index * width // len(headings), 0)
-    return picture
 
 
 def _places(widths: Sequence[int], available: int) -> list[tuple[int, int]]:

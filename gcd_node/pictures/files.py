@@ -12,9 +12,13 @@ from gcd_node.errors import OutputError
 
 Image = NDArray[np.uint8]
 
+_ANIMATION_QUALITY = 60  # WebP's scale of 100
 
-def to_u8(video: NDArray[np.float32]) -> Image:
-    """[T, 3, H, W] in [0, 1] -> u8 [T, H, W, 3], rounded to the nearest level."""
+
+def to_u8(video: NDArray[np.float32] | NDArray[np.uint8]) -> Image:
+    """[T, 3, H, W] in [0, 1], or in levels already -> u8 [T, H, W, 3], rounded to the nearest level."""
+    if video.dtype == np.uint8:
+        return np.ascontiguousarray(video.transpose(0, 2, 3, 1), np.uint8)
     frames, _, height, width = video.shape
     pixels = np.empty((frames, height, width, 3), np.uint8)
     for picture, frame in zip(pixels, np.ascontiguousarray(video), strict=True):
@@ -57,6 +61,16 @@ def write_video(path: Path, frames: Sequence[Image], fps: float) -> None:
     writer.release()
 
 
+def write_animation(path: Path, frames: Sequence[Image], fps: float) -> None:
+    """Write a moving picture that plays for ever where pictures are shown (.webp), lossy. Raises OutputError."""
+    make_folder(path.parent)
+    animation = cv2.Animation()
+    animation.frames = [cv2.cvtColor(frame, cv2.COLOR_RGB2BGR) for frame in frames]
+    animation.durations = [round(1000 / max(fps, 1.0))] * len(frames)
+    if not cv2.imwriteanimation(str(path), animation, [cv2.IMWRITE_WEBP_QUALITY, _ANIMATION_QUALITY]):
+        raise OutputError(f"cannot write {path}; is there space, and may this user write there?")
+
+
 def side_by_side(*columns: Image) -> Image:
     """Pictures of one height next to each other, a thin white line between."""
     height = columns[0].shape[0]
@@ -75,6 +89,12 @@ def strip(rows: Sequence[Sequence[Image]]) -> Image:
     for row in joined:
         parts += [line, row]
     return np.concatenate(parts[1:], axis=0)
+
+
+def scaled(image: Image, width: int) -> Image:
+    """A smaller copy, of that width and the same shape."""
+    size = (width, round(image.shape[0] * width / image.shape[1]))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
 
 
 def spread(count: int, wanted: int) -> list[int]:

@@ -3,7 +3,7 @@
 import heapq
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 
 from gcd_node.envelope import ViewMessage
@@ -38,6 +38,13 @@ class FramePacer:
         if self._thread is None:
             self._thread = threading.Thread(target=self._serve, name="frame pacer", daemon=True)
             self._thread.start()
+
+    def forget(self, topics: Collection[str]) -> None:
+        """Let go of messages of these topics that are not yet due."""
+        with self._changed:
+            self._waiting = [each for each in self._waiting if each[2].topic not in topics]
+            heapq.heapify(self._waiting)
+            self._changed.notify()
 
     def finish(self, *, abandon: bool = False) -> None:
         """Wait until all messages have left, or forget those that wait. Raises what a send failed with."""

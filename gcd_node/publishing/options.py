@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from gcd_node.publishing.subscriptions import NOBODY, Readers
 from gcd_node.security.gate import ServerSecurity
 
 
@@ -32,10 +33,11 @@ class PublisherOptions:
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PublisherStats:
     """sent, bytes: handed to ZeroMQ on the data socket. dropped: refused because the queue was full.
-    subscribers: subscriptions on the data socket now. What ZeroMQ drops for a slow reader shows in no counter here:
-    that reader sees a gap in the sequence."""
+    subscribers: subscriptions on the data socket now; readers: the same by what they get. What ZeroMQ drops for a slow
+    reader shows in no counter here: that reader sees a gap in the sequence."""
 
     sent: int
     dropped: int
     subscribers: int
     bytes: int
+    readers: Readers = NOBODY

@@ -13,7 +13,8 @@ class IdleRule:
         self._watched_s = clock()
 
     def rests(self, subscribers: int) -> bool:
-        """Whether nobody has watched for `idle_s`. subscribers: now."""
+        """Whether nobody has watched for `idle_s`. subscribers: of views, now; who
+        looks at the input alone keeps nobody busy."""
         now_s = self._clock()
         if subscribers > 0:
             self._watched_s = now_s

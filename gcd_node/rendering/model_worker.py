@@ -16,16 +16,16 @@ from gcd_node.health.announcer import Announcer
 from gcd_node.health.monitor import IDLE, Health
 from gcd_node.health.report import Level
 from gcd_node.life.live_config import LiveConfig, Settings
-from gcd_node.optics.preprocess import to_clip_tensor
 from gcd_node.publishing.dispatcher import Dispatcher
 from gcd_node.publishing.outbox import Outbox
 from gcd_node.rendering.degrade import WHOLE, Rung, rungs
+from gcd_node.rendering.endings import Endings
 from gcd_node.rendering.idle import IdleRule
 from gcd_node.rendering.model_slot import ModelSlot
 from gcd_node.rendering.setbacks import Setbacks
 from gcd_node.rendering.virtual_view import VirtualView, VirtualViews
 from gcd_node.window import FrameWindow
-from gcd_node.wire.view_message import Rendered, Run, end_messages, messages, newest_ns, utc_offset_ns
+from gcd_node.wire.view_message import Rendered, Run, messages, newest_ns, utc_offset_ns
 
 _LOG = logging.getLogger(__name__)
 _KEPT = 1000  # a node runs for weeks
@@ -84,6 +84,7 @@ class ModelWorker:
         config = parts.live.config
         self._realtime = config.source.pace == "realtime"
         self._dispatcher = Dispatcher(parts.outbox, paced=self._realtime)
+        self._endings = Endings(parts.live, self._dispatcher, lambda: run_of(-1))
         self._views = VirtualViews(parts.model.traits)
         self._idle = IdleRule(config.life.idle_s if self._realtime else 0.0)
         self._setbacks = Setbacks(parts.health, parts.announcer)
@@ -113,19 +114,23 @@ class ModelWorker:
             self._ready()
             self.warm.set()
             while (window := newest.take()) is not None:
-                self._announce_removed()
+                self._endings.announce_due(self.counts.last_window_id)
                 if not self._rests():
                     self._beat()
                     self._parts.health.stage("window", (time.monotonic_ns() - window.arrival_ns) / 1e9)
                     self._render_or_count(self._job(window))
                 self._ready()
-            self._announce_removed()
+            self._endings.announce_due(self.counts.last_window_id)
         except Cancelled:
             _LOG.info("the window in work was abandoned")
         finally:
             self._beat_s = None
             self.warm.set()
             self._dispatcher.finish(abandon=self._cancel.is_set())
+
+    def announce_end(self, *, delay_ms: int | None) -> None:
+        """Send the end of every view. After `work`. delay_ms: see Outbox."""
+        self._endings.announce_all(self.counts.last_window_id, delay_ms=delay_ms)
 
     def _beat(self) -> None:
         self._beat_s = time.monotonic()
@@ -141,7 +146,7 @@ class ModelWorker:
 
     def _rests(self) -> bool:
         """Whether nobody would see this window."""
-        rests = self._idle.rests(self._parts.outbox.stats.subscribers)
+        rests = self._idle.rests(self._parts.outbox.stats.readers.watchers)
         if rests:
             self._parts.health.raise_reason(IDLE, Level.OK)
         else:
@@ -155,11 +160,6 @@ class ModelWorker:
         run = replace(known, config=settings.config, traits=self._parts.model.traits)
         views = self._views.following(settings, run.mount)
         return _Job(window=window, settings=settings, run=run, views=views[:1] if self._rung.single else views)
-
-    def _announce_removed(self) -> None:
-        for view_id, rev in self._parts.live.take_removed():
-            for message in end_messages(self._run_of(-1), view_id, rev, self.counts.last_window_id):
-                self._parts.outbox.end(message, delay_ms=0)
 
     def _warm_up(self) -> None:
         """Render a grey clip in one step, so that the first window does not pay for what happens only once."""
@@ -189,24 +189,29 @@ class ModelWorker:
 
     def _render_or_count(self, job: _Job) -> None:
         """One retry, with another seed or with less asked; a window that fails again is counted and not published."""
-        failure: Exception | None = None
+        failure: NonFiniteError | DeviceMemoryError | None = None
         seeds = [window_seed(job.run.config.digest, job.window.window_id, attempt) for attempt in (0, 1)]
         for seed in seeds:
-            try:
-                self._publish(job, seed)
-            except NonFiniteError as error:
-                failure = error
-                _LOG.warning("window %d: %s", job.window.window_id, error)
-            except DeviceMemoryError as error:
-                failure = error
-                self._give_up_more(job, error)
-                job = self._job(job.window)
-            else:
+            failure = self._attempt(job, seed)
+            if failure is None:
                 self._setbacks.none()
                 return
+            if isinstance(failure, NonFiniteError):
+                _LOG.warning("window %d: %s", job.window.window_id, failure)
+            else:
+                self._give_up_more(job, failure)
+                job = self._job(job.window)
         self._parts.health.drop("model")
         if isinstance(failure, NonFiniteError):
             self._count_nan(job, seeds)
+
+    def _attempt(self, job: _Job, seed: int) -> NonFiniteError | DeviceMemoryError | None:
+        """What it failed with; without its traceback, which would keep the model and all its work in memory."""
+        try:
+            self._publish(job, seed)
+        except (NonFiniteError, DeviceMemoryError) as error:
+            return error.with_traceback(None)
+        return None
 
     def _give_up_more(self, job: _Job, error: DeviceMemoryError) -> None:
         """Step down the ladder, which is laid by what is asked when it is first needed."""
@@ -214,6 +219,8 @@ class ModelWorker:
         way = rungs(views=len(job.views), samples=samples, steps=self._asked_steps(job), can_halve=model.can_halve)
         self._setbacks.out_of_memory(job.window.window_id, error, way)
         if self._rung.half and model.can_halve:
+            self._beat_s = None  # loading takes as long as it takes
+            self._parts.health.model("loading")
             model.halve()
 
     def _count_nan(self, job: _Job, seeds: list[int]) -> None:
@@ -236,6 +243,8 @@ class ModelWorker:
         started_ns = time.monotonic_ns()
         steps = max(1, self._asked_steps(job) // self._rung.steps_divisor)
         drawn = self._draw(job, seed, steps if self._rung.steps_divisor > 1 else job.run.config.model.steps)
+        if self._cancel.is_set():  # a model that hears no cancel: nothing may follow the end
+            raise Cancelled("the node was told to stop")
         ended_ns, offset_ns = time.monotonic_ns(), utc_offset_ns()
         for virtual, view in zip(job.views, drawn, strict=True):
             rendered = Rendered(
@@ -258,8 +267,7 @@ class ModelWorker:
     def _draw(self, job: _Job, seed: int, steps: int | None) -> list[View]:
         synthesizer, health = self._parts.model.synthesizer, self._parts.health
         started_s = time.monotonic()
-        video = torch.from_numpy(to_clip_tensor(job.window.images))
-        clip = Clip(video=video, fps=job.window.fps, mount=job.run.mount)
+        clip = Clip(video=torch.from_numpy(job.window.clip), fps=job.window.fps, mount=job.run.mount)
         features = synthesizer.encode(clip, Augmentation(strength=job.run.config.model.cond_aug, seed=seed))
         encoded_s = time.monotonic()
         health.stage("encode", encoded_s - started_s)

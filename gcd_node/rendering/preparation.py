@@ -1,6 +1,8 @@
 """What can be said of a run before its first frame: frame rate, cameras, and what lies outside the trained domain."""
 
 import logging
+import math
+from dataclasses import replace
 from pathlib import Path
 
 from gcd_model import CameraMount, Intrinsics, OptionError, Traits
@@ -20,9 +22,11 @@ _HFOV_TOLERANCE_DEG = 2.0
 _WORDS = {"fps": "frame rate", "hfov": "field of view", "view": "camera mount"}
 
 
-def prepare_run(config: NodeConfig, traits: Traits, source: SourceInfo) -> tuple[Run, float]:
+def prepare_run(config: NodeConfig, traits: Traits, source: SourceInfo, *, changed: bool = False) -> tuple[Run, float]:
     """Everything that can be said before the first frame, and the frame rate windows will have.
 
+    Args:
+        changed: see fit_of(); a calibration that is left out flags the field of view, which nobody knows then.
     Raises:
         ConfigError: a frame rate the source cannot give; a source pose in words the model does not know; pictures the
             model cannot be given, see fit_of(); in strict mode, a rate, field of view or mount the model was not
@@ -34,11 +38,12 @@ def prepare_run(config: NodeConfig, traits: Traits, source: SourceInfo) -> tuple
     elif fps > source.fps_nominal * (1 + RATE_TOLERANCE):
         raise ConfigError(f"[window] fps {fps:g} is more than the {source.fps_nominal:g} the source gives; lower it")
     elif traits.rates:
-        foreign_rate = fps not in traits.rates
-    fit = fit_of(config, traits, source)
+        foreign_rate = not any(abs(fps / rate - 1) <= RATE_TOLERANCE for rate in traits.rates)
+    fit = fit_of(config, traits, source, changed=changed)
     camera = _source_camera(config, source, fit)
     mount = _mount(config, traits, camera)
-    foreign = {"fps": foreign_rate, "hfov": _is_foreign_field(camera, traits), "view": is_foreign(mount, traits)}
+    foreign_field = _is_foreign_field(camera, traits) or (isinstance(fit, Fit) and _is_calibrated(config, source))
+    foreign = {"fps": foreign_rate, "hfov": foreign_field, "view": is_foreign(mount, traits)}
     ood = tuple(name for name, is_so in foreign.items() if is_so)
     _refuse_or_warn(ood, strict=config.strict, fps=fps, model=traits.name)
     run = Run(
@@ -103,33 +108,64 @@ def _trained_hfov_deg(traits: Traits) -> float | None:
     return None if traits.family is None else traits.family.hfov_deg
 
 
-def fit_of(config: NodeConfig, traits: Traits, source: SourceInfo) -> Fit | Rectifier:
+def fit_of(config: NodeConfig, traits: Traits, source: SourceInfo, *, changed: bool = False) -> Fit | Rectifier:
     """How the source's pictures become the model's: undistorted and cut to its field of view if there is a
-    calibration, else cropped to its shape.
+    calibration, else cropped to its shape, and to its field of view if the source's is known and wider.
 
+    Args:
+        changed: the pictures have changed their size in mid-stream: a calibration for another shape, which cannot tell
+            what the camera keeps of it now, is left out instead of refused.
     Raises:
         ConfigError: they are too small, the calibration is unusable or for other pictures, or it contradicts hfov_deg.
     """
-    width, height = traits.config.width, traits.config.height
-    lens = _lens(config, source)
-    if lens is not None:
-        return Rectifier(
-            lens.resized(source.width, source.height),
-            width=width,
-            height=height,
-            hfov_deg=_trained_hfov_deg(traits),
-            allow_upscale=config.source.allow_upscale,
-        )
-    fit = Fit(width=width, height=height, resize=config.source.resize, allow_upscale=config.source.allow_upscale)
-    fit.crop_box(source.width, source.height)
-    return fit
+    lens = lens_in_use(config, source)
+    if lens is None or (changed and not lens.fits(source.width, source.height)):
+        return _crop(config, traits, source)
+    return Rectifier(
+        lens.resized(source.width, source.height),
+        width=traits.config.width,
+        height=traits.config.height,
+        hfov_deg=_trained_hfov_deg(traits),
+        allow_upscale=config.source.allow_upscale,
+    )
 
 
-def _lens(config: NodeConfig, source: SourceInfo) -> LensModel | None:
-    """The stated calibration, else what the source itself knows, unless a stated hfov_deg overrides that."""
+def _crop(config: NodeConfig, traits: Traits, source: SourceInfo) -> Fit:
+    """Cut to the trained field of view, unless too few pixels would be left of it. Raises ConfigError."""
+    whole = Fit(
+        width=traits.config.width,
+        height=traits.config.height,
+        resize=config.source.resize,
+        allow_upscale=config.source.allow_upscale,
+    )
+    whole.crop_box(source.width, source.height)
+    stated, trained = config.source.hfov_deg or source.hfov_deg, _trained_hfov_deg(traits)
+    if stated is None or trained is None or stated <= trained:
+        return whole
+    narrowed = replace(whole, share=math.tan(math.radians(trained / 2)) / math.tan(math.radians(stated / 2)))
+    try:
+        narrowed.crop_box(source.width, source.height)
+    except ConfigError as error:
+        _LOG.info("the source sees %g degrees, the model %g, and is not cut to that: %s", stated, trained, error)
+        return whole
+    return narrowed
+
+
+def lens_in_use(config: NodeConfig, source: SourceInfo) -> LensModel | None:
+    """The stated calibration, else what the source itself knows, unless a stated hfov_deg overrides that; None without
+    one. It may be for pictures of another size.
+
+    Raises:
+        ConfigError: it is stated twice, or its file is missing or damaged.
+    """
     stated = config.source
     if stated.calibration is None:
         return source.lens if stated.hfov_deg is None else None
     if stated.hfov_deg is not None:
         raise ConfigError("[source] calibration and hfov_deg say the same thing twice; leave one of them out")
     return load_lens(Path(stated.calibration).expanduser())
+
+
+def _is_calibrated(config: NodeConfig, source: SourceInfo) -> bool:
+    """Whether `lens_in_use` finds one."""
+    return config.source.calibration is not None or (source.lens is not None and config.source.hfov_deg is None)

@@ -34,6 +34,7 @@ class VirtualView:
         )
         self._orbit = _orbit(wanted)
         self._newest: tuple[int, int] | None = None  # epoch and stamp of the last window
+        self._planned: tuple[SphericalDelta, Trajectory] | None = None  # most views stand still
         self._check_reach()
         if config.model.motion_bucket is None:
             traits.motion_bucket(self.planned())
@@ -51,7 +52,10 @@ class VirtualView:
 
     def planned(self) -> Trajectory:
         """The path to where the view is now; an orbit does not move on."""
-        return self._plan(self._destination(self._orbit))
+        goal = self._destination(self._orbit)
+        if self._planned is None or self._planned[0] != goal:
+            self._planned = (goal, self._plan(goal))
+        return self._planned[1]
 
     def _destination(self, orbit: Orbit | None) -> SphericalDelta:
         return self._goal if orbit is None else replace(self._goal, azimuth_deg=orbit.azimuth_deg)

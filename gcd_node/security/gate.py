@@ -6,9 +6,6 @@ Standard library and pyzmq only, Python 3.10 syntax: planners import this.
 """
 
 import logging
-import os
-import socket as stream
-import stat
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -21,6 +18,7 @@ from zmq.utils import z85
 from zmq.utils.monitor import parse_monitor_message
 
 from gcd_node.errors import AuthError, ConfigError, EndpointError
+from gcd_node.security.connections import Connections
 from gcd_node.security.keys import Client, ClientKeys, KeyPair, fingerprint
 from gcd_node.wire.endpoints import Channel, check_bindable, free_ipc_path, is_ipv6
 
@@ -37,19 +35,18 @@ _TICK_MS = 100
 _FAILED = zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 _HEARD = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED | _FAILED
 _REFUSED = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
-_MOST_CONNECTIONS = 256
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ServerSecurity:
-    """A node's own keys, and its clients by their public keys (Z85)."""
+    """A node's own keys, and its clients by their public keys (Z85).
+
+    refresh: asked often, gives the clients as they are now; None if they never change.
+    """
 
     keys: KeyPair
     clients: Mapping[str, Client]
-
-    def named(self, name: str) -> Client | None:
-        """The client of this name."""
-        return next((each for each in self.clients.values() if each.name == name), None)
+    refresh: Callable[[], Mapping[str, Client]] | None = field(default=None, compare=False)
 
 
 def new_key_pair() -> KeyPair:
@@ -106,12 +103,14 @@ class HandshakeWatch:
 class Gate:
     """In front of the bound sockets of one context. Bind through it, then `start`; `close` it after the sockets.
 
-    Until started, who connects to a secured socket waits. on_event gets AUTH_DENIED and TOO_LARGE; rare by themselves
-    or limited here, so that a hostile client cannot flood with them.
+    Until started, who connects to a secured socket waits. When a client is taken off the list, or may do less, all
+    connections are cut: who is still on it connects again within a second. on_event gets AUTH_DENIED, AUTH_UNCUT and
+    TOO_LARGE; rare by themselves or limited here, so that a hostile client cannot flood with them.
     """
 
     def __init__(self, context: Context, security: ServerSecurity | None, on_event: EventSink | None) -> None:
         self._security = security
+        self._clients: Mapping[str, Client] = {} if security is None else security.clients
         self._denials = _Denials(on_event or _unheard)
         self._on_event = on_event or _unheard
         self._monitors: dict[Socket, _Monitored] = {}
@@ -124,7 +123,7 @@ class Gate:
             self._zap.bind(_ZAP_ENDPOINT)
 
     def bind(self, socket: Socket, endpoint: str, channel: Channel) -> str:
-        """Bind a socket: tcp with keys if there are any, ipc guarded by its folder.
+        """Bind a socket: tcp with keys if there are any, ipc for this user, and for his group if the umask lets it.
 
         Returns:
             The endpoint, with the port that was chosen if 0 was asked for.
@@ -137,19 +136,26 @@ class Gate:
             free_ipc_path(Path(endpoint.removeprefix("ipc://")))
         if secured:
             self._secure(socket, channel)
+        monitored: _Monitored | None = None
         if secured or channel == "control":
-            self._monitors[socket.get_monitor_socket(_HEARD)] = _Monitored(channel=channel, secured=secured)
+            monitored = self._monitors[socket.get_monitor_socket(_HEARD)] = _Monitored(channel=channel, secured=secured)
         socket.set(zmq.IPV6, int(is_ipv6(endpoint)))
         try:
             socket.bind(endpoint)
         except zmq.ZMQError as error:
             message = f"cannot bind {endpoint}: {error.strerror}; stop who uses it or choose another"
             raise EndpointError(message) from error
-        return socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        bound = socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        if bound.startswith("ipc://"):
+            path = Path(bound.removeprefix("ipc://"))
+            path.chmod(path.stat().st_mode & 0o770)  # whatever folder and umask say: not for everybody
+        if secured and monitored is not None:
+            monitored.port = int(bound.rpartition(":")[2])
+        return bound
 
     def client(self, user: str) -> Client | None:
-        """Who a message's ZeroMQ user id belongs to; None if nobody was asked to name himself."""
-        return None if self._security is None else self._security.named(user)
+        """Who a message's ZeroMQ user id, his key, belongs to; None if he is not, or no longer, on the list."""
+        return self._clients.get(user)
 
     def start(self) -> None:
         """Begin to let clients in."""
@@ -180,6 +186,7 @@ class Gate:
             while not self._closing.is_set():
                 for ready, _ in poller.poll(_TICK_MS):
                     self._hear(ready, poller)
+                self._look_at_list()
         finally:
             for each, monitored in self._monitors.items():
                 monitored.connections.forget()
@@ -202,14 +209,31 @@ class Gate:
         """Answer one ZAP request: version, id, domain, address, identity, mechanism, key."""
         request = zap.recv_multipart()
         known = self._known(request)
-        verdict = (b"400", b"not allowed", b"", b"") if known is None else (b"200", b"OK", known.name.encode(), b"")
+        user = (_key_of(request) or "").encode()
+        verdict = (b"400", b"not allowed", b"", b"") if known is None else (b"200", b"OK", user, b"")
         zap.send_multipart((b"1.0", request[1] if len(request) > 1 else b"", *verdict))
         if known is None:
             self._denials.tell(_key_of(request), _text(request, 2), _text(request, 3))
 
     def _known(self, request: list[bytes]) -> Client | None:
         key = _key_of(request)
-        return None if self._security is None or key is None else self._security.clients.get(key)
+        return None if key is None else self._clients.get(key)
+
+    def _look_at_list(self) -> None:
+        """Follow the list of clients; nobody who was let in by an older one stays connected to more than he may."""
+        if self._security is None or self._security.refresh is None:
+            return
+        before, now = self._clients, self._security.refresh()
+        if now is before:
+            return
+        self._clients = now
+        if all(now.get(key) == client for key, client in before.items()):
+            return
+        left = sum(each.connections.cut_all(each.port) for each in self._monitors.values() if each.secured)
+        if left:
+            message = f"{left} connections could not be cut after a change of the list of clients; restart the node"
+            _LOG.error("AUTH_UNCUT: %s", message)
+            self._on_event("AUTH_UNCUT", {"level": 2, "message": message})
 
     def _notice(self, monitor: Socket, monitored: "_Monitored") -> bool:
         """One event of a bound socket; False once the socket is closed."""
@@ -227,66 +251,14 @@ class Gate:
         return event != zmq.EVENT_MONITOR_STOPPED
 
 
-class _Connections:
-    """Tells a client that was dropped from one that left; the monitor's events are the same for both.
-
-    A second handle on each connection stays when ZeroMQ closes its own: where the other end is still there, or has
-    sent what nobody read, it was not the client who hung up. After a handshake, ZeroMQ hangs up on oversize alone.
-    A failed handshake names no connection, but the next one to end is always its own.
-    """
-
-    def __init__(self) -> None:
-        self._kept: dict[int, stream.socket] = {}
-        self._failed = False
-
-    def accepted(self, handle: int) -> None:
-        """Keep a second handle; a connection already gone, or too many of them, and it goes unnoticed."""
-        self._forget(handle)
-        if len(self._kept) >= _MOST_CONNECTIONS:
-            return
-        try:
-            if stat.S_ISSOCK(os.fstat(handle).st_mode):
-                self._kept[handle] = stream.socket(fileno=os.dup(handle))
-        except OSError as error:
-            _LOG.debug("a connection was gone before it could be looked at: %s", error)
-
-    def failed(self) -> None:
-        """A handshake came to nothing."""
-        self._failed = True
-
-    def cut_off(self, handle: int) -> bool:
-        """Whether this end hung up on a client it had welcomed; lets go of the connection."""
-        welcomed, self._failed = not self._failed, False
-        kept = self._kept.get(handle)
-        if kept is None:
-            return False
-        try:
-            return kept.recv(1, stream.MSG_PEEK | stream.MSG_DONTWAIT) != b"" and welcomed
-        except BlockingIOError:
-            return welcomed
-        except OSError:
-            return False  # the other end died
-        finally:
-            self._forget(handle)
-
-    def forget(self) -> None:
-        """Let go of all."""
-        for handle in tuple(self._kept):
-            self._forget(handle)
-
-    def _forget(self, handle: int) -> None:
-        kept = self._kept.pop(handle, None)
-        if kept is not None:
-            kept.close()
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(kw_only=True, slots=True)
 class _Monitored:
-    """A bound socket that is listened to."""
+    """A bound socket that is listened to. port: of tcp with keys."""
 
     channel: Channel
     secured: bool
-    connections: _Connections = field(default_factory=_Connections)
+    port: int = 0
+    connections: Connections = field(default_factory=Connections)
 
 
 class _Denials:

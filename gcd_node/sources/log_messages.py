@@ -1,7 +1,7 @@
 """Pictures and calibrations in the messages of robot logs: ROS 2 (CDR) and Foxglove (protobuf).
 
-Only the few fields needed are read, at the places their definitions fix. So no definition out of the log is ever
-executed, and neither ROS nor protobuf is needed.
+Only the few fields needed are read, at the places their definitions fix. So no definition out of a log is ever
+followed (mcap_container.py says why that matters), and neither ROS nor protobuf is needed.
 """
 
 import struct

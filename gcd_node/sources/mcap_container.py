@@ -1,8 +1,15 @@
 """The MCAP container: messages of a log, in the order they were written, to the last whole one.
 
-Logs come from robots that lost power, and from strangers. So this reads front to back without the index at the end,
-takes what is whole of a chunk that was cut, and unfolds no chunk beyond a limit; the reference library does none of
-these. It needs that library's two decompressors, zstandard and lz4, and these only for chunks that use them.
+Logs come from robots that lost power, and from strangers. The reference library (`mcap` 1.6 and `mcap-ros2-support`
+0.6 were tried) is not made for either, which is why containers, CDR and protobuf are read by code of our own:
+
+- of a chunk that was cut it gives nothing; with one chunk a log, that is the whole log. Here its whole messages count.
+- it unfolds a chunk without a bound: 9 kB that state 1000 bytes became 285 MB. Here a chunk has what it states.
+- its ROS 2 messages are decoded as definitions in the log say, whatever these ask for. Here nothing of a log decides
+  what is done with it (log_messages.py).
+
+The tests compare with what the reference writers wrote, and with what the reference readers read of it. Needed are
+that library's two decompressors, zstandard and lz4, and these only for chunks that use them.
 
 Source: the MCAP format specification, version 0 of the magic.
 """
@@ -11,7 +18,7 @@ import logging
 import os
 import struct
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from io import BufferedReader
 from pathlib import Path
@@ -25,7 +32,8 @@ MAGIC = b"\x89MCAP0\r\n"
 MAX_BYTES = 256 * 2**20
 """Larger records, and chunks that unfold to more, are refused."""
 
-_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END, _FOOTER = 3, 4, 5, 6, 15, 2
+_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA, _DATA_END, _FOOTER = 3, 4, 5, 6, 12, 15, 2
+_MOST_METADATA = 64
 _LAST_KNOWN, _FIRST_PRIVATE = 15, 128
 _HEAD = struct.Struct("<BQ")
 _PIECE = 2**20
@@ -60,6 +68,7 @@ class McapContainer:
         self._path = path
         self._schemas: dict[int, str] = {0: ""}
         self._channels: dict[int, LogChannel] = {}
+        self._metadata: dict[str, dict[str, str]] = {}
         self._whole = False
         self._damaged = 0
 
@@ -77,6 +86,11 @@ class McapContainer:
     def channels(self) -> Collection[LogChannel]:
         """Those met so far."""
         return self._channels.values()
+
+    @property
+    def metadata(self) -> Mapping[str, Mapping[str, str]]:
+        """What the log has said of itself so far, by name; of several of one name the latest."""
+        return self._metadata
 
     def messages(self) -> Iterator[LogMessage]:
         """Every message. Raises SourceError: the file cannot be read, or a decompressor is not installed."""
@@ -97,7 +111,7 @@ class McapContainer:
             if kind == 0 or _LAST_KNOWN < kind < _FIRST_PRIVATE or (length > left and kind != _CHUNK):
                 return
             length, cut = min(length, left), length > left
-            if kind not in (_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK) or length > MAX_BYTES:
+            if kind not in (_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA) or length > MAX_BYTES:
                 self._damaged += length > MAX_BYTES and kind in (_MESSAGE, _CHUNK)
                 file.seek(length, os.SEEK_CUR)
                 continue
@@ -133,6 +147,8 @@ class McapContainer:
                 self._schemas[number] = cursor.text()
             elif kind == _CHANNEL:
                 self._add_channel(cursor)
+            elif kind == _METADATA:
+                self._add_metadata(cursor)
             elif kind == _MESSAGE:
                 yield from self._message(cursor)
         except SourceError as error:
@@ -142,6 +158,15 @@ class McapContainer:
         number, schema = cursor.integer("H"), cursor.integer("H")
         topic, encoding = cursor.text(), cursor.text()
         self._channels[number] = LogChannel(topic=topic, encoding=encoding, schema=self._schemas.get(schema, ""))
+
+    def _add_metadata(self, cursor: ByteCursor) -> None:
+        name, pairs = cursor.text(), ByteCursor(cursor.blob(cursor.integer("I")))
+        found: dict[str, str] = {}
+        while pairs.left:
+            key = pairs.text()
+            found[key] = pairs.text()
+        if name in self._metadata or len(self._metadata) < _MOST_METADATA:
+            self._metadata[name] = found
 
     def _message(self, cursor: ByteCursor) -> Iterator[LogMessage]:
         channel = self._channels.get(cursor.integer("H"))

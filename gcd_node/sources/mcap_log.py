@@ -10,6 +10,7 @@ from gcd_node.sources.log_messages import PICTURES, read_picture_message
 from gcd_node.sources.log_pictures import to_rgb
 from gcd_node.sources.mcap_container import LogChannel, LogMessage, McapContainer
 from gcd_node.sources.mcap_survey import survey
+from gcd_node.sources.own_recording import log_files
 from gcd_node.sources.pace import Pace, Pacer
 
 _LOG = logging.getLogger(__name__)
@@ -28,20 +29,23 @@ class McapLog:
         """Find the pictures and decode the first.
 
         Args:
-            path: a .mcap file; an unfinished one plays to its last whole message.
-            topic: where the pictures are; may be left out if just one topic has some.
+            path: a .mcap file, or the folder of a recording that this node made; an unfinished file plays to its last
+                whole message.
+            topic: where the pictures are; may be left out if just one topic has some, or in this node's recordings,
+                whose input it is.
             pace: "realtime" yields every frame at its time (holes over 10 s are skipped), "lockstep" as soon as it is
                 asked for.
             loop: begin again at the end; stamps and sequence numbers keep rising.
         Raises:
-            SourceError: see survey().
+            SourceError: see log_files() and survey().
         """
         self._path = path.resolve()
         self._pacer = Pacer(pace)
         self._loop = loop
         self._corrupt = 0
-        self._survey = survey(self._path, topic)
-        self._container = McapContainer(self._path)
+        self._files = log_files(self._path)
+        self._survey = survey(self._path, self._files, topic)
+        self._container = McapContainer(self._files[0])
 
     @property
     def info(self) -> SourceInfo:
@@ -93,9 +97,13 @@ class McapLog:
             begin_seq = newest.seq + 1 - first.seq
 
     def _one_pass(self) -> Iterator[Frame]:
-        self._corrupt += self._container.damaged
-        container = self._container = McapContainer(self._path)
         numbers = _Numbers()
+        for file in self._files:
+            yield from self._one_file(file, numbers)
+
+    def _one_file(self, file: Path, numbers: "_Numbers") -> Iterator[Frame]:
+        self._corrupt += self._container.damaged
+        container = self._container = McapContainer(file)
         for message in container.messages():
             if self._pacer.stopped:
                 return
@@ -103,7 +111,7 @@ class McapLog:
                 image, stamp_ns = read
                 yield Frame(image=image, stamp_ns=stamp_ns, seq=numbers.next(message.sequence))
         if not container.whole:
-            _LOG.warning("%s was not finished, or is damaged: it was read to its last whole message", self._path)
+            _LOG.warning("%s was not finished, or is damaged: it was read to its last whole message", file)
 
     def _is_picture(self, channel: LogChannel) -> bool:
         return channel.topic == self.topic and (channel.encoding, channel.schema) in PICTURES

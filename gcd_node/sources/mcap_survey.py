@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
@@ -19,6 +19,7 @@ from gcd_node.sources.log_messages import (
 )
 from gcd_node.sources.log_pictures import to_rgb
 from gcd_node.sources.mcap_container import LogChannel, LogMessage, McapContainer
+from gcd_node.sources.own_recording import OwnRecording, own_recording
 
 _LOG = logging.getLogger(__name__)
 _SURVEYED_NS = 5_000_000_000
@@ -74,21 +75,33 @@ class Survey:
     info: SourceInfo
 
 
-def survey(path: Path, wanted: str | None) -> Survey:
+@dataclass(kw_only=True, slots=True)
+class _Seen:
+    """What was met on the way. topics: with pictures. cameras: the first calibration on each topic that has some.
+    channels: every one. own: what this node said of its own recording."""
+
+    topics: dict[str, _Topic] = field(default_factory=dict[str, _Topic])
+    cameras: dict[str, StatedCamera] = field(default_factory=dict[str, StatedCamera])
+    channels: list[LogChannel] = field(default_factory=list[LogChannel])
+    own: OwnRecording | None = None
+
+
+def survey(path: Path, files: Sequence[Path], wanted: str | None) -> Survey:
     """Look at the first seconds of a log, or as far as it takes to find the pictures.
 
     Args:
-        wanted: the topic; None if there is just one with pictures.
+        path: what to call it. files: played one after another.
+        wanted: the topic; None if there is just one with pictures, or for the input of this node's own recording.
     Raises:
         SourceError: no MCAP; no such topic; no pictures, or on several topics; none of them can be decoded.
         TooShortError: one picture.
     """
-    container = McapContainer(path)
-    topics, cameras = _collect(container, wanted)
-    chosen = _choose(path, topics, wanted, container)
+    seen = _collect(files, wanted)
+    chosen = _choose(path, seen, _topic_of(seen, wanted))
     if chosen.size is None:
         raise SourceError(f"{path}: no picture on {chosen.channel.topic} can be decoded: {chosen.reason}")
-    header_stamps = _rise(chosen.header_ns)
+    own = seen.own
+    header_stamps = own is not None or _rise(chosen.header_ns)  # ours may begin at 0
     stamps = chosen.header_ns if header_stamps else chosen.published_ns
     fps = _rate(path, chosen.channel.topic, stamps)
     info = SourceInfo(
@@ -99,31 +112,53 @@ def survey(path: Path, wanted: str | None) -> Survey:
         fps_nominal=fps,
         clock="replay",
         codec=chosen.codec,
-        lens=_lens(path, chosen, cameras),
+        lens=_lens(path, chosen, seen.cameras),
         stamp_uncertainty_us=_HEADER_UNCERTAINTY_US if header_stamps else round(1e6 / fps),
     )
+    info = _as_recorded(info, own) if own is not None and own.input_topic == chosen.channel.topic else info
     return Survey(topic=chosen.channel.topic, header_stamps=header_stamps, info=info)
 
 
-def _collect(container: McapContainer, wanted: str | None) -> tuple[dict[str, _Topic], dict[str, StatedCamera]]:
-    """Picture topics, and the first calibration on each topic that has some."""
-    topics: dict[str, _Topic] = {}
-    cameras: dict[str, StatedCamera] = {}
-    first_ns: int | None = None
-    for message in container.messages():
-        channel = message.channel
-        kind = channel.encoding, channel.schema
-        if kind in PICTURES:
-            topics.setdefault(channel.topic, _Topic(channel=channel)).add(message)
-        elif kind in CAMERAS and channel.topic not in cameras:
-            try:
-                cameras[channel.topic] = read_camera_message(*kind, message.data)
-            except SourceError as error:
-                _LOG.warning("a calibration on %s is left out: %s", channel.topic, error)
-        first_ns = message.log_ns if first_ns is None else first_ns
-        if message.log_ns - first_ns > _SURVEYED_NS and _settled(topics, wanted):
-            break
-    return topics, cameras
+def _as_recorded(info: SourceInfo, own: OwnRecording) -> SourceInfo:
+    """With what was known of the source when it was recorded. A field of view is not made a lens of: that would be
+    another way to the model's picture."""
+    uncertainty_us = own.stamp_uncertainty_us
+    return replace(
+        info,
+        lens=info.lens if own.calibrated else None,
+        hfov_deg=None if own.calibrated else own.hfov_deg,
+        stamp_uncertainty_us=info.stamp_uncertainty_us if uncertainty_us is None else uncertainty_us,
+    )
+
+
+def _topic_of(seen: _Seen, wanted: str | None) -> str | None:
+    return seen.own.input_topic if wanted is None and seen.own is not None else wanted
+
+
+def _collect(files: Sequence[Path], wanted: str | None) -> _Seen:
+    seen, first_ns = _Seen(), None
+    for file in files:
+        container = McapContainer(file)
+        for message in container.messages():
+            seen.own = own_recording(container.metadata) or seen.own
+            _look(seen, message)
+            first_ns = message.log_ns if first_ns is None else first_ns
+            if message.log_ns - first_ns > _SURVEYED_NS and _settled(seen.topics, _topic_of(seen, wanted)):
+                return seen
+        seen.channels.extend(container.channels)
+    return seen
+
+
+def _look(seen: _Seen, message: LogMessage) -> None:
+    channel = message.channel
+    kind = channel.encoding, channel.schema
+    if kind in PICTURES:
+        seen.topics.setdefault(channel.topic, _Topic(channel=channel)).add(message)
+    elif kind in CAMERAS and channel.topic not in seen.cameras:
+        try:
+            seen.cameras[channel.topic] = read_camera_message(*kind, message.data)
+        except SourceError as error:
+            _LOG.warning("a calibration on %s is left out: %s", channel.topic, error)
 
 
 def _settled(topics: dict[str, _Topic], wanted: str | None) -> bool:
@@ -133,13 +168,12 @@ def _settled(topics: dict[str, _Topic], wanted: str | None) -> bool:
     return good or (bool(found) and all(topic.settled for topic in found))
 
 
-def _choose(path: Path, topics: dict[str, _Topic], wanted: str | None, container: McapContainer) -> _Topic:
+def _choose(path: Path, seen: _Seen, wanted: str | None) -> _Topic:
+    topics = seen.topics
     if wanted is not None and wanted in topics:
         return topics[wanted]
     if wanted is not None:
-        raise SourceError(
-            f"{path} has no pictures on the topic {wanted!r}; {_listed(list(topics.values()), container)}"
-        )
+        raise SourceError(f"{path} has no pictures on the topic {wanted!r}; {_listed(seen)}")
     usable = [topic for topic in topics.values() if topic.size is not None]
     if len(usable) > 1:
         names = ", ".join(sorted(topic.channel.topic for topic in usable)[:_LISTED])
@@ -149,13 +183,13 @@ def _choose(path: Path, topics: dict[str, _Topic], wanted: str | None, container
     if topics:
         topic = next(iter(topics.values()))
         raise SourceError(f"{path}: no picture on {topic.channel.topic} can be decoded: {topic.reason}")
-    raise SourceError(f"{path} holds no pictures; {_listed([], container)}")
+    raise SourceError(f"{path} holds no pictures; {_listed(seen)}")
 
 
-def _listed(topics: Sequence[_Topic], container: McapContainer) -> str:
-    if topics:
-        return f"it has pictures on {', '.join(sorted(topic.channel.topic for topic in topics)[:_LISTED])}"
-    others = sorted(f"{each.topic} ({each.schema}, {each.encoding})" for each in container.channels)[:_LISTED]
+def _listed(seen: _Seen) -> str:
+    if seen.topics:
+        return f"it has pictures on {', '.join(sorted(seen.topics)[:_LISTED])}"
+    others = sorted(f"{each.topic} ({each.schema}, {each.encoding})" for each in seen.channels)[:_LISTED]
     readable = ", ".join(f"{schema} ({encoding})" for encoding, schema in PICTURES)
     return f"its topics are {', '.join(others) or 'none'}; readable are {readable}"
 

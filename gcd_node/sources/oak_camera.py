@@ -4,6 +4,8 @@ DepthAI is imported when a camera is opened, not before. Three of its habits sha
 Python code on one of its threads ends the process: such code goes through a Guard. An unplugged camera is silence:
 the device's state explains it. A pipeline that is dropped before its threads have ended can block the whole
 interpreter: the thread that stops a pipeline holds it until then.
+
+Over 300 lines, because no other file may import DepthAI.
 """
 
 import logging
@@ -141,6 +143,11 @@ class OakCamera:
             self._loss.wait(_EXPLAIN_S)  # the state callback may be a moment behind, and knows why
             self._loss.tell("its pipeline ended")
             raise self._loss.error() from None
+        except RuntimeError as error:  # what DepthAI makes of a link that broke
+            if self._closed.is_set():
+                return None
+            self._loss.tell(f"reading from it failed ({error})")
+            raise self._loss.error() from error
         newest = later[-1] if later else message
         if isinstance(newest, dai.ImgFrame):
             return newest

@@ -162,8 +162,8 @@ class OpenCvCamera:
             with quiet_opencv():
                 self._read()
         except Exception as error:  # the end of a thread: whoever opens, or takes frames, gets it
-            self._error = error
-            self._answer.put(error)
+            self._error = self._lost(f"fails ({error.err})") if isinstance(error, cv2.error) else error
+            self._answer.put(self._error)
         self._newest.finish()
 
     def _read(self) -> None:
@@ -188,7 +188,10 @@ class OpenCvCamera:
             if picture is not None:
                 return _Grabbed(picture=picture, stamp_ns=stamp_ns, seq=seq)
             self._corrupt += 1
-        raise SourceLostError(f"{self._port.name} gives no more pictures; {self._port.hint}")
+        raise self._lost("gives no more pictures")
+
+    def _lost(self, what: str) -> SourceLostError:
+        return SourceLostError(f"{self._port.name} {what}; {self._port.hint}")
 
     def _measure_fps(self, connection: Connection, newest: _Grabbed) -> tuple[_Grabbed, float]:
         """The newest picture after a few, and the rate they came at."""

@@ -89,7 +89,10 @@ def _device_path(device: str | None) -> Path:
 
 def _check_device(path: Path) -> None:
     if not path.exists():
-        raise SourceAbsentError(f"there is no camera {path}; there is {', '.join(list_v4l2()) or 'none'}")
+        there = ", ".join(list_v4l2()) or "none"
+        raise SourceAbsentError(
+            f"there is no camera {path}; there is {there}: plug it in, or correct device in [source]"
+        )
     if not stat.S_ISCHR(path.stat().st_mode):
         raise SourceError(f"{path} is no camera device; give a number or a path such as /dev/video0")
     if not os.access(path, os.R_OK | os.W_OK):

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rich.console import Group
+from rich.styled import Styled
 from rich.table import Table
 from rich.text import Text
 
@@ -16,6 +17,7 @@ from gcd_node.health.report import Level
 from gcd_node.security.keys import ClientKeys
 from gcd_node.subscriber import NoteSubscriber
 from gcd_node.watching.status_board import STALE_AFTER_S, StatusBoard
+from gcd_node.wire.endpoints import resolve_endpoint
 
 _REFRESH_MS = 250
 _LONGEST = 60
@@ -90,16 +92,20 @@ def watch_status(
                 raise StaleError(_silence(request, board, now_s))
 
 
-def render_status(board: StatusBoard, now_s: float) -> Group:
-    """The board for rich: a headline, the sections, the stages and the latest events."""
-    parts: list[Text | Table] = [_headline(board, now_s)]
+def render_status(board: StatusBoard, now_s: float, endpoint: str = "") -> Group:
+    """The board for rich: a headline, the sections, the stages and the latest events; dim where it no longer holds.
+
+    endpoint: named while nothing has come.
+    """
+    parts: list[Text | Table] = [_headline(board, now_s, endpoint)]
     if board.known:
         parts.append(_sections(board))
     if stages := board.section("stages"):
         parts.append(_stages(stages))
     if board.events:
         parts.append(_events(board, now_s))
-    return Group(*parts)
+    stale = "dim" if board.stale(now_s) else ""
+    return Group(parts[0], *(Styled(part, stale) for part in parts[1:]))
 
 
 def _next_note(notes: NoteSubscriber) -> NoteMessage | None:
@@ -112,25 +118,30 @@ def _next_note(notes: NoteSubscriber) -> NoteMessage | None:
 def _silence(request: StatusRequest, board: StatusBoard, now_s: float) -> str:
     silent_s = board.silent_s(now_s)
     last = "" if silent_s is None else f"; its last one is {silent_s:.0f} s old"
+    endpoint = resolve_endpoint(request.endpoint, "status")
     return (
-        f"no status from {request.endpoint} within {request.timeout_s:g} s{last}: is the node running, and is this "
+        f"no status from {endpoint} within {request.timeout_s:g} s{last}: is the node running, and is this "
         "the status endpoint of its [publish]?"
     )
 
 
-def _headline(board: StatusBoard, now_s: float) -> Text:
+def _headline(board: StatusBoard, now_s: float, endpoint: str) -> Text:
     level = board.level(now_s)
     line = Text()
     line.append(f" {level.name} ", style=f"reverse {_STYLES[level]}")
     if not board.known:
-        return line.append(" no status yet")
+        where = f" from {_shown(endpoint)}" if endpoint else ""
+        return line.append(f" no status yet{where}: is the node running?")
     line.append(f" {_shown(board.node_id)}", style="bold")
-    line.append(f"  {_shown(board.fields.get('state', '?'))}")
-    line.append("  ready" if board.fields.get("ready") is True else "  not ready", style="dim")
-    if reasons := board.reasons():
-        line.append(f"  {_shown(', '.join(reasons))}", style=_STYLES[level])
+    state, ready = _shown(board.fields.get("state", "?")), board.fields.get("ready") is True
+    reasons = _shown(", ".join(board.reasons()))
     if board.stale(now_s):
         line.append(f"  silent for {board.silent_s(now_s) or 0.0:.0f} s", style=_STYLES[level])
+        line.append(f"  before: {state}{f', {reasons}' if reasons else ''}", style="dim")
+    else:
+        line.append(f"  {state}")
+        line.append("  ready" if ready else "  not ready", style="dim")
+        line.append(f"  {reasons}" if reasons else "", style=_STYLES[level])
     if board.restarts:
         line.append(f"  restarted {board.restarts} times", style="dim")
     return line
@@ -140,7 +151,7 @@ def _sections(board: StatusBoard) -> Table:
     table = Table.grid(padding=(0, 2))
     for name, columns in _SECTIONS:
         section = board.section(name)
-        shown = [f"{_shown(section[key])}{unit}" for key, unit in columns if section.get(key) is not None]
+        shown = [f"{_shown(section[key])}{unit}" for key, unit in columns if _says_something(key, section.get(key))]
         if shown:
             table.add_row(Text(name, style="bold"), Text(", ".join(shown)))
     faults = board.section("window").get("reason_counts")
@@ -153,6 +164,10 @@ def _sections(board: StatusBoard) -> Table:
         shown = [f"{_shown(hop)} {_shown(count)}" for hop, count in drops.items()]
         table.add_row(Text("drops", style="bold"), Text(", ".join(shown)))
     return table
+
+
+def _says_something(key: str, value: object) -> bool:
+    return value is not None and (key, value) != ("backoff_s", 0)
 
 
 def _view(name: str, told: object) -> str:

@@ -9,13 +9,16 @@ from pathlib import Path
 from types import TracebackType
 
 import cv2
+from rich import box
 from rich.table import Table
+from rich.text import Text
 
 from gcd_node.envelope import ViewKind
 from gcd_node.errors import MessageError, OutputError
 from gcd_node.pictures.array_file import write_npy
 from gcd_node.pictures.comparison import legend
 from gcd_node.pictures.files import video_writer, write_png
+from gcd_node.security.keys import ClientKeys
 from gcd_node.subscriber import ReceivedView, ViewSubscriber
 from gcd_node.wire.header import ClassRecord, ViewHeader
 
@@ -50,6 +53,7 @@ class WatchRequest:
 
     view: one view's id, None for all. kind: as in ViewSubscriber, None for all. save: folder for pictures, or None.
     limit: stop after this many messages. timeout_s: stop when nothing came for so long. None for no bound.
+    keys: for a node that asks for them.
     """
 
     endpoint: str = "ipc"
@@ -58,6 +62,7 @@ class WatchRequest:
     save: Path | None = None
     limit: int | None = None
     timeout_s: float | None = None
+    keys: ClientKeys | None = None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -164,8 +169,9 @@ def watch(request: WatchRequest, on_change: Callable[[Sequence[ViewRow]], None])
 
     Raises:
         ConfigError, MessageError: the endpoint or the view id is none. OutputError: a picture cannot be written.
+        AuthError: the node does not let us in.
     """
-    with ViewSubscriber(request.endpoint, request.view, request.kind, conflate=False) as views:
+    with ViewSubscriber(request.endpoint, request.view, request.kind, conflate=False, keys=request.keys) as views:
         if request.save is None:
             return _Watch(request, views, None).run(on_change)
         with ViewSaver(request.save) as saver:
@@ -174,13 +180,17 @@ def watch(request: WatchRequest, on_change: Callable[[Sequence[ViewRow]], None])
 
 def render(rows: Sequence[ViewRow]) -> Table:
     """The rows as a table for rich."""
-    table = Table(title="Virtual views: generated pixels, never evidence of free space", title_style="dim")
+    title = "Virtual views: generated pixels, never evidence of free space"
+    table = Table(
+        title=title, title_style="dim", box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0), min_width=len(title)
+    )
     for name in ("topic", "window", "shape", "age ms", "rate Hz", "missed", "MB", "state"):
-        table.add_column(name, justify="left" if name in ("topic", "state") else "right", no_wrap=True)
+        left = name in ("topic", "state")
+        table.add_column(name, justify="left" if left else "right", no_wrap=name != "topic", overflow="fold")
     for row in rows:
         shape = "x".join(map(str, row.shape))
         numbers = (f"{row.age_ms:.0f}", f"{row.rate_hz:.2f}", str(row.missed), f"{row.bytes / 1e6:.1f}")
-        state = f"[{_STYLES[row.state]}]{row.state}[/]"
+        state = Text(row.state, style=_STYLES[row.state])
         table.add_row(row.topic, str(row.window_id), shape, *numbers, state)
     return table
 

@@ -9,9 +9,9 @@ import functools
 import json
 import math
 import types
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
-from typing import Annotated, Any, Literal, TypeAlias, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from gcd_node.errors import MessageError
 
@@ -22,6 +22,7 @@ StampNs: TypeAlias = Annotated[int, "nanoseconds; a [sec, nanosec] pair on the w
 
 _SECOND_NS = 1_000_000_000
 _WIRE_NAME = "wire"
+_Convert: TypeAlias = Callable[[Any, str], Any]  # a value, and its place for an error message
 Record = TypeVar("Record")
 
 
@@ -43,7 +44,7 @@ def to_json(record: object) -> dict[str, Any]:
         MessageError: a value that from_json() would refuse; names the field.
     """
     values = ((item, getattr(record, item.name)) for item in _described(type(record)))
-    return {item.wire: _write(item.kind, value, item.wire) for item, value in values if value is not None}
+    return {item.wire: item.write(value, item.wire) for item, value in values if value is not None}
 
 
 def from_json(kind: type[Record], value: Mapping[str, Any], place: str = "header") -> Record:
@@ -55,7 +56,7 @@ def from_json(kind: type[Record], value: Mapping[str, Any], place: str = "header
     arguments: dict[str, Any] = {}
     for item in _described(kind):
         if item.wire in value:
-            arguments[item.name] = _read(item.kind, value[item.wire], f"{place}.{item.wire}")
+            arguments[item.name] = item.read(value[item.wire], f"{place}.{item.wire}")
         elif item.required:
             raise MessageError(f"{place} lacks {item.wire!r}")
     return kind(**arguments)
@@ -82,12 +83,16 @@ def parse(text: bytes) -> dict[str, Any]:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Item:
-    """One field of a record: attribute name, wire name, type, and whether it must be there."""
+    """One field of a record: attribute name, wire name, how it is converted, and whether it must be there."""
 
     name: str
     wire: str
-    kind: Any
+    write: _Convert
+    read: _Convert
     required: bool
+
+
+# What a type asks for is worked out once, not with every value: a header has hundreds of numbers.
 
 
 @functools.cache
@@ -98,19 +103,30 @@ def _described(kind: type) -> tuple[_Item, ...]:
 
 def _item(entry: "Field[Any]", hint: Any) -> _Item:
     required = entry.default is MISSING and entry.default_factory is MISSING
-    return _Item(name=entry.name, wire=entry.metadata.get(_WIRE_NAME, entry.name), kind=hint, required=required)
+    wired = entry.metadata.get(_WIRE_NAME, entry.name)
+    return _Item(name=entry.name, wire=wired, write=_writer(hint), read=_reader(hint), required=required)
 
 
-def _write(kind: Any, value: Any, place: str) -> Any:
+def _writer(kind: Any) -> _Convert:
+    """From a value to JSON, checked."""
     if get_origin(kind) in (Union, types.UnionType):
-        kind = get_args(kind)[0]
+        return _writer(get_args(kind)[0])  # None never gets here
     if get_origin(kind) is Annotated:
-        return list(divmod(_read_stamp_ns(value, place), _SECOND_NS))
-    if is_dataclass(value):
-        return to_json(value)
-    if isinstance(value, tuple):
-        return [_write(get_args(kind)[0], each, place) for each in value]
-    return _read(kind, value, place)
+        return lambda value, place: list(divmod(_read_stamp_ns(value, place), _SECOND_NS))
+    read = _reader(kind)
+    if is_dataclass(kind):
+        return lambda value, place: to_json(value) if is_dataclass(value) else read(value, place)
+    if get_origin(kind) is tuple:
+        write_each = _writer(get_args(kind)[0])
+        whole = _finite if get_args(kind)[0] is float else _never
+        return lambda value, place: _write_tuple(value, place, whole, write_each)
+    return read
+
+
+def _write_tuple(value: Any, place: str, whole: Callable[[Any], bool], write_each: _Convert) -> list[Any]:
+    if not isinstance(value, tuple):
+        raise MessageError(f"{place} must be a tuple, got {short(value)}")
+    return list(value) if whole(value) else [write_each(each, place) for each in value]
 
 
 def _read_stamp_ns(value: Any, place: str) -> int:
@@ -119,19 +135,36 @@ def _read_stamp_ns(value: Any, place: str) -> int:
     raise MessageError(f"{place} must be an int of nanoseconds, got {short(value)}")
 
 
-def _read(kind: Any, value: Any, place: str) -> Any:
+def _reader(kind: Any) -> _Convert:
+    """From JSON to a value, checked."""
     origin, arguments = get_origin(kind), get_args(kind)
     if origin in (Union, types.UnionType):
-        return None if value is None else _read(arguments[0], value, place)
+        read_some = _reader(arguments[0])
+        return lambda value, place: None if value is None else read_some(value, place)
     if origin is Annotated:
-        return _read_stamp(value, place)
+        return _read_stamp
     if origin is Literal:
-        return _read_choice(arguments, value, place)
+        return lambda value, place: _read_choice(arguments, value, place)
     if origin is tuple:
-        return tuple(_read(arguments[0], each, f"{place}[{i}]") for i, each in enumerate(_read_list(value, place)))
+        read_each, whole = _reader(arguments[0]), _finite if arguments[0] is float else _never
+        return lambda value, place: _read_tuple(_read_list(value, place), place, whole, read_each)
     if is_dataclass(kind):
-        return from_json(kind, _read_object(value, place), place)  # pyright: ignore[reportArgumentType]  a class
-    return _read_scalar(kind, value, place)
+        record = cast(type[Any], kind)
+        return lambda value, place: from_json(record, _read_object(value, place), place)
+    return lambda value, place: _read_scalar(kind, value, place)
+
+
+def _read_tuple(value: list[Any], place: str, whole: Callable[[Any], bool], read_each: _Convert) -> tuple[Any, ...]:
+    return tuple(value) if whole(value) else tuple(read_each(each, f"{place}[{i}]") for i, each in enumerate(value))
+
+
+def _finite(values: list[Any] | tuple[Any, ...]) -> bool:
+    """Whether all are floats that JSON can say, as most lists of numbers are: then none must be looked at alone."""
+    return {*map(type, values)} == {float} and all(map(math.isfinite, values))
+
+
+def _never(_: Any) -> bool:
+    return False
 
 
 def _read_stamp(value: Any, place: str) -> int:

@@ -1,7 +1,8 @@
 """From a rendered view to the messages that leave the node."""
 
+import functools
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +30,7 @@ from gcd_node.wire.header import (
 )
 from gcd_node.wire.jpeg import encode_frames
 
+_PATHS = 32  # most views stand still: their path is the same in every window
 _HALF_PIXEL = 0.5  # ours counts from the corner of the first pixel, the wire and OpenCV from its centre
 
 
@@ -100,8 +102,10 @@ def messages(run: Run, rendered: Rendered) -> list[ViewMessage]:
     ]
 
 
-def end_messages(run: Run, view_id: str, view_rev: int, last_window_id: int) -> list[EndMessage]:
-    """End-of-stream of a view, for each of its topics. last_window_id: -1 if none was published."""
+def end_messages(
+    run: Run, view_id: str, view_rev: int, last_window_id: int, kinds: Iterable[ViewKind]
+) -> list[EndMessage]:
+    """End-of-stream of a view, for its topics of these kinds. last_window_id: -1 if none was published."""
     header = EndHeader(
         node_id=run.config.node_id,
         boot_id=run.boot_id,
@@ -111,10 +115,10 @@ def end_messages(run: Run, view_id: str, view_rev: int, last_window_id: int) -> 
         window_id=last_window_id,
         clock=run.source.clock,
     )
-    return [EndMessage(topic=view_topic(view_id, kind), header=header) for kind in _kinds(run)]
+    return [EndMessage(topic=view_topic(view_id, kind), header=header) for kind in kinds]
 
 
-def _kinds(run: Run) -> Iterator[ViewKind]:
+def published_kinds(run: Run) -> Iterator[ViewKind]:
     """What is published of each view."""
     yield from ("win", "frm")
     if run.classes:
@@ -248,6 +252,7 @@ def _model(traits: Traits) -> ModelRecord:
     )
 
 
+@functools.lru_cache(maxsize=_PATHS)
 def _deltas(path: Trajectory) -> tuple[PoseDelta, ...] | None:
     if path.delta is None:
         return None
@@ -256,6 +261,7 @@ def _deltas(path: Trajectory) -> tuple[PoseDelta, ...] | None:
     )
 
 
+@functools.lru_cache(maxsize=_PATHS)
 def _matrices(path: Trajectory) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(row) for row in path.source_from_target.flatten(1).tolist())
 
@@ -270,10 +276,11 @@ def _at_goal(path: Trajectory) -> Sequence[int]:
 
 def _input_flags(images: Image) -> tuple[str, ...]:
     """What is wrong with the input picture itself (wire protocol, section 7, F13)."""
-    thin = images[:, ::8, ::8].astype(np.int16)
+    frames, height, width, _ = images.shape
+    thin = images.reshape(frames, height, 3 * width)[:, ::16, ::8]  # of all three colours in turn
     flags: list[str] = []
     if not 8 <= float(thin.mean()) <= 247:
         flags.append("exposure")
-    if int(np.abs(np.diff(thin, axis=0)).max()) == 0:
+    if (thin[1:] == thin[0]).all():
         flags.append("static")
     return tuple(flags)

@@ -43,7 +43,8 @@ class Clip:
 class View:
     """The clip as another camera would have seen it. Every pixel is generated.
 
-    samples: float32 [S, T, 3, H, W], RGB in [0, 1], on the CPU; S draws of the same view.
+    samples: float32 [S, T, 3, H, W], RGB in [0, 1], on the CPU; S draws of the same view. A model whose device makes
+        whole levels gives those, uint8 in 0..255; none of ours does.
     latents: float32 [S, T, C, h, w], what was decoded, in the scaled space the network works in.
     trajectory: the camera path that was asked for.
     motion_bucket: the motion number the network was told.
@@ -66,7 +67,8 @@ class View:
         """Per-pixel population standard deviation over samples, channel mean: [T, H, W]; None with one sample."""
         if self.samples.shape[0] < 2:
             return None
-        return self.samples.std(dim=0, correction=0).mean(dim=1)
+        samples = self.samples if self.samples.is_floating_point() else self.samples / 255
+        return samples.std(dim=0, correction=0).mean(dim=1)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -1,6 +1,7 @@
 """The door: what `encode` and `render` promise, on the smallest network that has every part."""
 
 import threading
+from dataclasses import replace
 
 import pytest
 import torch
@@ -86,6 +87,13 @@ def test_the_uncertainty_is_the_population_deviation_over_samples_averaged_over_
     assert_close(view.std, expected)
     assert view.std.max() > 0
     assert synthesize(synthesizer, random_clip(), path(synthesizer)).std is None
+
+
+def test_the_uncertainty_of_whole_levels_is_that_of_their_pictures(synthesizer: Synthesizer) -> None:
+    features = synthesizer.encode(random_clip())
+    (view,) = synthesizer.render(features, [path(synthesizer)], RenderOptions(samples=2))
+    levels = (view.samples * 255).round().to(torch.uint8)
+    assert_close(replace(view, samples=levels).std, replace(view, samples=levels.float() / 255).std)
 
 
 def test_the_same_seed_gives_the_same_view_and_another_seed_another(synthesizer: Synthesizer) -> None:

@@ -40,7 +40,7 @@ class FakeCommands:
             message = f"the view has revision {self.view_rev}"
             return Outcome(code=Code.WRONG_STATE, message=message, result={"view_rev": self.view_rev})
         if abs(command.args.azimuth_deg or 0.0) > 90:
-            result: dict[str, object] = {"arg": "azimuth_deg", "allowed": [-90, 90]}
+            result: dict[str, object] = {"allowed": {"azimuth_deg": [-90, 90]}}
             raise RequestError("azimuth_deg is beyond what the model was trained with", Code.OUT_OF_RANGE, "", result)
         if not command.dry_run:
             self.view_rev += 1

@@ -26,6 +26,7 @@ class FakeVideoCapture:
         self.awake = threading.Event()
         self.awake.set()
         self.gone = False
+        self.breaks = False
         self.there = True
         self.damaged: set[int] = set()
         self.grabbed = -1
@@ -68,6 +69,8 @@ class FakeVideoCapture:
         while not self.awake.wait(0.01):
             if self.gone:
                 return False
+        if self.breaks:
+            raise cv2.error("the driver gave up")
         self.grabbed += 1
         return not self.gone
 

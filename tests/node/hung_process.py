@@ -1,6 +1,6 @@
-"""A node in its own process whose model hangs in its first window and hears no cancel.
+"""A node in its own process that hangs and hears no cancel: while its model loads, warms up, or renders.
 
-hung_process.py FOLDER
+hung_process.py FOLDER load|warm|render
 Prints `hangs` once it does.
 """
 
@@ -11,21 +11,29 @@ from pathlib import Path
 from fakes import FakeSource, FakeSynthesizer, traits
 from rig import rig_config
 
-from gcd_model import RenderOptions
+from gcd_model import ViewSynthesizer
+from gcd_node.config import ModelSection
 from gcd_node.life.machinery import Parts
 from gcd_node.node import Node, NodeOptions
 from gcd_node.publisher import Publisher
 from gcd_node.session import publisher_options, run_until_signal
 
 
-def hang(_: RenderOptions) -> None:
+def hang(_: object = None) -> None:
     print("hangs", flush=True)
     time.sleep(3600)
 
 
+def load(_: ModelSection) -> ViewSynthesizer:
+    if sys.argv[2] == "load":
+        hang()
+    return FakeSynthesizer(traits(), hang)
+
+
 def main() -> None:
-    config = rig_config(Path(sys.argv[1]), 'kind = "synthetic"\npace = "lockstep"', "[view.main]", "")
-    parts = Parts(open_source=lambda _: FakeSource(100_000), load_model=lambda _: FakeSynthesizer(traits(), hang))
+    pace = "realtime" if sys.argv[2] == "warm" else "lockstep"  # nothing is warmed up in lockstep
+    config = rig_config(Path(sys.argv[1]), f'kind = "synthetic"\npace = "{pace}"', "[view.main]", "")
+    parts = Parts(open_source=lambda _: FakeSource(100_000), load_model=load)
     with Publisher(publisher_options(config)) as publisher:
         node = Node(config, parts, publisher, NodeOptions(once=False))
         run_until_signal(node, publisher)

@@ -97,6 +97,7 @@ class Rig:
             self.node,
             lambda: self.node.state.label,
             self.node.event,
+            self.node.recorder.command,
         )
         self.folder = folder
         self.notes: list[tuple[float, str, Mapping[str, Any]]] = []

@@ -118,10 +118,16 @@ class RosLog:
 
 @contextmanager
 def ros_log(
-    path: Path, *, compression: CompressionType = CompressionType.ZSTD, chunk_size: int = 1 << 16, finish: bool = True
+    path: Path,
+    *,
+    compression: CompressionType = CompressionType.ZSTD,
+    chunk_size: int = 1 << 16,
+    finish: bool = True,
+    checked: bool = True,
 ) -> Generator[RosLog]:
+    """checked: with checksums of the chunks."""
     with path.open("wb") as file:
-        writer = RosWriter(file, chunk_size=chunk_size, compression=compression)
+        writer = RosWriter(file, chunk_size=chunk_size, compression=compression, enable_crcs=checked)
         yield RosLog(writer)
         if finish:
             writer.finish()
@@ -134,9 +140,10 @@ def write_log(
     topic: str = TOPIC,
     compression: CompressionType = CompressionType.ZSTD,
     chunk_size: int = 1 << 16,
+    checked: bool = True,
 ) -> Path:
     """One topic of JPEG pictures at 10 a second."""
-    with ros_log(path, compression=compression, chunk_size=chunk_size) as log:
+    with ros_log(path, compression=compression, chunk_size=chunk_size, checked=checked) as log:
         for i, image in enumerate(images):
             message = compressed(image, START_NS + i * PERIOD_NS)
             log.say(topic, "sensor_msgs/msg/CompressedImage", message, sequence=i)
@@ -151,10 +158,16 @@ def write_raw(path: Path, messages: Sequence[dict[str, object]]) -> Path:
     return path
 
 
-def write_foxglove(path: Path, messages: Sequence[CompressedImage | RawImage | CameraCalibration]) -> Path:
+def write_foxglove(
+    path: Path,
+    messages: Sequence[CompressedImage | RawImage | CameraCalibration],
+    *,
+    compression: CompressionType = CompressionType.ZSTD,
+    checked: bool = True,
+) -> Path:
     """Pictures on /camera/image, calibrations on /camera/calibration."""
     with path.open("wb") as file:
-        writer = ProtobufWriter(file)
+        writer = ProtobufWriter(file, compression=compression, enable_crcs=checked)
         for i, message in enumerate(messages):
             topic = "/camera/calibration" if isinstance(message, CameraCalibration) else "/camera/image"
             log_ns = START_NS + i * PERIOD_NS

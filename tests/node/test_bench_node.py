@@ -11,6 +11,7 @@ from gcd_node.cli.main import run_app
 from gcd_node.load.bench import (
     BenchOptions,
     BenchReport,
+    FirstView,
     Latency,
     SlowModel,
     SourceBack,
@@ -18,8 +19,9 @@ from gcd_node.load.bench import (
     bench_node,
 )
 
-SMALL = BenchOptions(windows=4, slow_windows=3, stall_s=2.0, returns=1, outage_s=0.2, width=96, height=64)
+SMALL = BenchOptions(windows=4, slow_windows=3, stall_s=2.0, returns=1, outage_s=0.2, starts=1, width=96, height=64)
 REPORT = BenchReport(
+    machine_load=0.25,
     frames=14,
     width=384,
     height=256,
@@ -51,6 +53,7 @@ REPORT = BenchReport(
         after_plugged_most_ms=1200.0,
         window_ms=583.3,
     ),
+    first_view=FirstView(count=3, median_s=6.0, most_s=6.5),
 )
 
 
@@ -58,7 +61,7 @@ REPORT = BenchReport(
 def test_every_figure_comes_out_and_can_be_true() -> None:
     parts: list[str] = []
     report = bench_node(SMALL, parts.append)
-    assert len(parts) == 4
+    assert len(parts) == 5
     assert (report.frames, report.height, report.width) == (14, 64, 96)
     assert report.latency.count == SMALL.windows
     assert 0 < report.latency.p50_ms <= report.latency.p99_ms < 60_000
@@ -77,6 +80,8 @@ def test_every_figure_comes_out_and_can_be_true() -> None:
     assert back.count == 1
     assert back.after_first_ms >= 13 / 14 * back.window_ms  # the frames of a window come first
     assert back.after_plugged_ms >= back.after_first_ms
+    assert report.first_view.count == 1
+    assert 0 < report.first_view.median_s == report.first_view.most_s
 
 
 def test_the_command_shows_every_figure_beside_what_is_wanted(
@@ -100,6 +105,7 @@ def test_the_command_shows_every_figure_beside_what_is_wanted(
         "+12.5",
         "1583",
         "600, most 610",
+        "6.0, most 6.5",
     ):
         assert shown in out
 

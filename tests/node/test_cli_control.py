@@ -1,6 +1,8 @@
 """`gcd-node ctl` and `gcd-node keys` as a user types them."""
 
 import json
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -72,7 +74,7 @@ def test_ctl_wants_key_value_once(settings: list[str], capsys: pytest.CaptureFix
 
 
 def test_ctl_without_a_node_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_app(["ctl", "hello", "--endpoint", f"ipc://{tmp_path}/x", "--timeout", "0.1"]) == 70
+    assert run_app(["ctl", "hello", "--endpoint", f"ipc://{tmp_path}/x", "--timeout", "0.1"]) == 69
     assert "is the node running" in capsys.readouterr().err
 
 
@@ -108,3 +110,14 @@ def test_keys_show_prints_the_fingerprint(tmp_path: Path, capsys: pytest.Capture
 def test_half_of_the_key_options_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_app(["ctl", "hello", "--keys", str(tmp_path)]) == 64
     assert "--node-key" in capsys.readouterr().err
+
+
+def test_who_talks_to_a_running_node_does_not_wait_for_torch(tmp_path: Path) -> None:
+    code = (
+        "import sys; from gcd_node.cli.main import run_app; "
+        f"ends = run_app(['-v', 'ctl', 'state', '--endpoint', 'ipc://{tmp_path}/none', '--timeout', '0.1']); "
+        f"ends += run_app(['status', 'ipc://{tmp_path}/none', '--once', '--timeout', '0.1']); "
+        "print(ends, sorted({'torch', 'cv2', 'kornia'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.stdout == "138 []\n", done.stderr

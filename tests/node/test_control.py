@@ -114,7 +114,7 @@ def test_f14_refusals_carry_the_allowed_interval_and_change_nothing(
     client: ControlClient, commands: FakeCommands
 ) -> None:
     beyond = client.request("set_view", {"view": "top", "azimuth_deg": 120.0})
-    assert (beyond.code, beyond.result) == ("OUT_OF_RANGE", {"arg": "azimuth_deg", "allowed": [-90, 90]})
+    assert (beyond.code, beyond.result) == ("OUT_OF_RANGE", {"allowed": {"azimuth_deg": [-90, 90]}})
     assert client.request("set_view", {"view": "nose"}).code == "UNKNOWN_VIEW"
     assert client.request("set_view", {"view": "top", "azimut": 1}).code == "BAD_ARG"
     assert client.request("set_vew", {}).code == "UNKNOWN_VERB"

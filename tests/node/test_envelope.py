@@ -31,7 +31,8 @@ from gcd_node.envelope import (
 from gcd_node.errors import MessageError
 from gcd_node.wire.jpeg import encode_frames
 
-PLANNER_FILES = ("envelope", "header", "class_colours", "record_json", "subscriber", "endpoints", "errors", "jpeg")
+WIRE_FILES = ("wire/header", "wire/class_colours", "wire/record_json", "wire/endpoints", "wire/jpeg")
+PLANNER_FILES = ("envelope", "subscriber", "errors", *WIRE_FILES)
 
 
 def rebuilt(

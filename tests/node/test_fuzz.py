@@ -4,17 +4,12 @@ GCD_MUTATIONS=100000 makes as many inputs for each parser; the default is a frac
 test_mcap_log.py.
 """
 
-import gc
 import io
 import json
 import math
-import os
-import random
 import struct
 import time
-import tracemalloc
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +20,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mutations import BYTE_PIECES, ROUNDS, TEXT_PIECES, Mutator, outcomes
 from rich.console import Console
 from wire_messages import class_map, end, origin, pixels, view_header, window
 
@@ -54,7 +50,6 @@ from gcd_node.envelope import (
     view_topic,
 )
 from gcd_node.errors import ConfigError, ControlError, MessageError, NodeError, SourceError
-from gcd_node.load.meter import memory_mb
 from gcd_node.optics.calibration import parse_lens
 from gcd_node.security.allow_list import load_clients
 from gcd_node.sources import read_picture
@@ -64,7 +59,6 @@ from gcd_node.watching.status_board import StatusBoard
 from gcd_node.watching.status_table import render_status
 from gcd_node.wire.jpeg import decode_frames, encode_frames
 
-ROUNDS = int(os.environ.get("GCD_MUTATIONS", "400"))
 SETTINGS = settings(
     max_examples=max(50, ROUNDS // 4),
     deadline=None,
@@ -72,96 +66,9 @@ SETTINGS = settings(
     database=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.data_too_large],
 )
-GROWN_BYTES = 2_000_000  # tracemalloc: of Python and numpy
-GROWN_MB = 128.0  # resident: of OpenCV too, which keeps some for itself
 LAUNCH = sorted((Path(__file__).parents[2] / "launch").glob("*.toml"))
 
 pytestmark = pytest.mark.timeout(max(120, ROUNDS // 10))
-
-
-# --- a mutator ---------------------------------------------------------------------------------------------------
-
-TEXT_PIECES = (
-    b"null", b"true", b"[", b"]", b"{", b"}", b'"', b"\\", b"\\ud800", b",", b":", b"=", b"\n", b"#", b"'''", b"\0",
-    b"1e999", b"-0", b"NaN", b"9" * 400, b"\xff\xfe", b"\xed\xa0\x80", b"*a", b"&a ", b"[" * 300, b"2020-01-01",
-)  # fmt: skip
-BYTE_PIECES = (b"\0" * 8, b"\xff" * 8, b"\x7f" + b"\xff" * 7, b"\1" + b"\0" * 7, b"\xff\xd8\xff", b"\x89PNG", MAGIC)
-
-
-class Mutator:
-    """Turns bits, sets bytes to extremes, cuts out, doubles, moves, and joins one example to another."""
-
-    def __init__(self, seed: int, examples: Sequence[bytes], pieces: Sequence[bytes]) -> None:
-        self._chance, self._examples, self._pieces = random.Random(seed), examples, pieces
-
-    def next(self) -> bytes:
-        out = bytearray(self._chance.choice(self._examples))
-        for _ in range(self._chance.choice((1, 1, 1, 2, 3, 8))):
-            self._change(out)
-        return bytes(out)
-
-    def _change(self, out: bytearray) -> None:
-        chance = self._chance
-        at, span = chance.randrange(len(out) + 1), chance.choice((1, 1, 2, 4, 16, 64))
-        act = chance.randrange(8)
-        if act == 0 and at < len(out):
-            out[at] ^= 1 << chance.randrange(8)
-        elif act == 1:
-            out[at : at + 1] = bytes([chance.randrange(256)])
-        elif act == 2:
-            del out[at : at + span]
-        elif act == 3:
-            out[at:at] = out[at : at + span]
-        elif act == 4:
-            piece = chance.choice(self._pieces)
-            out[at : at + chance.choice((0, len(piece)))] = piece
-        elif act == 5:
-            there = chance.randrange(len(out) + 1)
-            out[at:at] = out[there : there + span]
-        elif act == 6:
-            other = chance.choice(self._examples)
-            out[at:] = other[at:]
-        else:
-            del out[at:]
-
-
-def outcomes(read: Callable[[bytes], str], inputs: Mutator, *refusals: type[Exception]) -> Counter[str]:
-    """Read ROUNDS inputs; how many ended how. What is no documented error fails the test, and so does growth."""
-    ended: Counter[str] = Counter()
-    few = max(1, ROUNDS // 4)
-    tracemalloc.start()
-    try:
-        _read(few, read, inputs, refusals, ended)
-        gc.collect()
-        before, before_mb = tracemalloc.get_traced_memory()[0], memory_mb()
-        _read(ROUNDS - few, read, inputs, refusals, ended)
-        gc.collect()
-        grown, grown_mb = tracemalloc.get_traced_memory()[0] - before, memory_mb() - before_mb
-    finally:
-        tracemalloc.stop()
-    assert ended.total() == ROUNDS
-    assert grown < GROWN_BYTES
-    assert grown_mb < GROWN_MB
-    return ended
-
-
-def _read(
-    count: int,
-    read: Callable[[bytes], str],
-    inputs: Mutator,
-    refusals: tuple[type[Exception], ...],
-    ended: Counter[str],
-) -> None:
-    for _ in range(count):
-        part = inputs.next()
-        try:
-            outcome, error = read(part), None
-        except refusals as known:
-            outcome, error = "refused", known
-        except Exception as other:
-            raise AssertionError(f"{type(other).__name__} for {part[:2000]!r}") from other
-        assert error is None or 0 < len(str(error)) < 2000
-        ended[outcome] += 1
 
 
 def refusal(read: Callable[[], object], *refusals: type[Exception]) -> str:
@@ -428,6 +335,22 @@ def test_mutated_client_lists_end_as_clients_or_config_errors(tmp_path: Path) ->
 
     ended = outcomes(read, Mutator(5, [CLIENTS], TEXT_PIECES), ConfigError)
     assert ended["refused"] > ROUNDS // 4
+
+
+@pytest.mark.parametrize("depth", [600, 30_000])
+def test_what_nests_too_deep_is_refused(depth: int, tmp_path: Path) -> None:
+    deep = b"[" * depth
+    clients = tmp_path / "clients.toml"
+    clients.touch(mode=0o600)
+    clients.write_bytes(b"client = " + deep)
+    for read in (
+        lambda: parse_config(b"node_id = " + deep, "launch.toml"),
+        lambda: parse_config(CONFIG, "launch.toml", [f"node_id={deep.decode()}"]),
+        lambda: load_clients(clients),
+        lambda: parse_lens(b"image_width: " + deep, "lens"),
+    ):
+        with pytest.raises(ConfigError):
+            read()
 
 
 def test_mutated_calibrations_end_as_lenses_or_config_errors() -> None:

@@ -19,7 +19,7 @@ from typer.main import get_command
 
 from gcd_node import check as checking
 from gcd_node.check import Resources, check
-from gcd_node.cli.main import app
+from gcd_node.cli.commands import app
 from gcd_node.config import NodeConfig, load_config
 from gcd_node.errors import ConfigError, SourceError, TooShortError, UsageError
 

@@ -219,7 +219,7 @@ def test_a_node_tells_who_it_is_and_what_it_can(tmp_path: Path) -> None:
         assert (state["state"], state["source"]) == ("active", "streaming")
         assert stats is not None
         assert "heartbeat_seq" not in stats
-        assert rig.ask("record_start").code is Code.WRONG_STATE
+        assert rig.ask("record_start").code is Code.NOT_READY
 
 
 def test_a_command_is_answered_while_the_model_computes(tmp_path: Path) -> None:

@@ -13,7 +13,8 @@ import pytest
 from media import HEIGHT, WIDTH, flat, ramp, write_video
 
 from gcd_node.errors import SourceAbsentError, SourceError, SourceLostError
-from gcd_node.frame import Frame
+from gcd_node.frame import Frame, SourceInfo
+from gcd_node.life.source_watch import Backoff, Patience, SourceWatch
 from gcd_node.sources.oak_camera import OakCamera
 from gcd_node.sources.oak_loss import Guard, Loss
 
@@ -256,6 +257,50 @@ def test_what_a_host_node_raises_is_a_loss_that_says_so() -> None:
 
     with pytest.raises(SourceLostError, match="ValueError: boom"), closing(opened(script)) as camera:
         list(camera.frames())
+
+
+def test_a_link_that_breaks_while_it_is_read_is_a_loss(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Broken:
+        def get(self, patience: object) -> None:
+            raise RuntimeError("X_LINK_ERROR")
+
+    with closing(opened(pipelines.steady())) as camera:
+        monkeypatch.setattr(camera, "_queue", Broken())
+        with pytest.raises(SourceLostError, match=f"{pipelines.NAME} is lost: reading from it failed .X_LINK_ERROR."):
+            list(camera.frames())
+        camera.close()
+        assert list(camera.frames()) == []
+
+
+def test_silence_is_seen_and_the_camera_is_opened_again_by_the_nodes_own_watch() -> None:
+    handed, again = pipelines.Handed(pipelines.picture(0), pipelines.picture(1)), pipelines.Scripted(pipelines.steady())
+    told: list[str] = []
+    asked: list[str] = []
+
+    class Listener:
+        def source_state(self, state: str, detail: str) -> None:
+            told.append(state)
+
+        def source_frame(self, frame: Frame) -> None: ...
+
+        def source_broken(self, reason: str) -> None:
+            told.append(reason)
+
+        def source_opened(self, info: SourceInfo) -> bool:
+            return True
+
+    def reopen(before: SourceInfo) -> OakCamera:
+        asked.append(before.id)
+        return OakCamera(again, open_timeout_s=PATIENT_S)
+
+    quick = Backoff(first_s=0.01, limit_s=0.05)
+    watch = SourceWatch(opened(handed), reopen, Listener(), Patience(stall_s=0.2, open_s=PATIENT_S), quick)
+    handed.hand()
+    frames = list(islice(watch.frames(), 4))
+    watch.close()
+    assert len(frames) == 4
+    assert told == ["connecting", "streaming", "stalled", "lost", "SRC_LOST", "streaming"]
+    assert asked == [pipelines.NAME]
 
 
 def test_the_first_reason_of_a_loss_stays() -> None:

@@ -4,6 +4,7 @@ import logging
 import sys
 import time
 from contextlib import closing
+from unittest.mock import create_autospec
 
 import pytest
 from media import HEIGHT, WIDTH
@@ -11,7 +12,7 @@ from media import HEIGHT, WIDTH
 from gcd_node.config import SourceConfig
 from gcd_node.errors import SourceAbsentError, SourceError
 from gcd_node.optics.calibration import LensModel
-from gcd_node.sources.oak_camera import OakCamera, lens_in_memory, load_depthai, open_oak
+from gcd_node.sources.oak_camera import OakCamera, camera_pipeline, lens_in_memory, load_depthai, open_oak
 from gcd_node.sources.oak_search import find_device
 
 try:
@@ -89,6 +90,28 @@ def test_an_address_where_nobody_answers_is_absent(monkeypatch: pytest.MonkeyPat
     monkeypatch.setenv("DEPTHAI_SEARCH_TIMEOUT", "300")
     with pytest.raises(SourceAbsentError, match=r"no OAK camera answers at 127\.0\.0\.1"):
         open_oak(SourceConfig(kind="oak", device="127.0.0.1", open_timeout_s=PATIENT_S))
+
+
+def test_a_real_camera_is_wired_by_depthais_own_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = create_autospec(dai.Device, instance=True)
+    camera = create_autospec(dai.node.Camera, instance=True)
+    pipeline = create_autospec(dai.Pipeline, instance=True)
+    opened.getDeviceId.return_value, camera.getBoardSocket.return_value = ONE.deviceId, SOCKET
+    opened.readCalibration.return_value = memory(coefficients=[0.0] * 14, model="Perspective")
+    pipeline.create.return_value = camera.build.return_value = camera
+    devices = create_autospec(dai.Device, return_value=opened)
+    devices.getAllAvailableDevices.return_value = [ONE]
+    monkeypatch.setattr(dai, "Device", devices)
+    monkeypatch.setattr(dai, "Pipeline", lambda device: pipeline if device is opened else None)
+    stream = camera_pipeline(device=None, width=1280, height=720, fps=15.0)(lambda body: body)
+    lens = stream.lens(1280, 720)
+    devices.assert_called_once_with(ONE)
+    opened.setMaxReconnectionAttempts.assert_called_once_with(0)
+    pipeline.create.assert_called_once_with(dai.node.Camera)
+    camera.requestOutput.assert_called_once_with((1280, 720), dai.ImgFrame.Type.NV12, fps=15.0)
+    assert (stream.id, stream.fps, stream.pipeline) == (ONE.deviceId, 15.0, pipeline)
+    assert lens is not None
+    assert lens.fx == pytest.approx(3100 * 1280 / 4056, rel=1e-5)
 
 
 def test_a_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:

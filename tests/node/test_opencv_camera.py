@@ -103,6 +103,17 @@ def test_an_unplugged_camera_is_lost_every_time_it_is_asked() -> None:
     assert fake.released.wait(GUARD_S)
 
 
+def test_a_driver_that_raises_is_a_lost_camera_and_no_fault_of_the_node() -> None:
+    fake = FakeVideoCapture(RED)
+    source = camera(fake)
+    fake.breaks = True
+    with pytest.raises(SourceLostError, match=r"the camera /dev/null fails .*; check its cable"):
+        list(source.frames())
+    assert fake.released.wait(GUARD_S)
+    with pytest.raises(SourceAbsentError, match="gives no picture"):
+        camera(fake)
+
+
 def test_a_read_that_never_returns_is_left_behind(caplog: pytest.LogCaptureFixture) -> None:
     fake = FakeVideoCapture(RED)
     source = camera(fake)

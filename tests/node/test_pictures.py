@@ -5,13 +5,31 @@ import numpy as np
 import pytest
 
 from gcd_node.errors import OutputError
-from gcd_node.pictures.files import heat, side_by_side, spread, strip, to_u8, write_frames, write_png, write_video
+from gcd_node.pictures.files import (
+    heat,
+    scaled,
+    side_by_side,
+    spread,
+    strip,
+    to_u8,
+    write_animation,
+    write_frames,
+    write_png,
+    write_video,
+)
 
 
 def gradient(red: int = 200) -> np.ndarray:
     image = np.zeros((16, 24, 3), np.uint8)
     image[..., 0], image[..., 2] = red, np.arange(24) * 10
     return image
+
+
+def test_to_u8_takes_levels_as_they_are_without_a_copy_if_they_lie_as_they_are_sent() -> None:
+    levels = np.random.default_rng(0).integers(0, 256, (2, 4, 5, 3), np.uint8)
+    assert np.shares_memory(to_u8(levels.transpose(0, 3, 1, 2)), levels)
+    planar = np.ascontiguousarray(levels.transpose(0, 3, 1, 2))
+    assert (to_u8(planar) == levels).all()
 
 
 def test_to_u8_rounds_to_the_nearest_level_and_keeps_the_order_of_axes() -> None:
@@ -70,3 +88,18 @@ def test_heat_is_black_at_zero_and_brightest_at_the_top() -> None:
 def test_frames_are_numbered_from_zero(tmp_path: Path) -> None:
     assert write_frames(tmp_path, [gradient()] * 3) == 3
     assert sorted(path.name for path in tmp_path.iterdir()) == ["0000.png", "0001.png", "0002.png"]
+
+
+def test_a_moving_picture_plays_every_frame_at_its_rate_and_for_ever(tmp_path: Path) -> None:
+    frames = [np.full((24, 40, 3), (level, 255 - level, 0), np.uint8) for level in (0, 120, 240)]
+    write_animation(tmp_path / "new" / "a.webp", frames, 10.0)
+    read, animation = cv2.imreadanimation(str(tmp_path / "new" / "a.webp"))
+    assert read
+    assert list(animation.durations) == [100, 100, 100]
+    assert animation.loop_count == 0
+    for frame, shown in zip(frames, animation.frames, strict=True):
+        assert np.abs(shown[..., 2::-1].astype(int) - frame).max() < 12
+
+
+def test_a_scaled_picture_keeps_its_shape() -> None:
+    assert scaled(np.zeros((90, 160, 3), np.uint8), 80).shape == (45, 80, 3)

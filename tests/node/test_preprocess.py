@@ -80,6 +80,25 @@ def test_cropping_the_sides_narrows_the_field_of_view() -> None:
     assert fitted.vfov_deg == pytest.approx(wide.vfov_deg)
 
 
+@pytest.mark.parametrize(("width", "height"), [(1280, 720), (640, 480), (300, 900)])
+@pytest.mark.parametrize("share", [1.0, 0.7, 0.31])
+def test_a_share_of_the_width_is_cut_out_of_the_middle_in_the_wanted_shape(
+    width: int, height: int, share: float
+) -> None:
+    left, top, wide, high = Fit(width=48, height=32, share=share).crop_box(width, height)
+    assert wide <= share * width + 1
+    assert wide / high == pytest.approx(1.5, abs=0.03)
+    assert abs(2 * left + wide - width) <= 1
+    assert abs(2 * top + high - height) <= 1
+    assert wide >= min(share * width - 2, height * 1.5 - 2)
+
+
+@pytest.mark.parametrize("share", [0.0, 1.1, float("nan")])
+def test_a_share_that_cannot_be_is_refused(share: float) -> None:
+    with pytest.raises(ConfigError, match="share of a picture"):
+        Fit(width=48, height=32, share=share)
+
+
 def test_the_clip_spans_minus_one_to_one() -> None:
     images = np.zeros((2, 4, 5, 3), np.uint8)
     images[1, 2, 3] = (255, 51, 0)

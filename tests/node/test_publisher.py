@@ -72,6 +72,20 @@ def test_a_second_process_receives_every_window_bit_for_bit(tmp_path, transport)
     assert lines_of(reader) == [*expected, "end"]
 
 
+@pytest.mark.parametrize("transport", ["ipc", "tcp"])
+def test_only_what_leaves_the_machine_s_memory_carries_a_checksum(tmp_path, context, transport) -> None:
+    data = f"ipc://{tmp_path}/data" if transport == "ipc" else "tcp://127.0.0.1:0"
+    with Publisher(PublisherOptions(data=data, status=f"ipc://{tmp_path}/status")) as publisher:
+        views = plain_reader(context, publisher.endpoint, topic_key("view/top/win"))
+        notes = plain_reader(context, publisher.status_endpoint, topic_key("status"))
+        wait_for_subscribers(publisher, 1)
+        publisher.send(window())
+        publisher.note("status", origin(), {"state": "active"})
+        parts = [each.recv() for each in (views, notes) if each.poll(10_000)]
+    found = [int.from_bytes(part[56:60], "little") for part in parts]
+    assert found == [0 if transport == "ipc" else zlib.crc32(parts[0][64:]), zlib.crc32(parts[1][64:])]
+
+
 def test_lockstep_never_skips_for_a_slow_reader(tmp_path) -> None:
     big = pixels(1, frames=14, height=128, width=192)  # 1 MB: more than the kernel's buffers hold
     with Publisher(options(tmp_path, lockstep=True, readers=1)) as publisher:
@@ -230,6 +244,23 @@ def test_lockstep_that_no_reader_takes_is_an_error_at_the_end(tmp_path) -> None:
     publisher.send(window())
     with pytest.raises(EndpointError, match=r"2 messages were not taken .*0 subscribers, wanted 1"):
         publisher.close()
+
+
+def test_a_slow_reader_cannot_stretch_the_end_of_a_node_that_was_told_to_stop(tmp_path, monkeypatch) -> None:
+    made = PublisherOptions(data=f"ipc://{tmp_path}/data", status=None, lockstep=True, queue_size=64, linger_ms=300)
+    publisher, tries = Publisher(made), []
+
+    def room_now_and_then(parcel: object) -> bool:
+        time.sleep(0.05)
+        tries.append(parcel)
+        return len(tries) % 2 == 0
+
+    monkeypatch.setattr(publisher._data, "send", room_now_and_then)
+    for _ in range(60):
+        publisher.send(window())
+    publisher.hurry()
+    publisher.close()
+    assert len(tries) < 60  # all 60 messages would take two tries each
 
 
 def test_closing_twice_is_harmless_and_sending_afterwards_is_an_error(tmp_path) -> None:

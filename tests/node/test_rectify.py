@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from fakes import traits
+from fakes import HEIGHT, WIDTH, traits
 from numpy.typing import NDArray
 
 from gcd_model import Intrinsics
@@ -317,8 +317,41 @@ def test_the_calibration_of_the_source_itself_is_used_at_its_own_size() -> None:
 
 
 def test_a_stated_field_of_view_overrides_the_calibration_of_the_source() -> None:
-    run, _ = prepare_run(config("hfov_deg = 70.0"), traits(), info(lens=BARREL))
+    run, _ = prepare_run(config("hfov_deg = 40.0"), traits(), info(lens=BARREL))
     assert (run.resize, run.ood) == ("released", ("hfov",))
+
+
+def test_a_stated_field_of_view_that_is_too_wide_is_cut_to_the_trained_one() -> None:
+    run, _ = prepare_run(config("hfov_deg = 90.0"), traits(), info())
+    assert run.intrinsics is not None
+    assert run.intrinsics.hfov_deg == pytest.approx(53.13, abs=0.05)
+    assert run.ood == ()
+    fit = fit_of(config("hfov_deg = 90.0"), traits(), info())
+    assert isinstance(fit, Fit)
+    left, top, wide, high = fit.crop_box(1280, 720)
+    assert (left, top) == ((1280 - wide) // 2, (720 - high) // 2)
+    assert (wide, high) == (640, 426)
+
+
+@pytest.mark.parametrize("allowed", [False, True])
+def test_a_cut_that_would_leave_too_few_pixels_is_not_made_unless_they_may_be_enlarged(allowed: bool) -> None:
+    stated = f"hfov_deg = 90.0\nallow_upscale = {str(allowed).lower()}"
+    run, _ = prepare_run(config(stated), traits(), info(width=WIDTH, height=HEIGHT))
+    assert run.ood == (() if allowed else ("hfov",))
+    assert run.intrinsics is not None
+    assert run.intrinsics.hfov_deg == pytest.approx(53.13 if allowed else 90.0, abs=1.0)
+
+
+def test_a_calibration_for_another_shape_is_refused_at_the_start_and_left_out_in_mid_stream(tmp_path: Path) -> None:
+    stated = config(camera_file(tmp_path, fx=800.0))
+    with pytest.raises(ConfigError, match="which is another shape"):
+        prepare_run(stated, traits(), info(width=640, height=480))
+    run, _ = prepare_run(stated, traits(), info(width=640, height=480), changed=True)
+    assert (run.resize, run.ood) == ("released", ("hfov",))
+    kept, _ = prepare_run(stated, traits(), info(width=640, height=360), changed=True)
+    assert (kept.resize, kept.ood) == ("remap2x_area", ())
+    own = info(lens=BARREL, width=640, height=480)
+    assert prepare_run(config(), traits(), own, changed=True)[0].ood == ("hfov",)
 
 
 def test_a_lens_too_narrow_for_the_model_is_flagged_and_refused_if_strict(tmp_path: Path) -> None:
@@ -334,6 +367,12 @@ def test_a_lens_too_narrow_for_the_model_is_flagged_and_refused_if_strict(tmp_pa
 def test_a_calibration_and_a_field_of_view_contradict_each_other(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="calibration and hfov_deg"):
         fit_of(config(camera_file(tmp_path, 800.0) + "\nhfov_deg = 60.0"), traits(), info())
+
+
+def test_a_stated_rate_that_is_a_trained_one_but_for_rounding_is_not_flagged() -> None:
+    for fps, flags in ((23.976, ()), (20.0, ("fps",))):
+        run, rate = prepare_run(config(top=f"window = {{fps = {fps}}}"), traits(), info())
+        assert (rate, run.ood) == (fps, flags)
 
 
 def test_without_calibration_nothing_changes() -> None:

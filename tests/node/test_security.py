@@ -1,5 +1,6 @@
 """Keys on disk, the list of clients, and who gets through to a secured node over tcp."""
 
+import os
 import stat
 import subprocess
 import sys
@@ -200,6 +201,15 @@ def test_ipc_beside_keys_stays_this_users(tmp_path: Path, commands: FakeCommands
 # Where a node may be reached
 
 
+def test_an_ipc_endpoint_is_never_open_to_everybody(tmp_path: Path, commands: FakeCommands, events: Events) -> None:
+    before = os.umask(0)
+    try:
+        with ControlServer(ControlOptions(endpoint=f"ipc://{tmp_path}/c"), commands, lambda: "active", events):
+            assert stat.S_IMODE((tmp_path / "c").stat().st_mode) == 0o770
+    finally:
+        os.umask(before)
+
+
 def test_f19_with_keys_and_clients_a_wider_bind_is_allowed(commands: FakeCommands, events: Events) -> None:
     options = ControlOptions(endpoint="tcp://0.0.0.0:0", security=SECURITY)
     with ControlServer(options, commands, lambda: "active", events) as server:
@@ -310,7 +320,7 @@ def test_no_security_section_means_none() -> None:
     ("text", "says"),
     [
         ("", "client"),
-        ("[client]", "length >= 1"),
+        ("[client]", "names no client"),
         ("[client.a]\nkey = 'short'", "the key of a must be 40 Z85 characters"),
         (f"[client.a]\nkey = '{VIEWER.public}'\nrole = 'root'", "role"),
         (f"[client.a]\nkey = '{VIEWER.public}'\nrol = 'viewer'", "rol"),

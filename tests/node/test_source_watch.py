@@ -26,6 +26,7 @@ class Log:
     details: list[str] = field(default_factory=list)
     told: list[str] = field(default_factory=list)
     heard: list[Frame] = field(default_factory=list)
+    unwanted: tuple[int, int] | None = None
     infos: list[SourceInfo] = field(default_factory=list)
 
     def source_state(self, state: SourceState, detail: str) -> None:
@@ -40,9 +41,10 @@ class Log:
     def source_broken(self, reason: Reason) -> None:
         self.told.append(reason)
 
-    def source_opened(self, info: SourceInfo) -> None:
+    def source_opened(self, info: SourceInfo) -> bool:
         self.told.append("opened")
         self.infos.append(info)
+        return (info.width, info.height) != self.unwanted
 
 
 class Reader:
@@ -50,8 +52,8 @@ class Reader:
 
     def __init__(self, first: FrameSource, bench: Bench | None = None, **patience: float | None) -> None:
         self.log = Log()
-        reopen = (bench or Bench()).open
-        self.watch = SourceWatch(first, reopen, self.log, Patience(**patience), QUICK)  # type: ignore[arg-type]
+        plugged = bench or Bench()
+        self.watch = SourceWatch(first, lambda _: plugged.open(), self.log, Patience(**patience), QUICK)  # type: ignore[arg-type]
         self.frames: list[Frame] = []
         self.failure: Exception | None = None
         self.thread = threading.Thread(target=self._read, daemon=True)
@@ -193,11 +195,26 @@ def test_another_picture_size_is_told_before_its_first_frame() -> None:
 
 def test_what_the_listener_refuses_ends_the_frames() -> None:
     class Strict(Log):
-        def source_opened(self, info: SourceInfo) -> None:
+        def source_opened(self, info: SourceInfo) -> bool:
             raise ConfigError("too small")
 
     with pytest.raises(ConfigError, match="too small"):
-        next(SourceWatch(Camera(), Bench().open, Strict()).frames())
+        next(SourceWatch(Camera(), lambda _: Camera(), Strict()).frames())
+
+
+def test_frames_of_a_size_nobody_wants_are_told_of_and_not_given() -> None:
+    camera = Camera()
+    reader = Reader(camera)
+    reader.log.unwanted = (48, 32)
+    for size in ((96, 64), (48, 32), (48, 32), (96, 64)):
+        camera.shoot(np.zeros((size[1], size[0], 3), np.uint8))
+    until(lambda: len(reader.log.heard) == 4)
+    until(lambda: len(reader.frames) == 2)
+    reader.watch.close()
+    reader.finish()
+    assert [frame.seq for frame in reader.frames] == [0, 3]
+    assert reader.log.told == ["connecting", "opened", "streaming", *["SRC_FORMAT", "opened"] * 2]
+    assert reader.watch.skipped == 2
 
 
 def test_a_fault_of_ours_in_a_source_is_not_taken_for_a_lost_camera() -> None:
@@ -209,7 +226,7 @@ def test_a_fault_of_ours_in_a_source_is_not_taken_for_a_lost_camera() -> None:
 
 def test_a_slow_reader_gets_the_newest_frames_and_the_rest_is_counted() -> None:
     camera = Camera()
-    watch = SourceWatch(camera, Bench().open, Log())
+    watch = SourceWatch(camera, lambda _: Camera(), Log())
     frames: Iterator[Frame] = watch.frames()
     camera.shoot()
     assert next(frames).seq == 0
@@ -247,6 +264,31 @@ def test_closing_ends_a_silent_watch_and_one_that_looks_for_its_camera() -> None
         reader.finish()
         assert time.monotonic() - started_s < 10
         assert camera.closed.is_set()
+
+
+def test_closing_does_not_wait_for_a_camera_that_is_being_opened() -> None:
+    camera, late = Camera(), Camera()
+    asked, answer = threading.Event(), threading.Event()
+    asked_for: list[SourceInfo] = []
+
+    def open_slowly(before: SourceInfo) -> Camera:
+        asked_for.append(before)
+        asked.set()
+        answer.wait(60)
+        return late
+
+    watch = SourceWatch(camera, open_slowly, Log(), backoff=QUICK)
+    left = threading.Thread(target=lambda: list(watch.frames()), daemon=True)
+    left.start()
+    camera.feed(None)
+    assert asked.wait(20)
+    watch.close()
+    left.join(20)
+    assert not left.is_alive()
+    assert not late.closed.is_set()
+    answer.set()
+    until(late.closed.is_set)  # nobody wants it any more
+    assert asked_for == [camera.info]
 
 
 def test_waiting_doubles_up_to_its_limit_and_never_passes_it() -> None:

@@ -6,7 +6,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -135,6 +135,31 @@ def test_a_working_node_is_shown_with_its_figures() -> None:
         assert expected in text, expected
 
 
+def test_a_dead_node_is_not_shown_as_if_it_lived() -> None:
+    text = shown(board_of(note("status", working()), now_s=10.0), 20.0)
+    headline = text.splitlines()[0]
+    assert headline.split() == ["STALE", "robot_7", "silent", "for", "10", "s", "before:", "active"]
+    assert "streaming" in text  # what it said last is still there
+
+
+def test_a_node_that_never_spoke_is_looked_for_at_its_endpoint() -> None:
+    console = Console(width=80, file=io.StringIO(), record=True)
+    console.print(render_status(StatusBoard(), 0.0, "ipc:///run/gcd/status"))
+    assert "no status yet from ipc:///run/gcd/status: is the node running?" in console.export_text()
+
+
+def test_every_figure_fits_into_80_columns() -> None:
+    said = working() | {"views": {"a_long_view_name": {"last_ms": 12_345}, "another_long_one": {"last_ms": 3}}}
+    board = board_of(note("status", said), note("event", {"code": "SRC_STALLED", "level": 1, "message": "no frame"}))
+    console = Console(width=80, file=io.StringIO(), record=True)
+    console.print(render_status(board, 10.0))
+    text = console.export_text()
+    assert max(map(len, text.splitlines())) <= 80
+    assert "…" not in text
+    for expected in ("a_long_view_name 12345 ms ago", "another_long_one 3 ms ago", "capture_gap", "125.0 ms p99"):
+        assert expected in " ".join(text.split()), expected
+
+
 HOSTILE: tuple[dict[str, Any], ...] = (
     {},
     {"level": "high", "reasons": "fps", "source": 3, "window": [], "stages": [1], "views": None, "drops": "many"},
@@ -243,6 +268,29 @@ def test_an_endpoint_that_is_none_is_refused() -> None:
 def test_the_command_prints_a_table(node: Node, endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_app(["status", endpoint, "--once", "--timeout", "20"]) == 0
     assert "streaming, 10.0 FPS" in capsys.readouterr().out
+
+
+def test_into_a_pipe_the_live_table_is_printed_status_by_status(
+    node: Node, endpoint: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen: list[StatusBoard] = []
+
+    def until_enough(
+        request: StatusRequest, on_change: Callable[[StatusBoard], None], on_note: Callable[[NoteMessage], None]
+    ) -> None:
+        def change(board: StatusBoard) -> None:
+            on_change(board)
+            on_change(board)  # nothing new: nothing printed
+            seen.append(board)
+            if len(seen) == 10:
+                raise KeyboardInterrupt
+
+        watch_status(request, change, on_note)
+
+    monkeypatch.setattr("gcd_node.cli.status.watch_status", until_enough)
+    assert run_app(["status", endpoint]) == 130
+    printed = capsys.readouterr().out.count("capture_gap")
+    assert 0 < printed <= 10  # of 20 calls
 
 
 def test_the_command_prints_one_json_line(node: Node, endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,6 @@
 """The subscriber: what it checks, what it leaves out, and that a planner can import it with next to nothing."""
 
+import gc
 import subprocess
 import sys
 import time
@@ -264,3 +265,16 @@ def test_a_conflated_reader_finds_the_newest_of_many(sender) -> None:
         view = views.receive(5000)
         assert view.header.window_id == 49
         assert views.receive(20) is None
+
+
+def test_pixels_outlive_what_comes_later_and_the_subscriber(sender) -> None:
+    big = pixels(1, frames=14, height=64, width=96)  # large enough that ZeroMQ's own memory is looked at
+    with ViewSubscriber(sender.endpoint, "top", conflate=False) as views:
+        sender.wait()
+        for i in range(4):
+            sender.send(sender.numbered(i, window(i, images=big + np.uint8(i))))
+        kept = [views.receive(5000).images for _ in range(4)]
+    gc.collect()
+    assert [(each == big + np.uint8(i)).all() for i, each in enumerate(kept)] == [True] * 4
+    with pytest.raises(ValueError, match="read-only"):
+        kept[0][:] = 0

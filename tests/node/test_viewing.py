@@ -82,6 +82,19 @@ def test_a_rendered_table_shows_each_row_and_the_warning() -> None:
         assert word in shown
 
 
+def test_the_table_of_long_names_loses_nothing_in_80_columns() -> None:
+    table = ViewTable()
+    for name in ("topdown", "a_view_name_of16"):
+        table.add(received(window(123_456, view_id=name)), now_s=0.0)
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(render(table.rows(now_s=99.0)))
+    shown = console.export_text()
+    assert "…" not in shown
+    assert max(map(len, shown.splitlines())) <= 80
+    for word in ("window", "age ms", "rate Hz", "missed", "123456", "view/topdown/win", "expired"):
+        assert word in shown, word
+
+
 def test_a_watch_sees_all_views_until_the_stream_ends(tmp_path) -> None:
     request = WatchRequest(endpoint=f"ipc://{tmp_path}/data", timeout_s=10)
     report = watched(tmp_path, request, 3, ending=True)

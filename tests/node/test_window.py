@@ -1,6 +1,7 @@
 """Frames become windows: the grid, its holes, restarts and the end of a stream."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from media import frames_at
 
 from gcd_node.errors import ConfigError, SourceError
 from gcd_node.frame import Frame
+from gcd_node.optics.preprocess import to_clip_tensor
 from gcd_node.window import FrameWindow, WindowBuilder, choose_fps
 
 
@@ -94,6 +96,17 @@ def test_a_variable_rate_is_resampled_by_its_stamps() -> None:
     np.testing.assert_allclose(used_ms, np.arange(32) * 125, atol=0.01)
 
 
+@pytest.mark.parametrize("stride", [1, 3, 4, 6])
+def test_the_clip_of_a_window_is_its_pictures_as_the_network_takes_them(stride: int) -> None:
+    frames = even(20, 10.0)
+    stepped = [*frames[:9], *(replace(frame, stamp_ns=frame.stamp_ns + 10**10) for frame in frames[9:])]
+    windows = run(WindowBuilder(frames=4, fps=10.0, stride=stride), stepped)
+    assert {window.epoch for window in windows} == {0, 1}
+    for window in windows:
+        assert window.images[:, 0, 0, 0].tolist() == list(window.seqs)
+        np.testing.assert_array_equal(window.clip, to_clip_tensor(window.images))
+
+
 # --- a window ----------------------------------------------------------------------------------------------------
 
 
@@ -176,6 +189,23 @@ def test_another_picture_size_begins_a_new_epoch() -> None:
     windows = run(builder, [*small, *large])
     assert [(window.epoch, window.images.shape[2]) for window in windows] == [(0, 4), (1, 8)]
     assert builder.counts.reasons == {"SRC_FORMAT": 1}
+
+
+def test_after_a_restart_a_builder_goes_on_at_another_rate() -> None:
+    builder = WindowBuilder(frames=4, fps=24.0, source_fps=24.0)
+    before = run(builder, even(6, 24.0))
+    builder.restart("SRC_LOST")
+    builder.run_at(12.0, 12.5)
+    after = run(builder, even(9, 12.5, first_ms=9000.0))
+    assert [(window.epoch, window.fps, window.window_id) for window in before + after] == [
+        (0, 24.0, 0),
+        (1, 12.0, 1),
+        (1, 12.0, 2),
+    ]
+    assert seqs(after) == list(range(8))
+    with pytest.raises(ConfigError, match="a window needs"):
+        builder.run_at(0.0, None)
+    assert builder.fps == 12.0
 
 
 def test_the_end_completes_a_window_that_only_waits_for_a_nearer_frame() -> None:

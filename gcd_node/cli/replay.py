@@ -1,0 +1,107 @@
+"""`gcd-node replay` and `diff`: a recording through the model into a run on disk, and two such runs compared."""
+
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+import msgspec
+import typer
+from rich.console import Console
+from rich.table import Table
+from typer import Argument, Option
+
+from gcd_node.cli.check import Changes, ConfigPath
+from gcd_node.config import load_config
+from gcd_node.rendering.model_worker import WindowReport
+from gcd_node.replay.diff_pictures import REPORT, write_report
+from gcd_node.replay.diff_report import divergence, facts_table, to_plain, verdict, views_table
+from gcd_node.replay.lockstep import replay
+from gcd_node.replay.run_diff import RunComparison, Tolerance, compare
+from gcd_node.replay.run_folder import RunFolder, open_run
+
+RunOut: TypeAlias = Annotated[Path, Option("--out", metavar="RUN", help="Folder for the run; new, or empty.")]
+RunA: TypeAlias = Annotated[Path, Argument(metavar="RUN_A", help="A run of `gcd-node replay`, such as the golden one.")]
+RunB: TypeAlias = Annotated[Path, Argument(metavar="RUN_B", help="The run to compare with it.")]
+MinPsnr: TypeAlias = Annotated[
+    float | None,
+    Option(metavar="DB", help="What each frame of each view must reach; else all pixels must be identical."),
+]
+MaxClassShare: TypeAlias = Annotated[
+    float, Option(metavar="SHARE", help="Of a view's class pixels in a window, how many may differ, 0 to 1.")
+]
+DiffOut: TypeAlias = Annotated[
+    Path | None, Option("--out", metavar="DIR", help="Folder for diff.json and pictures of the worst windows.")
+]
+AsJson: TypeAlias = Annotated[bool, Option("--json", help="Print the whole comparison as one line of JSON.")]
+
+
+def replay_launch(config: ConfigPath, out: RunOut, changes: Changes = None) -> None:
+    """Replay a launch file's recording in lockstep, as fast as the model goes, into a run that can be compared.
+
+    RUN gets manifest.json (what it was made from, and a SHA-256 of every view of every window) and the pixels without
+    loss. It appears when it is complete. Opens no socket; the same machine gives the same hashes every time.
+    """
+    settings = load_config(config, changes or ())
+    console = Console(stderr=True, markup=False)
+    with console.status(f"loading {settings.model.weights}") as status:
+
+        def tell(report: WindowReport) -> None:
+            status.update(f"window {report.window.window_id}: {report.render_s * 1000:.0f} ms")
+
+        run = replay(settings, out, tell)
+    Console(markup=False).print(_run_table(run))
+    Console(markup=False).print(f"wrote {run.path}", soft_wrap=True, highlight=False)
+
+
+def diff(
+    run_a: RunA,
+    run_b: RunB,
+    min_psnr: MinPsnr = None,
+    max_class_share: MaxClassShare = 0.0,
+    out: DiffOut = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compare two runs window by window: identical, or how far apart, where first, and what they were made from.
+
+    Ends with 0 if they are identical or near enough, with 1 if not, with 65 or 66 if one is damaged or missing.
+    """
+    tolerance = Tolerance(min_psnr_db=min_psnr, max_class_share=max_class_share)
+    runs = open_run(run_a), open_run(run_b)
+    with Console(stderr=True, markup=False).status("comparing"):
+        comparison = compare(*runs)
+        pictures = () if out is None else write_report(out, comparison, tolerance, runs)
+    if as_json:
+        typer.echo(msgspec.json.encode(to_plain(comparison, tolerance)).decode())
+    else:
+        _print(comparison, tolerance)
+        for path in () if out is None else (out / REPORT, *pictures):
+            Console(markup=False).print(f"wrote {path}", soft_wrap=True, highlight=False)
+    if comparison.failures(tolerance):
+        raise typer.Exit(1)
+
+
+def _print(comparison: RunComparison, tolerance: Tolerance) -> None:
+    console = Console(markup=False)
+    if comparison.facts:
+        console.print(facts_table(comparison))
+    console.print(views_table(comparison, tolerance))
+    first = divergence(comparison)
+    for line in (verdict(comparison, tolerance), *(() if first is None else (first,))):
+        console.print(line, soft_wrap=True, highlight=False)
+
+
+def _run_table(run: RunFolder) -> Table:
+    manifest = run.manifest
+    totals, machine = manifest.totals, manifest.machine
+    rejected = ", ".join(f"{count} {reason}" for reason, count in totals.rejected.items()) or "0"
+    table = Table(show_header=False)
+    for row in (
+        ("weights", f"{manifest.weights.name} {manifest.weights.sha256_12}"),
+        ("frames read", str(totals.frames)),
+        ("windows rendered", str(totals.windows)),
+        ("windows rejected", rejected),
+        ("windows with NaN", str(totals.nan_windows)),
+        ("views", ", ".join(manifest.views)),
+        ("on", f"{machine.device}, {machine.processor}, {machine.threads} threads"),
+    ):
+        table.add_row(*row)
+    return table

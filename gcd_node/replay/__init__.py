@@ -1,0 +1,1 @@
+"""Replays of recordings that can be compared: a run on disk, the difference of two, and goldens."""

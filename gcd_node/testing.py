@@ -1,0 +1,147 @@
+"""A pytest plugin for projects that run gcd-node: replay a launch file in a test, and compare it with a golden run.
+
+    def test_the_drive_looks_as_it_did(gcd_replay: ReplayFixture) -> None:
+        run = gcd_replay("launch.toml", {"model.steps": 1})
+        run.assert_same_as("tests/golden/drive", min_psnr=40.0)
+
+Installed with the package, so plain `pytest` finds it; `pytest --gcd-update` writes the golden runs. Light to import:
+the model comes with the first replay.
+"""
+
+import contextlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from gcd_node.replay.manifest import Manifest
+    from gcd_node.replay.run_folder import RunFolder
+
+__all__ = ["ReplayFixture", "ReplayedRun", "gcd_replay"]
+
+_RENEWED = pytest.StashKey[list[str]]()
+_UPDATE = "--gcd-update"
+
+
+class ReplayedRun:
+    """A launch file that was replayed in a test."""
+
+    def __init__(self, run: "RunFolder", config: pytest.Config) -> None:
+        self._run, self._config = run, config
+
+    @property
+    def folder(self) -> Path:
+        """The run, as `gcd-node replay --out` writes it; lies in the test's tmp_path."""
+        return self._run.path
+
+    @property
+    def manifest(self) -> "Manifest":
+        """What the run states of itself: seeds, stamps, digests, totals."""
+        return self._run.manifest
+
+    def assert_same_as(
+        self, golden: str | Path, *, min_psnr: float | None = None, max_class_share: float = 0.0
+    ) -> None:
+        """Fail unless this run is what a golden run says. With --gcd-update the golden becomes this run instead.
+
+        When it fails, pictures of the worst windows and diff.json lie beside the run, in a folder named in the message.
+
+        Args:
+            golden: its folder; from pytest's root folder if relative.
+            min_psnr: decibels each frame of each view must reach; left out, all pixels must be identical, which only
+                the same machine promises.
+            max_class_share: of a view's class pixels in a window, how many may differ, 0 to 1.
+        Raises:
+            AssertionError: it differs, or there is no golden run yet. DamagedRunError: the golden is damaged.
+        """
+        __tracebackhide__ = True
+        path = self._config.rootpath / golden
+        if self._config.getoption(_UPDATE):
+            self._renew(path)
+            return
+        if not path.exists():
+            raise AssertionError(
+                f"no golden run at {path}: make one with `pytest {_UPDATE}`, look at it, and commit it"
+            )
+        text = self._difference(path, min_psnr, max_class_share)
+        if text is not None:
+            raise AssertionError(text)
+
+    def _renew(self, golden: Path) -> None:
+        from gcd_node.replay.golden import renew_golden
+
+        if renew_golden(self._run, golden):
+            self._config.stash[_RENEWED].append(str(golden))
+
+    def _difference(self, golden: Path, min_psnr: float | None, max_class_share: float) -> str | None:
+        """What to say of a run that is too far from its golden; None for one that is near enough."""
+        from gcd_node.replay.diff_pictures import write_report
+        from gcd_node.replay.diff_report import report_text
+        from gcd_node.replay.run_diff import Tolerance, compare
+        from gcd_node.replay.run_folder import open_run
+
+        tolerance, expected = Tolerance(min_psnr_db=min_psnr, max_class_share=max_class_share), open_run(golden)
+        comparison = compare(expected, self._run)
+        if not comparison.failures(tolerance):
+            return None
+        folder = self.folder.with_name(f"{self.folder.name}-differences")
+        pictures = write_report(folder, comparison, tolerance, (expected, self._run))
+        shown = "\n".join(f"  {path}" for path in pictures) or f"  {folder}: no pictures, see diff.json"
+        return (
+            f"{report_text(comparison, tolerance)}\nA is the golden run {golden}\nB is this run {self.folder}\n"
+            f"pictures:\n{shown}\nIf this is how it should be: pytest {_UPDATE}"
+        )
+
+
+class ReplayFixture:
+    """What the fixture `gcd_replay` gives: call it with a launch file."""
+
+    def __init__(self, config: pytest.Config, folder: Path) -> None:
+        self._config, self._folder, self._count = config, folder, 0
+
+    def __call__(self, launch: str | Path, settings: Mapping[str, object] | None = None) -> ReplayedRun:
+        """Replay a launch file, in lockstep and without sockets, into the test's tmp_path.
+
+        Runs in pytest's root folder: what is relative, in the launch file too, is meant from there.
+
+        Args:
+            launch: path of the launch file.
+            settings: changes to it, such as {"model.steps": 1}; what `gcd-node run --set` takes.
+        Raises:
+            ConfigError, SourceError, CheckpointError and others: as `gcd-node replay`.
+        """
+        from gcd_node.config import load_config
+        from gcd_node.config_text import to_change
+        from gcd_node.replay.lockstep import replay
+
+        changes = [to_change(key, value) for key, value in (settings or {}).items()]
+        folder = self._folder / f"gcd-run-{self._count}"
+        self._count += 1
+        with contextlib.chdir(self._config.rootpath):
+            run = replay(load_config(Path(launch), changes), folder)
+        return ReplayedRun(run, self._config)
+
+
+@pytest.fixture
+def gcd_replay(request: pytest.FixtureRequest, tmp_path: Path) -> ReplayFixture:
+    """Replays launch files and compares them with golden runs; see ReplayFixture."""
+    return ReplayFixture(request.config, tmp_path)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Adds --gcd-update."""
+    group = parser.getgroup("gcd-node")
+    group.addoption(_UPDATE, action="store_true", help="make every golden run that a test asks for what it is now")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Nothing is renewed yet."""
+    config.stash[_RENEWED] = []
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """Says which golden runs were renewed."""
+    for path in dict.fromkeys(config.stash[_RENEWED]):
+        terminalreporter.write_line(f"gcd-node: renewed the golden run {path}")

@@ -1,0 +1,139 @@
+// Puts the page together, and says in one word how things stand.
+
+import { Controls } from "./controls.js";
+import { HealthPanel } from "./health.js";
+import { Link } from "./link.js";
+import { InputPicture, ViewPicture } from "./pictures.js";
+import { Plots } from "./plots.js";
+
+const TICK_MS = 100;
+const element = (id) => document.getElementById(id);
+
+const health = new HealthPanel();
+const plots = new Plots();
+const input = new InputPicture();
+const view = new ViewPicture();
+let bootId = null;
+let steered = ""; // what the controls were last fitted to
+let taking = Promise.resolve(); // pictures are taken in the order they came
+let ticked = 0;
+
+const link = new Link({
+  open: () => { steered = ""; if (view.view) link.say({ type: "watch", view: view.view }); },
+  welcome: ({ commands }) => { controls.commands = commands; controls.explain(); },
+  role: ({ role, refused }) => {
+    element("role").textContent = refused ? "viewer: the token is not this node's" : role;
+    element("role").dataset.role = role;
+    controls.setRole(role);
+  },
+  history: ({ samples }) => { health.forget(); plots.forget(); plots.addSamples(samples, false); },
+  windows: ({ windows }) => plots.addWindows(windows),
+  status: (told) => {
+    noticeBoot(told.boot_id);
+    health.take(told);
+    plots.addSamples([{ at_s: told.at_s, stages: medians(told.fields.stages) }], true);
+    fitControls();
+  },
+  meta: (told) => { noticeBoot(told.boot_id); offerViews(told.fields.views ?? []); },
+  event: (told) => {
+    health.event(told);
+    if (["VIEW_SET", "VIEW_REMOVED", "PARAM_SET"].includes(told.fields.code)) controls.refresh(controls.commands);
+  },
+  picture: (head, bytes, at) => {
+    taking = taking.then(() => take(head, bytes, at)).catch((error) => console.warn("a picture could not be shown", error))
+      .finally(() => link.say({ type: "got", number: head.number }));
+  },
+});
+const controls = new Controls(link);
+
+async function take(head, bytes, at) {
+  if (head.kind === "src") return input.take(head, bytes, at);
+  if (head.view !== view.view) return;
+  if (head.kind === "win") plots.addWindows([{ view: head.view, at_s: head.at_s, ...head.published }]);
+  await view.take(head, bytes, at);
+}
+
+function medians(stages = {}) {
+  return Object.fromEntries(Object.entries(stages).map(([name, told]) => [name, told.p50_ms]));
+}
+
+// The node was started anew: what was tied to the old one is forgotten.
+function noticeBoot(id) {
+  if (bootId !== null && bootId !== id) {
+    steered = "";
+    view.reset(view.view);
+    link.say({ type: "watch", view: view.view });
+  }
+  bootId = id;
+}
+
+// Ask again what can be steered when the model or the state has changed.
+function fitControls() {
+  const { state, model } = health.status;
+  const now = `${bootId} ${state} ${["absent", "loading"].includes(model?.state)}`;
+  if (now === steered) return;
+  steered = now;
+  controls.refresh(controls.commands).then(() => controls.setRole(element("role").dataset.role));
+}
+
+function offerViews(ids) {
+  const choice = element("views");
+  choice.hidden = ids.length < 2;
+  const kept = localStorage.getItem("gcd-view");
+  const selected = ids.includes(view.view) ? view.view : ids.includes(kept) ? kept : ids[0];
+  choice.replaceChildren(choice.querySelector("legend"), ...ids.map((id) => option(id, id === selected)));
+  if (selected !== undefined && selected !== view.view) select(selected);
+}
+
+function option(id, isSelected) {
+  const label = document.createElement("label");
+  const radio = document.createElement("input");
+  const text = document.createElement("span");
+  Object.assign(radio, { type: "radio", name: "view", value: id, checked: isSelected });
+  radio.addEventListener("change", () => { localStorage.setItem("gcd-view", id); select(id); });
+  text.textContent = id;
+  label.append(radio, text);
+  return label;
+}
+
+function select(id) {
+  view.reset(id);
+  controls.select(id);
+  link.say({ type: "watch", view: id });
+}
+
+// The one word: connecting, live, stale, dead. `since` is this page's clock, for whoever measures.
+function turn(now) {
+  const [life, why] = link.life(now);
+  const isFresh = view.isFresh(now);
+  const state = life !== "alive" ? life : isFresh ? "live" : "stale";
+  const reason = why || health.summary() || (state === "live" ? "" : view.now ? "the last view is too old, and no newer one has come" : "no view has come yet");
+  const { dataset } = document.body;
+  if (dataset.state !== state) {
+    dataset.state = state;
+    dataset.since = String(now);
+    element("state").textContent = state;
+    document.title = `${state === "live" ? "" : `${state}: `}${health.status ? element("node").textContent : "gcd-node"}`;
+  }
+  if (element("why").textContent !== reason) element("why").textContent = reason;
+  return state === "dead";
+}
+
+function paint() {
+  const now = performance.now();
+  const isDead = document.body.dataset.state === "dead";
+  view.refresh(now, isDead);
+  if (view.now && !isDead) controls.seen(view.now.head.rev);
+  input.refresh(now, view.last, isDead);
+  requestAnimationFrame(paint);
+}
+
+setInterval(() => {
+  const now = performance.now();
+  turn(now);
+  if (now - ticked > 1000) {
+    ticked = now;
+    plots.draw(view.view);
+  }
+}, TICK_MS);
+requestAnimationFrame(paint);

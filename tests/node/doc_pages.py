@@ -1,0 +1,172 @@
+"""Reads the pages: their blocks, links, commands, and the errors they quote."""
+
+import ast
+import re
+import shlex
+import types
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import typer
+
+from gcd_node.cli.commands import app as node_app
+from gcd_node.config import parse_config
+from gcd_node.control.verbs import VERBS
+from gcd_node.errors import ConfigError
+from gcd_train.cli import app as train_app
+
+ROOT = Path(__file__).parent.parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+SOURCES = [ROOT / "gcd_node", ROOT / "model" / "gcd_model", ROOT / "train" / "gcd_train"]
+SHELL = ("", "sh", "bash", "console")
+GAP = "\0"  # stands for what a message fills in
+WHOLE = ("source.kind=synthetic", "model.weights=random:driving", "view.topdown.kind=fixed")
+"""What a launch file cannot do without, as changes."""
+
+
+class Block(NamedTuple):
+    """A fenced block. language, mark: the words behind the fence, such as `toml fragment`."""
+
+    page: str
+    line: int
+    language: str
+    mark: str
+    text: str
+
+    @property
+    def place(self) -> str:
+        return f"{self.page}:{self.line}"
+
+
+def read_blocks(page: str, text: str) -> Iterator[Block]:
+    for found in re.finditer(r"^```([^\n`]*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
+        language, _, mark = found[1].strip().partition(" ")
+        yield Block(page, text.count("\n", 0, found.start()) + 1, language, mark, found[2])
+
+
+def name_of(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
+
+
+BLOCKS = [block for page in PAGES for block in read_blocks(name_of(page), page.read_text())]
+
+
+def without_blocks(text: str) -> str:
+    return re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+
+
+def headings(page: Path) -> set[str]:
+    """Anchors as GitHub makes them."""
+    found = re.findall(r"^#+ (.+)$", without_blocks(page.read_text()), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in found}
+
+
+def dead_links(page: Path, text: str) -> list[str]:
+    dead: list[str] = []
+    for link in re.findall(r"\]\(([^)\s]+)\)", without_blocks(text)):
+        if re.match(r"[a-z]+:", link):
+            continue
+        file, _, anchor = link.partition("#")
+        target = page if not file else (page.parent / file).resolve()
+        if not target.exists() or (anchor and anchor not in headings(target)):
+            dead.append(f"{page.name}: {link}")
+    return dead
+
+
+@cache
+def programs() -> dict[str, Any]:
+    return {"gcd-node": typer.main.get_command(node_app), "gcd-train": typer.main.get_command(train_app)}
+
+
+def said_commands(text: str) -> Iterator[list[str]]:
+    """Calls of our programs in a shell block, each as its words; comments, pipes and prompts are taken off."""
+    for line in text.replace("\\\n", " ").splitlines():
+        for call in re.split(r"\s(?:\\?\||&&|;|>|&)(?:\s|$)", re.sub(r"(?:^|\s)#.*", "", line).strip(" $")):
+            words = shlex.split(call)
+            while words and "=" in words[0]:
+                words = words[1:]
+            if words and Path(words[0]).name in programs():
+                yield [Path(words[0]).name, *words[1:]]
+
+
+def quoted_commands(text: str) -> Iterator[list[str]]:
+    """The same in running text, between backticks."""
+    for quoted in re.findall(r"`((?:gcd-node|gcd-train)(?: [^`]*)?)`", without_blocks(text)):
+        yield from said_commands(quoted.replace("...", " "))
+
+
+def mistakes(words: list[str]) -> list[str]:
+    """What a call names that the program does not know."""
+    command, rest, wrong = programs()[words[0]], words[1:], list[str]()
+    while rest:
+        word = rest.pop(0)
+        if word.startswith("-") and word != "-":
+            option = _option(command, word.partition("=")[0])
+            if option is None:
+                wrong.append(word)
+            elif not option.is_flag and "=" not in word:
+                values, rest = rest[: option.nargs], rest[option.nargs :]
+                wrong += _wrong_change(values) if "--set" in option.opts else []
+        elif hasattr(command, "commands"):
+            if word not in command.commands:
+                return [word]
+            command = command.commands[word]
+        elif command.name == "ctl" and word.islower() and "=" not in word and word not in VERBS:
+            wrong.append(word)
+    return wrong
+
+
+def _option(command: Any, word: str) -> Any:
+    if word == "--help":
+        return types.SimpleNamespace(is_flag=True, opts=[word])
+    return next((each for each in command.params if word in (*each.opts, *each.secondary_opts)), None)
+
+
+def _wrong_change(values: list[str]) -> list[str]:
+    """A change of a key that no launch file has."""
+    try:
+        parse_config(b"", "here", [*WHOLE, *values])
+    except ConfigError as error:
+        return values if "unknown key" in str(error) else []
+    return []
+
+
+def wrong_commands(page: str, text: str) -> list[str]:
+    shell = [block.text for block in read_blocks(page, text) if block.language in SHELL]
+    calls = [*quoted_commands(text), *(call for each in shell for call in said_commands(each))]
+    return [f"{page}: {' '.join(words)}: {wrong}" for words in calls if (wrong := mistakes(words))]
+
+
+def said_texts() -> set[str]:
+    """Every text in the sources, with a gap where something is filled in."""
+    texts: set[str] = set()
+    for path in (path for root in SOURCES for path in root.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                texts.add(re.sub(r"%[sdg]|%\.\d+[fg]", GAP, node.value) if "%" in node.value else node.value)
+            elif isinstance(node, ast.JoinedStr):
+                texts.add("".join(str(v.value) if isinstance(v, ast.Constant) else GAP for v in node.values))
+    return texts
+
+
+def is_said(quoted: str, texts: set[str]) -> bool:
+    """Whether the parts of a quotation, in their order, stand in one text of the sources."""
+    first, *others = [part.strip() for part in quoted.split("…") if part.strip()]
+
+    def follows(text: str) -> bool:
+        at = text.find(first) + len(first)
+        for part in others:
+            at = text.find(part, at) + len(part)
+            if at < len(part):
+                return False
+        return True
+
+    return any(first in text and follows(text) for text in texts)
+
+
+def quoted_errors(text: str) -> list[str]:
+    """What stands between backticks in the first column of the tables."""
+    rows = re.findall(r"^\| `([^`]+)` \|", text, re.MULTILINE)
+    return [row for row in rows if row != "Message"]

@@ -1,0 +1,189 @@
+"""Recordings for tests: made by a node over fakes, read back by the reference libraries."""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from fakes import Box, FakeSource, FakeSynthesizer, made_node, traits
+from mcap.exceptions import McapError
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.records import Channel, Schema
+from mcap.summary import Summary
+from mcap_ros2.decoder import DecoderFactory
+
+from gcd_model import Traits
+from gcd_node.config import NodeConfig, parse_config
+from gcd_node.frame import Frame, FrameSource
+from gcd_node.node import Node
+from gcd_node.optics.calibration import LensModel
+from gcd_node.sources import open_source
+
+SECOND_NS = 10**9
+LENS = LensModel(
+    width=192,
+    height=128,
+    fx=200.0,
+    fy=201.0,
+    cx=95.5,
+    cy=63.5,
+    distortion="plumb_bob",
+    coefficients=(-0.1, 0.02, 0.0, 0.0, 0.0),
+)
+
+
+class Calibrated(FakeSource):
+    """A source that knows its lens, with noise that no coder keeps whole."""
+
+    def __init__(self, count: int = 30) -> None:
+        super().__init__(count, size=(192, 128))
+        self.info = replace(self.info, lens=LENS)
+
+    def frames(self) -> Iterator[Frame]:
+        draw = np.random.default_rng(0)
+        for frame in super().frames():
+            yield replace(frame, image=draw.integers(0, 256, frame.image.shape, np.uint8))
+
+
+@dataclass(frozen=True)
+class Said:
+    """One message of a recording, decoded by the reference libraries: a ROS message, or a JSON object."""
+
+    topic: str
+    schema: Schema
+    channel: Channel
+    log_ns: int
+    publish_ns: int
+    sequence: int
+    data: bytes
+    value: Any
+
+    @property
+    def stamp_ns(self) -> int:
+        """Of its header."""
+        return self.value.header.stamp.sec * SECOND_NS + self.value.header.stamp.nanosec
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """The JSON in it, whichever way it was written."""
+        return self.value if isinstance(self.value, dict) else json.loads(self.value.data)
+
+
+def recorder_config(
+    folder: Path,
+    *,
+    record: str = "",
+    source: str = 'kind = "synthetic"\npace = "lockstep"',
+    more: str = "",
+    keep_free_mb: float = 0.0,
+) -> NodeConfig:
+    text = f"""
+        [source]
+        {source}
+        [model]
+        weights = "fake"
+        {more}
+        [view.main]
+        [record]
+        folder = "{folder}"
+        keep_free_mb = {keep_free_mb}
+        autostart = true
+        {record}
+    """
+    return parse_config(text.encode(), "test")
+
+
+def recorded(config: NodeConfig, source: FrameSource | None = None, made: Traits | None = None) -> tuple[Node, Box]:
+    """A node that recorded a whole run."""
+    box = Box()
+    node = made_node(config, FakeSynthesizer(made or traits()), source or FakeSource(30), box)
+    node.run()
+    return node, box
+
+
+def replayed(path: Path, made: Traits | None = None, *, source: str = "", more: str = "") -> tuple[FrameSource, Box]:
+    """What a node makes of a recording."""
+    text = f"""
+        [source]
+        kind = "mcap"
+        path = "{path}"
+        pace = "lockstep"
+        {source}
+        [model]
+        weights = "fake"
+        {more}
+        [view.main]
+    """
+    config, box = parse_config(text.encode(), "test"), Box()
+    opened = open_source(config.source)
+    made_node(config, FakeSynthesizer(made or traits()), opened, box).run()
+    return opened, box
+
+
+def files(folder: Path) -> list[Path]:
+    """Every file of every recording, in the order of their names."""
+    return sorted(folder.rglob("*.mcap"))
+
+
+def said(path: Path) -> list[Said]:
+    """Every message of a finished file."""
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        return [
+            Said(
+                topic=channel.topic,
+                schema=schema,
+                channel=channel,
+                log_ns=message.log_time,
+                publish_ns=message.publish_time,
+                sequence=message.sequence,
+                data=message.data,
+                value=decoded,
+            )
+            for schema, channel, message, decoded in _decoded(reader)
+            if schema is not None
+        ]
+
+
+def _decoded(reader: Any) -> Iterator[tuple[Any, Any, Any, Any]]:
+    decoders = DecoderFactory()
+    for schema, channel, message in reader.iter_messages():
+        decode = decoders.decoder_for(channel.message_encoding, schema)
+        assert decode is not None or channel.message_encoding == "json"
+        yield schema, channel, message, json.loads(message.data) if decode is None else decode(message.data)
+
+
+def of(messages: Sequence[Said], topic: str) -> list[Said]:
+    return [each for each in messages if each.topic == topic]
+
+
+def summary(path: Path) -> Summary:
+    with path.open("rb") as file:
+        found = make_reader(file).get_summary()
+    assert found is not None
+    return found
+
+
+def metadata(path: Path) -> dict[str, dict[str, str]]:
+    with path.open("rb") as file:
+        return {each.name: each.metadata for each in make_reader(file).iter_metadata()}
+
+
+def attachments(path: Path) -> dict[str, bytes]:
+    with path.open("rb") as file:
+        return {each.name: each.data for each in make_reader(file).iter_attachments()}
+
+
+def salvaged(path: Path, topic: str) -> list[int]:
+    """Sequence numbers on a topic, as far as the reference reader gets front to back in a file without an end."""
+    found: list[int] = []
+    with path.open("rb") as file:
+        try:
+            for _, channel, message in NonSeekingReader(file).iter_messages(log_time_order=False):
+                if channel.topic == topic:
+                    found.append(message.sequence)
+        except (McapError, EOFError, ValueError):
+            pass  # where it was cut
+    return found

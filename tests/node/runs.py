@@ -1,0 +1,99 @@
+"""Replays of a made-up source through a made-up model: quick, and different exactly where a test wants it."""
+
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import torch
+from fakes import FakeSource, FakeSynthesizer, traits
+
+from gcd_model import NonFiniteError, RenderOptions, SourceFeatures, Traits, Trajectory, View
+from gcd_node.config import NodeConfig, parse_config
+from gcd_node.life.machinery import Parts
+from gcd_node.replay.lockstep import replay
+from gcd_node.replay.run_folder import RunFolder
+
+LAUNCH = """
+[source]
+kind = "synthetic"
+frames = 42
+[model]
+weights = "fake"
+steps = 1
+[view.main]
+"""
+WINDOWS, FRAMES = 3, 14
+
+
+class LevelModel(FakeSynthesizer):
+    """Gives the source back, each level a whole number lower: by one for each step beyond the first, and by `lower`
+    at (window, frame). `classes` moves the class numbers of a window's frame 0 in so many columns."""
+
+    def __init__(
+        self,
+        made: Traits,
+        lower: Mapping[tuple[int, int], int] | None = None,
+        classes: Mapping[int, int] | None = None,
+        act: Callable[[RenderOptions], None] | None = None,
+    ) -> None:
+        super().__init__(made, act)
+        self._lower, self._classes = lower or {}, classes or {}
+
+    def render(
+        self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
+    ) -> list[View]:
+        window, options = len(self.asked), options or RenderOptions()
+        video = ((features.latents + 1) / 2 * 255).round() - ((options.steps or 1) - 1)
+        for (at, frame), levels in self._lower.items():
+            if at == window:
+                video[frame] -= levels
+        return [self._view(view, video, window) for view in super().render(features, trajectories, options)]
+
+    def _view(self, view: View, video: torch.Tensor, window: int) -> View:
+        classes = view.classes
+        if classes is not None:
+            columns = self._classes.get(window, 0)
+            classes[:, 0, :, :columns] = (classes[:, 0, :, :columns] + 1) % len(self.traits.classes)
+        return View(
+            samples=(video / 255)[None],
+            latents=view.latents,
+            trajectory=view.trajectory,
+            motion_bucket=view.motion_bucket,
+            classes=classes,
+        )
+
+
+def nan_model(windows: set[int]) -> FakeSynthesizer:
+    """NaN in these windows, in both attempts."""
+    calls = iter(window for window in range(99) for _ in range(2 if window in windows else 1))
+
+    def act(_: RenderOptions) -> None:
+        if next(calls) in windows:
+            raise NonFiniteError("NaN in the latents")
+
+    return LevelModel(traits(), act=act)
+
+
+def launch(changes: Sequence[str] = ()) -> NodeConfig:
+    return parse_config(LAUNCH.encode(), "test", changes)
+
+
+def parts(model: FakeSynthesizer | None = None, source: FakeSource | None = None) -> Parts:
+    chosen = LevelModel(traits()) if model is None else model
+    return Parts(
+        open_source=lambda _: FakeSource(WINDOWS * FRAMES) if source is None else source,
+        load_model=lambda _: chosen,
+    )
+
+
+def made_run(
+    folder: Path,
+    model: FakeSynthesizer | None = None,
+    source: FakeSource | None = None,
+    changes: Sequence[str] = (),
+) -> RunFolder:
+    return replay(launch(changes), folder, parts=parts(model, source))
+
+
+def copied(run: RunFolder, folder: Path) -> Path:
+    return Path(shutil.copytree(run.path, folder))

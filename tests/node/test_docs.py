@@ -1,0 +1,252 @@
+"""The pages tell the truth: links lead somewhere, launch files load, commands exist, errors are quoted as they are
+said, and the planner of the guide follows a live node."""
+
+import ast
+import itertools
+import time
+import tomllib
+import types
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from cameras import Bench, Camera, until
+from doc_pages import (
+    BLOCKS,
+    GAP,
+    PAGES,
+    ROOT,
+    WHOLE,
+    Block,
+    dead_links,
+    is_said,
+    mistakes,
+    name_of,
+    quoted_errors,
+    said_commands,
+    said_texts,
+    wrong_commands,
+)
+from fakes import FakeSynthesizer, warping_traits
+from rig import Rig
+from wire_messages import class_map
+
+from gcd_node.config import parse_config
+from gcd_node.errors import ConfigError, MessageError, StaleError
+from gcd_node.security.allow_list import AllowList
+from gcd_node.subscriber import ReceivedView
+from gcd_node.wire.header import ClassRecord
+
+pytestmark = pytest.mark.timeout(120)
+
+
+# --- links ---------------------------------------------------------------------------------------------------------
+
+
+def test_every_link_leads_somewhere() -> None:
+    assert [dead for page in PAGES for dead in dead_links(page, page.read_text())] == []
+
+
+def test_a_dead_link_is_noticed() -> None:
+    text = "[a](nowhere.md) [b](node.md#no-such-heading) [c](node.md#states) [d](https://example.org/x)"
+    assert dead_links(ROOT / "docs" / "x.md", text) == ["x.md: nowhere.md", "x.md: node.md#no-such-heading"]
+
+
+def test_the_index_names_every_page() -> None:
+    index = (ROOT / "docs" / "README.md").read_text()
+    assert [page.name for page in (ROOT / "docs").glob("*.md") if f"({page.name})" not in index + "(README.md)"] == []
+
+
+# --- launch files --------------------------------------------------------------------------------------------------
+
+
+def load_block(block: Block) -> None:
+    """A launch file, a part of one (what it lacks is filled in), or a list of clients. Raises what is wrong with it."""
+    table = tomllib.loads(block.text)
+    if block.mark == "other":
+        return
+    if set(table) == {"client"}:
+        msgspec.toml.decode(block.text, type=AllowList)
+        return
+    stated = {"source.kind": table.get("source", {}).keys() & {"kind", "path"}, "model.weights": table.get("model")}
+    stated["view.topdown.kind"] = table.get("view")
+    lacking = [change for change in WHOLE if not stated[change.partition("=")[0]]]
+    parse_config(block.text.encode(), block.place, () if block.mark == "launch" else lacking)
+
+
+@pytest.mark.parametrize("block", [b for b in BLOCKS if b.language == "toml"], ids=lambda block: block.place)
+def test_a_toml_block_loads(block: Block) -> None:
+    """Mark it `toml launch` if it is whole, `toml other` if it is no launch file."""
+    load_block(block)
+
+
+@pytest.mark.parametrize(
+    ("mark", "text", "said"),
+    [
+        ("fragment", '[source]\nkind = "v4l2"\nhfov_degg = 85.0\n', "did you mean `hfov_deg`"),
+        ("launch", '[source]\nkind = "v4l2"\n', "missing required field `model`"),
+        ("", "[sourse]\n", "did you mean `source`"),
+    ],
+)
+def test_a_mistaken_toml_block_is_noticed(mark: str, text: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        load_block(Block("x.md", 1, "toml", mark, text))
+
+
+# --- commands ------------------------------------------------------------------------------------------------------
+
+
+def test_every_command_and_option_exists() -> None:
+    assert [wrong for page in PAGES for wrong in wrong_commands(name_of(page), page.read_text())] == []
+
+
+@pytest.mark.parametrize(
+    ("call", "wrong"),
+    [
+        ("gcd-node runn launch/demo.toml", ["runn"]),
+        ("gcd-node view ipc --savee out", ["--savee"]),
+        ("gcd-node ctl set_views view=a", ["set_views"]),
+        ("gcd-node run x.toml --set model.stepz=4 --once", ["model.stepz=4"]),
+        ("gcd-train generate driving --clipz 8", ["--clipz"]),
+        ("gcd-node -v keys new FOLDER", []),
+        ("gcd-node ctl --endpoint tcp://robot:5582 state --json", []),
+    ],
+)
+def test_a_mistaken_command_is_noticed(call: str, wrong: list[str]) -> None:
+    (words,) = said_commands(f"$ X=1 .venv/bin/{call} | less  # a comment")
+    assert mistakes(words) == wrong
+
+
+# --- errors --------------------------------------------------------------------------------------------------------
+
+
+def test_every_quoted_error_is_said_somewhere() -> None:
+    texts, quoted = said_texts(), quoted_errors((ROOT / "docs" / "troubleshooting.md").read_text())
+    assert len(quoted) > 100
+    assert [each for each in quoted if not is_said(each, texts)] == []
+    assert [each for each in quoted if len(each.replace("…", "").strip()) < 7] == []  # too short to tell anything
+
+
+def test_an_error_that_nobody_says_is_noticed() -> None:
+    texts = {f"there is no camera {GAP}; there is {GAP}"}
+    assert is_said("there is no camera …; there is …", texts)
+    assert not is_said("there is no camera …; there are …", texts)
+    assert not is_said("; there is … no camera", texts)
+    assert not is_said("there is no kamera", texts)
+
+
+# --- programs ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("block", [b for b in BLOCKS if b.language == "python"], ids=lambda block: block.place)
+def test_a_python_block_is_python(block: Block) -> None:
+    assert compile(block.text, block.place, "exec", flags=ast.PyCF_ALLOW_TOP_LEVEL_AWAIT) is not None
+
+
+def planner() -> dict[str, Any]:
+    """What the program of the guide defines."""
+    (block,) = [block for block in BLOCKS if block.mark == "planner"]
+    defined: dict[str, Any] = {"__name__": "planner"}
+    exec(compile(block.text, block.place, "exec"), defined)
+    return defined
+
+
+def held(awareness: Any, camera: Camera) -> Any:
+    """The next view that the planner holds, while the camera goes on. Its stamps lie on an even grid in the past: a
+    window of them takes as long as this machine needs, and none is spoilt by a slow one."""
+    found: list[Any] = []
+    stamps = itertools.count(time.monotonic_ns() - 1_000_000_000_000, round(1e9 / camera.info.fps_nominal))
+
+    def look() -> bool:
+        camera.shoot(stamp_ns=next(stamps))
+        found.append(awareness.poll(wait_ms=10.0))
+        return found[-1] is not None
+
+    until(look)
+    return found[-1]
+
+
+def live(folder: Path, camera: Camera) -> Rig:
+    """A node whose model draws class maps; it has just begun."""
+    return Rig(folder, Bench(camera), FakeSynthesizer(warping_traits()), views="[view.main]", watched=False)
+
+
+def test_the_planner_of_the_guide_follows_a_node_to_its_end_and_into_its_next_life(tmp_path: Path) -> None:
+    defined = planner()
+    awareness = defined["Awareness"](f"ipc://{tmp_path}/data", "main", max_age_ms=1e9)
+    assert awareness.poll() is None
+    assert awareness.why_not == "nothing has come yet"
+    with live(tmp_path, camera := Camera(fps=10.0)):
+        first = held(awareness, camera)
+        assert 0.0 < defined["caution"](first) <= 1.0
+    until(lambda: awareness.poll(wait_ms=10) is None and awareness.ended)
+    assert awareness.why_not == "the stream has ended"
+    with live(tmp_path, camera := Camera(fps=10.0)):
+        second = held(awareness, camera)
+        assert second.header.boot_id != first.header.boot_id
+        assert awareness.why_not == "the node was started anew"
+        assert not awareness.ended
+        defined["time"] = types.SimpleNamespace(monotonic=lambda: awareness._until_s + 0.001)
+        until(lambda: awareness.poll() is None)
+        assert awareness.why_not == "the last one has expired"
+    awareness.close()
+
+
+def received(**changes: object) -> ReceivedView:
+    """A class map as it arrives; changes: of `ReceivedView`, and of its header."""
+    header = {key: changes.pop(key) for key in ("src", "quality") if key in changes}
+    classes = (ClassRecord(id=0, name="road", colour=(0, 0, 0)), ClassRecord(id=1, name="car", colour=(0, 0, 255)))
+    message = class_map(drawn=np.ones((14, 4, 6), np.uint8))
+    message = replace(message, header=replace(message.header, classes=classes, **header))
+    how = {"age_ms": message.header.age_ms, "expired": False, "skipped": 0, "restarted": False}
+    return ReceivedView(message=message, **{**how, **changes})
+
+
+class Scripted:
+    """A subscriber that gives what a test says, or raises it."""
+
+    ended = False
+
+    def __init__(self, *given: ReceivedView | Exception | None) -> None:
+        self._given = list(given)
+
+    def receive(self, timeout_ms: float) -> ReceivedView | None:
+        item = self._given.pop(0)
+        if isinstance(item, Exception):
+            raise item
+        return item
+
+
+def scripted(folder: Path, *given: ReceivedView | Exception | None) -> Any:
+    awareness = planner()["Awareness"](f"ipc://{folder}/data", "main")
+    awareness.close()
+    awareness._views = Scripted(*given)
+    return awareness
+
+
+def test_the_planner_of_the_guide_drops_what_is_stale_late_or_of_another_epoch(tmp_path: Path) -> None:
+    good, old_src = received(), received().header.src
+    jumped = received(src=replace(old_src, epoch=old_src.epoch + 1))
+    given = (good, MessageError("damaged"), None, StaleError("too old"), good, jumped, received(expired=True))
+    awareness = scripted(tmp_path, *given)
+    assert awareness.poll() is good
+    assert awareness.poll() is good
+    assert awareness.damaged == 1
+    assert awareness.poll() is good  # nothing new, and not run out yet
+    assert awareness.poll() is None
+    assert awareness.why_not == "too old"
+    assert awareness.poll() is good
+    assert awareness.poll() is jumped
+    assert awareness.why_not == "the camera's clock or format jumped"
+    assert awareness.poll() is None
+    assert awareness.why_not == "it came too late"
+
+
+def test_the_planner_of_the_guide_does_not_believe_what_lies_outside_the_trained_domain() -> None:
+    caution, quality = planner()["caution"], received().header.quality
+    assert caution(None) == 0.0
+    assert caution(received(quality=replace(quality, ood=()))) > 0.0
+    assert caution(received(quality=replace(quality, ood=("fps",)))) == 0.0

@@ -1,0 +1,245 @@
+"""The preview of the input on src/frm: who gets it, what it says, and that nobody else pays for it."""
+
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cameras import Bench, Camera, until
+from fakes import Box, FakeSource, FakeSynthesizer, traits
+from rig import Rig, rig_config
+from wire_messages import window
+
+from gcd_model import ViewSynthesizer
+from gcd_node.config import SourceConfig
+from gcd_node.envelope import PREVIEW_TOPIC, ViewMessage, images, topic_key, view_topic
+from gcd_node.errors import ConfigError, MessageError
+from gcd_node.frame import Frame, FrameSource
+from gcd_node.optics.calibration import LensModel
+from gcd_node.publisher import Publisher, PublisherOptions
+from gcd_node.publishing.input_preview import InputPreview
+from gcd_node.publishing.options import PublisherStats
+from gcd_node.publishing.subscriptions import Readers, Subscriptions
+from gcd_node.rendering.preparation import prepare_run
+from gcd_node.subscriber import ReceivedView, ViewSubscriber
+from gcd_node.wire.input_preview import PREVIEW_WIDTH, Shot, preview_message
+from gcd_node.wire.view_message import Run
+
+pytestmark = pytest.mark.timeout(90)
+REALTIME = 'kind = "synthetic"\npace = "realtime"'
+PREVIEW_KEY, VIEW_KEY = topic_key(PREVIEW_TOPIC), topic_key("view/main/win")
+
+
+class Steady(FakeSource):
+    """Frames at 24 FPS until it is closed."""
+
+    def __init__(self) -> None:
+        super().__init__(100_000)
+        self.period_s = 1 / 24
+
+
+class Watched(Box):
+    """An outbox with so many subscribers of the preview."""
+
+    previews = 0
+
+    @property
+    def stats(self) -> PublisherStats:
+        readers = Readers(total=self.previews, previews=self.previews, previews_alone=self.previews)
+        return PublisherStats(sent=0, dropped=0, subscribers=self.previews, bytes=0, readers=readers)
+
+
+def run_of(folder: Path, source: FrameSource, model: ViewSynthesizer | None = None, **settings: float) -> Run:
+    more = "".join(f"\n{name} = {value}" for name, value in settings.items())
+    config = rig_config(folder, REALTIME + more, "[view.main]", "")
+    return prepare_run(config, traits() if model is None else model.traits, source.info)[0]
+
+
+def shot(width: int, height: int, *, seq: int = 7) -> Shot:
+    image = np.full((height, width, 3), (200, 100, 50), np.uint8)
+    return Shot(frame=Frame(image=image, stamp_ns=5_000_000_000, seq=seq), arrival_ns=time.monotonic_ns(), epoch=3)
+
+
+def preview(folder: Path, width: int, height: int, **settings: float) -> ViewMessage:
+    source = FakeSource(1, size=(width, height))
+    return preview_message(run_of(folder, source, **settings), shot(width, height))
+
+
+def next_preview(views: ViewSubscriber) -> ReceivedView:
+    received = views.receive(60_000)
+    assert received is not None
+    return received
+
+
+# Laws.
+
+
+@pytest.mark.parametrize(("width", "height"), [(96, 64), (640, 480), (641, 480), (1920, 1080), (3000, 100)])
+def test_a_preview_is_the_whole_picture_and_never_wider_than_said(tmp_path: Path, width: int, height: int) -> None:
+    message = preview(tmp_path, width, height)
+    _, shown_height, shown_width, _ = message.header.shape
+    assert shown_width == min(width, PREVIEW_WIDTH)
+    assert shown_height == pytest.approx(shown_width * height / width, abs=0.51)
+    assert message.header.src.resize == ("none" if width <= PREVIEW_WIDTH else "area")
+    assert np.abs(images(message)[0].astype(int) - (200, 100, 50)).max() <= 4  # JPEG
+
+
+@pytest.mark.parametrize("topics", [[], [VIEW_KEY], [PREVIEW_KEY], [b""], [PREVIEW_KEY, b"", b"src/", VIEW_KEY]])
+def test_whoever_subscribes_is_counted_by_what_they_get_until_they_leave(topics: list[bytes]) -> None:
+    counted = Subscriptions()
+    for topic in topics:
+        counted.hear(b"\1" + topic)
+    assert counted.now.total == len(topics)
+    assert counted.now.previews == sum(PREVIEW_KEY.startswith(topic) for topic in topics)
+    assert counted.now.watchers == sum(VIEW_KEY.startswith(topic) for topic in topics)
+    for topic in topics:
+        counted.hear(b"\0" + topic)
+    assert counted.now == Readers()
+
+
+# What it says.
+
+
+def test_a_preview_says_that_it_is_no_generated_view_and_what_frame_it_is(tmp_path: Path) -> None:
+    header = preview(tmp_path, 96, 64).header
+    assert (header.view_id, header.synthetic, header.encoding, header.window_id) == ("src", False, "jpeg", -1)
+    assert header.t_capture_ns == (5_000_000_000,)  # of a recording, its own clock
+    assert (header.src.seq, header.src.epoch, header.model.name) == ((7,), 3, "none")
+    assert 0 <= header.age_ms < 30_000
+    assert header.pose is not None
+    assert header.pose[0].az_deg == 0.0
+
+
+def test_the_camera_matrix_is_that_of_the_smaller_picture(tmp_path: Path) -> None:
+    camera = preview(tmp_path, 1280, 720, hfov_deg=90.0).header.intrinsics
+    assert camera is not None
+    assert camera[0] == pytest.approx(320.0)  # half of 640 over tan 45 degrees
+    assert (camera[2], camera[5]) == (319.5, 179.5)
+    assert preview(tmp_path, 1280, 720).header.intrinsics is None
+
+
+def test_a_lens_that_distorts_has_no_camera_matrix_in_its_preview(tmp_path: Path) -> None:
+    lens = LensModel(
+        fx=50.0,
+        fy=50.0,
+        cx=48.0,
+        cy=32.0,
+        width=96,
+        height=64,
+        distortion="plumb_bob",
+        coefficients=(0.1, 0.0, 0.0, 0.0),
+    )
+    source = FakeSource(1)
+    run = run_of(tmp_path, source)
+    distorting = replace(run, source=replace(source.info, lens=lens, hfov_deg=80.0))
+    assert preview_message(distorting, shot(96, 64)).header.intrinsics is None
+
+
+def test_the_input_has_one_topic_and_no_view_takes_its_name(tmp_path: Path) -> None:
+    assert view_topic("src", "frm") == PREVIEW_TOPIC
+    with pytest.raises(MessageError, match="src/frm"):
+        view_topic("src", "win")
+    with pytest.raises(ConfigError, match="view"):
+        rig_config(tmp_path, REALTIME, "[view.src]", "")
+
+
+# When it is made.
+
+
+def test_nothing_is_made_while_nobody_looks_and_at_most_five_a_second_then(tmp_path: Path) -> None:
+    box, now = Watched(), [0.0]
+    shown = InputPreview(box, lambda: run_of(tmp_path, FakeSource(1)), lambda: now[0])
+    for seq in range(48):
+        now[0] = seq / 24
+        shown.offer(shot(96, 64, seq=seq))
+    assert not any(thread.name == "input preview" for thread in threading.enumerate())
+    box.previews = 1
+    for seq in range(48, 48 + 240):  # 10 s
+        now[0] = seq / 24
+        before = len(box.views)
+        shown.offer(shot(96, 64, seq=seq))
+        if seq % 12 == 0:  # let the thread keep up now and then; what it is too slow for is replaced
+            until(lambda before=before: len(box.views) > before or not shown_waits(shown))
+    shown.close()
+    shown.join(20.0)
+    shown.announce_end(delay_ms=None)
+    seqs = [message.header.src.seq[0] for message in box.views]
+    assert 0 < len(seqs) <= 50
+    assert seqs == sorted(set(seqs))
+    assert min(seqs) >= 48
+    assert [message.topic for message in box.ends] == [PREVIEW_TOPIC]
+
+
+def shown_waits(shown: InputPreview) -> bool:
+    return bool(shown._newest._slot)  # pyright: ignore[reportPrivateUsage]
+
+
+def test_a_subscriber_sees_the_input_and_is_told_of_its_end(tmp_path: Path) -> None:
+    camera = Camera()
+    with Rig(tmp_path, Bench(camera), config='kind = "v4l2"\nhfov_deg = 60.0', watched=False) as rig:
+        with ViewSubscriber(f"ipc://{tmp_path}/data", "src", "frm") as views:
+            rig.await_state("active")
+            until(lambda: rig.publisher.stats.readers.previews == 1)
+            camera.run(30)
+            first = next_preview(views)
+            assert first.images.shape == (1, 64, 96, 3)
+            assert not first.header.synthetic
+            assert first.header.intrinsics is not None
+            assert len(set(first.images[0].reshape(-1, 3)[:, 0])) == 1
+            level = 20 + first.header.src.seq[0]
+            assert abs(int(first.images[0, 0, 0, 0]) - level) <= 3
+            assert 0 <= first.age_ms < 60_000
+            rig.ask("deactivate")
+            until(lambda: views.receive(100) is None and views.ended)
+        rig.await_state("inactive")
+
+
+def test_who_looks_at_the_input_alone_keeps_no_model_busy(tmp_path: Path) -> None:
+    def open_steady(_: SourceConfig) -> Steady:
+        return Steady()
+
+    with (
+        Rig(tmp_path, open_steady, config=REALTIME, more="life = {idle_s = 0.2}", watched=False) as rig,
+        ViewSubscriber(f"ipc://{tmp_path}/data", "src", "frm") as camera,
+    ):
+        rig.await_status(lambda status: "IDLE" in status["reasons"] and status["publish"]["subs"] == 1)
+        assert isinstance(rig.model, FakeSynthesizer)
+        before = len(rig.model.asked)
+        for _ in range(5):  # a second, in which a watched node would render
+            assert next_preview(camera).header.view_id == "src"
+        assert len(rig.model.asked) == before
+        with ViewSubscriber(f"ipc://{tmp_path}/data", "main") as views:
+            assert next_preview(views).header.view_id == "main"
+
+
+def test_a_reader_of_previews_that_hangs_does_not_hold_up_a_lockstep_run(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
+    frame = Frame(image=noise, stamp_ns=0, seq=0)
+    picture = preview_message(
+        run_of(tmp_path, FakeSource(1, size=(640, 480))), Shot(frame=frame, arrival_ns=time.monotonic_ns(), epoch=0)
+    )
+    options = PublisherOptions(data=f"ipc://{tmp_path}/data", status=None, lockstep=True, min_subscribers=1)
+    with (
+        Publisher(options) as publisher,
+        ViewSubscriber(publisher.endpoint, "src", "frm", conflate=False),
+        ViewSubscriber(publisher.endpoint, "top", conflate=False) as views,
+    ):
+        until(lambda: publisher.stats.subscribers == 2)
+        fill(publisher, picture)
+        for number in range(20):
+            publisher.send(window(number))
+        assert [next_preview(views).header.window_id for _ in range(20)] == list(range(20))
+        publisher.hurry()
+
+
+def fill(publisher: Publisher, picture: ViewMessage) -> None:
+    """Send until nothing leaves any more: every buffer on the way is full."""
+    refused = 0
+    while refused < 5:
+        before, until_s = publisher.stats.sent, time.monotonic() + 0.1
+        publisher.send(picture)
+        while publisher.stats.sent == before and time.monotonic() < until_s:
+            time.sleep(0.001)
+        refused += publisher.stats.sent == before

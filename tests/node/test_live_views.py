@@ -1,0 +1,220 @@
+"""Several views of one input while commands change them: on every topic, down to its end-of-stream."""
+
+import threading
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import msgspec
+import pytest
+import zmq
+from cameras import Bench, Camera, until
+from fakes import FakeSource, FakeSynthesizer, traits, warping_traits
+from rig import Rig
+
+from gcd_model import ModelError, RenderOptions
+from gcd_node.config import parse_config
+from gcd_node.control.message import Code
+from gcd_node.control.verbs import SetView
+from gcd_node.envelope import EndMessage, NoteMessage, ViewMessage, decode
+from gcd_node.rendering.virtual_view import VirtualView
+
+LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
+TWO_VIEWS = '[view.top]\n[view.swing]\nkind = "orbit"\nrate_deg_s = 24.0\namplitude_deg = 60.0'
+
+
+class Endless(FakeSource):
+    """Frames until it is closed."""
+
+    def __init__(self) -> None:
+        super().__init__(1_000_000)
+        self.period_s = 0.002
+
+
+@dataclass
+class Tape:
+    """Every message of the data socket, in its order."""
+
+    said: list[ViewMessage | EndMessage] = field(default_factory=list[ViewMessage | EndMessage])
+
+    def views(self, topic: str) -> list[ViewMessage]:
+        return [each for each in list(self.said) if isinstance(each, ViewMessage) and each.topic == topic]
+
+    def ends(self, topic: str) -> list[EndMessage]:
+        return [each for each in list(self.said) if isinstance(each, EndMessage) and each.topic == topic]
+
+    def await_more(self, topic: str, count: int = 2) -> None:
+        wanted = len(self.views(topic)) + count
+        until(lambda: len(self.views(topic)) >= wanted)
+
+    def after_its_end(self, topic: str) -> list[ViewMessage | EndMessage]:
+        of_topic = [each for each in list(self.said) if each.topic == topic]
+        first = next(index for index, each in enumerate(of_topic) if isinstance(each, EndMessage))
+        return of_topic[first + 1 :]
+
+
+@contextmanager
+def taped(folder: Path) -> Generator[Tape]:
+    """Listens from before the node's start to after its end."""
+    tape, done, there = Tape(), threading.Event(), threading.Event()
+
+    def hear() -> None:
+        with zmq.Context() as context, context.socket(zmq.SUB) as socket:
+            socket.set(zmq.SUBSCRIBE, b"view/")
+            socket.set(zmq.LINGER, 0)
+            socket.connect(f"ipc://{folder}/data")
+            there.set()
+            while not done.is_set() or socket.poll(200):
+                if socket.poll(50):
+                    message = decode(socket.recv())
+                    assert not isinstance(message, NoteMessage)
+                    tape.said.append(message)
+
+    thread = threading.Thread(target=hear, daemon=True)
+    thread.start()
+    assert there.wait(20)
+    try:
+        yield tape
+    finally:
+        done.set()
+        thread.join(20)
+
+
+def test_a_topic_that_a_command_opens_and_closes_begins_and_ends_with_it(tmp_path: Path) -> None:
+    with taped(tmp_path) as tape, Rig(tmp_path, lambda _: Endless(), config=LOCKSTEP, views=TWO_VIEWS) as rig:
+        until(lambda: rig.publisher.stats.subscribers >= 2)
+        tape.await_more("view/top/win")
+        assert rig.ask("set_param", samples=2).code is Code.OK
+        tape.await_more("view/top/std")
+        assert rig.ask("set_param", samples=1).code is Code.OK
+        until(lambda: tape.ends("view/top/std") != [] and tape.ends("view/swing/std") != [])
+        assert tape.ends("view/top/win") == []
+        tape.await_more("view/top/win", 4)
+        assert tape.after_its_end("view/top/std") == []
+        assert rig.ask("set_param", samples=2).code is Code.OK
+        until(lambda: len(tape.after_its_end("view/top/std")) >= 2)  # the sequence goes on where it was
+    sequences = [each.sequence for each in tape.said if each.topic == "view/top/std"]
+    assert sequences == list(range(len(sequences)))
+    assert [len(tape.ends(f"view/{name}/std")) for name in ("top", "swing")] == [2, 2]
+    assert [len(tape.ends(f"view/{name}/win")) for name in ("top", "swing")] == [1, 1]
+
+
+def test_a_removed_view_ends_on_every_topic_it_ever_had(tmp_path: Path) -> None:
+    model = FakeSynthesizer(warping_traits())
+    views = "[view.top]\n[view.second]"
+    with taped(tmp_path) as tape, Rig(tmp_path, lambda _: Endless(), model, config=LOCKSTEP, views=views) as rig:
+        until(lambda: rig.publisher.stats.subscribers >= 2)
+        rig.ask("set_param", samples=2)
+        tape.await_more("view/second/std")
+        tape.await_more("view/second/cls")
+        assert rig.ask("remove_view", view="second").code is Code.OK
+        topics = [f"view/second/{kind}" for kind in ("win", "std", "cls")]
+        until(lambda: all(tape.ends(topic) for topic in topics))
+        tape.await_more("view/top/cls")
+        assert rig.ask("set_view", view="second").code is Code.OK
+        tape.await_more("view/second/cls")
+    revisions = [each.header.view_rev for each in tape.said if each.topic == "view/second/cls"]
+    assert revisions == sorted(revisions)
+    assert set(revisions) == {1, 2}
+    assert all(len(tape.ends(topic)) == 2 for topic in topics)
+
+
+def test_a_view_removed_in_the_last_window_still_ends(tmp_path: Path) -> None:
+    begun = threading.Event()
+
+    def slow(options: RenderOptions) -> None:
+        begun.set()
+        assert options.cancel is not None
+        until(options.cancel.is_set)
+
+    model = FakeSynthesizer(traits(), slow)
+    with taped(tmp_path) as tape, Rig(tmp_path, lambda _: Endless(), model, config=LOCKSTEP, views=TWO_VIEWS) as rig:
+        assert begun.wait(30)
+        assert rig.ask("remove_view", view="swing").code is Code.OK
+        assert rig.ask("deactivate").code is Code.ACCEPTED
+        rig.await_state("inactive")
+        until(lambda: tape.ends("view/swing/win") != [] and tape.ends("view/top/win") != [])
+    assert all(isinstance(each, EndMessage) for each in tape.said)  # what was in work when it was told to stop is lost
+
+
+def test_single_frames_of_a_removed_view_do_not_follow_its_end(tmp_path: Path) -> None:
+    camera = Camera()
+    with taped(tmp_path) as tape, Rig(tmp_path, Bench(camera), views=TWO_VIEWS) as rig:
+        rig.await_state("active")
+        camera.run(14)
+        tape.await_more("view/swing/frm", 1)  # an orbit that has not moved is at its goal in all 14, spread over 0.6 s
+        assert rig.ask("remove_view", view="swing").code is Code.OK
+        camera.run(40, pause_s=0.0)
+        until(lambda: tape.ends("view/swing/frm") != [])
+        tape.await_more("view/top/frm", 14)
+    assert tape.after_its_end("view/swing/frm") == []
+
+
+def test_all_topics_of_a_window_agree_on_its_view_whatever_changes_meanwhile(tmp_path: Path) -> None:
+    model = FakeSynthesizer(traits())
+    changes: list[Callable[[Rig], object]] = [
+        lambda rig: rig.ask("set_view", view="top", azimuth_deg=-20.0),
+        lambda rig: rig.ask("set_param", samples=2),
+        lambda rig: rig.ask("set_view", view="swing", azimuth_deg=5.0),
+        lambda rig: rig.ask("set_param", steps=2),
+        lambda rig: rig.ask("set_view", view="top", azimuth_deg=20.0),
+    ]
+    with taped(tmp_path) as tape, Rig(tmp_path, lambda _: Endless(), model, config=LOCKSTEP, views=TWO_VIEWS) as rig:
+        until(lambda: rig.publisher.stats.subscribers >= 2)
+        tape.await_more("view/top/win")
+        for change in changes:
+            change(rig)
+            tape.await_more("view/top/win")
+            tape.await_more("view/swing/win")
+    by_window: dict[tuple[int, str], set[tuple[object, ...]]] = {}
+    digests: dict[int, set[str]] = {}
+    for each in tape.said:
+        if isinstance(each, ViewMessage):
+            header = each.header
+            goal = None if header.pose is None else header.pose[-1].az_deg
+            told = (header.view_rev, goal, header.quality.steps, header.quality.seed)
+            by_window.setdefault((header.window_id, header.view_id), set()).add(told)
+            digests.setdefault(header.window_id, set()).add(header.cfg_digest)
+    assert all(len(told) == 1 for told in by_window.values())
+    assert all(len(found) == 1 for found in digests.values())
+    assert {len(paths) for paths, _ in model.asked} == {2}  # one batch each
+    assert {told[0] for (_, view), each in by_window.items() for told in each if view == "top"} == {1, 2, 3}
+
+
+WILD: list[dict[str, object]] = [
+    {"azimuth_deg": 1e308},
+    {"radius": 1e308},
+    {"radius": -1e308},
+    {"kind": "orbit", "rate_deg_s": 1e308, "amplitude_deg": 60.0},
+    {"kind": "orbit", "rate_deg_s": 1.0, "amplitude_deg": 1e308},
+    {"kind": "orbit", "rate_deg_s": 1.0, "amplitude_deg": 1e-308},
+    {"T_src_dst": [1e308] * 16},
+    {"T_src_dst": [1, 0, 0, 1e308, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]},
+]
+
+
+def test_no_number_in_a_view_can_end_the_stream(tmp_path: Path) -> None:
+    with Rig(tmp_path, lambda _: Endless(), config=LOCKSTEP) as rig:
+        for wanted in WILD:
+            reply = rig.ask("set_view", wanted, view="main")
+            assert reply.code in (Code.OK, Code.OUT_OF_RANGE, Code.BAD_ARG)
+            rig.await_views(len(rig.of()) + 3)
+        assert rig.events("MODEL_FAILED") == []
+
+
+@pytest.mark.parametrize("wanted", [each for each in WILD if "T_src_dst" not in each])
+def test_without_limits_a_view_is_refused_at_once_or_stays_finite(wanted: dict[str, object]) -> None:
+    text = b'[source]\nkind = "synthetic"\n[model]\nweights = "fake"\nmotion_bucket = 127.0\n[view.main]'
+    config = parse_config(text, "test")
+    asked = msgspec.convert({"view": "main", **wanted}, SetView).to_config()
+    unknown = replace(traits(), family=None)  # a checkpoint whose training nobody knows
+    try:
+        view = VirtualView("main", msgspec.structs.replace(config, view={"main": asked}), unknown)
+    except ModelError:
+        return
+    for window in range(3):
+        path = view.trajectory(window * 1_000_000_000, 0)
+        assert path.source_from_target.isfinite().all()
+        assert path.delta is not None
+        assert path.delta.isfinite().all()

@@ -1,0 +1,54 @@
+"""What is not needed any more goes back to the system, and what was imported is not searched for garbage."""
+
+import gc
+import threading
+
+import numpy as np
+import pytest
+
+from gcd_node.life import memory
+from gcd_node.life.memory import give_back_memory, settle_process
+from gcd_node.load.meter import memory_mb
+
+
+class Ring:
+    """Holds pixels, and itself."""
+
+    def __init__(self) -> None:
+        self.pixels = [np.ones(2**18, np.uint8) for _ in range(400)]  # 100 MiB in pieces that come from a heap
+        self.itself = self
+
+
+def test_pixels_that_hang_on_a_ring_go_back_to_the_system() -> None:
+    gc.disable()  # Python would find them some time
+    try:
+        before_mb = memory_mb()
+        worker = threading.Thread(target=Ring)
+        worker.start()
+        worker.join()
+        held_mb = memory_mb()
+        give_back_memory()
+        assert held_mb - before_mb > 90
+        assert memory_mb() - before_mb < 30
+    finally:
+        gc.enable()
+
+
+def test_a_settled_process_searches_for_new_garbage_only_and_is_settled_once() -> None:
+    settle_process()
+    frozen = gc.get_freeze_count()
+    assert frozen > 10_000
+    settle_process()
+    assert gc.get_freeze_count() <= frozen
+    ring = Ring()
+    del ring
+    assert gc.collect() > 0
+
+
+def test_another_c_library_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "_glibc", lambda: None)
+    ring: list[object] = []
+    ring.append(ring)
+    del ring
+    give_back_memory()
+    assert gc.collect() == 0

@@ -1,0 +1,96 @@
+"""The model of a node that has to make do with less memory: the rung on which its weights are loaded in bfloat16."""
+
+import gc
+import weakref
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from fakes import FakeSource, FakeSynthesizer, traits
+from rig import Rig
+
+from gcd_model import (
+    Clip,
+    DeviceMemoryError,
+    RenderOptions,
+    SourceFeatures,
+    SphericalDelta,
+    Trajectory,
+    View,
+    ViewSynthesizer,
+)
+from gcd_node.config import ModelSection
+from gcd_node.rendering.model_slot import ModelSlot
+from gcd_node.session import load_model
+
+LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
+
+
+def test_a_halved_model_has_half_the_weights_and_still_renders() -> None:
+    slot = ModelSlot(ModelSection(weights="random:driving", device="cpu", threads=1), load_model)
+    assert (slot.traits.precision, slot.can_halve) == ("float32", False)  # a CPU gains nothing by it, and is not asked
+    slot.halve()
+    assert slot.traits.precision == "bfloat16"
+    assert slot.synthesizer.traits is slot.traits
+    config = slot.traits.config
+    clip = Clip(video=torch.zeros(config.frames, 3, config.height, config.width), fps=slot.traits.fps)
+    path = slot.traits.plan_view(SphericalDelta(azimuth_deg=0.0, elevation_deg=0.0, radius_m=0.0))
+    drawn = slot.synthesizer.render(slot.synthesizer.encode(clip), [path], RenderOptions(steps=1))
+    assert drawn[0].video.isfinite().all()
+
+
+class OnGpu(FakeSynthesizer):
+    """Says that it is on a GPU, and fits there in bfloat16 alone; holds itself in a cycle, as modules may."""
+
+    def __init__(self, section: ModelSection) -> None:
+        precision = section.dtype or "float32"
+        super().__init__(replace(traits(), device="cuda:0", precision=precision))
+
+    def render(
+        self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
+    ) -> list[View]:
+        if self.traits.precision == "float32":
+            raise DeviceMemoryError("out of memory")
+        return super().render(features, trajectories, options)
+
+
+class Loader:
+    """Loads models, and says how many of those it loaded before were still there when it was asked again."""
+
+    def __init__(self) -> None:
+        self.loaded: list[weakref.ref[OnGpu]] = []
+        self.still_there: list[int] = []
+
+    def __call__(self, section: ModelSection) -> ViewSynthesizer:
+        self.still_there.append(sum(model() is not None for model in self.loaded))
+        made = OnGpu(section)
+        self.loaded.append(weakref.ref(made))
+        return made
+
+
+def test_the_wide_model_is_gone_before_the_halved_one_is_loaded() -> None:
+    load = Loader()
+    slot = ModelSlot(ModelSection(weights="fake"), load)
+    assert slot.can_halve
+    slot.halve()
+    assert load.still_there == [0, 0]
+    assert not slot.can_halve
+
+
+def test_f11_a_full_gpu_gets_the_same_model_in_bfloat16(tmp_path: Path) -> None:
+    load = Loader()
+    gc.disable()  # what only a collection would free is still on the device when the next model is loaded
+    try:
+        with Rig(tmp_path, lambda _: FakeSource(10_000), load, config=LOCKSTEP) as rig:
+            told = rig.await_event("GPU_OOM")
+            views = rig.await_views(2)
+            status = rig.await_status(lambda status: status["model"]["state"] == "degraded")
+    finally:
+        gc.enable()
+    assert told["rung"] == "bfloat16"
+    assert len(rig.events("GPU_OOM")) == 1
+    assert [view.header.model.precision for view in views[:2]] == ["bfloat16", "bfloat16"]
+    assert views[0].header.window_id == 0  # nothing was lost: the same window again
+    assert status["reasons"] == ["MODEL_DEGRADED"]
+    assert load.still_there == [0, 0]

@@ -1,0 +1,308 @@
+"""Two runs compared: what counts as the same, how far apart they are, and what is said and shown of it."""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+from fakes import FakeSource, traits, warping_traits
+from rich.console import Console
+from runs import FRAMES, WINDOWS, LevelModel, copied, made_run, nan_model
+
+from gcd_node.cli.main import run_app
+from gcd_node.errors import DamagedRunError, UsageError
+from gcd_node.replay.diff_pictures import WORST, gain_for, write_report
+from gcd_node.replay.diff_report import divergence, facts_table, report_text, to_plain, verdict, views_table
+from gcd_node.replay.manifest import Manifest
+from gcd_node.replay.run_diff import Missing, RunComparison, Tolerance, ViewComparison, compare, psnr_db
+from gcd_node.replay.run_folder import MANIFEST, RunFolder, open_run, write_manifest
+
+pytestmark = pytest.mark.timeout(60)
+EXACT = Tolerance()
+
+
+@pytest.fixture(scope="module")
+def golden(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    return made_run(tmp_path_factory.mktemp("golden") / "run")
+
+
+def lowered(folder: Path, lower: Mapping[tuple[int, int], int]) -> RunFolder:
+    return made_run(folder, LevelModel(traits(), lower))
+
+
+def classed(folder: Path, columns: Mapping[int, int]) -> RunFolder:
+    return made_run(folder, LevelModel(warping_traits(), classes=columns), FakeSource(42, fps=10.0))
+
+
+def restated(run: RunFolder, folder: Path, **changes: object) -> RunFolder:
+    """A copy of a run whose manifest says something else."""
+    copied(run, folder)
+    manifest: Manifest = msgspec.structs.replace(run.manifest, **changes)
+    write_manifest(folder, manifest)
+    return open_run(folder)
+
+
+def first_view(comparison: RunComparison) -> ViewComparison:
+    return comparison.views[0]
+
+
+# Laws.
+
+
+def test_a_run_is_identical_to_itself_and_to_its_like(golden: RunFolder, tmp_path: Path) -> None:
+    for other in (golden, made_run(tmp_path / "again")):
+        comparison = compare(golden, other)
+        assert len(comparison.views) == WINDOWS
+        assert all(view.identical for view in comparison.views)
+        assert (comparison.facts, comparison.missing, comparison.first_divergence) == ((), (), None)
+        assert comparison.failures(EXACT) == comparison.worst(WORST) == ()
+
+
+@pytest.mark.parametrize("levels", [1, 2, 10])
+def test_psnr_is_that_of_the_definition(levels: int, golden: RunFolder, tmp_path: Path) -> None:
+    other = lowered(tmp_path / "run", {(0, frame): levels for frame in range(FRAMES)})
+    distance = first_view(compare(golden, other)).distance
+    assert distance is not None
+    assert distance.psnr_db == pytest.approx(20 * math.log10(255 / levels))
+    assert distance.worst_psnr_db == pytest.approx(distance.psnr_db)
+    assert distance.largest == levels
+
+
+def test_comparison_is_symmetric(golden: RunFolder, tmp_path: Path) -> None:
+    other = lowered(tmp_path / "run", {(0, 3): 2, (2, 5): 7})
+    there, back = compare(golden, other), compare(other, golden)
+    assert there.views == back.views
+    assert [(fact.a, fact.b) for fact in there.facts] == [(fact.b, fact.a) for fact in back.facts]
+
+
+def test_psnr_of_equal_pictures_is_infinite_and_of_black_and_white_is_nothing() -> None:
+    assert psnr_db(0.0, 100) == math.inf
+    assert psnr_db(100 * 255.0**2, 100) == 0.0
+
+
+# What counts.
+
+
+def test_one_bad_frame_is_not_hidden_by_thirteen_good_ones(golden: RunFolder, tmp_path: Path) -> None:
+    comparison = compare(golden, lowered(tmp_path / "run", {(1, 9): 10}))
+    view = comparison.views[1]
+    assert view.distance is not None
+    frame_db = 20 * math.log10(25.5)
+    assert view.distance.worst_frame == 9
+    assert view.distance.worst_psnr_db == pytest.approx(frame_db)
+    assert view.distance.psnr_db == pytest.approx(frame_db + 10 * math.log10(FRAMES))
+    assert view.within(Tolerance(min_psnr_db=frame_db - 0.01))
+    assert not view.within(Tolerance(min_psnr_db=frame_db + 0.01))
+    assert [each.window_id for each in comparison.failures(EXACT)] == [1]
+    assert comparison.first_divergence == view
+
+
+def test_class_pixels_have_a_bound_of_their_own(tmp_path: Path) -> None:
+    a, b = classed(tmp_path / "a", {}), classed(tmp_path / "b", {1: 24})
+    view = compare(a, b).views[1]
+    assert view.distance is not None
+    share = 24 / 96 / FRAMES  # a quarter of the columns, in one frame
+    assert view.distance.class_share == pytest.approx(share)
+    assert view.distance.worst_class_frame == 0
+    assert view.distance.largest == 0
+    assert not view.within(Tolerance(min_psnr_db=10.0))
+    assert not view.within(Tolerance(max_class_share=0.9 * share))
+    assert view.within(Tolerance(max_class_share=1.1 * share))
+
+
+def test_windows_that_only_one_run_has_always_fail(golden: RunFolder, tmp_path: Path) -> None:
+    longer = made_run(tmp_path / "run", source=FakeSource(4 * FRAMES))
+    comparison = compare(golden, longer)
+    assert comparison.missing == (Missing(window_id=3, view_id="main", only_in="B"),)
+    assert comparison.failures(Tolerance(min_psnr_db=1.0)) == comparison.missing
+    assert comparison.first_divergence == comparison.missing[0]
+    assert compare(longer, golden).missing[0].only_in == "A"
+
+
+def test_a_window_that_is_missing_does_not_shift_what_follows(golden: RunFolder, tmp_path: Path) -> None:
+    comparison = compare(golden, made_run(tmp_path / "run", nan_model({1})))
+    assert comparison.missing == (Missing(window_id=1, view_id="main", only_in="A"),)
+    assert [(view.window_id, view.identical) for view in comparison.views] == [(0, True), (2, True)]
+    assert {fact.name for fact in comparison.facts} == {
+        "total windows",
+        "total nan_windows",
+        "trouble MODEL_NAN in window 1",
+    }
+
+
+def test_a_damaged_run_is_never_compared(golden: RunFolder, tmp_path: Path) -> None:
+    windows = golden.manifest.windows
+    with pytest.raises(DamagedRunError, match="SHA-256"):  # the pixels of window 1 are where those of 2 should be
+        compare(golden, restated(golden, tmp_path / "run", windows=(windows[0], windows[2])))
+
+
+def test_a_view_that_one_run_lacks_is_missing_in_every_window(golden: RunFolder, tmp_path: Path) -> None:
+    two = made_run(tmp_path / "run", changes=["view.second.azimuth_deg=5.0"])
+    comparison = compare(golden, two)
+    assert [(each.window_id, each.view_id) for each in comparison.missing] == [(i, "second") for i in range(WINDOWS)]
+    assert {fact.name for fact in comparison.facts} >= {"config view.second.azimuth_deg"}
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("stamps", tuple((9, i) for i in range(FRAMES))), ("seqs", tuple(range(1, FRAMES + 1))), ("epoch", 4)],
+)
+def test_other_moments_fail_even_if_the_pixels_agree(
+    field: str, value: object, golden: RunFolder, tmp_path: Path
+) -> None:
+    first, *others = golden.manifest.windows
+    changed = msgspec.structs.replace(first, **{field: value})
+    comparison = compare(golden, restated(golden, tmp_path / "run", windows=(changed, *others)))
+    assert first_view(comparison).facts == (field,)
+    assert not first_view(comparison).within(Tolerance(min_psnr_db=1.0))
+    assert comparison.worst(WORST) == ()
+
+
+def test_another_flag_on_a_view_fails(golden: RunFolder, tmp_path: Path) -> None:
+    first, *others = golden.manifest.windows
+    view = msgspec.structs.replace(first.views["main"], ood=("fps",))
+    changed = msgspec.structs.replace(first, views={"main": view})
+    comparison = compare(golden, restated(golden, tmp_path / "run", windows=(changed, *others)))
+    assert first_view(comparison).facts == ("ood",)
+
+
+def test_pictures_of_another_size_cannot_be_near(golden: RunFolder, tmp_path: Path) -> None:
+    size = msgspec.structs.replace(golden.manifest.size, width=97)
+    comparison = compare(golden, restated(golden, tmp_path / "run", size=size))
+    assert first_view(comparison).facts == ("size",)
+    assert len(comparison.failures(Tolerance(min_psnr_db=1.0))) == WINDOWS
+
+
+@pytest.mark.parametrize("bounds", [{"min_psnr_db": 0.0}, {"min_psnr_db": math.nan}, {"max_class_share": 1.5}])
+def test_bounds_that_make_no_sense_are_refused(bounds: dict[str, float]) -> None:
+    with pytest.raises(UsageError):
+        Tolerance(**bounds)
+
+
+# What is said.
+
+
+def test_what_the_runs_were_made_from_is_named_first(golden: RunFolder, tmp_path: Path) -> None:
+    other = made_run(tmp_path / "run", changes=["model.steps=3", "source.seed=7"])
+    weights = msgspec.structs.replace(other.manifest.weights, sha256_12="f" * 12)
+    versions = {**other.manifest.versions, "torch": "0.1"}
+    other = restated(other, tmp_path / "restated", weights=weights, versions=versions)
+    comparison = compare(golden, other)
+    assert [(fact.name, fact.a, fact.b) for fact in comparison.facts] == [
+        ("config source.seed", "0", "7"),
+        ("config model.steps", "1", "3"),
+        ("weights sha256_12", "0" * 12, "f" * 12),
+        ("version torch", golden.manifest.versions["torch"], "0.1"),
+    ]
+    text = report_text(comparison, EXACT)
+    assert text.index("model.steps: 1, 3") < text.index("first divergence: window 0, view main")
+
+
+def test_settings_a_replay_does_not_use_are_no_difference(golden: RunFolder, tmp_path: Path) -> None:
+    other = made_run(tmp_path / "run", changes=["publish.jpeg_quality=70", "life.nice=3", "source.pace=realtime"])
+    assert compare(golden, other).facts == ()
+
+
+def test_the_first_divergence_says_whether_the_input_was_the_same(golden: RunFolder, tmp_path: Path) -> None:
+    same_input = compare(golden, lowered(tmp_path / "a", {(2, 0): 1}))
+    assert "window 2" in (divergence(same_input) or "")
+    assert "given the same pictures" in (divergence(same_input) or "")
+    shifted = FakeSource(42)
+    shifted.frames = lambda: (  # type: ignore[method-assign]
+        type(frame)(image=frame.image + 1, stamp_ns=frame.stamp_ns, seq=frame.seq) for frame in FakeSource(42).frames()
+    )
+    other_input = compare(golden, made_run(tmp_path / "b", source=shifted))
+    assert "other pictures already" in (divergence(other_input) or "")
+
+
+def test_the_verdict_has_three_words(golden: RunFolder, tmp_path: Path) -> None:
+    comparison = compare(golden, lowered(tmp_path / "run", {(1, 0): 1}))
+    assert verdict(compare(golden, golden), EXACT) == "identical: all 3 views"
+    assert verdict(comparison, Tolerance(min_psnr_db=40.0)).startswith("near enough: 2 of 3")
+    assert verdict(comparison, Tolerance(min_psnr_db=60.0)).startswith("DIFFERENT: 1 of 3")
+
+
+def test_tables_show_every_view(golden: RunFolder, tmp_path: Path) -> None:
+    other = made_run(tmp_path / "run", source=FakeSource(56), changes=["model.steps=2"])
+    comparison, console = compare(golden, other), Console(record=True, width=120)
+    console.print(facts_table(comparison))
+    console.print(views_table(comparison, EXACT))
+    shown = console.export_text()
+    assert "config model.steps" in shown
+    assert shown.count("48.13 dB") == WINDOWS
+    assert "only in B" in shown
+
+
+def test_json_says_the_same_and_knows_no_infinity(golden: RunFolder, tmp_path: Path) -> None:
+    comparison = compare(golden, lowered(tmp_path / "run", {(1, 4): 5}))
+    plain = json.loads(msgspec.json.encode(to_plain(comparison, EXACT)))
+    assert (plain["passed"], plain["identical"]) == (False, False)
+    assert plain["first_divergence"] == {"window_id": 1, "view": "main"}
+    assert [view["psnr_db"] is None for view in plain["views"]] == [True, False, True]
+    assert plain["views"][1]["worst_frame"] == 4
+
+
+# What is shown.
+
+
+def test_pictures_show_the_worst_views_and_where_they_differ(golden: RunFolder, tmp_path: Path) -> None:
+    other = lowered(tmp_path / "run", {(0, 2): 1, (2, 6): 9})
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "window-000099-view-old.png").touch()
+    (tmp_path / "out" / "mine.txt").touch()
+    paths = write_report(tmp_path / "out", compare(golden, other), EXACT, (golden, other))
+    assert [path.name for path in paths] == ["window-000002-view-main.png", "window-000000-view-main.png"]
+    assert sorted(path.name for path in (tmp_path / "out").glob("*.*")) == [
+        "diff.json",
+        "mine.txt",
+        "window-000000-view-main.png",
+        "window-000002-view-main.png",
+    ]
+    picture = cv2.imread(str(paths[0]))
+    assert picture is not None
+    right = picture[:, -100:]  # of the last column, the difference: black but for the middle row of three
+    rows = [right[int(part * right.shape[0])].mean() for part in (0.2, 0.5, 0.8)]
+    assert rows == [0.0, 9.0 * gain_for(9), 0.0]
+
+
+def test_class_maps_are_shown_where_they_differ(tmp_path: Path) -> None:
+    a, b = classed(tmp_path / "a", {}), classed(tmp_path / "b", {0: 48})
+    (path,) = write_report(tmp_path / "out", compare(a, b), EXACT, (a, b))
+    picture = cv2.imread(str(path))
+    assert picture is not None
+    assert np.all(picture[-150, -340] == 255)  # the last row of pictures, above the legend: where classes differ
+    assert np.all(picture[-150, -20] == 0)
+
+
+@pytest.mark.parametrize(
+    ("largest", "gain"), [(0, 64), (1, 64), (3, 64), (4, 32), (10, 16), (127, 2), (128, 1), (255, 1)]
+)
+def test_a_difference_is_made_as_bright_as_it_can_be(largest: int, gain: int) -> None:
+    assert gain_for(largest) == gain
+
+
+# The command.
+
+
+def test_exit_codes_tell_same_different_damaged_and_missing(
+    golden: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = lowered(tmp_path / "run", {(1, 4): 5})
+    damaged = copied(golden, tmp_path / "damaged")
+    (damaged / MANIFEST).write_text("{")
+    a, b = str(golden.path), str(other.path)
+    assert run_app(["diff", a, a]) == 0
+    assert run_app(["diff", a, b]) == 1
+    assert run_app(["diff", a, b, "--min-psnr", "30", "--out", str(tmp_path / "out")]) == 0
+    assert run_app(["diff", a, b, "--min-psnr", "40"]) == 1
+    assert run_app(["diff", a, b, "--min-psnr", "-1"]) == 64
+    assert run_app(["diff", a, str(damaged)]) == 65
+    assert run_app(["diff", str(tmp_path / "nowhere"), b]) == 66
+    capsys.readouterr()
+    assert run_app(["diff", a, b, "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["views"][1]["largest"] == 5
+    assert (tmp_path / "out" / "window-000001-view-main.png").stat().st_size > 1000

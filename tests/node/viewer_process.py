@@ -1,0 +1,75 @@
+"""A node in a process of its own, steered by angles and with a page; prints the page's address and runs until it is
+killed. Not a test: started by test_viewer_browser.py."""
+
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from fakes import FakeSynthesizer, traits
+from rig import rig_config
+
+from gcd_node.control.server import ControlOptions, ControlServer
+from gcd_node.frame import Frame, SourceInfo
+from gcd_node.life.machinery import Parts
+from gcd_node.node import Node, NodeOptions
+from gcd_node.publisher import Publisher
+from gcd_node.session import publisher_options
+from gcd_node.viewer.hub import NodeEndpoints
+from gcd_node.viewer.server import ViewerOptions, ViewerServer
+
+VIEWS = "[view.left]\nazimuth_deg = -30.0\n[view.swing]\nkind = 'orbit'\nrate_deg_s = 10.0\namplitude_deg = 20.0"
+SOURCE = 'kind = "synthetic"\npace = "realtime"'
+WIDTH, HEIGHT, FPS = 192, 128, 24.0
+
+
+class Bar:
+    """A bright bar that wanders across the picture, in real time and for ever."""
+
+    def __init__(self) -> None:
+        self.info = SourceInfo(
+            kind="synthetic", id="bar", width=WIDTH, height=HEIGHT, fps_nominal=FPS, clock="replay", hfov_deg=53.1
+        )
+        self.corrupt = 0
+        self._closed = False
+
+    def frames(self) -> Iterator[Frame]:
+        """At 24 FPS."""
+        began_s, seq = time.monotonic(), 0
+        while not self._closed:
+            image = np.full((HEIGHT, WIDTH, 3), (40, 60, 90), np.uint8)
+            at = 4 * seq % WIDTH
+            image[:, at : at + 24] = (250, 180, 40)
+            yield Frame(image=image, stamp_ns=round(seq * 1e9 / FPS), seq=seq)
+            seq += 1
+            time.sleep(max(0.0, began_s + seq / FPS - time.monotonic()))
+
+    def close(self) -> None:
+        """End `frames`."""
+        self._closed = True
+
+
+def main(folder: Path) -> None:
+    """Run the node on sockets in `folder`."""
+    config = rig_config(folder, SOURCE, VIEWS, "")
+    model = FakeSynthesizer(traits())
+    with Publisher(publisher_options(config)) as publisher:
+        node = Node(
+            config,
+            Parts(open_source=lambda _: Bar(), load_model=lambda _: model),
+            publisher,
+            NodeOptions(once=False),
+        )
+        options = ControlOptions(endpoint=f"ipc://{folder}/control")
+        with ControlServer(options, node, lambda: node.state.label, node.event) as control:
+            reached = NodeEndpoints(
+                data=publisher.endpoint, status=publisher.status_endpoint or "", control=control.endpoint
+            )
+            with ViewerServer(ViewerOptions(http="127.0.0.1:0", node=reached)) as viewer:
+                print(viewer.operator_url, flush=True)
+                node.run()
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
