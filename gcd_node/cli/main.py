@@ -2,8 +2,10 @@
 
 import contextlib
 import os
+import signal
 import sys
 import threading
+from types import FrameType
 from typing import cast
 
 import typer
@@ -17,10 +19,17 @@ _UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__mro__[1])  #
 
 def main() -> None:
     """Entry point: runs a command; an expected error becomes one line and its exit code."""
+    if _command(sys.argv[1:]) == "run":
+        signal.signal(signal.SIGTERM, _end_early)
     code = run_app(sys.argv[1:])
     if any(thread.daemon for thread in threading.enumerate()):
         _leave(code)
     sys.exit(code)
+
+
+def _end_early(_: int, __: FrameType | None) -> None:
+    """Until the node itself listens to signals, there is nothing to end."""
+    os._exit(0)
 
 
 def _leave(code: int) -> None:
@@ -51,11 +60,15 @@ def run_app(arguments: list[str]) -> int:
 
 def _app_for(arguments: list[str]) -> typer.Typer:
     """All commands, or those alone that need no torch, where one of these is asked for: importing it takes seconds."""
-    if next((word for word in arguments if not word.startswith("-")), "") in QUICK:
+    if _command(arguments) in QUICK:
         return quick
     from gcd_node.cli.commands import app
 
     return app
+
+
+def _command(arguments: list[str]) -> str:
+    return next((word for word in arguments if not word.startswith("-")), "")
 
 
 def _exit_code_of(error: Exception) -> int | None:

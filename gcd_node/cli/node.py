@@ -19,7 +19,7 @@ from gcd_model import Traits
 from gcd_node.cli.check import Changes, ConfigPath, PrintConfig
 from gcd_node.cli.control import KeyFolder, NodeKey, client_keys
 from gcd_node.cli.viewer import show_page, tell_page
-from gcd_node.config import NodeConfig, load_config
+from gcd_node.config import LifeConfig, load_config
 from gcd_node.config_text import to_toml
 from gcd_node.demo import DemoReport, run_demo, run_open_demo
 from gcd_node.health.logs import log_json_lines
@@ -88,7 +88,7 @@ def run(config: ConfigPath, changes: Changes = None, print_config: PrintConfig =
         return
     if settings.health.log == "json":
         log_json_lines()
-    _be_considerate(settings)
+    be_considerate(settings.life)
     console = Console(stderr=True, markup=False)
     status = console.status(f"loading {settings.model.weights}")
     options = NodeOptions(
@@ -103,11 +103,11 @@ def run(config: ConfigPath, changes: Changes = None, print_config: PrintConfig =
     console.print(_table(summary, f"{publisher.stats.sent} messages sent"))
 
 
-def _be_considerate(settings: NodeConfig) -> None:
+def be_considerate(life: LifeConfig) -> None:
     """Towards others on this machine, and among our own threads: a thread with something to say waits for one that
     computes at most a millisecond instead of five, so that control and status answer in time (measured with three
     busy threads: median 23 ms, then 11)."""
-    os.nice(settings.life.nice)
+    os.nice(life.nice)
     sys.setswitchinterval(_SWITCH_S)
 
 

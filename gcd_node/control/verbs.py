@@ -1,9 +1,10 @@
 """The verbs of the control socket: what each takes, and who may say it (wire protocol, section 5)."""
 
+import functools
 import types
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import msgspec
 from msgspec import Meta
@@ -180,9 +181,24 @@ VERBS: Mapping[str, Verb] = types.MappingProxyType(
 """Every verb. A viewer's verbs change nothing; an operator may say all of them."""
 
 
-def schemas() -> dict[str, object]:
-    """Role and JSON schema of every verb's arguments, for `describe`."""
+@functools.cache
+def schemas() -> Mapping[str, object]:
+    """Role and JSON schema of every verb's arguments, for `describe`; null is left out, as no argument may be that."""
     return {
-        name: {"role": verb.role, "args": msgspec.json.schema(verb.arguments), "if_view_rev": verb.names_view}
+        name: {
+            "role": verb.role,
+            "args": _without_null(msgspec.json.schema(verb.arguments)),
+            "if_view_rev": verb.names_view,
+        }
         for name, verb in VERBS.items()
     }
+
+
+def _without_null(schema: dict[str, Any]) -> dict[str, Any]:
+    """What may be left out is an optional argument of msgspec, which counts null among its values."""
+    for definition in schema.get("$defs", {}).values():
+        for name, told in definition.get("properties", {}).items():
+            kinds = [kind for kind in told.get("anyOf", ()) if kind != {"type": "null"}]
+            if len(kinds) == 1:
+                definition["properties"][name] = kinds[0]
+    return schema

@@ -47,14 +47,19 @@ class Subscriptions:
             return
         if event[0]:
             self._topics[topic] += 1
-        elif self._topics[topic] > 1:
+            self._add(topic, 1)
+        elif topic in self._topics:
             self._topics[topic] -= 1
-        else:
-            self._topics.pop(topic, None)
-        self.now = self._counted()
+            if self._topics[topic] == 0:
+                del self._topics[topic]
+            self._add(topic, -1)
 
-    def _counted(self) -> Readers:
-        """ZeroMQ matches prefixes: a subscription to everything gets views and previews."""
-        previews = {topic: count for topic, count in self._topics.items() if _PREVIEW_KEY.startswith(topic)}
-        every = sum(previews.values())
-        return Readers(total=self._topics.total(), previews=every, previews_alone=every - previews.get(b"", 0))
+    def _add(self, topic: bytes, count: int) -> None:
+        """Without looking at the others: a client may subscribe to as many topics as it likes. ZeroMQ matches prefixes,
+        so a subscription to everything gets views and previews."""
+        now, preview = self.now, _PREVIEW_KEY.startswith(topic)
+        self.now = Readers(
+            total=now.total + count,
+            previews=now.previews + count * preview,
+            previews_alone=now.previews_alone + count * (preview and topic != b""),
+        )

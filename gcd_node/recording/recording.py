@@ -109,7 +109,8 @@ class Recording:
         except LimitReachedError as limit:
             self._give_up(limit.code, str(limit))
         except OSError as error:
-            self._give_up("DISK_FULL" if error.errno in _FULL else "DISK_ERROR", f"{error}; look at the disk")
+            remedy = "look at the disk" if self._parts else "check folder in [record], its permissions and its disk"
+            self._give_up("DISK_FULL" if error.errno in _FULL else "DISK_ERROR", f"{error}; {remedy}")
         except Exception as error:
             _LOG.exception("the recording broke")
             self._give_up("INTERNAL", f"{type(error).__name__}; see the log")

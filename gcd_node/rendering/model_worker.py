@@ -10,7 +10,17 @@ from dataclasses import dataclass, field, replace
 
 import torch
 
-from gcd_model import Augmentation, Cancelled, Clip, DeviceMemoryError, NonFiniteError, RenderOptions, View
+from gcd_model import (
+    Augmentation,
+    Cancelled,
+    Clip,
+    DeviceMemoryError,
+    NonFiniteError,
+    OptionError,
+    RenderOptions,
+    Traits,
+    View,
+)
 from gcd_node.capture import Newest
 from gcd_node.health.announcer import Announcer
 from gcd_node.health.monitor import IDLE, Health
@@ -166,8 +176,7 @@ class ModelWorker:
         self._parts.health.model("warming")
         self._beat_s = time.monotonic()
         settings, run, synthesizer = self._parts.live.settings(), self._run_of(-1), self._parts.model.synthesizer
-        config = run.traits.config
-        video = torch.zeros(config.frames, 3, config.height, config.width)
+        video = torch.zeros(run.traits.config.frames, 3, *_warm_up_size(run.traits))
         grey = Clip(video=video, fps=run.traits.fps, mount=run.mount)
         paths = [view.planned() for view in self._views.following(settings, run.mount)]
         try:
@@ -292,6 +301,19 @@ class ModelWorker:
             self._parts.health.model_load(gpu_mem_mb=torch.cuda.memory_allocated() / 1e6)
         if self._parts.on_window is not None:
             self._parts.on_window(WindowReport(window=job.window, render_s=seconds, age_ms=age_ms))
+
+
+def _warm_up_size(traits: Traits) -> tuple[int, int]:
+    """Height and width of the clip to warm up with: half of each on a CPU, where a whole rendering takes longer than
+    all that happens only once, and puts off the first view."""
+    height, width = traits.config.height, traits.config.width
+    if traits.device != "cpu":
+        return height, width
+    try:
+        traits.check_size(height // 2, width // 2)
+    except OptionError:
+        return height, width
+    return height // 2, width // 2
 
 
 def window_seed(config_digest: str, window_id: int, attempt: int) -> int:

@@ -28,14 +28,16 @@ def divergence(comparison: RunComparison) -> str | None:
     first = comparison.first_divergence
     if first is None:
         return None
-    cause = ""
-    if isinstance(first, ViewComparison):
-        cause = (
-            "; the model was given the same pictures"
-            if first.same_input
-            else "; the model was given other pictures already: look at the recording and its decoder"
-        )
+    cause = _cause(first) if isinstance(first, ViewComparison) else ""
     return f"first divergence: window {first.window_id}, view {first.view_id}: {describe(first)}{cause}"
+
+
+def _cause(first: ViewComparison) -> str:
+    if not first.same_input:
+        return "; the model was given other pictures already: look at the recording and its decoder"
+    if not first.same_seed:
+        return "; the model was given the same pictures and another seed, as any other setting brings one"
+    return "; the model was given the same pictures"
 
 
 def describe(each: ViewComparison | Missing) -> str:
@@ -146,6 +148,7 @@ def _plain_view(view: ViewComparison, tolerance: Tolerance) -> dict[str, Any]:
         "passed": view.within(tolerance),
         "other": list(view.facts),
         "same_input": view.same_input,
+        "same_seed": view.same_seed,
     }
     if distance is None:
         return plain

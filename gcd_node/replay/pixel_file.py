@@ -43,11 +43,11 @@ class PixelWriter:
 class PixelReader:
     """Takes windows from a video that PixelWriter wrote."""
 
-    def __init__(self, path: Path, *, frames: int, grey: bool) -> None:
-        """frames: T. grey: it holds class maps. Raises DamagedRunError if it cannot be opened."""
+    def __init__(self, path: Path, *, shape: tuple[int, int, int], grey: bool) -> None:
+        """shape: T, H, W. grey: it holds class maps. Raises DamagedRunError if it cannot be opened."""
         if not path.is_file():
             raise DamagedRunError(f"{path} is missing; copy the whole folder of the run, or replay it again")
-        self._path, self._frames, self._grey = path, frames, grey
+        self._path, self._shape, self._grey = path, shape, grey
         with quiet_opencv():
             self._video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
         if not self._video.isOpened():
@@ -57,15 +57,22 @@ class PixelReader:
         """The next window, u8 [T, H, W, 3], or [T, H, W] if grey.
 
         Raises:
-            DamagedRunError: the video ends too early, or these are not the pixels with that digest.
+            DamagedRunError: the video ends too early, its pictures have another size, or these are not the pixels
+                with that digest.
         """
         frames: list[Pixels] = []
-        for index in range(self._frames):
+        count, height, width = self._shape
+        for index in range(count):
             good, frame = self._video.read()
             if not good:
                 raise DamagedRunError(
-                    f"{self._path} ends at frame {index} of {self._frames} of window {window_id}: it is shorter than "
+                    f"{self._path} ends at frame {index} of {count} of window {window_id}: it is shorter than "
                     "manifest.json says; copy it again, or replay again"
+                )
+            if frame.shape[:2] != (height, width):
+                raise DamagedRunError(
+                    f"{self._path} has pictures of {frame.shape[1]} x {frame.shape[0]} pixels, manifest.json says "
+                    f"{width} x {height}; one of the two was changed or damaged: replay again"
                 )
             plain = frame[..., 0] if self._grey else cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
             frames.append(np.asarray(plain, np.uint8))

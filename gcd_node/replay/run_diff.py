@@ -58,13 +58,14 @@ class ViewComparison:
     """One view of one window that is in both runs.
 
     facts: what must agree and does not: "stamps", "seqs", "epoch", "ood", "size", "class map". distance: None if the
-    pictures have different sizes. same_input: the model was given the same pictures.
+    pictures have different sizes. same_input, same_seed: the model was given the same pictures, and the same seed.
     """
 
     window_id: int
     view_id: str
     facts: tuple[str, ...]
     same_input: bool
+    same_seed: bool
     distance: Distance | None
 
     @property
@@ -172,6 +173,7 @@ def _compare_view(view_id: str, a: WindowPixels, b: WindowPixels, *, same_size: 
         view_id=view_id,
         facts=tuple(facts),
         same_input=a.entry.input_sha256 == b.entry.input_sha256,
+        same_seed=entry_a.seed == entry_b.seed,
         distance=_distance(a.pictures[view_id], b.pictures[view_id], maps) if same_size else None,
     )
 

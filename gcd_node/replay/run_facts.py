@@ -32,8 +32,9 @@ def different_facts(a: Manifest, b: Manifest) -> tuple[Fact, ...]:
     """
     all_a, all_b = dict(_facts(a)), dict(_facts(b))
     names = dict.fromkeys((*all_a, *all_b))
-    facts = (Fact(name=name, a=all_a.get(name, ABSENT), b=all_b.get(name, ABSENT)) for name in names)
-    return tuple(sorted((fact for fact in facts if fact.a != fact.b), key=lambda fact: _GROUPS.index(_group(fact))))
+    pairs = ((name, all_a.get(name, ABSENT), all_b.get(name, ABSENT)) for name in names)
+    facts = (Fact(name=_shown(name), a=_shown(a), b=_shown(b)) for name, a, b in pairs if a != b)
+    return tuple(sorted(facts, key=lambda fact: _GROUPS.index(_group(fact))))
 
 
 _GROUPS = ("config", "weights", "source", "version", "machine", "size", "total", "trouble")
@@ -41,6 +42,11 @@ _GROUPS = ("config", "weights", "source", "version", "machine", "size", "total",
 
 def _group(fact: Fact) -> str:
     return fact.name.partition(" ")[0]
+
+
+def _shown(text: str) -> str:
+    """Without control characters: a manifest may come from a stranger, and terminals obey some of them."""
+    return "".join(char if char.isprintable() else "?" for char in text)
 
 
 def _facts(manifest: Manifest) -> Iterator[tuple[str, str]]:

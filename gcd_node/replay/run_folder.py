@@ -77,13 +77,14 @@ def read_windows(run: RunFolder) -> Iterator[WindowPixels]:
     Raises:
         DamagedRunError: see PixelReader.
     """
-    frames = run.manifest.size.frames
+    size = run.manifest.size
+    shape = size.frames, size.height, size.width
     readers: dict[Path, PixelReader] = {}
     with ExitStack() as stack:
 
         def reader(path: Path, *, grey: bool) -> PixelReader:
             if path not in readers:
-                readers[path] = PixelReader(path, frames=frames, grey=grey)
+                readers[path] = PixelReader(path, shape=shape, grey=grey)
                 stack.callback(readers[path].close)
             return readers[path]
 

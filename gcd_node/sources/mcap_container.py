@@ -33,7 +33,8 @@ MAX_BYTES = 256 * 2**20
 """Larger records, and chunks that unfold to more, are refused."""
 
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA, _DATA_END, _FOOTER = 3, 4, 5, 6, 12, 15, 2
-_MOST_METADATA = 64
+_MOST_METADATA, _MAX_METADATA = 64, 2**16
+_LONGEST_NAME = 1024  # of topics, encodings, schemas: they are kept, and a few kB can unfold to gigabytes of them
 _LAST_KNOWN, _FIRST_PRIVATE = 15, 128
 _HEAD = struct.Struct("<BQ")
 _PIECE = 2**20
@@ -134,9 +135,10 @@ class McapContainer:
         while place + _HEAD.size <= len(records):
             kind, length = _HEAD.unpack_from(records, place)
             place += _HEAD.size
-            if length > len(records) - place:
+            if kind == 0 or length > len(records) - place:
                 return
-            yield from self._record(kind, records[place : place + length])
+            if kind != _METADATA:  # which stands outside of chunks
+                yield from self._record(kind, records[place : place + length])
             place += length
 
     def _record(self, kind: int, body: memoryview) -> Iterator[LogMessage]:
@@ -144,7 +146,7 @@ class McapContainer:
         try:
             if kind == _SCHEMA:
                 number = cursor.integer("H")
-                self._schemas[number] = cursor.text()
+                self._schemas[number] = _name(cursor)
             elif kind == _CHANNEL:
                 self._add_channel(cursor)
             elif kind == _METADATA:
@@ -156,10 +158,12 @@ class McapContainer:
 
     def _add_channel(self, cursor: ByteCursor) -> None:
         number, schema = cursor.integer("H"), cursor.integer("H")
-        topic, encoding = cursor.text(), cursor.text()
+        topic, encoding = _name(cursor), _name(cursor)
         self._channels[number] = LogChannel(topic=topic, encoding=encoding, schema=self._schemas.get(schema, ""))
 
     def _add_metadata(self, cursor: ByteCursor) -> None:
+        if cursor.left > _MAX_METADATA:
+            raise SourceError(f"{cursor.left} bytes of metadata, more than {_MAX_METADATA}")
         name, pairs = cursor.text(), ByteCursor(cursor.blob(cursor.integer("I")))
         found: dict[str, str] = {}
         while pairs.left:
@@ -175,6 +179,14 @@ class McapContainer:
         sequence, log_ns, published_ns = cursor.integer("I"), cursor.integer("Q"), cursor.integer("Q")
         data = cursor.blob(cursor.left)
         yield LogMessage(channel=channel, sequence=sequence, log_ns=log_ns, published_ns=published_ns, data=data)
+
+
+def _name(cursor: ByteCursor) -> str:
+    """Raises SourceError for one that is too long to be kept, or that a terminal would obey when it is shown."""
+    name = cursor.text()
+    if len(name) > _LONGEST_NAME or not name.isprintable():
+        raise SourceError(f"a name of {len(name)} characters, wanted are at most {_LONGEST_NAME} that can be printed")
+    return name
 
 
 def check_mcap(path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import http
 import logging
+import os
 import socket
 import struct
 import threading
@@ -211,8 +212,13 @@ def _bound(address: str) -> socket.socket:
         return socket.create_server((host, port), family=family, backlog=16)
     except OSError as error:
         raise EndpointError(
-            f"cannot bind http://{address}: {error.strerror}; stop who uses it or choose another port in [viewer]"
+            f"cannot bind http://{address}: {_reason(error)}; stop who uses it or choose another port in [viewer]"
         ) from error
+
+
+def _reason(error: OSError) -> str:
+    """Without what create_server() adds to it, which is the address once more."""
+    return str(error.strerror) if error.errno is None else os.strerror(error.errno)
 
 
 def _library(listening: socket.socket, viewer: ViewerServer) -> Server:

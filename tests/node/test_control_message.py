@@ -267,3 +267,9 @@ def test_mutated_requests_end_as_commands_or_documented_errors() -> None:
             msgspec.json.encode(Reply(id=error.request_id, ok=False, code=error.reason, message=str(error), state=""))
     assert {"BAD_JSON", "BAD_PROTO", "BAD_ARG", "UNKNOWN_VERB"} <= codes
     assert codes & set(VERBS)
+
+
+def test_no_schema_promises_that_null_is_allowed() -> None:
+    told = msgspec.json.encode(schemas())
+    assert b'"null"' not in told
+    assert b'"azimuth_deg":{"type":"number"}' in told

@@ -1,7 +1,14 @@
+from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
+from cameras import Bench, Camera
+from fakes import FakeSynthesizer, traits
+from msgspec.structs import replace as struct_replace
+from rig import Rig
 
+from gcd_model import DRIVING_SMALL
 from gcd_node.health.wall_clock import WallClock
 from gcd_node.rendering.degrade import WHOLE, Ladder, rungs
 from gcd_node.rendering.idle import IdleRule
@@ -100,3 +107,15 @@ def test_a_look_that_was_interrupted_is_not_trusted() -> None:
     assert wall.step_ms() is None
     utc.now = 0.5
     assert wall.step_ms() is None
+
+
+@pytest.mark.parametrize(
+    ("device", "height", "size"), [("cpu", 128, (64, 96)), ("cpu", 96, (96, 192)), ("cuda:0", 128, (128, 192))]
+)
+def test_a_cpu_warms_up_with_less_where_it_can(device: str, height: int, size: tuple[int, int], tmp_path: Path) -> None:
+    config = struct_replace(DRIVING_SMALL, height=height, width=192)
+    model = FakeSynthesizer(replace(traits("driving"), config=config, device=device))
+    camera = Camera(size=(192, 128))
+    with Rig(tmp_path, Bench(camera), model, views="[view.main]") as rig:
+        rig.await_state("active")
+    assert tuple(model.clips[0].video.shape) == (14, 3, *size)

@@ -53,6 +53,15 @@ INFO = "sensor_msgs/msg/CameraInfo"
 COLOUR = (250, 10, 120)
 
 
+def record(kind: int, body: bytes) -> bytes:
+    return struct.pack("<BQ", kind, len(body)) + body
+
+
+def length_of(data: bytes) -> bytes:
+    """With its length before it, as MCAP writes texts."""
+    return struct.pack("<I", len(data)) + data
+
+
 def noisy(count: int) -> list[Image]:
     return list(np.random.default_rng(0).integers(0, 255, (count, HEIGHT, WIDTH, 3), np.uint8))
 
@@ -491,6 +500,33 @@ def test_a_chunk_that_would_fill_the_memory_is_not_unfolded(
     assert "more than 5000" in caplog.text
 
 
+def test_names_and_metadata_that_unfold_to_gigabytes_are_not_kept(tmp_path: Path) -> None:
+    long = length_of(b"a" * 2000)
+    pairs = length_of(b"key") + length_of(b"a" * 70_000)
+    schema = struct.pack("<H", 1) + long + bytes(8)
+    channel = struct.pack("<HH", 2, 0) + long + length_of(b"cdr") + bytes(4)
+    beep = struct.pack("<HH", 3, 0) + length_of(b"/beep\x07") + length_of(b"cdr") + bytes(4)
+    metadata = length_of(b"name") + length_of(pairs)
+    hidden = length_of(b"hidden") + length_of(length_of(b"key") + length_of(b"value"))
+    inside = record(3, schema) + record(4, channel) + record(4, beep) + record(12, hidden)
+    chunk = struct.pack("<QQQI", 0, 0, len(inside), 0) + length_of(b"") + struct.pack("<Q", len(inside)) + inside
+    (tmp_path / "log.mcap").write_bytes(MAGIC + record(12, metadata) + record(6, chunk) + record(15, bytes(4)))
+    container = McapContainer(tmp_path / "log.mcap")
+    assert list(container.messages()) == []
+    assert container.whole
+    assert not container.channels
+    assert not container.metadata
+
+
+def test_a_chunk_of_nothing_is_not_counted_through(tmp_path: Path) -> None:
+    inside = bytes(9) + record(4, struct.pack("<HH", 1, 0) + length_of(b"/late") + length_of(b"cdr") + bytes(4))
+    chunk = struct.pack("<QQQI", 0, 0, len(inside), 0) + length_of(b"") + struct.pack("<Q", len(inside)) + inside
+    (tmp_path / "log.mcap").write_bytes(MAGIC + record(6, chunk) + record(15, bytes(4)))
+    container = McapContainer(tmp_path / "log.mcap")
+    assert list(container.messages()) == []
+    assert not container.channels
+
+
 def test_a_chunk_that_lies_about_its_size_is_left_out() -> None:
     import zstandard
 
@@ -590,9 +626,6 @@ def test_uncompressed_logs_need_no_library_and_compressed_ones_name_the_extra(tm
 
 
 def test_messages_of_unknown_channels_and_private_records_are_passed_over(tmp_path: Path) -> None:
-    def record(kind: int, body: bytes) -> bytes:
-        return struct.pack("<BQ", kind, len(body)) + body
-
     out = io.BytesIO()
     out.write(MAGIC)
     out.write(record(0x80, b"private"))

@@ -79,7 +79,7 @@ def test_noise_of_every_level_survives_the_disk(tmp_path: Path) -> None:
         writer = PixelWriter(tmp_path / "noise.mkv", height=16, width=24, fps=10.0)
         writer.write(pixels)
         writer.close()
-        reader = pixel_file.PixelReader(tmp_path / "noise.mkv", frames=3, grey=pixels.ndim == 3)
+        reader = pixel_file.PixelReader(tmp_path / "noise.mkv", shape=(3, 16, 24), grey=pixels.ndim == 3)
         assert np.array_equal(reader.read(0, pixel_digest(pixels)), pixels)
         reader.require_end()
         reader.close()

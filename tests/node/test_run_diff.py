@@ -17,9 +17,10 @@ from gcd_node.cli.main import run_app
 from gcd_node.errors import DamagedRunError, UsageError
 from gcd_node.replay.diff_pictures import WORST, gain_for, write_report
 from gcd_node.replay.diff_report import divergence, facts_table, report_text, to_plain, verdict, views_table
-from gcd_node.replay.manifest import Manifest
+from gcd_node.replay.manifest import Manifest, SizeEntry, WindowEntry
+from gcd_node.replay.pixel_file import PixelWriter, pixel_digest
 from gcd_node.replay.run_diff import Missing, RunComparison, Tolerance, ViewComparison, compare, psnr_db
-from gcd_node.replay.run_folder import MANIFEST, RunFolder, open_run, write_manifest
+from gcd_node.replay.run_folder import MANIFEST, RunFolder, classes_path, open_run, pictures_path, write_manifest
 
 pytestmark = pytest.mark.timeout(60)
 EXACT = Tolerance()
@@ -43,6 +44,27 @@ def restated(run: RunFolder, folder: Path, **changes: object) -> RunFolder:
     copied(run, folder)
     manifest: Manifest = msgspec.structs.replace(run.manifest, **changes)
     write_manifest(folder, manifest)
+    return open_run(folder)
+
+
+def resized(run: RunFolder, folder: Path, *, honest: bool, kind: str = "pictures") -> RunFolder:
+    """A copy whose pictures or class maps are black, with true digests. honest: the manifest states their size."""
+    frames, height, width = run.manifest.size.frames, 16, 24
+    copied(run, folder)
+    grey = kind == "classes"
+    pixels = np.zeros((frames, height, width) if grey else (frames, height, width, 3), np.uint8)
+    path = (classes_path if grey else pictures_path)(folder, "main")
+    path.unlink()
+    writer = PixelWriter(path, height=height, width=width, fps=10.0)
+    digest = {"classes_sha256" if grey else "sha256": pixel_digest(pixels)}
+    windows: list[WindowEntry] = []
+    for window in run.manifest.windows:
+        writer.write(pixels)
+        view = msgspec.structs.replace(window.views["main"], **digest)
+        windows.append(msgspec.structs.replace(window, views={"main": view}))
+    writer.close()
+    said = SizeEntry(frames=frames, height=height, width=width) if honest else run.manifest.size
+    write_manifest(folder, msgspec.structs.replace(run.manifest, windows=tuple(windows), size=said))
     return open_run(folder)
 
 
@@ -171,10 +193,16 @@ def test_another_flag_on_a_view_fails(golden: RunFolder, tmp_path: Path) -> None
 
 
 def test_pictures_of_another_size_cannot_be_near(golden: RunFolder, tmp_path: Path) -> None:
-    size = msgspec.structs.replace(golden.manifest.size, width=97)
-    comparison = compare(golden, restated(golden, tmp_path / "run", size=size))
+    comparison = compare(golden, resized(golden, tmp_path / "run", honest=True))
     assert first_view(comparison).facts == ("size",)
     assert len(comparison.failures(Tolerance(min_psnr_db=1.0))) == WINDOWS
+
+
+@pytest.mark.parametrize("kind", ["pictures", "classes"])
+def test_a_manifest_that_lies_about_the_size_is_damage(kind: str, tmp_path: Path) -> None:
+    golden = classed(tmp_path / "golden", {})
+    with pytest.raises(DamagedRunError, match=r"manifest\.json says"):
+        compare(golden, resized(golden, tmp_path / "run", honest=False, kind=kind))
 
 
 @pytest.mark.parametrize("bounds", [{"min_psnr_db": 0.0}, {"min_psnr_db": math.nan}, {"max_class_share": 1.5}])
@@ -202,6 +230,12 @@ def test_what_the_runs_were_made_from_is_named_first(golden: RunFolder, tmp_path
     assert text.index("model.steps: 1, 3") < text.index("first divergence: window 0, view main")
 
 
+def test_what_a_strange_manifest_says_cannot_command_a_terminal(golden: RunFolder, tmp_path: Path) -> None:
+    weights = msgspec.structs.replace(golden.manifest.weights, name="\x1b]0;mine\x07")
+    comparison = compare(golden, restated(golden, tmp_path / "run", weights=weights))
+    assert [(fact.name, fact.b) for fact in comparison.facts] == [("weights name", "?]0;mine?")]
+
+
 def test_settings_a_replay_does_not_use_are_no_difference(golden: RunFolder, tmp_path: Path) -> None:
     other = made_run(tmp_path / "run", changes=["publish.jpeg_quality=70", "life.nice=3", "source.pace=realtime"])
     assert compare(golden, other).facts == ()
@@ -217,6 +251,15 @@ def test_the_first_divergence_says_whether_the_input_was_the_same(golden: RunFol
     )
     other_input = compare(golden, made_run(tmp_path / "b", source=shifted))
     assert "other pictures already" in (divergence(other_input) or "")
+
+
+def test_the_first_divergence_says_when_settings_brought_another_seed(golden: RunFolder, tmp_path: Path) -> None:
+    other = made_run(tmp_path / "run", LevelModel(traits(), {(0, 0): 1}), changes=["source.seed=7"])
+    comparison = compare(golden, other)
+    assert not first_view(comparison).same_seed
+    assert "same pictures and another seed" in str(divergence(comparison))
+    assert "another seed" not in str(divergence(compare(golden, lowered(tmp_path / "lowered", {(0, 0): 1}))))
+    assert to_plain(comparison, EXACT)["views"][0]["same_seed"] is False
 
 
 def test_the_verdict_has_three_words(golden: RunFolder, tmp_path: Path) -> None:

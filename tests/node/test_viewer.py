@@ -239,7 +239,7 @@ def test_what_is_no_address_is_refused(address: str) -> None:
 
 
 def test_a_port_in_use_is_refused(viewer: ViewerServer, tmp_path: Path) -> None:
-    with pytest.raises(EndpointError, match="in use"):
+    with pytest.raises(EndpointError, match="already in use; stop who uses it"):
         ViewerServer(ViewerOptions(http=host_of(viewer), node=nobody(tmp_path)))
 
 

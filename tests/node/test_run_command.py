@@ -1,0 +1,73 @@
+"""How `gcd-node run` behaves beside others on its machine, and how the process ends."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from gcd_node.cli.node import be_considerate
+from gcd_node.config import LifeConfig, ModelSection
+from gcd_node.session import load_model, model_threads
+
+
+def test_the_model_leaves_the_rest_of_the_robot_a_core(monkeypatch: pytest.MonkeyPatch) -> None:
+    for cores, threads in ((1, 1), (2, 1), (8, 7)):
+        ours = set(range(cores))
+
+        def affinity(_: int, ours: set[int] = ours) -> set[int]:
+            return ours
+
+        monkeypatch.setattr(os, "sched_getaffinity", affinity)
+        assert model_threads(ModelSection(weights="fake")) == threads
+        assert model_threads(ModelSection(weights="fake", threads=3)) == 3
+
+
+def test_a_loaded_model_computes_on_so_many_threads() -> None:
+    before = torch.get_num_threads()
+    try:
+        load_model(ModelSection(weights="random:driving", device="cpu", threads=before + 1))
+        assert torch.get_num_threads() == before + 1
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_a_node_is_as_nice_as_it_is_told_and_its_threads_take_turns_quickly(monkeypatch: pytest.MonkeyPatch) -> None:
+    nice: list[int] = []
+    monkeypatch.setattr(os, "nice", nice.append)
+    before = sys.getswitchinterval()
+    try:
+        be_considerate(LifeConfig(nice=7))
+        assert nice == [7]
+        assert sys.getswitchinterval() == pytest.approx(0.001)
+    finally:
+        sys.setswitchinterval(before)
+
+
+def test_a_thread_that_hangs_changes_neither_the_exit_code_nor_what_was_said() -> None:
+    code = """
+import sys, threading, time
+from gcd_node.cli.main import main
+threading.Thread(target=time.sleep, args=(3600,), daemon=True).start()
+sys.argv = ["gcd-node", "ctl", "state", "--endpoint", "ipc:///nowhere/at/all", "--timeout", "0.1"]
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 69
+    assert done.stderr.startswith("error: ipc:///nowhere/at/all did not answer state")
+
+
+def test_f23_a_node_that_has_not_even_begun_ends_with_0() -> None:
+    code = """
+import sys, time
+from gcd_node.cli import main
+sys.argv = ["gcd-node", "-v", "run", "launch.toml"]
+main.run_app = lambda _: (print("importing torch", flush=True), time.sleep(3600))
+main.main()
+"""
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as node:
+        assert node.stdout is not None
+        assert node.stdout.readline() == "importing torch\n"
+        node.terminate()
+        assert node.wait(60) == 0
