@@ -4,16 +4,18 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal, TypeAlias
 
 import torch
 
 from gcd_model import FAMILIES, CheckpointError, ModelError, Traits, WeightsReport, inspect_weights, load_synthesizer
-from gcd_node.config import ModelSection, NodeConfig
-from gcd_node.errors import NodeError, SourceLostError
+from gcd_node.config import ModelSection, NodeConfig, RecordConfig
+from gcd_node.errors import ConfigError, NodeError, SourceLostError
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.life.live_config import LiveConfig
+from gcd_node.recording.folder import LimitReachedError, check_folder
 from gcd_node.rendering.preparation import prepare_run
 from gcd_node.rendering.virtual_view import VirtualViews
 from gcd_node.session import model_threads, open_session
@@ -55,12 +57,15 @@ class _Known:
 
 
 def check(config: NodeConfig, resources: Resources | None = None) -> Iterator[Finding]:
-    """Look at endpoints, source, weights, memory, views and time, in this order; each as soon as it is known.
+    """Look at endpoints, source, weights, memory, views and time, in this order, and where recordings go, if anywhere;
+    each as soon as it is known.
 
     resources: measured if left out. What follows from something that failed is left out.
     """
     known = _Known()
     yield _tried("endpoints", lambda: _endpoints(config))
+    if config.record.folder is not None:
+        yield _tried("record", lambda: _record(Path(config.record.folder or ""), config.record))
     yield _tried("source", lambda: _source(config, known))
     yield _tried("weights", lambda: _weights(config.model, known))
     info, traits = known.info, known.traits
@@ -89,6 +94,21 @@ def _endpoints(config: NodeConfig) -> str:
         wanted = config.control.endpoint
         control = "no control" if wanted is None else f"control {resolve_endpoint(wanted, 'control')}"
         return f"free: data {publisher.endpoint}, status {publisher.status_endpoint}, {control}"
+
+
+def _record(folder: Path, section: RecordConfig) -> str:
+    """What fails here ends no start, but nothing would be recorded."""
+    root = folder.expanduser()
+    try:
+        free_mb = check_folder(root, section)
+    except OSError as error:
+        raise ConfigError(f"nothing can be recorded in {root}: {error}; check folder in [record]") from error
+    except LimitReachedError as limit:
+        raise _DoubtfulError(f"nothing would be recorded: {limit}") from limit
+    if find_spec("mcap") is None:
+        raise ConfigError("recording needs the extra `record`: pip install 'gcd-node[record]'")
+    when = "from the start" if section.autostart else "when asked to"
+    return f"{', '.join(section.what)} into {root}, {when}; {free_mb / 1000:.1f} GB are free"
 
 
 def _source(config: NodeConfig, known: _Known) -> str:

@@ -312,11 +312,11 @@ class NodeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     @property
     def digest(self) -> str:
-        """12 hex digits that name this configuration: how views are rendered; not from which recording, on which
-        device or at what pace, nor where they are sent. Seeds follow from it."""
-        source = msgspec.structs.replace(
-            self.source, path=None, device=None, url=None, kind="synthetic", pace="lockstep", loop=False
-        )
+        """12 hex digits that name this configuration: how views are rendered from given pictures; not from which
+        camera or recording they come, on which device or at what pace, nor where they are sent. Seeds follow from it,
+        so that a recording of a camera is rendered as the camera was."""
+        taken = self.source
+        source = (taken.resize, taken.allow_upscale, taken.hfov_deg, taken.pose)
         model = msgspec.structs.replace(self.model, device="auto", threads=None)
         rendered = msgspec.json.encode((source, model, self.view, self.window), order="deterministic")
         return hashlib.sha256(rendered).hexdigest()[:12]

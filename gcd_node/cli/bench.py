@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from typer import Option
 
+from gcd_node.cli.soak import quiet_node
 from gcd_node.load.bench import BenchOptions, BenchReport, Latency, bench_node
 
 bench = typer.Typer(no_args_is_help=True, help="Measure on this machine.")
@@ -40,7 +41,7 @@ def node(
     Takes about four minutes, with nothing else running. Needs no camera.
     """
     options = BenchOptions(windows=windows, slow_windows=slow_windows, stall_s=stall, returns=returns, starts=starts)
-    with Console(stderr=True).status("starting") as status:
+    with Console(stderr=True).status("starting") as status, quiet_node():
         report = bench_node(options, lambda part: status.update(part))
     if as_json:
         typer.echo(msgspec.json.encode(report).decode())

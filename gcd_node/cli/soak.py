@@ -32,7 +32,7 @@ def soak(hours: Hours = 1.0, report: ReportPath = None, as_json: AsJson = False,
     """
     _check_writable(report)
     console = Console(stderr=True)
-    with console.status("starting") as status, _quiet():
+    with console.status("starting") as status, quiet_node():
 
         def tell(sample: Sample) -> None:
             left = time.strftime("%H:%M:%S", time.gmtime(sample.left_s))
@@ -91,12 +91,12 @@ def _record(report: SoakReport, found: tuple[str, ...]) -> bytes:
 
 
 @contextmanager
-def _quiet() -> Generator[None]:
-    """Without the node's warnings of every attack and every loss, which are what was asked for; -v shows them."""
+def quiet_node() -> Generator[None]:
+    """Without what the node says of every attack and every loss, which are what was asked for; -v shows it."""
     logger = logging.getLogger("gcd_node")
     was = logger.level
     if logging.getLogger().level > logging.INFO:
-        logger.setLevel(logging.ERROR)
+        logger.setLevel(logging.CRITICAL)
     try:
         yield
     finally:

@@ -44,7 +44,8 @@ class CameraScript:
     """One camera over all its openings. Frames are numbered through; every method may be called from any thread.
 
     acts: what it does, one after another; steady once they are used up.
-    size: width and height; never smaller than what the model takes. outage_s: see "die".
+    size: width and height; never smaller than what the model takes. outage_s: see "die". half_s: of good frames, before
+    whatever an act does, and after; for tests that cannot wait a second.
     """
 
     def __init__(
@@ -54,8 +55,9 @@ class CameraScript:
         fps: float = 24.0,
         size: tuple[int, int] = (480, 320),
         outage_s: float = 1.0,
+        half_s: float = 0.5,
     ) -> None:
-        self.fps, self.size, self.outage_s = fps, size, outage_s
+        self.fps, self.size, self.outage_s, self.half_s = fps, size, outage_s, half_s
         self.larger = (size[0] * 4 // 3, size[1] * 3 // 2)
         self.done: Counter[Act] = Counter()
         """How often each act was played."""
@@ -150,7 +152,7 @@ class ScriptedCamera:
         self._closed.set()
 
     def _play(self, act: Act) -> Iterator[Frame]:
-        half = round(self._script.fps / 2)
+        half = round(self._script.fps * self._script.half_s)
         yield from self._take(half)
         if act in ("stall", "silence", "deaf"):
             self._hold(act)

@@ -1,6 +1,7 @@
 """Where recordings go: names that sort by time and are never taken twice, and how much room is left."""
 
 import os
+import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,6 +68,22 @@ def limits_of(root: Path, config: RecordConfig) -> Limits:
     """What holds for a recording that begins now. Raises OSError."""
     found = root.rglob(f"*{SUFFIX}") if config.max_total_mb else ()
     return Limits(root=root, config=config, others=sum(each.stat().st_size for each in found))
+
+
+def check_folder(root: Path, config: RecordConfig) -> float:
+    """Whether a recording could begin: makes the folder if there is none, and writes a file that is gone at once.
+
+    Returns:
+        MB that are free on its disk.
+    Raises:
+        LimitReachedError, OSError.
+    """
+    root.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=root) as file:
+        file.write(b"\0")
+    limits_of(root, config).check(0)
+    disk = os.statvfs(root)
+    return disk.f_bavail * disk.f_frsize / _MB
 
 
 def is_due(config: RecordConfig, size: int, age_s: float) -> bool:

@@ -19,6 +19,7 @@ from gcd_node.load.bench import (
     StalledReader,
     bench_node,
 )
+from gcd_node.load.first_view import first_view
 
 SMALL = BenchOptions(windows=4, slow_windows=3, stall_s=2.0, returns=1, outage_s=0.2, starts=1, width=96, height=64)
 REPORT = BenchReport(

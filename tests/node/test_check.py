@@ -194,3 +194,16 @@ def test_names_of_tables_reach_the_terminal(
     launch.write_text("\n".join(line for line in text.splitlines() if "path =" not in line))
     assert run_app(["check", str(launch)]) == 69
     assert "[source]" in capsys.readouterr().out
+
+
+def test_where_recordings_would_go_is_looked_at(launch: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "new" / "recordings"
+    verdict, detail = found(launch, f"record.folder={folder}", "record.keep_free_mb=0")["record"]
+    assert verdict == "ok"
+    assert "inputs, views" in detail
+    assert list(folder.iterdir()) == []
+    assert found(launch, f"record.folder={folder}", "record.keep_free_mb=1e12")["record"][0] == "warning"
+    (tmp_path / "file").write_text("")
+    verdict, detail = found(launch, f"record.folder={tmp_path}/file/x")["record"]
+    assert verdict == "failed"
+    assert "check folder in [record]" in detail

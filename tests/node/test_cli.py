@@ -275,6 +275,7 @@ def test_view_saves_what_a_running_node_publishes(video: Path, tmp_path: Path) -
     assert (tmp_path / "s" / "main.mkv").exists()
 
 
+@pytest.mark.slow  # in lockstep it is F23 in test_faults.py
 def test_sigterm_ends_a_running_node_in_order(video: Path, tmp_path: Path) -> None:
     settings = launch_file(tmp_path, video, source="loop = true")
     settings.write_text(settings.read_text().replace("lockstep", "realtime"))
@@ -301,7 +302,15 @@ REAL = Path(__file__).parents[2].parent / "shared" / "real"
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="needs the four real clips in ../shared/real")
-@pytest.mark.parametrize("name", ["kubmv7_scn01992_v11", "kubmv7_scn01996_v2", "pd_scn00590", "pd_scn01969"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "kubmv7_scn01992_v11",
+        pytest.param("kubmv7_scn01996_v2", marks=pytest.mark.slow),  # another scene of the same camera
+        "pd_scn00590",
+        pytest.param("pd_scn01969", marks=pytest.mark.slow),
+    ],
+)
 def test_real_recordings_go_through_both_programs(name: str, tmp_path: Path) -> None:
     source, windows = REAL / f"{name}.mp4", 4 if name.startswith("kub") else 3
     weights = KUBRIC if name.startswith("kub") else DRIVING

@@ -60,7 +60,7 @@ from gcd_node.watching.status_table import render_status
 from gcd_node.wire.jpeg import decode_frames, encode_frames
 
 SETTINGS = settings(
-    max_examples=max(50, ROUNDS // 4),
+    max_examples=max(30, ROUNDS // 16),
     deadline=None,
     derandomize=True,
     database=None,

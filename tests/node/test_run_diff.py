@@ -254,7 +254,7 @@ def test_the_first_divergence_says_whether_the_input_was_the_same(golden: RunFol
 
 
 def test_the_first_divergence_says_when_settings_brought_another_seed(golden: RunFolder, tmp_path: Path) -> None:
-    other = made_run(tmp_path / "run", LevelModel(traits(), {(0, 0): 1}), changes=["source.seed=7"])
+    other = made_run(tmp_path / "run", LevelModel(traits(), {(0, 0): 1}), changes=["model.cond_aug=0.01"])
     comparison = compare(golden, other)
     assert not first_view(comparison).same_seed
     assert "same pictures and another seed" in str(divergence(comparison))

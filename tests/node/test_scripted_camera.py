@@ -16,11 +16,11 @@ from gcd_node.load.stand_in import StandInModel
 
 SIZE = (96, 64)
 FPS = 200.0  # twenty times as fast as a camera, for the tests' sake
-HALF = 100
+HALF = 20
 
 
 def script(*acts: Act, outage_s: float = 0.05) -> CameraScript:
-    return CameraScript(iter(acts), fps=FPS, size=SIZE, outage_s=outage_s)
+    return CameraScript(iter(acts), fps=FPS, size=SIZE, outage_s=outage_s, half_s=HALF / FPS)
 
 
 def taken(*acts: Act, count: int = 3 * HALF) -> tuple[ScriptedCamera, list[Frame]]:
@@ -84,7 +84,7 @@ def test_a_dead_camera_is_absent_until_its_outage_is_over() -> None:
 @pytest.mark.parametrize("act", [act for act in ACTS if act not in ("die", "deaf")])
 def test_closing_ends_every_act(act: Act) -> None:
     camera = script(act).open()
-    closing = threading.Timer(0.7, camera.close)
+    closing = threading.Timer(0.3, camera.close)
     closing.start()
     last = sum(1 for _ in camera.frames())
     closing.join()

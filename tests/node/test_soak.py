@@ -23,7 +23,7 @@ from gcd_node.publisher import Publisher
 from gcd_node.publishing.options import PublisherOptions
 from gcd_node.subscriber import ViewSubscriber
 
-SECONDS = 20.0
+SECONDS = 12.0
 FLAT = Growth(first=10.0, last=10.0, peak=12.0)
 GOOD = SoakReport(
     seconds=3600.0,
