@@ -130,7 +130,8 @@ class Stream:
         return (*self.run.ood, *LASTING)
 
     def start(self) -> None:
-        """Begin; frames are read once the model is warm."""
+        """Begin. Frames are read while the model warms up: its first window is a new one, and no camera's own buffers
+        grow old."""
         self._raise_flags((), self.run.ood)
         self.notice_change()
         for thread in self._threads:
@@ -280,7 +281,6 @@ class Stream:
             self._parts.health.raise_reason(code, Level.WARN)
 
     def _read(self) -> None:
-        self.worker.warm.wait()
         read(self._watch, self._builder, self._newest)
 
     def _work(self) -> None:

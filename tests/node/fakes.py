@@ -130,6 +130,14 @@ class FakeSource:
         self.closed = True
 
 
+class Steady(FakeSource):
+    """Frames at their rhythm until it is closed."""
+
+    def __init__(self, period_s: float = 0.002) -> None:
+        super().__init__(10_000_000)
+        self.period_s = period_s
+
+
 def made_node(
     config: NodeConfig,
     synthesizer: ViewSynthesizer,

@@ -1,5 +1,6 @@
 """What a shell sees of the failure table: the exit code of each row that has one, and the line that goes with it."""
 
+import time
 from collections.abc import Callable
 from importlib.resources import files
 from pathlib import Path
@@ -23,6 +24,7 @@ from gcd_node.publisher import Publisher
 from gcd_node.publishing.options import PublisherOptions
 
 PACKAGED = Path(str(files("gcd_model"))) / "weights" / "driving-small.safetensors"
+SLACK_S = 10.0  # what a machine that does other things may add
 LIVE = 'kind = "v4l2"\ndevice = "/dev/video-none"'
 
 Outcome = Callable[..., tuple[int, str]]
@@ -138,7 +140,9 @@ def test_f19_a_wider_bind_without_keys_is_exit_78_and_names_both_settings(run: O
 
 def test_f20_an_endpoint_in_use_is_exit_73_and_named(run: Outcome, tmp_path: Path) -> None:
     with Publisher(PublisherOptions(data=f"ipc://{tmp_path}/data", status=None)):
+        began_s = time.monotonic()
         code, said = run()
+    assert time.monotonic() - began_s < 1.0 + SLACK_S
     assert code == 73
     assert f"{tmp_path}/data" in said
 

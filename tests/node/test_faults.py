@@ -1,14 +1,9 @@
 """Each row of the failure table as a test named after it, through real sockets: `pytest tests/node -k f9_`.
 
-F16 to F19 are with control and security, the exit codes in test_fault_exits.py.
+F9, F20 and F23 are in test_fault_processes.py, F16 to F19 with control and security, exit codes in test_fault_exits.py.
 """
 
-import os
-import resource
-import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -18,16 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cameras import FPS, Bench, Camera, until
-from fakes import HEIGHT, WIDTH, FakeSource, FakeSynthesizer, traits
-from recordings import files, of, said, summary
+from fakes import HEIGHT, WIDTH, FakeSource, FakeSynthesizer, Steady, traits
 from rig import Rig
-from torch import Tensor
-from wire_messages import start_reader
 
-import gcd_node
 from gcd_model import (
-    Augmentation,
-    Clip,
     DeviceMemoryError,
     NonFiniteError,
     RenderOptions,
@@ -50,38 +39,6 @@ LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
 REALTIME = 'kind = "synthetic"\npace = "realtime"'
 TWO_VIEWS = "[view.main]\nazimuth_deg = 10.0\n[view.other]\nazimuth_deg = -10.0"
 SLACK_S = 3.0  # what a machine that does other things may add
-START_S = 300.0  # the same for starting a process; shorter than a model hangs
-END_S = 5.0 + 30.0  # and for ending one
-
-starts_a_process = pytest.mark.timeout(2 * START_S)
-
-
-class Forgetful(FakeSynthesizer):
-    """Keeps no clip, for whoever measures memory."""
-
-    def encode(
-        self, clip: Clip, augmentation: Augmentation | None = None, extra: Tensor | None = None
-    ) -> SourceFeatures:
-        features = super().encode(clip, augmentation, extra)
-        self.clips.clear()
-        return features
-
-
-class Steady(FakeSource):
-    """Frames at their rhythm until it is closed."""
-
-    def __init__(self, period_s: float = 0.002) -> None:
-        super().__init__(10_000_000)
-        self.period_s = period_s
-
-
-def command(*arguments: str) -> list[str]:
-    return [sys.executable, "-m", "gcd_node", *arguments]
-
-
-def environment() -> dict[str, str]:
-    ours = [str(Path(gcd_node.__file__).parent.parent), str(Path(__file__).parent)]
-    return os.environ | {"PYTHONPATH": os.pathsep.join([*ours, *sys.path])}
 
 
 # F1, F2: a camera that goes, and one that is not there.
@@ -299,31 +256,7 @@ def test_f8_of_the_trained_rates_the_highest_the_source_can_give_is_chosen(tmp_p
     assert "fps" not in view.quality.ood
 
 
-# F9, F10: readers that are slow, and none at all.
-
-
-@starts_a_process
-def test_f9_a_stalled_reader_disturbs_nobody(tmp_path: Path) -> None:
-    with Rig(tmp_path, lambda _: Steady(), Forgetful(traits()), config=REALTIME, keep=False) as rig:
-        reader = start_reader(f"ipc://{tmp_path}/data", "main")
-        try:
-            assert reader.stdout is not None
-            assert reader.stdout.readline()
-            reader.send_signal(signal.SIGSTOP)
-            begun, before_kb = len(rig.of()), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-            rig.await_views(begun + 60)  # 15 MB
-            after_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-            reader.send_signal(signal.SIGCONT)
-            newest = rig.of()[-1].header.window_id
-            seen = [int(reader.stdout.readline().split()[0]) for _ in range(5)]
-        finally:
-            reader.kill()
-            reader.communicate()
-        healthy = rig.of()[begun : begun + 60]
-    assert sum(view.skipped for view in healthy) == 0
-    assert sorted(view.age_ms for view in healthy)[30] < 50 + 1000 * SLACK_S
-    assert after_kb - before_kb < 64 * 1024
-    assert max(seen) >= newest  # it did not have to work off what it had slept through
+# F10: nobody reads.
 
 
 def test_f10_without_a_reader_nothing_is_rendered_until_one_comes(tmp_path: Path) -> None:
@@ -470,30 +403,7 @@ def test_f15_a_window_in_work_keeps_the_view_it_was_begun_with(tmp_path: Path) -
     assert poses == [10.0, -30.0]
 
 
-# F20 to F25: the process and its surroundings.
-
-
-@starts_a_process
-def test_f20_an_endpoint_in_use_is_refused_and_a_dead_ones_file_is_cleared_away(tmp_path: Path) -> None:
-    with socket.socket(socket.AF_UNIX) as dead:
-        dead.bind(str(tmp_path / "data"))  # closed below without being unlinked, as after a kill
-    with Rig(tmp_path, lambda _: Steady(), config=LOCKSTEP) as rig:
-        rig.await_views(1)
-        launch = tmp_path / "second.toml"
-        launch.write_text(f"""
-            [source]
-            kind = "synthetic"
-            [model]
-            weights = "random:driving"
-            [view.main]
-            [publish]
-            data = "ipc://{tmp_path}/data"
-            status = "ipc://{tmp_path}/other"
-        """)
-        done = subprocess.run(command("run", str(launch)), capture_output=True, text=True, timeout=START_S)
-        assert done.returncode == 73, done.stderr
-        assert f"{tmp_path}/data" in done.stderr
-        rig.await_views(len(rig.of()) + 1)  # whoever was first goes on
+# F21 to F25: the process and its surroundings.
 
 
 def test_f21_a_model_that_hangs_is_an_error_and_the_watchdog_is_not_fed(tmp_path: Path) -> None:
@@ -537,70 +447,6 @@ def test_f22_with_nowhere_to_record_to_recording_is_refused_and_streaming_goes_o
         assert (begin.code, end.code) == (Code.NOT_READY, Code.WRONG_STATE)
         assert "[record]" in begin.message
         rig.await_views(len(rig.of()) + 1)
-
-
-@starts_a_process
-def test_f23_sigterm_ends_every_view_and_the_process_with_0(tmp_path: Path) -> None:
-    launch = tmp_path / "launch.toml"
-    launch.write_text(f"""
-        [source]
-        kind = "synthetic"
-        pace = "lockstep"
-        [model]
-        weights = "random:driving"
-        steps = 1
-        [view.main]
-        [publish]
-        data = "ipc://{tmp_path}/data"
-        status = "ipc://{tmp_path}/status"
-        min_subscribers = 1
-        [control]
-        endpoint = "ipc://{tmp_path}/control"
-        [record]
-        folder = "{tmp_path}/recordings"
-        keep_free_mb = 0
-        autostart = true
-    """)
-    with ViewSubscriber(f"ipc://{tmp_path}/data", "main", conflate=False) as views:
-        node = subprocess.Popen(command("run", str(launch)), stderr=subprocess.PIPE, text=True)
-        try:
-            assert views.receive(1000 * START_S) is not None
-            node.send_signal(signal.SIGTERM)
-            while views.receive(1000 * START_S) is not None:
-                pass
-            assert views.ended
-            views.close()
-            assert node.wait(END_S) == 0
-            (recording,) = files(tmp_path / "recordings")
-            assert summary(recording).chunk_indexes  # it was finished
-            assert of(said(recording), "/view/main/image")
-        finally:
-            node.kill()
-            node.communicate()
-
-
-@starts_a_process
-@pytest.mark.parametrize(
-    ("phase", "signals", "code"), [("load", 1, 0), ("warm", 1, 0), ("render", 1, 0), ("render", 2, -signal.SIGTERM)]
-)
-def test_f23_a_model_that_hears_nothing_does_not_hold_up_the_end(
-    phase: str, signals: int, code: int, tmp_path: Path
-) -> None:
-    script = str(Path(__file__).with_name("hung_process.py"))
-    node = subprocess.Popen(
-        [sys.executable, script, str(tmp_path), phase], stdout=subprocess.PIPE, text=True, env=environment()
-    )
-    try:
-        assert node.stdout is not None
-        assert node.stdout.readline() == "hangs\n"
-        for i in range(signals):
-            node.send_signal(signal.SIGTERM)
-            time.sleep(0.3 if i + 1 < signals else 0)
-        assert node.wait(END_S) == code
-        assert ("left behind" in node.stdout.read()) == (code == 0)
-    finally:
-        node.kill()
-        node.communicate()
 
 
 def test_f24_ages_do_not_notice_that_somebody_set_the_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -68,7 +68,7 @@ def test_a_run_that_differs_fails_with_causes_and_pictures(project: pytest.Pytes
         [
             "*DIFFERENT: 3 of 3 views are not within 45 dB in every frame",
             "*config model.steps: 1, 3",
-            "*first divergence: window 0, view main: 42.11 dB*the same pictures",
+            "*first divergence: window 0, view main: 42.11 dB*the same pictures*",
         ]
     )
     (picture,) = re.findall(r"^E +(/\S+window-000000-view-main.png)$", result.stdout.str(), re.MULTILINE)

@@ -1,0 +1,176 @@
+"""Rows of the failure table in which processes meet: a reader that sleeps, an endpoint in use, SIGTERM.
+
+See test_faults.py for the others.
+"""
+
+import os
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fakes import FakeSynthesizer, Steady, traits
+from recordings import files, of, said, summary
+from rig import Rig
+from torch import Tensor
+from wire_messages import start_reader
+
+import gcd_node
+from gcd_model import Augmentation, Clip, SourceFeatures
+from gcd_node.subscriber import ViewSubscriber
+
+LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
+REALTIME = 'kind = "synthetic"\npace = "realtime"'
+SLACK_S = 3.0  # what a machine that does other things may add
+START_S = 300.0  # the same for starting a process; shorter than a model hangs
+END_S = 5.0 + 30.0  # and for ending one
+
+pytestmark = pytest.mark.timeout(2 * START_S)
+
+
+class Forgetful(FakeSynthesizer):
+    """Keeps no clip, for whoever measures memory."""
+
+    def encode(
+        self, clip: Clip, augmentation: Augmentation | None = None, extra: Tensor | None = None
+    ) -> SourceFeatures:
+        features = super().encode(clip, augmentation, extra)
+        self.clips.clear()
+        return features
+
+
+def command(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "gcd_node", *arguments]
+
+
+def environment() -> dict[str, str]:
+    ours = [str(Path(gcd_node.__file__).parent.parent), str(Path(__file__).parent)]
+    return os.environ | {"PYTHONPATH": os.pathsep.join([*ours, *sys.path])}
+
+
+def test_f9_a_stalled_reader_disturbs_nobody(tmp_path: Path) -> None:
+    with Rig(tmp_path, lambda _: Steady(), Forgetful(traits()), config=REALTIME, keep=False) as rig:
+        reader = start_reader(f"ipc://{tmp_path}/data", "main")
+        try:
+            assert reader.stdout is not None
+            assert reader.stdout.readline()
+            reader.send_signal(signal.SIGSTOP)
+            begun, before_kb = len(rig.of()), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            rig.await_views(begun + 60)  # 15 MB
+            after_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            reader.send_signal(signal.SIGCONT)
+            newest = rig.of()[-1].header.window_id
+            seen = [int(reader.stdout.readline().split()[0]) for _ in range(5)]
+        finally:
+            reader.kill()
+            reader.communicate()
+        healthy = rig.of()[begun : begun + 60]
+    assert sum(view.skipped for view in healthy) == 0
+    assert sorted(view.age_ms for view in healthy)[30] < 50 + 1000 * SLACK_S
+    assert after_kb - before_kb < 64 * 1024
+    assert max(seen) >= newest  # it did not have to work off what it had slept through
+
+
+def test_f20_an_endpoint_in_use_is_refused_and_a_dead_ones_file_is_cleared_away(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(str(tmp_path / "data"))  # closed below without being unlinked, as after a kill
+    with Rig(tmp_path, lambda _: Steady(), config=LOCKSTEP) as rig:
+        rig.await_views(1)
+        launch = tmp_path / "second.toml"
+        launch.write_text(f"""
+            [source]
+            kind = "synthetic"
+            [model]
+            weights = "random:driving"
+            [view.main]
+            [publish]
+            data = "ipc://{tmp_path}/data"
+            status = "ipc://{tmp_path}/other"
+        """)
+        done = subprocess.run(command("run", str(launch)), capture_output=True, text=True, timeout=START_S)
+        assert done.returncode == 73, done.stderr
+        assert f"{tmp_path}/data" in done.stderr
+        rig.await_views(len(rig.of()) + 1)  # whoever was first goes on
+
+
+def test_f23_sigterm_ends_every_view_and_the_process_with_0(tmp_path: Path) -> None:
+    launch = tmp_path / "launch.toml"
+    launch.write_text(f"""
+        [source]
+        kind = "synthetic"
+        pace = "lockstep"
+        [model]
+        weights = "random:driving"
+        steps = 1
+        [view.main]
+        [publish]
+        data = "ipc://{tmp_path}/data"
+        status = "ipc://{tmp_path}/status"
+        min_subscribers = 1
+        [control]
+        endpoint = "ipc://{tmp_path}/control"
+        [record]
+        folder = "{tmp_path}/recordings"
+        keep_free_mb = 0
+        autostart = true
+    """)
+    with ViewSubscriber(f"ipc://{tmp_path}/data", "main", conflate=False) as views:
+        node = subprocess.Popen(command("run", str(launch)), stderr=subprocess.PIPE, text=True)
+        try:
+            assert views.receive(1000 * START_S) is not None
+            node.send_signal(signal.SIGTERM)
+            while views.receive(1000 * START_S) is not None:
+                pass
+            assert views.ended
+            views.close()
+            assert node.wait(END_S) == 0
+            (recording,) = files(tmp_path / "recordings")
+            assert summary(recording).chunk_indexes  # it was finished
+            assert of(said(recording), "/view/main/image")
+        finally:
+            node.kill()
+            node.communicate()
+
+
+@pytest.fixture(scope="module")
+def hung(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, "subprocess.Popen[str]"]]:
+    """Nodes that hang, begun all at once: each takes its time to start and to end."""
+    begun = {each: _hung(each, tmp_path_factory.mktemp(each)) for each in ("load", "warm", "render", "render twice")}
+    yield begun
+    for node in begun.values():
+        node.kill()
+        node.communicate()
+
+
+def _hung(phase: str, folder: Path) -> "subprocess.Popen[str]":
+    script = str(Path(__file__).with_name("hung_process.py"))
+    command = [sys.executable, script, str(folder), phase.split()[0]]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment())
+
+
+@pytest.mark.parametrize("phase", ["load", "warm", "render"])
+def test_f23_a_model_that_hears_nothing_does_not_hold_up_the_end(
+    hung: dict[str, "subprocess.Popen[str]"], phase: str
+) -> None:
+    node = hung[phase]
+    assert node.stdout is not None
+    assert node.stdout.readline() == "hangs\n"
+    node.send_signal(signal.SIGTERM)
+    assert node.wait(END_S) == 0
+    assert "left behind" in node.stdout.read()
+
+
+def test_f23_a_second_sigterm_ends_the_process_at_once(hung: dict[str, "subprocess.Popen[str]"]) -> None:
+    node = hung["render twice"]
+    assert node.stdout is not None
+    assert node.stdout.readline() == "hangs\n"
+    node.send_signal(signal.SIGTERM)
+    time.sleep(0.3)
+    node.send_signal(signal.SIGTERM)
+    assert node.wait(END_S) == -signal.SIGTERM
+    assert "left behind" not in node.stdout.read()
