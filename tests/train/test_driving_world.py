@@ -80,9 +80,7 @@ def _span(mover: Mover, seconds: float) -> tuple[float, float, float]:
     return middle - half, middle + half, mover.lateral_m
 
 
-def _vehicle(rows: NDArray[np.float32]) -> NDArray[np.float64]:
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    for pose, (x, y, z, yaw) in zip(poses, rows.astype(float), strict=True):
-        pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-        pose[:3, 3] = x, y, z
+def _vehicle(world_from_body: NDArray[np.float32]) -> NDArray[np.float64]:
+    poses = np.tile(np.eye(4), (len(world_from_body), 1, 1))
+    poses[:, :3] = world_from_body
     return poses

@@ -9,7 +9,7 @@ from headless import needs_egl
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.errors import RenderError
-from gcd_train.scenes.description import Light, Part, Pattern, Scene
+from gcd_train.scenes.description import Light, Part, Pattern, Scene, upright
 from gcd_train.scenes.primitives import SHAPES, shape
 from gcd_train.scenes.renderer import Renderer, Rendering
 
@@ -37,7 +37,7 @@ def draw(parts: list[Part], width: int = 96, height: int = 64, poses: np.ndarray
     scene = Scene(
         parts=tuple(parts),
         sheets=(),
-        poses=np.zeros((1, 1, 4), np.float32) if poses is None else poses,
+        poses=upright(np.zeros((1, 1, 4), np.float32) if poses is None else poses),
         focus=np.zeros((1, 3), np.float32),
         cameras={"camera": FORWARD[None]},
         hfov_deg=90.0,

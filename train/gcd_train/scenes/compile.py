@@ -6,7 +6,7 @@ from operator import attrgetter
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_train.scenes.description import Floats, Part, Pattern, Scene, Sheet
+from gcd_train.scenes.description import Floats, Part, Pattern, Scene, Sheet, rotations, upright
 from gcd_train.scenes.primitives import shape
 
 VERTEX = np.dtype(
@@ -39,7 +39,7 @@ def _of_parts(name: str, parts: list[Part]) -> Vertices:
     corners, normals = (array.reshape(-1, 3) for array in shape(name))  # [V, 3]
     size = np.array([part.size for part in parts], np.float32)[:, None]
     centre = np.array([part.centre for part in parts], np.float32)[:, None]
-    turn = _turns(np.array([part.yaw for part in parts]))
+    turn = _turns(np.array([part.turn for part in parts]), np.array([part.yaw for part in parts]))
     outward = normals / size
     outward /= np.linalg.norm(outward, axis=-1, keepdims=True)
     made = np.empty((len(parts), len(corners)), VERTEX)
@@ -50,13 +50,10 @@ def _of_parts(name: str, parts: list[Part]) -> Vertices:
     return made.reshape(-1)
 
 
-def _turns(yaw: NDArray[np.float64]) -> Floats:
+def _turns(quaternions: NDArray[np.float64], yaw: NDArray[np.float64]) -> Floats:
     """[P, 3, 3], to be multiplied from the right."""
-    turn = np.zeros((len(yaw), 3, 3), np.float32)
-    turn[:, 0, 0] = turn[:, 1, 1] = np.cos(yaw)
-    turn[:, 0, 1], turn[:, 1, 0] = np.sin(yaw), -np.sin(yaw)
-    turn[:, 2, 2] = 1
-    return turn
+    about_z = upright(np.stack([0 * yaw, 0 * yaw, 0 * yaw, yaw], -1))[..., :3]
+    return np.swapaxes(about_z @ rotations(quaternions), -1, -2).astype(np.float32)
 
 
 def _of_sheet(sheet: Sheet) -> Vertices:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_model.geometry import CameraMount, driving_trajectory
-from gcd_train.scenes.description import Colour, Floats, Light, Part, Scene
+from gcd_train.scenes.description import Colour, Floats, Light, Part, Scene, upright
 from gcd_train.scenes.road import Road, random_road, road_sheets
 from gcd_train.scenes.surroundings import DISTRICTS, surroundings
 from gcd_train.scenes.traffic import Traffic, random_traffic
@@ -37,13 +37,13 @@ def driving_scene(seed: int, *, frames: int = 14, mount: CameraMount | None = No
     parts = [sky_dome(), *surroundings(road, DISTRICTS[name], random)]
     traffic = random_traffic(road, random)
     light = _random_light(random)
-    poses = traffic.poses(road, frames)
+    rows = traffic.poses(road, frames)
     return Scene(
         parts=(*parts, *_bodies(traffic)),
         sheets=tuple(sheets),
-        poses=poses,
-        focus=_ahead_of(poses[:, _EGO_BODY]),
-        cameras=_cameras(poses[:, _EGO_BODY], frames, mount or CameraMount()),
+        poses=upright(rows),
+        focus=_ahead_of(rows[:, _EGO_BODY]),
+        cameras=_cameras(rows[:, _EGO_BODY], frames, mount or CameraMount()),
         hfov_deg=HFOV_DEG if mount is None else mount.hfov_deg,
         light=light,
         facts=_facts(seed, name, road, traffic),
@@ -71,9 +71,7 @@ def _cameras(ego: Floats, frames: int, mount: CameraMount) -> dict[str, NDArray[
 def _poses(rows: Floats) -> NDArray[np.float64]:
     """x, y, z, yaw [T, 4] as rigid transforms [T, 4, 4]."""
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    cos, sin = np.cos(rows[:, 3]), np.sin(rows[:, 3])
-    poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = cos, -sin, sin, cos
-    poses[:, :3, 3] = rows[:, :3]
+    poses[:, :3] = upright(rows)
     return poses
 
 

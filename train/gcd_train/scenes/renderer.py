@@ -5,6 +5,7 @@ software OpenGL (Mesa's llvmpipe) as on a GPU.
 """
 
 import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
@@ -13,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_train.errors import RenderError
-from gcd_train.scenes.compile import VERTEX, vertices_of
+from gcd_train.scenes.compile import VERTEX
 from gcd_train.scenes.description import Floats, Light, Scene
+from gcd_train.scenes.frozen import FrozenScene, freeze
 from gcd_train.scenes.shaders import FRAGMENT, SHADOW_FRAGMENT, SHADOW_VERTEX
 from gcd_train.scenes.shaders import VERTEX as VERTEX_SHADER
 
@@ -59,7 +61,7 @@ class Renderer:
         self._shadow = self._context.depth_texture((_SHADOW_PIXELS, _SHADOW_PIXELS))
         self._shadow.compare_func = "<="
         self._shadow_target = self._context.framebuffer(depth_attachment=self._shadow)
-        self._bodies = self._context.texture((1, _BODIES), 4, dtype="f4")
+        self._bodies = self._context.texture((3, _BODIES), 4, dtype="f4")
         self._bodies.filter = (self._context.NEAREST, self._context.NEAREST)
 
     def render(self, scene: Scene) -> dict[str, list[Rendering]]:
@@ -67,30 +69,38 @@ class Renderer:
 
         Raises: RenderError if there are more bodies than the renderer can move.
         """
+        made: dict[str, list[Rendering]] = {name: [] for name in scene.cameras}
+        for _, name, view in self.views(freeze(scene), scene.cameras):
+            made[name].append(view)
+        return made
+
+    def views(
+        self, scene: FrozenScene, cameras: Mapping[str, NDArray[np.float64]]
+    ) -> Iterator[tuple[int, str, Rendering]]:
+        """Time step, camera and view, one after the other, so that a long scene needs no memory for all.
+
+        cameras: name -> world_from_camera [T, 4, 4]. All cameras of a time step follow each other.
+        Raises: RenderError if there are more bodies than the renderer can move.
+        """
         if scene.poses.shape[1] > _BODIES:
             raise RenderError(f"a scene may have {_BODIES} bodies, got {scene.poses.shape[1]}; split it")
-        buffer = self._context.buffer(vertices_of(scene).tobytes())
+        buffer = self._context.buffer(scene.vertices.tobytes())
         full = self._context.vertex_array(self._program, [(buffer, _FORMAT, *_NAMES)])
         shadow_format = f"3f4 {VERTEX.itemsize - 16}x 4u1"
         shadow = self._context.vertex_array(self._shadow_program, [(buffer, shadow_format, "position", "tags")])
         try:
             self._set_light(scene.light)
-            return self._all_steps(scene, full, shadow)
+            for step in range(scene.frames):
+                self._move(scene.poses[step])
+                self._cast(scene.light, scene.focus[step], shadow)
+                for name, poses in cameras.items():
+                    yield step, name, self._view(poses[step], scene.hfov_deg, full)
         finally:
             for resource in (full, shadow, buffer):
                 resource.release()
 
-    def _all_steps(self, scene: Scene, full: Any, shadow: Any) -> dict[str, list[Rendering]]:
-        made: dict[str, list[Rendering]] = {name: [] for name in scene.cameras}
-        for step in range(scene.frames):
-            self._move(scene.poses[step])
-            self._cast(scene.light, scene.focus[step], shadow)
-            for name, poses in scene.cameras.items():
-                made[name].append(self._view(poses[step], scene.hfov_deg, full))
-        return made
-
     def _move(self, poses: Floats) -> None:
-        rows = np.zeros((_BODIES, 4), np.float32)
+        rows = np.zeros((_BODIES, 3, 4), np.float32)
         rows[: len(poses)] = poses
         self._bodies.write(rows.tobytes())
         self._bodies.use(0)

@@ -2,12 +2,14 @@
 
 _VERTEX_IN = """
 #version 330
-uniform sampler2D bodies;  // row b: x, y, z, yaw of body b
+uniform sampler2D bodies;  // row b: the three rows of world_from_body of body b
 uniform mat4 clip_from_world;
 in vec3 position;
-vec3 turned(vec3 v, float yaw) {
-    float c = cos(yaw), s = sin(yaw);
-    return vec3(c * v.x - s * v.y, s * v.x + c * v.y, v.z);
+vec3 placed(vec4 point, uint body) {
+    vec4 x = texelFetch(bodies, ivec2(0, int(body)), 0);
+    vec4 y = texelFetch(bodies, ivec2(1, int(body)), 0);
+    vec4 z = texelFetch(bodies, ivec2(2, int(body)), 0);
+    return vec3(dot(x, point), dot(y, point), dot(z, point));
 }
 """
 
@@ -16,8 +18,7 @@ SHADOW_VERTEX = (
     + """
 in uvec4 tags;
 void main() {
-    vec4 body = texelFetch(bodies, ivec2(0, int(tags.z)), 0);
-    gl_Position = clip_from_world * vec4(turned(position, body.w) + body.xyz, 1.0);
+    gl_Position = clip_from_world * vec4(placed(vec4(position, 1.0), tags.z), 1.0);
     if (tags.w == 4u) gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // the sky casts no shadow
 }
 """
@@ -41,9 +42,8 @@ out vec4 paint;
 out float depth;
 flat out uvec4 labels;
 void main() {
-    vec4 body = texelFetch(bodies, ivec2(0, int(tags.z)), 0);
-    world = turned(position, body.w) + body.xyz;
-    normal_world = turned(normal, body.w);
+    world = placed(vec4(position, 1.0), tags.z);
+    normal_world = placed(vec4(normal, 0.0), tags.z);
     local = position;
     normal_local = normal;
     in_light = (light_from_world * vec4(world + 0.06 * normal_world, 1.0)).xyz * 0.5 + 0.5;

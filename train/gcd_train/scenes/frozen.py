@@ -1,0 +1,78 @@
+"""A scene ready to draw, and as a file: triangles and where their bodies are, so that any camera can look at it later.
+
+A scene folder keeps one, and a target view can be drawn exactly along any path, without simulating anything again.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, Self
+
+import msgspec
+import numpy as np
+
+from gcd_train.errors import DataError
+from gcd_train.scenes.compile import VERTEX, Vertices, vertices_of
+from gcd_train.scenes.description import Floats, Light, Scene
+
+_FORMAT = 1
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class FrozenScene:
+    """What the renderer needs.
+
+    vertices: [N] of `compile.VERTEX`, three in a row are a triangle, in their bodies' frames. poses: [T, B, 3, 4],
+    world_from_body. focus: [T, 3], the point around which shadows are cast. hfov_deg: of every camera.
+    """
+
+    vertices: Vertices
+    poses: Floats
+    focus: Floats
+    hfov_deg: float
+    light: Light
+
+    @property
+    def frames(self) -> int:
+        """T."""
+        return self.poses.shape[0]
+
+    def save(self, file: BinaryIO) -> None:
+        """Write it as a compressed npz."""
+        facts = {"format": _FORMAT, "hfov_deg": self.hfov_deg, "light": self.light}
+        told = np.frombuffer(msgspec.json.encode(facts), np.uint8)
+        raw = self.vertices.view(np.uint8).reshape(-1, VERTEX.itemsize)
+        np.savez_compressed(file, vertices=raw, poses=self.poses, focus=self.focus, facts=told)
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read what `save` wrote. Raises DataError if the file is missing, damaged or of another version."""
+        try:
+            with np.load(path, allow_pickle=False) as kept:
+                arrays: dict[str, Any] = dict(kept)
+            facts = msgspec.json.decode(arrays["facts"].tobytes(), type=_Facts)
+            return cls(
+                vertices=arrays["vertices"].reshape(-1).view(VERTEX),
+                poses=arrays["poses"].astype(np.float32),
+                focus=arrays["focus"].astype(np.float32),
+                hfov_deg=facts.hfov_deg,
+                light=facts.light,
+            )
+        except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
+            raise DataError(f"{path} is no drawable scene ({error}); generate the scene again") from error
+
+
+class _Facts(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    format: int
+    hfov_deg: float
+    light: Light
+
+
+def freeze(scene: Scene) -> FrozenScene:
+    """A scene's triangles and motion, without its cameras."""
+    return FrozenScene(
+        vertices=vertices_of(scene),
+        poses=scene.poses,
+        focus=scene.focus,
+        hfov_deg=scene.hfov_deg,
+        light=scene.light,
+    )
