@@ -42,7 +42,8 @@ def gradient_magnitude(pictures: Tensor) -> Tensor:
     A view's over its target's is the gradient energy: 1 is as sharp as the target, below is blurred, above is noisy.
     """
     gradient = spatial_gradient(pictures, mode="sobel", order=1, normalized=True)  # [T, 3, 2, H, W]
-    return torch.linalg.vector_norm(gradient, dim=2).mean(dim=(1, 2, 3))
+    across, down = gradient.unbind(dim=2)
+    return torch.hypot(across, down).mean(dim=(1, 2, 3))  # a norm over two of five dimensions takes ten times as long
 
 
 def frame_change(pictures: Tensor) -> Tensor:
