@@ -3,7 +3,6 @@
 Longer than most files: one page with every section of a launch file.
 """
 
-import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
@@ -141,7 +140,7 @@ class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     """The model and how it is sampled. What is left out is as the checkpoint was made for.
 
     weights: a checkpoint, a diffusers folder, `package:NAME`, or `random:FAMILY` (noise, for trying the plumbing).
-    threads: CPU threads for the model; leave the rest of the robot its cores.
+    threads: CPU threads for the model, and for OpenCV beside it; leave the rest of the robot its cores.
     guidance: scale of the first and of the last frame.
     cond_aug: strength of the noise on the conditioning frames.
     """
@@ -309,17 +308,6 @@ class NodeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     viewer: ViewerConfig = ViewerConfig()
     node_id: Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,32}$(?!\n)")] = "gcd"
     strict: bool = False
-
-    @property
-    def digest(self) -> str:
-        """12 hex digits that name this configuration: how views are rendered from given pictures; not from which
-        camera or recording they come, on which device or at what pace, nor where they are sent. Seeds follow from it,
-        so that a recording of a camera is rendered as the camera was."""
-        taken = self.source
-        source = (taken.resize, taken.allow_upscale, taken.hfov_deg, taken.pose)
-        model = msgspec.structs.replace(self.model, device="auto", threads=None)
-        rendered = msgspec.json.encode((source, model, self.view, self.window), order="deterministic")
-        return hashlib.sha256(rendered).hexdigest()[:12]
 
 
 def load_config(path: Path, changes: Sequence[str] = ()) -> NodeConfig:

@@ -106,7 +106,7 @@ class Node:
         return self._machinery.left_behind or (self._work is not None and self._work.is_alive())
 
     def stop(self) -> None:
-        """End in order, soon: no new window begins, the one in work is abandoned at its next step."""
+        """End in order, soon: no new window begins, the one in work is abandoned at its next layer."""
         self._outbox.hurry()
         self._inbox.put("stop")
 

@@ -8,6 +8,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from types import FrameType
 
+import cv2
 import torch
 
 from gcd_model import OptionError, ViewSynthesizer, load_synthesizer
@@ -50,12 +51,14 @@ def model_threads(section: ModelSection) -> int:
 
 
 def load_model(section: ModelSection) -> ViewSynthesizer:
-    """The model of a launch file, on as many threads as model_threads() says.
+    """The model of a launch file, on as many threads as model_threads() says; OpenCV gets no more for its pictures.
 
     Raises:
         CheckpointError: see load_synthesizer(). ConfigError: options the checkpoint cannot have.
     """
-    torch.set_num_threads(model_threads(section))
+    threads = model_threads(section)
+    torch.set_num_threads(threads)
+    cv2.setNumThreads(threads)
     try:
         return load_synthesizer(
             section.weights,

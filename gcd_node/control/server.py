@@ -4,6 +4,7 @@ Who reaches it over ipc, or over loopback where no keys are set up, is an operat
 Elsewhere the key decides.
 """
 
+import contextlib
 import logging
 import threading
 import time
@@ -37,7 +38,7 @@ from gcd_node.wire.endpoints import own_endpoint
 _LOG = logging.getLogger(__name__)
 _TICK_MS = 50
 _LINGER_MS = 500
-_QUEUED = 64
+_QUEUED = 16
 _SECOND_NS = 1_000_000_000
 _LOCAL = Client(name="", role="operator")
 
@@ -145,6 +146,7 @@ class ControlServer:
     def _receive(self) -> None:
         received_ns = time.time_ns()
         peer, *parts = self._socket.recv_multipart(copy=False)
+        self._note_whole(parts)
         if self._flood.ignores(peer.bytes, time.monotonic()):
             return
         client = self._client(parts[-1]) if parts else None
@@ -158,6 +160,10 @@ class ControlServer:
         self._socket.send_multipart((peer.bytes, answer.part), zmq.NOBLOCK)  # to a peer that left: thrown away
         if self._on_answer is not None:
             self._on_answer(parts[0].bytes, answer.part, client)
+
+    def _note_whole(self, parts: list[zmq.Frame]) -> None:
+        with contextlib.suppress(zmq.ZMQError):  # of a connection that is gone
+            self._gate.whole(int(parts[-1].get(zmq.SRCFD)))
 
     def _client(self, frame: zmq.Frame) -> Client | None:
         """Who sent this, by his key; None if the key was taken off the list since."""

@@ -90,7 +90,7 @@ def metadata(run: Run, settings: Settings, fps: float) -> dict[str, object]:
         "classes": [to_json(each) for each in run.classes],
         "size": [traits.config.width, traits.config.height],
         "fps": fps,
-        "cfg_digest": settings.config.digest,
+        "cfg_digest": run.digest,
     }
 
 

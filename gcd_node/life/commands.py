@@ -10,6 +10,7 @@ from msgspec.structs import replace
 
 from gcd_model import ASSUMED_SOURCE, DeltaFit, ModelError, Traits, ViewFixedError, ViewRangeError, nearest_delta
 from gcd_node.config import NodeConfig, ViewConfig
+from gcd_node.config_digest import config_digest
 from gcd_node.config_text import without_secrets
 from gcd_node.control.message import Code, Command, Outcome, RequestError
 from gcd_node.control.verbs import RemoveView, SetParam, SetView, schemas
@@ -121,8 +122,9 @@ class NodeCommands:
         }
 
     def _config(self) -> dict[str, object]:
-        config = self._machinery.live.config
-        return {"config": without_secrets(config), "cfg_digest": config.digest}
+        config, traits = self._machinery.live.config, self._machinery.traits
+        digest = None if traits is None else config_digest(config, traits)
+        return {"config": without_secrets(config), "cfg_digest": digest}
 
     def _calibration(self) -> dict[str, object]:
         stream, info = self._machinery.stream, self._machinery.source_info

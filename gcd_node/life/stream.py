@@ -149,7 +149,7 @@ class Stream:
         return (self._parts.live.config.window.stride or self._builder.frames) / self._known.fps
 
     def interrupt(self) -> None:
-        """End soon: no new window begins, the one in work is abandoned at its next step. Does not wait."""
+        """End soon: no new window begins, the one in work is abandoned at its next layer. Does not wait."""
         self.stopped = True
         self.worker.cancel()
         self._newest.close()
@@ -224,8 +224,7 @@ class Stream:
     def source_state(self, state: SourceState, detail: str) -> None:
         """Tell; see WatchListener."""
         was, self._was = self._was, state
-        if state != "ended":  # its last window may still be in work
-            self._parts.health.source(state)
+        self._parts.health.source(state)
         fields: dict[str, object] = {"message": detail, "source": self._watch.info.id}
         if state == "stalled":
             self._parts.announcer.event("SRC_STALLED", Level.WARN, fields)

@@ -36,7 +36,6 @@ def node_facts(identity: Identity, config: NodeConfig) -> dict[str, str]:
         "node_id": identity.node_id,
         "boot_id": identity.boot_id,
         "proto": PROTO,
-        "cfg_digest": config.digest,
         "begun": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "what": ",".join(record.what),
         "notes": record.notes,
@@ -48,9 +47,11 @@ def node_facts(identity: Identity, config: NodeConfig) -> dict[str, str]:
 
 
 def weights_facts(meta: NoteItem) -> dict[str, str] | None:
-    """The weights, as a metadata note names them; None if it does not."""
+    """The weights, as a metadata note names them, and the digest of what is drawn with them; None if it does not."""
     weights = meta.fields.get("weights")
-    return {key: str(value) for key, value in weights.items()} if isinstance(weights, Mapping) else None
+    if not isinstance(weights, Mapping):
+        return None
+    return {key: str(value) for key, value in weights.items()} | {"cfg_digest": str(meta.fields.get("cfg_digest"))}
 
 
 def source_facts(source: SourceFacts) -> dict[str, str]:

@@ -36,12 +36,19 @@ class McapPart:
         self._writer = Writer(stream, chunk_size=_CHUNK, compression=CompressionType.ZSTD)
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
+        self._added = self._chunked = self._safe = 0  # messages: so far, in closed chunks, of these on the disk
+        self._finished: int | None = None
         self._writer.start(profile=profile, library=f"gcd-node; mcap-python/{version('mcap')}")
 
     @property
     def size(self) -> int:
         """Bytes on the disk."""
         return self._disk.size
+
+    @property
+    def messages(self) -> int:
+        """Added so far; once it was finished, those that a reader finds in it."""
+        return self._added if self._finished is None else self._finished
 
     def describe(self, name: str, facts: Mapping[str, str]) -> None:
         """Add metadata."""
@@ -55,19 +62,14 @@ class McapPart:
     def write(self, entries: Sequence[Entry]) -> None:
         """Add messages that belong together. Raises OSError."""
         for entry in entries:
-            self._writer.add_message(
-                channel_id=self._channel(entry),
-                log_time=entry.log_ns,
-                data=entry.data,
-                publish_time=entry.publish_ns,
-                sequence=entry.sequence % _LARGEST_SEQUENCE,
-            )
-        self._disk.commit()
+            self._add(entry)
+        self._commit()
 
     def flush(self) -> None:
         """Close the chunk in work, so that a reader gets it whatever happens next. Raises OSError."""
         self._writer.flush()
-        self._disk.commit()
+        self._chunked = self._added
+        self._commit()
 
     def sync(self) -> None:
         """Make it survive a power cut. Raises OSError."""
@@ -82,7 +84,9 @@ class McapPart:
         """
         self._disk.make_room()
         try:
-            return self._tried(self._end) or self._tried(self._cut_short)
+            whole = self._tried(self._end)
+            self._finished = self._added if whole else self._safe
+            return whole or self._tried(self._cut_short)
         finally:
             with contextlib.suppress(OSError):
                 self._disk.sync()
@@ -97,8 +101,25 @@ class McapPart:
             return False
         return True
 
+    def _add(self, entry: Entry) -> None:
+        channel = self._channel(entry)
+        before = self._disk.tell()
+        self._writer.add_message(
+            channel_id=channel,
+            log_time=entry.log_ns,
+            data=entry.data,
+            publish_time=entry.publish_ns,
+            sequence=entry.sequence % _LARGEST_SEQUENCE,
+        )
+        self._added += 1
+        self._chunked = self._added if self._disk.tell() != before else self._chunked
+
+    def _commit(self) -> None:
+        self._disk.commit()
+        self._safe = self._chunked
+
     def _end(self) -> None:
-        self._disk.commit()  # what found no room before
+        self._commit()  # what found no room before
         self._writer.finish()
         self._disk.commit()
 
@@ -113,9 +134,11 @@ class McapPart:
 
     def _channel(self, entry: Entry) -> int:
         if entry.topic not in self._channels:
+            before = self._disk.tell()
             self._channels[entry.topic] = self._writer.register_channel(
                 entry.topic, entry.schema.data, self._schema(entry.schema)
             )
+            self._chunked = self._added if self._disk.tell() != before else self._chunked  # it may close a chunk too
         return self._channels[entry.topic]
 
     def _schema(self, schema: Schema) -> int:

@@ -56,7 +56,7 @@ class Recording:
         self._limits: Limits | None = None
         self._part: McapPart | None = None
         self._begun_s = 0.0
-        self._parts = self._earlier_bytes = 0
+        self._parts = self._earlier_bytes = self._earlier_written = 0
         self._bytes = self._written = 0  # of all parts, for others to read
         self._file: str | None = None
         self._whole = True
@@ -148,7 +148,7 @@ class Recording:
             self._known[item.topic] = item
             _describe(part, item)
         part.write(entries)
-        self._count(part, len(entries))
+        self._count(part)
         self._rotate_if_due()
 
     def _flush(self, *, sync: bool) -> None:
@@ -161,8 +161,8 @@ class Recording:
         self._count(part)
         self._rotate_if_due()
 
-    def _count(self, part: "McapPart", messages: int = 0) -> None:
-        self._written += messages
+    def _count(self, part: "McapPart") -> None:
+        self._written = self._earlier_written + part.messages
         self._bytes = self._earlier_bytes + part.size
 
     def _rotate_if_due(self) -> None:
@@ -195,21 +195,18 @@ class Recording:
         part.attach("config.toml", "application/toml", to_toml(config).encode())
         for item in self._known.values():
             _describe(part, item)
-            entries = self._translator.entries(_said_again(item))
-            part.write(entries)
-            self._written += len(entries)
+            part.write(self._translator.entries(_said_again(item)))
         part.flush()
         self._count(part)
 
     def _close_part(self) -> None:
         part, self._part = self._opened(), None
         self._whole &= part.finish()
-        self._earlier_bytes += part.size
-        self._bytes = self._earlier_bytes
+        self._count(part)
+        self._earlier_bytes, self._earlier_written = self._bytes, self._written
 
     def _give_up(self, reason: str, message: str) -> None:
         self._stop, self._failed = (reason, message), True
-        _LOG.warning("recording ends: %s", message)
 
     def _end(self) -> None:
         self._inbox.close(0.0)
@@ -227,7 +224,7 @@ class Recording:
             "bytes": done.bytes,
             "written": done.written,
             "dropped": dict(done.dropped),
-            "finished": self._whole,
+            "finished": self._whole and self._parts > 0,
         }
         level = Level.WARN if self._failed else Level.OK
         self._tell("REC_STOPPED", level, fields | ({"message": message} if message else {}))
@@ -236,7 +233,8 @@ class Recording:
         try:
             self._origin.tell(code, level, fields)
         except NodeError as error:  # the publisher is closed, or failed: no reason to stop
-            _LOG.info("nobody hears %s: %s", code, error)
+            at = logging.INFO if level is Level.OK else logging.WARNING  # the event would have been logged
+            _LOG.log(at, "nobody hears %s: %s %s", code, fields.get("message", ""), error)
 
 
 def _describe(part: "McapPart", item: Item) -> None:

@@ -31,6 +31,7 @@ from gcd_node.publishing.outbox import Outbox
 from gcd_node.rendering.degrade import WHOLE, Rung, rungs
 from gcd_node.rendering.endings import Endings
 from gcd_node.rendering.idle import IdleRule
+from gcd_node.rendering.interruption import interruptible
 from gcd_node.rendering.model_slot import ModelSlot
 from gcd_node.rendering.setbacks import Setbacks
 from gcd_node.rendering.virtual_view import VirtualView, VirtualViews
@@ -108,7 +109,7 @@ class ModelWorker:
         return 0.0 if beat_s is None else time.monotonic() - beat_s
 
     def cancel(self) -> None:
-        """Abandon the window in work at its next denoising step; from any thread."""
+        """Abandon the window in work at the next layer of a network; from any thread."""
         self._cancel.set()
 
     def work(self, newest: Newest[FrameWindow]) -> None:
@@ -119,24 +120,28 @@ class ModelWorker:
             whatever the source failed with, once its last window is done.
         """
         try:
-            if self._realtime:
-                self._warm_up()
-            self._ready()
-            self.warm.set()
-            while (window := newest.take()) is not None:
-                self._endings.announce_due(self.counts.last_window_id)
-                if not self._rests():
-                    self._beat()
-                    self._parts.health.stage("window", (time.monotonic_ns() - window.arrival_ns) / 1e9)
-                    self._render_or_count(self._job(window))
-                self._ready()
-            self._endings.announce_due(self.counts.last_window_id)
+            with interruptible(self._cancel):
+                self._work(newest)
         except Cancelled:
             _LOG.info("the window in work was abandoned")
         finally:
             self._beat_s = None
             self.warm.set()
             self._dispatcher.finish(abandon=self._cancel.is_set())
+
+    def _work(self, newest: Newest[FrameWindow]) -> None:
+        if self._realtime:
+            self._warm_up()
+        self._ready()
+        self.warm.set()
+        while (window := newest.take()) is not None:
+            self._endings.announce_due(self.counts.last_window_id)
+            if not self._rests():
+                self._beat()
+                self._parts.health.stage("window", (time.monotonic_ns() - window.arrival_ns) / 1e9)
+                self._render_or_count(self._job(window))
+            self._ready()
+        self._endings.announce_due(self.counts.last_window_id)
 
     def announce_end(self, *, delay_ms: int | None) -> None:
         """Send the end of every view. After `work`. delay_ms: see Outbox."""
@@ -199,7 +204,7 @@ class ModelWorker:
     def _render_or_count(self, job: _Job) -> None:
         """One retry, with another seed or with less asked; a window that fails again is counted and not published."""
         failure: NonFiniteError | DeviceMemoryError | None = None
-        seeds = [window_seed(job.run.config.digest, job.window.window_id, attempt) for attempt in (0, 1)]
+        seeds = [window_seed(job.run.digest, job.window.window_id, attempt) for attempt in (0, 1)]
         for seed in seeds:
             failure = self._attempt(job, seed)
             if failure is None:
@@ -241,7 +246,7 @@ class ModelWorker:
                 "seeds": seeds,
                 "seq": [window.seqs[0], window.seqs[-1]],
                 "view_revs": dict(job.settings.revisions),
-                "cfg_digest": job.run.config.digest,
+                "cfg_digest": job.run.digest,
             }
         )
 

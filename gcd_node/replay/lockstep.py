@@ -9,6 +9,7 @@ from msgspec.structs import replace
 
 from gcd_model import Traits
 from gcd_node.config import LIVE_KINDS, LifeConfig, NodeConfig, SourceConfig
+from gcd_node.config_digest import config_digest
 from gcd_node.config_text import to_toml
 from gcd_node.errors import ConfigError, DamagedRunError, ModelFailedError, OutputError
 from gcd_node.frame import FrameSource, SourceInfo
@@ -132,7 +133,7 @@ def _manifest(config: NodeConfig, watched: _Watched, writer: RunWriter, summary:
         versions=provenance.versions(),
         machine=provenance.machine(traits.device, model_threads(config.model)),
         config=to_toml(config),
-        cfg_digest=config.digest,
+        cfg_digest=config_digest(config, traits),
         weights=provenance.weights(traits),
         source=provenance.source(config.source, watched.infos[0]),
         size=kept.size,

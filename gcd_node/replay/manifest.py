@@ -11,6 +11,9 @@ from gcd_node.errors import DamagedRunError
 FORMAT = "gcd-run/1"
 """Of the folder and its manifest; another number is another layout."""
 
+MAX_WINDOW = 2**28
+"""Bytes of the pixels of a view's window, at most; those of the largest model here are 44 million."""
+
 Digest: TypeAlias = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$(?!\n)")]
 """SHA-256, 64 hex digits."""
 
@@ -76,6 +79,12 @@ class SizeEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     height: Count
     width: Count
 
+    def __post_init__(self) -> None:
+        if 3 * self.frames * self.height * self.width > MAX_WINDOW:
+            raise ValueError(
+                f"a window of {self.frames} x {self.height} x {self.width} takes more than {MAX_WINDOW} bytes"
+            )
+
 
 class TroubleEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What the model could not do: MODEL_NAN, the window is missing; GPU_OOM, less was asked of it from here on."""
@@ -132,8 +141,8 @@ class WindowEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A whole run. versions: of the programs that took part. config: TOML, without secrets. cfg_digest: NodeConfig's.
-    fps: of a window. classes: the ontology of the class maps, empty without. windows: by rising id."""
+    """A whole run. versions: of the programs that took part. config: TOML, without secrets. cfg_digest: see
+    config_digest(). fps: of a window. classes: the ontology of the class maps, empty without. windows: by rising id."""
 
     format: Literal["gcd-run/1"] = FORMAT
     versions: dict[str, str]

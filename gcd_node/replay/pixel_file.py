@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 
 from gcd_node.errors import DamagedRunError
 from gcd_node.pictures.files import video_writer
+from gcd_node.pictures.picture_header import MAX_PIXELS
 from gcd_node.sources.opencv_log import quiet_opencv
 
 Pixels = NDArray[np.uint8]
+_MATROSKA = b"\x1a\x45\xdf\xa3"
 
 
 def pixel_digest(pixels: Pixels) -> str:
@@ -47,11 +49,16 @@ class PixelReader:
         """shape: T, H, W. grey: it holds class maps. Raises DamagedRunError if it cannot be opened."""
         if not path.is_file():
             raise DamagedRunError(f"{path} is missing; copy the whole folder of the run, or replay it again")
+        _require_matroska(path)
         self._path, self._shape, self._grey = path, shape, grey
         with quiet_opencv():
             self._video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
         if not self._video.isOpened():
             raise DamagedRunError(f"{path} cannot be opened as a video: truncated or damaged; replay it again")
+        width, height = self._video.get(cv2.CAP_PROP_FRAME_WIDTH), self._video.get(cv2.CAP_PROP_FRAME_HEIGHT)
+        if width * height > MAX_PIXELS:  # before a picture of it is decoded
+            self.close()
+            raise DamagedRunError(f"{path} states {width:.0f} x {height:.0f} pixels; it was changed: replay again")
 
     def read(self, window_id: int, sha256: str) -> Pixels:
         """The next window, u8 [T, H, W, 3], or [T, H, W] if grey.
@@ -92,3 +99,16 @@ class PixelReader:
     def close(self) -> None:
         """Let the file go."""
         self._video.release()
+
+
+def _require_matroska(path: Path) -> None:
+    """FFmpeg goes by the content: it would follow a play list to files and addresses nobody named."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(len(_MATROSKA))
+    except OSError as error:
+        raise DamagedRunError(f"cannot read {path}: {error.strerror}; check its permissions") from error
+    if head != _MATROSKA:
+        raise DamagedRunError(
+            f"{path} cannot be opened: it is no Matroska video, its first bytes are {head!r}; replay again"
+        )

@@ -12,6 +12,8 @@ from gcd_node.replay.manifest import Manifest
 ABSENT = "-"
 """Shown for what one of the runs does not have."""
 
+_MAX_CONFIG = 256 * 1024
+_MOST_DOTS = 200  # of a name of n parts tomllib keeps all n beginnings: 200 kB of them took 40 GB
 _SECTIONS = ("strict", "source", "model", "view", "window")  # what a replay uses of a launch file
 
 
@@ -64,8 +66,10 @@ def _facts(manifest: Manifest) -> Iterator[tuple[str, str]]:
 
 def _config(text: str) -> Mapping[str, object]:
     try:
+        if len(text) > _MAX_CONFIG or any(line.count(".") > _MOST_DOTS for line in text.splitlines()):
+            raise ValueError(f"{len(text)} characters, or names of more than {_MOST_DOTS} parts")
         return tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise DamagedRunError(
             f"the config in manifest.json is not TOML: {error}; replay the recording again"
         ) from error

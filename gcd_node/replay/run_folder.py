@@ -13,6 +13,7 @@ from gcd_node.replay.manifest import Manifest, WindowEntry, encode_manifest, par
 from gcd_node.replay.pixel_file import PixelReader, Pixels
 
 MANIFEST = "manifest.json"
+_MAX_MANIFEST = 64 * 2**20  # a day of windows
 
 
 def pictures_path(folder: Path, view_id: str) -> Path:
@@ -53,7 +54,7 @@ def open_run(path: Path) -> RunFolder:
         raise SourceError(f"no such folder: {path}; give one that `gcd-node replay --out` wrote")
     file = path / MANIFEST
     try:
-        text = file.read_bytes()
+        text = _text(file)
     except FileNotFoundError as error:
         raise DamagedRunError(
             f"{path} has no {MANIFEST}: it is no run, or one that did not finish; replay again"
@@ -61,6 +62,16 @@ def open_run(path: Path) -> RunFolder:
     except OSError as error:
         raise DamagedRunError(f"cannot read {file}: {error.strerror}; check its permissions") from error
     return RunFolder(path=path, manifest=parse_manifest(text, str(file)))
+
+
+def _text(file: Path) -> bytes:
+    """Raises OSError, DamagedRunError."""
+    size = file.stat().st_size
+    if size > _MAX_MANIFEST or not file.is_file():
+        raise DamagedRunError(
+            f"{file} has {size} bytes, more than {_MAX_MANIFEST}, or is no file; replay a shorter part of the recording"
+        )
+    return file.read_bytes()
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:

@@ -3,6 +3,8 @@
 Encryption alone lets everybody in; so every secured socket also asks this gate, over ZeroMQ's authentication protocol
 (ZAP), in a domain of its own. What ZeroMQ does without a word, the gate hears from the sockets' monitors.
 Standard library and pyzmq only, Python 3.10 syntax: planners import this.
+
+Longer than most files: all of it waits in one thread for the same sockets.
 """
 
 import logging
@@ -18,7 +20,7 @@ from zmq.utils import z85
 from zmq.utils.monitor import parse_monitor_message
 
 from gcd_node.errors import AuthError, ConfigError, EndpointError
-from gcd_node.security.connections import Connections
+from gcd_node.security.connections import Allowance, Connections
 from gcd_node.security.keys import Client, ClientKeys, KeyPair, fingerprint
 from gcd_node.wire.endpoints import Channel, check_bindable, free_ipc_path, is_ipv6
 
@@ -32,6 +34,9 @@ Context: TypeAlias = "zmq.Context[zmq.Socket[bytes]]"
 
 _ZAP_ENDPOINT = "inproc://zeromq.zap.01"
 _TICK_MS = 100
+_RECEIVE_BUFFER = 256 * 1024
+_REQUESTS = Allowance(burst=2 * 2**20)  # more than may wait whole: 16 requests of 64 KiB
+_SUBSCRIPTIONS = Allowance(burst=256 * 1024, per_s=1024.0)  # a reader says little, and nobody tells when it has ended
 _FAILED = zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 _HEARD = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED | _FAILED
 _REFUSED = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
@@ -116,6 +121,7 @@ class Gate:
         self._monitors: dict[Socket, _Monitored] = {}
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._serve, name="gate", daemon=True)
+        self._next_look_s = 0.0
         self._zap: Socket | None = None
         if security is not None:
             self._zap = context.socket(zmq.REP)
@@ -137,7 +143,8 @@ class Gate:
         if secured:
             self._secure(socket, channel)
         monitored: _Monitored | None = None
-        if secured or channel == "control":
+        if channel == "control" or endpoint.startswith("tcp://"):
+            socket.set(zmq.RCVBUF, _RECEIVE_BUFFER)  # what is under way when somebody is cut off is still taken in
             monitored = self._monitors[socket.get_monitor_socket(_HEARD)] = _Monitored(channel=channel, secured=secured)
         socket.set(zmq.IPV6, int(is_ipv6(endpoint)))
         try:
@@ -149,13 +156,19 @@ class Gate:
         if bound.startswith("ipc://"):
             path = Path(bound.removeprefix("ipc://"))
             path.chmod(path.stat().st_mode & 0o770)  # whatever folder and umask say: not for everybody
-        if secured and monitored is not None:
+        if bound.startswith("tcp://") and monitored is not None:
             monitored.port = int(bound.rpartition(":")[2])
         return bound
 
     def client(self, user: str) -> Client | None:
         """Who a message's ZeroMQ user id, his key, belongs to; None if he is not, or no longer, on the list."""
         return self._clients.get(user)
+
+    def whole(self, handle: int) -> None:
+        """A request has arrived whole over this connection; from the thread that took it."""
+        for each in self._monitors.values():
+            if each.channel == "control":
+                each.connections.whole(handle)
 
     def start(self) -> None:
         """Begin to let clients in."""
@@ -187,6 +200,7 @@ class Gate:
                 for ready, _ in poller.poll(_TICK_MS):
                     self._hear(ready, poller)
                 self._look_at_list()
+                self._cut_endless()
         finally:
             for each, monitored in self._monitors.items():
                 monitored.connections.forget()
@@ -235,6 +249,21 @@ class Gate:
             _LOG.error("AUTH_UNCUT: %s", message)
             self._on_event("AUTH_UNCUT", {"level": 2, "message": message})
 
+    def _cut_endless(self) -> None:
+        """Ten times a second: hang up on clients whose message does not end."""
+        now_s = time.monotonic()
+        if now_s < self._next_look_s:
+            return
+        self._next_look_s = now_s + _TICK_MS / 1000
+        for each in self._monitors.values():
+            allowance = _REQUESTS if each.channel == "control" else _SUBSCRIPTIONS
+            for _ in range(each.connections.cut_endless(each.port, allowance, now_s) if each.port else 0):
+                self._tell_too_large(each.channel)
+
+    def _tell_too_large(self, channel: Channel) -> None:
+        _LOG.warning("TOO_LARGE: dropped a client of %s that sent more than it may", channel)
+        self._on_event("TOO_LARGE", {"level": 1, "channel": channel})
+
     def _notice(self, monitor: Socket, monitored: "_Monitored") -> bool:
         """One event of a bound socket; False once the socket is closed."""
         heard = parse_monitor_message(monitor.recv_multipart())
@@ -246,14 +275,13 @@ class Gate:
         if event == zmq.EVENT_ACCEPTED:
             connections.accepted(handle)
         if event == zmq.EVENT_DISCONNECTED and connections.cut_off(handle) and monitored.channel == "control":
-            _LOG.warning("TOO_LARGE: dropped a control client that sent more than a request may have")
-            self._on_event("TOO_LARGE", {"level": 1, "channel": monitored.channel})
+            self._tell_too_large(monitored.channel)
         return event != zmq.EVENT_MONITOR_STOPPED
 
 
 @dataclass(kw_only=True, slots=True)
 class _Monitored:
-    """A bound socket that is listened to. port: of tcp with keys."""
+    """A bound socket that is listened to. port: of tcp."""
 
     channel: Channel
     secured: bool

@@ -25,6 +25,7 @@ from pathlib import Path
 
 from gcd_node.errors import SourceError
 from gcd_node.sources.byte_cursor import ByteCursor
+from gcd_node.sources.log_patience import LogPatience
 
 _LOG = logging.getLogger(__name__)
 
@@ -63,10 +64,14 @@ class LogMessage:
 class McapContainer:
     """One reading of an MCAP file, front to back."""
 
-    def __init__(self, path: Path) -> None:
-        """Look at the file's first bytes. Raises SourceError: missing, empty, or no MCAP."""
+    def __init__(self, path: Path, patience: LogPatience | None = None) -> None:
+        """Look at the file's first bytes. patience: for going through it; None goes to its end, however far.
+
+        Raises:
+            SourceError: missing, empty, or no MCAP.
+        """
         check_mcap(path)
-        self._path = path
+        self._path, self._patience = path, patience
         self._schemas: dict[int, str] = {0: ""}
         self._channels: dict[int, LogChannel] = {}
         self._metadata: dict[str, dict[str, str]] = {}
@@ -94,7 +99,11 @@ class McapContainer:
         return self._metadata
 
     def messages(self) -> Iterator[LogMessage]:
-        """Every message. Raises SourceError: the file cannot be read, or a decompressor is not installed."""
+        """Every message.
+
+        Raises:
+            SourceError: the file cannot be read, or a decompressor is not installed. TiredError: see LogPatience.
+        """
         try:
             with self._path.open("rb") as file:
                 yield from self._walk(file, os.fstat(file.fileno()).st_size)
@@ -104,6 +113,7 @@ class McapContainer:
     def _walk(self, file: BufferedReader, size: int) -> Iterator[LogMessage]:
         file.seek(len(MAGIC))
         while (place := file.tell()) + _HEAD.size <= size:
+            self._spend()
             kind, length = _HEAD.unpack(file.read(_HEAD.size))
             if kind in (_DATA_END, _FOOTER):
                 self._whole = True
@@ -119,6 +129,10 @@ class McapContainer:
             body = memoryview(file.read(length))
             yield from self._chunk(body, cut=cut) if kind == _CHUNK else self._record(kind, body)
 
+    def _spend(self) -> None:
+        if self._patience is not None:
+            self._patience.spend()
+
     def _chunk(self, body: memoryview, *, cut: bool) -> Iterator[LogMessage]:
         try:
             records = unfolded(body, cut=cut)
@@ -133,6 +147,7 @@ class McapContainer:
             return
         place = 0
         while place + _HEAD.size <= len(records):
+            self._spend()
             kind, length = _HEAD.unpack_from(records, place)
             place += _HEAD.size
             if kind == 0 or length > len(records) - place:
@@ -243,7 +258,7 @@ def _decompressed(folded: memoryview, compression: str, size: int) -> memoryview
     return memoryview(_zstd(folded, size) if compression == "zstd" else _lz4(folded, size))
 
 
-def _zstd(folded: memoryview, size: int) -> bytes:
+def _zstd(folded: memoryview, size: int) -> bytearray:
     import zstandard
 
     found = bytearray()
@@ -253,7 +268,7 @@ def _zstd(folded: memoryview, size: int) -> bytes:
                 found += piece
     except zstandard.ZstdError as error:
         _LOG.debug("zstd: %s", error)  # what came before it is good, the checksum says if it is all
-    return bytes(found)
+    return found
 
 
 def _lz4(folded: memoryview, size: int) -> bytes:

@@ -7,6 +7,7 @@ from pathlib import Path
 from gcd_node.errors import SourceError
 from gcd_node.frame import Frame, Image, SourceInfo
 from gcd_node.sources.log_messages import PICTURES, read_picture_message
+from gcd_node.sources.log_patience import LogPatience, TiredError
 from gcd_node.sources.log_pictures import to_rgb
 from gcd_node.sources.mcap_container import LogChannel, LogMessage, McapContainer
 from gcd_node.sources.mcap_survey import survey
@@ -15,6 +16,7 @@ from gcd_node.sources.pace import Pace, Pacer
 
 _LOG = logging.getLogger(__name__)
 _LONGEST_STEP_NS = 10_000_000_000
+_MOST_RECORDS, _LONGEST_S = 50_000_000, 120.0  # from one picture to the next
 _LATEST_NS = 2**63  # in the year 2262
 
 
@@ -63,7 +65,11 @@ class McapLog:
         return self._corrupt + self._container.damaged
 
     def frames(self) -> Iterator[Frame]:
-        """Every picture that can be decoded. See FrameSource.frames. Raises SourceError if none can any more."""
+        """Every picture that can be decoded. See FrameSource.frames.
+
+        Raises:
+            SourceError: none can any more; or the next one does not come in 50 million records or 2 minutes.
+        """
         offset_ns, newest_ns = 0, None
         for frame in self._played():
             step_ns = None if newest_ns is None else frame.stamp_ns - newest_ns
@@ -98,18 +104,27 @@ class McapLog:
 
     def _one_pass(self) -> Iterator[Frame]:
         numbers = _Numbers()
-        for file in self._files:
-            yield from self._one_file(file, numbers)
+        patience = LogPatience(records=_MOST_RECORDS, seconds=_LONGEST_S, stopped=lambda: self._pacer.stopped)
+        try:
+            for file in self._files:
+                yield from self._one_file(file, numbers, patience)
+        except TiredError as tired:
+            if not self._pacer.stopped:
+                raise SourceError(
+                    f"{self._path}: after {numbers.given} pictures on {self.topic} none came in {tired}, and the log "
+                    f"goes on; cut it to the pictures: mcap filter LOG -y {self.topic} -o NEW"
+                ) from None
 
-    def _one_file(self, file: Path, numbers: "_Numbers") -> Iterator[Frame]:
+    def _one_file(self, file: Path, numbers: "_Numbers", patience: LogPatience) -> Iterator[Frame]:
         self._corrupt += self._container.damaged
-        container = self._container = McapContainer(file)
+        container = self._container = McapContainer(file, patience)
         for message in container.messages():
             if self._pacer.stopped:
                 return
             if self._is_picture(message.channel) and (read := self._read(message)) is not None:
                 image, stamp_ns = read
                 yield Frame(image=image, stamp_ns=stamp_ns, seq=numbers.next(message.sequence))
+                patience.renew()  # what was done with it took its own time
         if not container.whole:
             _LOG.warning("%s was not finished, or is damaged: it was read to its last whole message", file)
 
@@ -135,8 +150,10 @@ class _Numbers:
 
     def __init__(self) -> None:
         self._newest = -1
+        self.given = 0
 
     def next(self, recorded: int) -> int:
         """The number of a message that was recorded with this one."""
+        self.given += 1
         self._newest = max(recorded, self._newest + 1)
         return self._newest

@@ -17,6 +17,7 @@ from gcd_node.sources.log_messages import (
     read_camera_message,
     read_picture_message,
 )
+from gcd_node.sources.log_patience import LogPatience, TiredError
 from gcd_node.sources.log_pictures import to_rgb
 from gcd_node.sources.mcap_container import LogChannel, LogMessage, McapContainer
 from gcd_node.sources.own_recording import OwnRecording, own_recording
@@ -25,7 +26,9 @@ _LOG = logging.getLogger(__name__)
 _SURVEYED_NS = 5_000_000_000
 _MOST_STAMPS = 500
 _MOST_TRIES = 5
-_LISTED = 8
+_MOST_TOPICS = 1000
+_MOST_RECORDS, _LONGEST_S = 10_000_000, 30.0
+_LISTED, _SHOWN = 8, 100
 _LOWEST_FPS = 0.05
 _HEADER_UNCERTAINTY_US = 10_000  # drivers stamp anything from the begin of the exposure to the picture's arrival
 
@@ -78,12 +81,14 @@ class Survey:
 @dataclass(kw_only=True, slots=True)
 class _Seen:
     """What was met on the way. topics: with pictures. cameras: the first calibration on each topic that has some.
-    channels: every one. own: what this node said of its own recording."""
+    channels: every one. own: what this node said of its own recording. first_ns: when the first message was recorded.
+    """
 
     topics: dict[str, _Topic] = field(default_factory=dict[str, _Topic])
     cameras: dict[str, StatedCamera] = field(default_factory=dict[str, StatedCamera])
     channels: list[LogChannel] = field(default_factory=list[LogChannel])
     own: OwnRecording | None = None
+    first_ns: int | None = None
 
 
 def survey(path: Path, files: Sequence[Path], wanted: str | None) -> Survey:
@@ -93,10 +98,11 @@ def survey(path: Path, files: Sequence[Path], wanted: str | None) -> Survey:
         path: what to call it. files: played one after another.
         wanted: the topic; None if there is just one with pictures, or for the input of this node's own recording.
     Raises:
-        SourceError: no MCAP; no such topic; no pictures, or on several topics; none of them can be decoded.
+        SourceError: no MCAP; no such topic; no pictures, or on several topics; none of them can be decoded, or none
+            was found in 10 million records or 30 s.
         TooShortError: one picture.
     """
-    seen = _collect(files, wanted)
+    seen = _collect(path, files, wanted)
     chosen = _choose(path, seen, _topic_of(seen, wanted))
     if chosen.size is None:
         raise SourceError(f"{path}: no picture on {chosen.channel.topic} can be decoded: {chosen.reason}")
@@ -135,23 +141,41 @@ def _topic_of(seen: _Seen, wanted: str | None) -> str | None:
     return seen.own.input_topic if wanted is None and seen.own is not None else wanted
 
 
-def _collect(files: Sequence[Path], wanted: str | None) -> _Seen:
-    seen, first_ns = _Seen(), None
-    for file in files:
-        container = McapContainer(file)
+def _collect(path: Path, files: Sequence[Path], wanted: str | None) -> _Seen:
+    """Raises SourceError: not enough was found in what may be gone through."""
+    seen, patience = _Seen(), LogPatience(records=_MOST_RECORDS, seconds=_LONGEST_S)
+    try:
+        for file in files:
+            if _look_through(seen, McapContainer(file, patience), wanted):
+                break
+    except TiredError as tired:
+        if not _settled(seen.topics, _topic_of(seen, wanted)):
+            raise SourceError(
+                f"{path}: no pictures{'' if wanted is None else f' on {wanted!r}'} that can be played were found in "
+                f"the first {tired}; {_listed(seen)}. Cut it to the pictures: mcap filter LOG -y TOPIC -o NEW"
+            ) from None
+    return seen
+
+
+def _look_through(seen: _Seen, container: McapContainer, wanted: str | None) -> bool:
+    """One file; whether enough is known. Raises SourceError, TiredError."""
+    try:
         for message in container.messages():
             seen.own = own_recording(container.metadata) or seen.own
             _look(seen, message)
-            first_ns = message.log_ns if first_ns is None else first_ns
-            if message.log_ns - first_ns > _SURVEYED_NS and _settled(seen.topics, _topic_of(seen, wanted)):
-                return seen
+            seen.first_ns = message.log_ns if seen.first_ns is None else seen.first_ns
+            if message.log_ns - seen.first_ns > _SURVEYED_NS and _settled(seen.topics, _topic_of(seen, wanted)):
+                return True
+    finally:
         seen.channels.extend(container.channels)
-    return seen
+    return False
 
 
 def _look(seen: _Seen, message: LogMessage) -> None:
     channel = message.channel
     kind = channel.encoding, channel.schema
+    if max(len(seen.topics), len(seen.cameras)) >= _MOST_TOPICS and channel.topic not in seen.topics:
+        return
     if kind in PICTURES:
         seen.topics.setdefault(channel.topic, _Topic(channel=channel)).add(message)
     elif kind in CAMERAS and channel.topic not in seen.cameras:
@@ -188,8 +212,8 @@ def _choose(path: Path, seen: _Seen, wanted: str | None) -> _Topic:
 
 def _listed(seen: _Seen) -> str:
     if seen.topics:
-        return f"it has pictures on {', '.join(sorted(seen.topics)[:_LISTED])}"
-    others = sorted(f"{each.topic} ({each.schema}, {each.encoding})" for each in seen.channels)[:_LISTED]
+        return f"it has pictures on {', '.join(name[:_SHOWN] for name in sorted(seen.topics)[:_LISTED])}"
+    others = sorted({f"{each.topic} ({each.schema}, {each.encoding})"[:_SHOWN] for each in seen.channels})[:_LISTED]
     readable = ", ".join(f"{schema} ({encoding})" for encoding, schema in PICTURES)
     return f"its topics are {', '.join(others) or 'none'}; readable are {readable}"
 

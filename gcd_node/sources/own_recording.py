@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gcd_node.errors import SourceError
+from gcd_node.sources.log_patience import LogPatience
 from gcd_node.sources.mcap_container import McapContainer, check_mcap
 
 _LOG = logging.getLogger(__name__)
 
+_MOST_RECORDS, _LONGEST_S = 1_000_000, 10.0  # until the first messages of all parts
 NODE_METADATA, SOURCE_METADATA = "gcd-node", "gcd-node/source"
 """Names of the metadata records in each of their files."""
 
@@ -53,10 +55,11 @@ def log_files(path: Path) -> tuple[Path, ...]:
     Raises:
         SourceError: no log, or a folder with something else in it.
     """
+    patience = LogPatience(records=_MOST_RECORDS, seconds=_LONGEST_S)
     if not path.is_dir():
         check_mcap(path)
         return (path,)
-    parts = {file: _told_by(file) for file in sorted(path.glob("*.mcap")) if _has_something(file)}
+    parts = {file: _told_by(file, patience) for file in sorted(path.glob("*.mcap")) if _has_something(file)}
     numbered = sorted((own.part, file) for file, own in parts.items() if own is not None)
     names = {own.name for own in parts.values() if own is not None}
     if len(names) != 1 or len(numbered) != len(parts):
@@ -64,9 +67,9 @@ def log_files(path: Path) -> tuple[Path, ...]:
     return tuple(file for _, file in numbered)
 
 
-def _told_by(path: Path) -> OwnRecording | None:
+def _told_by(path: Path, patience: LogPatience) -> OwnRecording | None:
     try:
-        container = McapContainer(path)
+        container = McapContainer(path, patience)
         next(container.messages(), None)  # metadata comes first
     except SourceError:
         return None

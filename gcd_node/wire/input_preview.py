@@ -69,7 +69,7 @@ def preview_message(run: Run, shot: Shot) -> ViewMessage:
         encoding="jpeg",
         quality=QualityRecord(nan_frames=0, ood=(), steps=0, seed=0),
         model=_NO_MODEL,
-        cfg_digest=run.config.digest,
+        cfg_digest=run.digest,
         pose=(PoseDelta(az_deg=0.0, el_deg=0.0, r=0.0),),
         source_from_view=(_HERE,),
         pose_units="scene" if run.traits.family is None else run.traits.family.pose_units,

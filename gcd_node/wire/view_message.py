@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from gcd_model import ASSUMED_SOURCE, CameraMount, Intrinsics, Traits, Trajectory, View
 from gcd_node.config import NodeConfig
+from gcd_node.config_digest import config_digest
 from gcd_node.envelope import EndMessage, ViewKind, ViewMessage, payload_of, view_topic
 from gcd_node.frame import Image, SourceInfo
 from gcd_node.optics.preprocess import ResizePath
@@ -52,6 +53,11 @@ class Run:
     mount: CameraMount | None
     ood: tuple[str, ...]
     resize: ResizePath
+
+    @property
+    def digest(self) -> str:
+        """Of the configuration; see config_digest()."""
+        return config_digest(self.config, self.traits)
 
     @property
     def classes(self) -> tuple[ClassRecord, ...]:
@@ -185,7 +191,7 @@ def _header(run: Run, rendered: Rendered) -> ViewHeader:
             nan_frames=0, ood=(*run.ood, *_input_flags(window.images)), steps=rendered.steps, seed=rendered.seed
         ),
         model=_model(run.traits),
-        cfg_digest=run.config.digest,
+        cfg_digest=run.digest,
         pose=_deltas(path),
         source_from_view=_matrices(path) if run.traits.knows_camera else None,
         pose_units="scene" if run.traits.family is None else run.traits.family.pose_units,

@@ -75,19 +75,3 @@ def test_a_wrong_value_is_an_error_that_says_what_was_wanted(wrong: str, reason:
 def test_a_missing_launch_file_is_an_error_that_names_it(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"no\.toml"):
         load_config(tmp_path / "no.toml")
-
-
-def test_the_digest_names_what_is_rendered_and_not_where_it_goes() -> None:
-    base = parsed(MINIMAL).digest
-    assert parsed(MINIMAL + "[publish]\ndata = 'tcp://127.0.0.1:1'").digest == base
-    assert parsed(MINIMAL.replace('driving"', 'driving"\nseed = 1')).digest != base
-
-
-def test_a_camera_and_its_recording_share_a_digest_and_so_their_seeds() -> None:
-    camera = 'kind = "v4l2"\ndevice = "0"\nwidth = 640\nfps = 30.0\nstall_ms = 500.0\ncalibration = "lens.yaml"'
-    recording = 'kind = "mcap"\npath = "drive.mcap"\npace = "lockstep"'
-    live, again, other = (
-        parsed(MINIMAL.replace('path = "drive.mp4"', each)).digest
-        for each in (camera, recording, recording + '\nresize = "area"')
-    )
-    assert live == again != other

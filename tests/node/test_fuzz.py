@@ -294,7 +294,11 @@ distortion_coefficients:
 def configured(part: bytes) -> str:
     config = parse_config(part, "launch.toml")
     again = parse_config(to_toml(config).encode(), "again")
-    assert again.digest == config.digest  # passwords are hidden, so not the whole is the same
+    assert (again.view, again.model, again.window) == (
+        config.view,
+        config.model,
+        config.window,
+    )  # passwords are hidden, so not the whole
     return config.source.kind
 
 
@@ -322,7 +326,8 @@ def test_any_change_ends_as_a_configuration_or_a_config_error(changes: list[str]
         config = parse_config(CONFIG, "launch.toml", changes)
     except NodeError:
         return
-    assert parse_config(to_toml(config).encode(), "again").digest == config.digest
+    again = parse_config(to_toml(config).encode(), "again")
+    assert (again.view, again.model, again.window) == (config.view, config.model, config.window)
 
 
 def test_mutated_client_lists_end_as_clients_or_config_errors(tmp_path: Path) -> None:

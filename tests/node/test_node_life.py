@@ -69,6 +69,20 @@ def test_a_node_goes_through_its_life_as_it_is_asked(tmp_path: Path) -> None:
     assert [view.sequence for view in rig.of()] == [0, 2]  # 1 was the end of the first stream
 
 
+def test_the_end_of_a_recording_is_told_at_once_and_not_when_its_last_window_is_drawn(tmp_path: Path) -> None:
+    gate = Gate()
+    model = FakeSynthesizer(traits(), gate)
+    with Rig(tmp_path, lambda _: FakeSource(14), model, config=LOCKSTEP) as rig:
+        until(lambda: gate.begun == 1)
+        told = rig.await_status(lambda status: status["source"]["state"] == "ended")
+        assert (told["state"], told["model"]["state"], told["level"]) == ("active", "busy", 0)
+        assert not told["ready"]
+        assert rig.of() == []
+        gate.waits.release()
+        rig.await_event("SRC_ENDED")
+        rig.await_views(1)
+
+
 def test_a_dry_run_changes_nothing(tmp_path: Path) -> None:
     with Rig(tmp_path, Bench(), more="life = {autostart = false}") as rig:
         assert rig.try_out("configure").code is Code.OK

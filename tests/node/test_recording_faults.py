@@ -110,6 +110,7 @@ def test_f22_a_full_disk_ends_the_recording_with_a_whole_file_and_the_stream_goe
         rig.await_status(lambda later: later["heartbeat_seq"] > status["heartbeat_seq"] and later["level"] == 0)
     assert (ended["reason"], ended["finished"], ended["level"]) == ("DISK_FULL", True, Level.WARN)
     assert "No space left" in ended["message"]
+    assert ended["written"] == len(heard)
     assert ended["bytes"] > 1_000_000
     assert (status["level"], status["rec"]["state"]) == (1, "failed")
     assert found.chunk_indexes
@@ -154,6 +155,7 @@ def test_a_file_that_has_its_reserve_ends_with_an_index(tmp_path: Path, monkeypa
     room[0] += 2**20  # what the reserve gives back
     assert part.finish()
     assert _numbers(tmp_path / "a.mcap") == list(range(count + 1))  # the last one was held
+    assert part.messages == count + 1
     assert len(summary(tmp_path / "a.mcap").chunk_indexes) > 1
 
 
@@ -163,6 +165,7 @@ def test_a_file_without_room_for_an_index_ends_without(tmp_path: Path, monkeypat
     count = filled(part)
     assert part.finish()
     numbers = _numbers(tmp_path / "a.mcap")
+    assert part.messages == len(numbers)
     assert numbers == list(range(len(numbers)))
     assert count - 1 <= len(numbers) <= count
     assert (tmp_path / "a.mcap").read_bytes().endswith(b"\x89MCAP0\r\n")
@@ -178,6 +181,7 @@ def test_a_file_on_a_broken_disk_is_whole_up_to_its_last_chunk(tmp_path: Path, m
     found = salvaged(tmp_path / "a.mcap", "/noise")
     assert found == list(range(len(found)))
     assert len(found) >= count - 1
+    assert part.messages == len(found)
 
 
 def _numbers(path: Path) -> list[int]:
@@ -208,17 +212,22 @@ def test_a_recording_stops_before_the_room_is_gone_that_it_must_leave(tmp_path: 
         _, box = recorded(config, FakeSource(14))
         (ended,) = [fields for topic, fields in box.notes if topic == "event" and fields["code"] == "REC_STOPPED"]
         assert (ended["reason"], ended["file"], ended["level"]) == (code, None, 1)
+        assert (ended["finished"], ended["written"]) == (False, 0)  # it never began
         assert files(folder) == [folder / "older.mcap"]
         assert [each.name for each in folder.iterdir()] == ["older.mcap"]
         assert box.of("win")
 
 
-def test_a_folder_that_cannot_be_made_is_blamed_on_the_setting(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_blamed_on_the_setting_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     (tmp_path / "file").touch()
     _, box = recorded(recorder_config(tmp_path / "file" / "recordings"), FakeSource(14))
     (ended,) = [fields for topic, fields in box.notes if topic == "event" and fields["code"] == "REC_STOPPED"]
     assert (ended["reason"], ended["file"]) == ("DISK_ERROR", None)
     assert "check folder in [record]" in str(ended["message"])
+    assert ended["finished"] is False
+    assert caplog.text.count("check folder in [record]") == 1
     assert box.of("win")
 
 

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 
+import cv2
 import pytest
 import torch
 
@@ -24,13 +25,15 @@ def test_the_model_leaves_the_rest_of_the_robot_a_core(monkeypatch: pytest.Monke
         assert model_threads(ModelSection(weights="fake", threads=3)) == 3
 
 
-def test_a_loaded_model_computes_on_so_many_threads() -> None:
-    before = torch.get_num_threads()
+def test_a_loaded_model_and_the_pictures_around_it_are_computed_on_so_many_threads() -> None:
+    before = torch.get_num_threads(), cv2.getNumThreads()
+    wanted = max(before) + 1
     try:
-        load_model(ModelSection(weights="random:driving", device="cpu", threads=before + 1))
-        assert torch.get_num_threads() == before + 1
+        load_model(ModelSection(weights="random:driving", device="cpu", threads=wanted))
+        assert (torch.get_num_threads(), cv2.getNumThreads()) == (wanted, wanted)
     finally:
-        torch.set_num_threads(before)
+        torch.set_num_threads(before[0])
+        cv2.setNumThreads(before[1])
 
 
 def test_a_node_is_as_nice_as_it_is_told_and_its_threads_take_turns_quickly(monkeypatch: pytest.MonkeyPatch) -> None:

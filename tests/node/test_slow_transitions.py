@@ -1,22 +1,28 @@
 """Transitions that take long: what may be asked meanwhile, and what becomes of a thread that does not end."""
 
 import threading
+import time
+from collections.abc import Sequence
 from pathlib import Path
 
+import pytest
+import torch
 from cameras import Bench, until
 from fakes import FakeSource, FakeSynthesizer, traits
 from rig import Rig
+from torch import nn
 
-from gcd_model import RenderOptions, ViewSynthesizer
+from gcd_model import Augmentation, Cancelled, Clip, RenderOptions, SourceFeatures, Trajectory, View, ViewSynthesizer
 from gcd_node.config import ModelSection
 from gcd_node.control.message import Code
+from gcd_node.rendering.interruption import interruptible
 
 LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
 WAITING = "life = {autostart = false}"
 
 
 class Deaf:
-    """A model that hears no cancel: each rendering takes until it is let go."""
+    """A model that hears no cancel and has no layers: each rendering takes until it is let go."""
 
     def __init__(self) -> None:
         self.begun, self.go_on = threading.Event(), threading.Event()
@@ -24,6 +30,80 @@ class Deaf:
     def __call__(self, options: RenderOptions) -> None:
         self.begun.set()
         assert self.go_on.wait(60)
+
+
+class Slow(nn.Module):
+    """A part of a network that takes 40 s on a slow machine, and never asks whether anybody wants it still."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.begun = threading.Event()
+        self.layers = nn.ModuleList(Pause() for _ in range(4000))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        self.begun.set()
+        for layer in self.layers:
+            x = layer(x)
+        return x
+
+
+class Pause(nn.Module):
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        time.sleep(0.01)
+        return x
+
+
+class SlowSynthesizer(FakeSynthesizer):
+    """Slow in its encoder, in a denoising step or in its decoder; one step, so nobody asks between two."""
+
+    def __init__(self, part: str) -> None:
+        super().__init__(traits())
+        self.slow, self._part = Slow(), part
+
+    def encode(
+        self, clip: Clip, augmentation: Augmentation | None = None, extra: torch.Tensor | None = None
+    ) -> SourceFeatures:
+        if self._part == "encoder":
+            self.slow(clip.video)
+        return super().encode(clip, augmentation, extra)
+
+    def render(
+        self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
+    ) -> list[View]:
+        if self._part == "decoder" and options is not None and options.progress is not None:
+            options.progress(1, 1)
+        if self._part != "encoder":
+            self.slow(features.latents)
+        return super().render(features, trajectories, options)
+
+
+@pytest.mark.parametrize("part", ["encoder", "step", "decoder"])
+def test_f23_whatever_part_of_the_model_is_at_work_it_is_abandoned(
+    tmp_path: Path, part: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    model = SlowSynthesizer(part)
+    with Rig(tmp_path, lambda _: FakeSource(10_000), model, config=LOCKSTEP) as rig:
+        assert model.slow.begun.wait(30)
+        rig.node.stop()
+        rig.await_state("finalized")
+        assert not rig.node.left_behind
+    assert rig.failure is None
+    assert rig.views == []
+    assert "does not end" not in caplog.text
+
+
+def test_a_node_that_is_told_to_stop_interrupts_nobody_elses_network() -> None:
+    cancel, x = threading.Event(), torch.zeros(1)
+    cancel.set()
+    with interruptible(cancel):
+        with pytest.raises(Cancelled, match="Pause"):
+            Pause()(x)
+        other = threading.Thread(target=lambda: done.append(Pause()(x)))
+        done: list[torch.Tensor] = []
+        other.start()
+        other.join(30)
+    assert len(done) == 1
+    Pause()(x)  # and not here any more
 
 
 def test_while_a_transition_is_under_way_the_node_is_busy_and_can_still_be_ended(tmp_path: Path) -> None:

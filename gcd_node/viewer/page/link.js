@@ -1,7 +1,7 @@
 // The connection to the node: opens it again when it breaks, and knows by this page's own clock whether anybody is there.
 
-const BEAT_LOST_MS = 1500; // the server speaks at least twice a second
-const NODE_SILENT_MS = 1800; // the node itself once a second
+export const BEAT_LOST_MS = 1500; // the server speaks at least twice a second
+export const NODE_SILENT_MS = 1800; // the node itself once a second
 const AGAIN_MS = [250, 500, 1000, 2000, 3000];
 const REPLY_MS = 4000;
 const HEAD_BYTES = 4;
@@ -82,18 +82,24 @@ export class Link {
     waiting.resolve(reply);
   }
 
-  // "connecting", "alive" or "dead", and why, at this moment.
-  life(now) {
-    const isOpen = this.socket.readyState === WebSocket.OPEN;
-    const quietMs = now - (this.heard ?? this.began);
+  // At this moment: whether there is a connection, and for how long the server and the node behind it have said nothing.
+  silence(now) {
+    return {
+      isOpen: this.socket.readyState === WebSocket.OPEN,
+      quietMs: now - (this.heard ?? this.began),
+      silentMs: this.node && this.node.silentMs + (now - this.node.at),
+    };
+  }
+
+  // "connecting", "alive" or "dead", and why, after such a silence.
+  life({ isOpen, quietMs, silentMs }) {
     if (this.heard === null) {
       if (quietMs < BEAT_LOST_MS) return ["connecting", "waiting for the node"];
       return ["dead", this.reason || "nobody answers at this address"];
     }
     if (!isOpen) return ["dead", `${this.reason || "the connection is gone"}; last heard ${seconds(quietMs)} ago`];
     if (quietMs > BEAT_LOST_MS) return ["dead", `no sign of life for ${seconds(quietMs)}`];
-    if (this.node === null) return ["connecting", "the page is served, but the node has not spoken yet"];
-    const silentMs = this.node.silentMs + (now - this.node.at);
+    if (silentMs === null) return ["connecting", "the page is served, but the node has not spoken yet"];
     if (silentMs > NODE_SILENT_MS) return ["dead", `the node has been silent for ${seconds(silentMs)}: hung, or gone`];
     return ["alive", ""];
   }

@@ -17,6 +17,7 @@ let bootId = null;
 let steered = ""; // what the controls were last fitted to
 let taking = Promise.resolve(); // pictures are taken in the order they came
 let ticked = 0;
+let silence = null; // at the last look
 
 const link = new Link({
   open: () => { steered = ""; if (view.view) link.say({ type: "watch", view: view.view }); },
@@ -102,9 +103,12 @@ function select(id) {
   link.say({ type: "watch", view: id });
 }
 
-// The one word: connecting, live, stale, dead. `since` is this page's clock, for whoever measures.
+// The one word: connecting, live, stale, dead. For whoever measures: since when, by this page's clock, and after which
+// silence; and which it was when the page looked before.
 function turn(now) {
-  const [life, why] = link.life(now);
+  const before = silence;
+  silence = link.silence(now);
+  const [life, why] = link.life(silence);
   const isFresh = view.isFresh(now);
   const state = life !== "alive" ? life : isFresh ? "live" : "stale";
   const reason = why || health.summary() || (state === "live" ? "" : view.now ? "the last view is too old, and no newer one has come" : "no view has come yet");
@@ -112,6 +116,7 @@ function turn(now) {
   if (dataset.state !== state) {
     dataset.state = state;
     dataset.since = String(now);
+    dataset.silence = JSON.stringify([before, silence]);
     element("state").textContent = state;
     document.title = `${state === "live" ? "" : `${state}: `}${health.status ? element("node").textContent : "gcd-node"}`;
   }

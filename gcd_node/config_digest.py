@@ -1,0 +1,77 @@
+"""The name of a configuration: equal for configurations that render the same, however they are written."""
+
+import hashlib
+
+import msgspec
+from msgspec.structs import replace
+
+from gcd_model import ASSUMED_SOURCE, Traits
+from gcd_node.config import ModelSection, NodeConfig, SourcePose, WindowConfig
+
+
+def config_digest(config: NodeConfig, traits: Traits) -> str:
+    """12 hex digits that name how views are rendered from given pictures: not from which camera or recording they
+    come, on which device, in which precision or at what pace, nor where they are sent. Seeds follow from it, so that a
+    recording of a camera is rendered as the camera was.
+
+    What was left out counts as the value it stands for, wherever the model or its checkpoint decides that; so a default
+    changes nothing when it is written out. Two are for the source to decide and count as they are written: `fps` of
+    [window], and `hfov_deg` of [source]. `motion_bucket`, where it follows from each path, is the third.
+
+    Args:
+        traits: of the model in use.
+    """
+    source = config.source
+    taken = source.resize, source.allow_upscale, source.hfov_deg, _pose(source.pose, traits)
+    filled = taken, _model(config.model, traits), config.view, _window(config.window, traits)
+    plain = _without_negative_zero(msgspec.to_builtins(filled))
+    return hashlib.sha256(msgspec.json.encode(plain, order="deterministic")).hexdigest()[:12]
+
+
+def _model(section: ModelSection, traits: Traits) -> ModelSection:
+    sampling, family, tower = traits.config.sampling, traits.family, traits.config.image_encoder
+    return replace(
+        section,
+        device="auto",
+        threads=None,
+        dtype=None,
+        family=section.family if family is None else family.name,
+        steps=section.steps or sampling.steps,
+        guidance=section.guidance or sampling.guidance,
+        cond_aug=sampling.augmentation if section.cond_aug is None else section.cond_aug,
+        move_time=traits.move_time if section.move_time is None else section.move_time,
+        motion_bucket=family.motion_bucket if section.motion_bucket is None and family else section.motion_bucket,
+        head_width=traits.config.unet.head_width,
+        image_heads=None if tower is None else tower.heads,
+    )
+
+
+def _window(section: WindowConfig, traits: Traits) -> WindowConfig:
+    return replace(section, stride=section.stride or traits.config.frames)
+
+
+def _pose(pose: SourcePose | None, traits: Traits) -> SourcePose | None:
+    """Where the camera stands in the words the model knows; None for a model that has no use for them."""
+    stated, mount = pose or SourcePose(), traits.mount
+    if mount is not None:
+        return SourcePose(
+            height_m=mount.height_m if stated.height_m is None else stated.height_m,
+            forward_m=mount.forward_m if stated.forward_m is None else stated.forward_m,
+            left_m=mount.left_m if stated.left_m is None else stated.left_m,
+            tilt_deg=mount.tilt_deg if stated.tilt_deg is None else stated.tilt_deg,
+        )
+    if traits.config.camera == "none":
+        return None
+    return SourcePose(
+        elevation_deg=ASSUMED_SOURCE.elevation_deg if stated.elevation_deg is None else stated.elevation_deg,
+        radius=ASSUMED_SOURCE.radius_m if stated.radius is None else stated.radius,
+    )
+
+
+def _without_negative_zero(value: object) -> object:
+    """-0.0 is written otherwise than 0.0 and means the same."""
+    if isinstance(value, dict):
+        return {key: _without_negative_zero(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_negative_zero(each) for each in value]
+    return value + 0.0 if isinstance(value, float) else value

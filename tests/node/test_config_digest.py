@@ -1,0 +1,96 @@
+"""Configurations that render the same have the same name, however they are written."""
+
+import pytest
+from fakes import traits, warping_traits
+
+from gcd_model import Traits
+from gcd_node.config import NodeConfig, parse_config
+from gcd_node.config_digest import config_digest
+
+MINIMAL = """
+[source]
+path = "drive.mp4"
+[model]
+weights = "fake"
+[view.topdown]
+"""
+STEERED, WARPING, UNSTEERED = traits(), warping_traits(), traits("svd")
+
+
+def parsed(text: str = MINIMAL, *changes: str) -> NodeConfig:
+    return parse_config(text.encode(), "test.toml", changes)
+
+
+def digest(*changes: str, made: Traits = STEERED) -> str:
+    return config_digest(parsed(MINIMAL, *changes), made)
+
+
+@pytest.mark.parametrize(
+    ("made", "written_out"),
+    [
+        (STEERED, f"model.steps={STEERED.config.sampling.steps}"),
+        (STEERED, f"model.guidance={list(STEERED.config.sampling.guidance)}"),
+        (STEERED, f"model.cond_aug={STEERED.config.sampling.augmentation}"),
+        (STEERED, f"model.move_time={STEERED.move_time}"),
+        (STEERED, f"model.head_width={STEERED.config.unet.head_width}"),
+        (STEERED, "model.family=kubric90"),
+        (STEERED, "model.samples=1"),
+        (STEERED, "model.seed=0"),
+        (STEERED, "model.device=auto"),
+        (STEERED, f"window.stride={STEERED.config.frames}"),
+        (STEERED, "window.max_skew=0.5"),
+        (STEERED, "view.topdown.azimuth_deg=-0.0"),
+        (STEERED, "view.topdown.radius=0"),
+        (STEERED, "source.resize=released"),
+        (STEERED, "source.pose={}"),
+        (STEERED, "source.pose={elevation_deg = 5, radius = 15.0}"),
+        (WARPING, "source.pose={left_m = 0.0}"),
+        (WARPING, "source.pose={height_m = 1.55, tilt_deg = -0.0}"),
+        (WARPING, "model.motion_bucket=127"),
+        (UNSTEERED, "source.pose={}"),
+    ],
+)
+def test_a_default_that_is_written_out_changes_nothing(made: Traits, written_out: str) -> None:
+    assert digest(written_out, made=made) == digest(made=made)
+
+
+@pytest.mark.parametrize(
+    ("made", "change"),
+    [
+        (STEERED, "model.steps=3"),
+        (STEERED, "model.guidance=[1.0, 3.0]"),
+        (STEERED, "model.cond_aug=0.5"),
+        (STEERED, "model.cond_aug=0.0"),
+        (STEERED, "model.move_time=0"),
+        (STEERED, "model.seed=1"),
+        (STEERED, "model.samples=2"),
+        (STEERED, "model.motion_bucket=100.0"),
+        (STEERED, "window.stride=4"),
+        (STEERED, "window.fps=12.0"),
+        (STEERED, "view.topdown.azimuth_deg=1.0"),
+        (STEERED, "view.other={}"),
+        (STEERED, "source.resize=area"),
+        (STEERED, "source.hfov_deg=60.0"),
+        (STEERED, "source.pose={radius = 14.0}"),
+        (WARPING, "source.pose={height_m = 1.6}"),
+    ],
+)
+def test_what_changes_the_pixels_changes_the_name(made: Traits, change: str) -> None:
+    assert digest(change, made=made) != digest(made=made)
+
+
+@pytest.mark.parametrize(
+    "change", ["publish.data=tcp://127.0.0.1:1", "model.threads=3", "model.device=cpu", "model.dtype=float32"]
+)
+def test_where_it_goes_and_how_exactly_it_is_computed_do_not_count(change: str) -> None:
+    assert digest(change) == digest()
+
+
+def test_a_camera_and_its_recording_share_a_digest_and_so_their_seeds() -> None:
+    camera = 'kind = "v4l2"\ndevice = "0"\nwidth = 640\nfps = 30.0\nstall_ms = 500.0\ncalibration = "lens.yaml"'
+    recording = 'kind = "mcap"\npath = "drive.mcap"\npace = "lockstep"'
+    live, again, other = (
+        config_digest(parsed(MINIMAL.replace('path = "drive.mp4"', each)), STEERED)
+        for each in (camera, recording, recording + '\nresize = "area"')
+    )
+    assert live == again != other
