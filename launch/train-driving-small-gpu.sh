@@ -26,7 +26,7 @@ export PYTHONPATH="$PWD:$PWD/model:$PWD/train"
 gcd_train() {
   local left=$((${MINUTES:-60} * 60 - SECONDS))
   if [ "$left" -le 0 ]; then echo "out of MINUTES before: $1; run the same line to go on" >&2; exit 0; fi
-  timeout --signal=TERM "$left" "$PYTHON" -c 'from gcd_train.cli import main; main()' "$@"
+  timeout --signal=TERM "$left" "$PYTHON" -c 'from gcd_train.cli.main import main; main()' "$@"
 }
 
 keep() { if [ -n "${OUT:-}" ]; then cp -r "$RUN"/*.safetensors "$RUN"/*.jsonl "$RUN"/report* "$OUT"/ 2>/dev/null || true; fi; }

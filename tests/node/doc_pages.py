@@ -15,7 +15,7 @@ from gcd_node.cli.commands import app as node_app
 from gcd_node.config import parse_config
 from gcd_node.control.verbs import VERBS
 from gcd_node.errors import ConfigError
-from gcd_train.cli import app as train_app
+from gcd_train.cli.main import app as train_app
 
 ROOT = Path(__file__).parent.parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

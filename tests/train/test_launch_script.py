@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from gcd_train.cli import app
+from gcd_train.cli.main import app
 from gcd_train.recipe import load_recipe
 
 SCRIPT = Path(__file__).parents[2] / "launch" / "train-driving-small-gpu.sh"

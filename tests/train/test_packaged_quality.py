@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from gcd_model import load_synthesizer
 from gcd_model.geometry import CameraMount
 from gcd_train.baselines import driving_baselines, fit_statistics
-from gcd_train.cli import app
+from gcd_train.cli.main import app
 from gcd_train.datasets.paired import PairedClips
 from gcd_train.evaluation import Evaluation, SynthesizedViews, evaluate
 

@@ -14,7 +14,7 @@ from gcd_model.geometry import CameraMount
 from gcd_model.networks import random_networks
 from gcd_model.own_format import Card
 from gcd_train.baselines import CopySource, MajorityMap, driving_baselines, fit_statistics
-from gcd_train.cli import app
+from gcd_train.cli.main import app
 from gcd_train.errors import RunError
 from gcd_train.evaluation import evaluate
 from gcd_train.report import (

@@ -14,7 +14,7 @@ import pytest
 from headless import needs_egl
 from typer.testing import CliRunner
 
-from gcd_train.cli import app
+from gcd_train.cli.main import app
 from gcd_train.datasets.paired import PairedClips, require_apart
 from gcd_train.errors import DataError
 from gcd_train.scenes.driving import driving_scene
@@ -193,7 +193,7 @@ def test_sets_that_share_scenes_are_refused(tmp_path: Path) -> None:
 def test_sigterm_stops_the_workers_and_keeps_whole_shards(tmp_path: Path) -> None:
     size = ["--width", "48", "--height", "32", "--frames", "2", "--oversample", "1", "--clips-per-shard", "1"]
     line = ["generate", "driving", "--out", str(tmp_path), "--clips", "5000", "--workers", "2", *size]
-    code = "from gcd_train.cli import main; main()"
+    code = "from gcd_train.cli.main import main; main()"
     running = subprocess.Popen([sys.executable, "-c", code, *line], stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 60
     while not list(tmp_path.glob("*.zip")) and time.monotonic() < deadline:

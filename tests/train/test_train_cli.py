@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from gcd_train.cli import app
+from gcd_train.cli.main import app
 
 
 def test_families_lists_every_family_with_its_limits() -> None:
@@ -48,7 +48,7 @@ def test_architectures_lists_all_set_ups() -> None:
     assert "DRIVING_SMALL" in result.stdout
 
 
-@pytest.mark.parametrize("module", ["gcd_model", "gcd_node", "gcd_node.cli.main", "gcd_train.cli"])
+@pytest.mark.parametrize("module", ["gcd_model", "gcd_node", "gcd_node.cli.main", "gcd_train.cli.main"])
 def test_the_core_imports_without_cameras_gpu_ros_and_onnx(module: str) -> None:
     blocked = (
         "depthai",

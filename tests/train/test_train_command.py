@@ -2,7 +2,7 @@ from pathlib import Path
 
 from typer.testing import CliRunner
 
-from gcd_train.cli import app
+from gcd_train.cli.main import app
 
 
 def test_train_explains_itself() -> None:

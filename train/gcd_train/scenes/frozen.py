@@ -12,17 +12,16 @@ import numpy as np
 
 from gcd_train.errors import DataError
 from gcd_train.scenes.compile import VERTEX, Vertices, vertices_of
-from gcd_train.scenes.description import Floats, Light, Scene
+from gcd_train.scenes.description import STREET, Extent, Floats, Light, Scene
 
-_FORMAT = 1
+_FORMAT = 2
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class FrozenScene:
     """What the renderer needs.
 
-    vertices: [N] of `compile.VERTEX`, three in a row are a triangle, in their bodies' frames. poses: [T, B, 3, 4],
-    world_from_body. focus: [T, 3], the point around which shadows are cast. hfov_deg: of every camera.
+    vertices: [N] of `compile.VERTEX`, three in a row are a triangle, in their bodies' frames. The rest as in `Scene`.
     """
 
     vertices: Vertices
@@ -30,6 +29,7 @@ class FrozenScene:
     focus: Floats
     hfov_deg: float
     light: Light
+    extent: Extent = STREET
 
     @property
     def frames(self) -> int:
@@ -38,7 +38,7 @@ class FrozenScene:
 
     def save(self, file: BinaryIO) -> None:
         """Write it as a compressed npz."""
-        facts = {"format": _FORMAT, "hfov_deg": self.hfov_deg, "light": self.light}
+        facts = _Facts(format=_FORMAT, hfov_deg=self.hfov_deg, light=self.light, extent=self.extent)
         told = np.frombuffer(msgspec.json.encode(facts), np.uint8)
         raw = self.vertices.view(np.uint8).reshape(-1, VERTEX.itemsize)
         np.savez_compressed(file, vertices=raw, poses=self.poses, focus=self.focus, facts=told)
@@ -50,12 +50,15 @@ class FrozenScene:
             with np.load(path, allow_pickle=False) as kept:
                 arrays: dict[str, Any] = dict(kept)
             facts = msgspec.json.decode(arrays["facts"].tobytes(), type=_Facts)
+            if facts.format != _FORMAT:
+                raise ValueError(f"its format is {facts.format}, this version reads {_FORMAT}")
             return cls(
                 vertices=arrays["vertices"].reshape(-1).view(VERTEX),
                 poses=arrays["poses"].astype(np.float32),
                 focus=arrays["focus"].astype(np.float32),
                 hfov_deg=facts.hfov_deg,
                 light=facts.light,
+                extent=facts.extent,
             )
         except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
             raise DataError(f"{path} is no drawable scene ({error}); generate the scene again") from error
@@ -65,6 +68,7 @@ class _Facts(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     format: int
     hfov_deg: float
     light: Light
+    extent: Extent
 
 
 def freeze(scene: Scene) -> FrozenScene:
@@ -75,4 +79,5 @@ def freeze(scene: Scene) -> FrozenScene:
         focus=scene.focus,
         hfov_deg=scene.hfov_deg,
         light=scene.light,
+        extent=scene.extent,
     )

@@ -1,9 +1,13 @@
 """Unit shapes as triangles with normals; each fits a cube of side 1 about the origin."""
 
+import math
+from collections.abc import Sequence
 from functools import cache
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gcd_train.scenes.description import Floats
 
@@ -65,8 +69,8 @@ def _round(sides: int, axis: int) -> Triangles:
     return np.asarray(corners, np.float32)[..., order], np.asarray(normals, np.float32)[..., order]
 
 
-def _ball() -> Triangles:
-    """An icosahedron split once: 80 triangles, smooth."""
+def _icosahedron() -> Floats:
+    """Its 20 faces, corners [20, 3, 3] at distance 1."""
     golden = (1 + 5**0.5) / 2
     points = [(a, b * golden, 0.0) for a in (-1, 1) for b in (-1, 1)]
     points = np.array([*points, *[(0.0, a, b) for a, b, _ in points], *[(b, 0.0, a) for a, b, _ in points]])
@@ -77,13 +81,88 @@ def _ball() -> Triangles:
     faces = [
         (i, j, k) for i in range(12) for j in range(i) for k in range(j) if near[i, j] and near[j, k] and near[i, k]
     ]
-    split: list[Floats] = []
-    for i, j, k in faces:
-        a, b, c = points[i], points[j], points[k]
-        ab, bc, ca = ((p + q) / np.linalg.norm(p + q) for p, q in ((a, b), (b, c), (c, a)))
-        split += [np.stack(t) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
-    normals = np.stack(split).astype(np.float32)
+    return points[np.array(faces)]
+
+
+def _ball(splits: int) -> Triangles:
+    """An icosahedron, every triangle split in four so many times, smooth."""
+    corners = _icosahedron()
+    for _ in range(splits):
+        a, b, c = np.moveaxis(corners, 1, 0)
+        ab, bc, ca = ((p + q) / np.linalg.norm(p + q, axis=-1, keepdims=True) for p, q in ((a, b), (b, c), (c, a)))
+        quarters = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
+        corners = np.stack([np.stack(triangle, 1) for triangle in quarters], 1).reshape(-1, 3, 3)
+    normals = corners.astype(np.float32)
     return normals * np.float32(0.5), normals
+
+
+Profile = Sequence[tuple[float, float]]
+"""Distance from the axis and height, in order: walking along it, the outside is on the right hand."""
+_SHARP_DEG = 35.0
+_SIDES = 28
+
+
+def _revolved(profile: Profile, *, closed: bool = False) -> Triangles:
+    """A profile turned about z; smooth around, and along the profile wherever it bends little. May be concave."""
+    line = np.array([*profile, profile[0]] if closed else profile)  # [K + 1, 2]
+    step = np.diff(line, axis=0)
+    out = np.stack([step[:, 1], -step[:, 0]], -1) / np.linalg.norm(step, axis=1, keepdims=True)  # [K, 2]
+    before, after = np.roll(out, 1, 0), np.roll(out, -1, 0)
+    if not closed:
+        before[0], after[-1] = out[0], out[-1]
+    corners = _ring_triangles(_turned(line[:-1]), _turned(line[1:]))
+    normals = _ring_triangles(_turned(_bent(out, before)), _turned(_bent(out, after)))
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
+    return corners[area > 1e-9], normals[area > 1e-9]  # fields that end on the axis are triangles already
+
+
+def _turned(flat: NDArray[Any]) -> NDArray[Any]:
+    """Radius and height [K, 2] at every angle around: [K, sides + 1, 3]."""
+    angles = np.linspace(0, 2 * np.pi, _SIDES + 1)
+    return np.stack([flat[:, :1] * np.cos(angles), flat[:, :1] * np.sin(angles), flat[:, 1:] + 0 * angles], -1)
+
+
+def _bent(own: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:
+    """Normals [K, 2] where a piece meets another: between the two, or the piece's own at a sharp edge."""
+    smooth = (own * other).sum(-1, keepdims=True) > math.cos(math.radians(_SHARP_DEG))
+    between = np.where(smooth, own + other, own)
+    return between / np.linalg.norm(between, axis=-1, keepdims=True)
+
+
+def _ring_triangles(start: NDArray[Any], end: NDArray[Any]) -> Floats:
+    """Two triangles for each field of a band, [N, 3, 3], anticlockwise seen from outside."""
+    a, b, c, d = start[:, :-1], start[:, 1:], end[:, 1:], end[:, :-1]
+    halves = [np.stack(corners, 2).reshape(-1, 3, 3) for corners in ((a, b, c), (a, c, d))]
+    return np.concatenate(halves).astype(np.float32)
+
+
+def _arc(centre: tuple[float, float], radius: float, start_deg: float, end_deg: float, pieces: int) -> Profile:
+    angles = np.radians(np.linspace(start_deg, end_deg, pieces + 1))
+    return [(max(centre[0] + radius * float(np.cos(a)), 0.0), centre[1] + radius * float(np.sin(a))) for a in angles]
+
+
+_CAPSULE = [*_arc((0, -0.25), 0.25, -90, 0, 7), *_arc((0, 0.25), 0.25, 0, 90, 7)]
+_TORUS = _arc((0.36, 0), 0.14, 0, 360, 16)[:-1]
+_TUBE = [(0.34, -0.5), (0.5, -0.5), (0.5, 0.5), (0.34, 0.5)]
+_BOTTLE = [
+    *((0.0, -0.47), (0.1, -0.5), (0.16, -0.5), (0.18, -0.47), (0.18, 0.05), (0.165, 0.14), (0.12, 0.22), (0.075, 0.29)),
+    *((0.06, 0.36), (0.06, 0.44), (0.075, 0.44), (0.075, 0.5), (0.0, 0.5)),
+]
+_BOWL = [
+    *((0.0, -0.24), (0.2, -0.24), (0.22, -0.2), (0.36, -0.12), (0.46, 0.05), (0.5, 0.24)),
+    *((0.465, 0.24), (0.42, 0.06), (0.33, -0.07), (0.2, -0.15), (0.0, -0.17)),
+]
+_VASE = [
+    *((0.0, -0.5), (0.17, -0.5), (0.24, -0.4), (0.29, -0.24), (0.29, -0.08), (0.23, 0.1), (0.14, 0.25), (0.12, 0.35)),
+    *((0.15, 0.44), (0.21, 0.5), (0.18, 0.49), (0.12, 0.44), (0.09, 0.34), (0.09, 0.2), (0.0, 0.1)),
+]
+_SPOOL = [
+    *((0.0, -0.5), (0.4, -0.5), (0.42, -0.48), (0.42, -0.36), (0.4, -0.34), (0.2, -0.28), (0.17, 0.0), (0.2, 0.28)),
+    *((0.4, 0.34), (0.42, 0.36), (0.42, 0.48), (0.4, 0.5), (0.0, 0.5)),
+]
+_BARREL = [(0.0, -0.5), (0.33, -0.5), (0.39, -0.28), (0.41, 0.0), (0.39, 0.28), (0.33, 0.5), (0.0, 0.5)]
+_POT = [(0.0, -0.5), (0.34, -0.5), (0.46, 0.36), (0.5, 0.36), (0.5, 0.5), (0.42, 0.5), (0.3, -0.4), (0.0, -0.4)]
+_CONE = [(0.0, -0.5), (0.47, -0.5), (0.5, -0.48), (0.015, 0.49), (0.0, 0.5)]
 
 
 def _outward(triangles: Triangles) -> Triangles:
@@ -100,12 +179,14 @@ def shape(name: str) -> Triangles:
     """Corners and normals of a unit shape, cached.
 
     box; taper, cabin, nose: a box with a smaller upper face; gable: a roof; post: a cylinder along z; wheel: one
-    along y; ball; cone: a box that ends nearly in a point.
+    along y; ball; cone: a box that ends nearly in a point. Finer: sphere, cylinder, round_cone, capsule (0.5 wide, so
+    size (2 r, 2 r, length) wants a length of 4 r for round ends), icosahedron. Convex too: barrel. Concave:
+    torus (0.28 thick), tube, bottle (0.36 wide), bowl (0.48 high), vase (0.58 wide), spool, pot.
     """
-    return _outward(_MAKERS[name]())
+    return _outward(_CONVEX[name]()) if name in _CONVEX else _revolved(_TURNED[name], closed=name in ("torus", "tube"))
 
 
-_MAKERS = {
+_CONVEX = {
     "box": lambda: _hull(1.0),
     "taper": lambda: _hull(0.8),
     "cabin": lambda: _hull(0.68, -0.04),
@@ -114,6 +195,22 @@ _MAKERS = {
     "gable": _gable,
     "post": lambda: _round(6, 2),
     "wheel": lambda: _round(10, 1),
-    "ball": _ball,
+    "ball": lambda: _ball(1),
+    "sphere": lambda: _ball(3),
+    "cylinder": lambda: _round(_SIDES, 2),
+    "icosahedron": lambda: _flat((_icosahedron() * 0.5).tolist()),
+    "capsule": lambda: _revolved(_CAPSULE),
+    "round_cone": lambda: _revolved(_CONE),
+    "barrel": lambda: _revolved(_BARREL),
 }
-SHAPES = tuple(_MAKERS)
+_TURNED: dict[str, Profile] = {
+    "torus": _TORUS,
+    "tube": _TUBE,
+    "bottle": _BOTTLE,
+    "bowl": _BOWL,
+    "vase": _VASE,
+    "spool": _SPOOL,
+    "pot": _POT,
+}
+CONVEX = frozenset(_CONVEX)
+SHAPES = (*_CONVEX, *_TURNED)

@@ -1,7 +1,7 @@
-"""A headless OpenGL renderer: one draw call gives colour, depth, instance and class of a view.
+"""A headless OpenGL renderer: one pass gives colour, depth, instance and class of a view.
 
-The shadow map of a time step is drawn once and shared by its cameras; programs and primitives are cached. Works on
-software OpenGL (Mesa's llvmpipe) as on a GPU.
+The shadow map of a time step is drawn once and shared by its cameras. A scene is one vertex buffer; it is drawn with
+one call per way of painting (`shaders`), which is a handful. Works on software OpenGL (Mesa's llvmpipe) as on a GPU.
 """
 
 import math
@@ -10,21 +10,39 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gcd_train.errors import RenderError
-from gcd_train.scenes.compile import VERTEX
-from gcd_train.scenes.description import Floats, Light, Scene
+from gcd_train.scenes.compile import VERTEX, Run, indexed, runs_of
+from gcd_train.scenes.description import Extent, Floats, Light, Scene
 from gcd_train.scenes.frozen import FrozenScene, freeze
-from gcd_train.scenes.shaders import FRAGMENT, SHADOW_FRAGMENT, SHADOW_VERTEX
+from gcd_train.scenes.shaders import SHADOW_FRAGMENT, SHADOW_VERTEX, fragment
 from gcd_train.scenes.shaders import VERTEX as VERTEX_SHADER
 
-_NEAR_M, _FAR_M = 0.3, 900.0
-_SHADOW_PIXELS, _SHADOW_RADIUS_M = 1024, 55.0
-_FORMAT = "3f4 3f4 4f1 4u1"
-_NAMES = ("position", "normal", "colour", "tags")
+_FIELDS = {"position": "3f4", "normal": "3f4", "colour": "4f1", "accent": "4f1", "tags": "4u1"}
 _BODIES = 256
+_LIFT = 0.06 / 55.0
+"""Shadows are looked up this far off the surface, as a share of the shadow map's radius: half a shadow pixel."""
+_Frame = np.dtype(
+    [
+        ("clip_from_world", "16f4"),  # matrices column by column, as OpenGL wants them
+        ("light_from_world", "16f4"),
+        ("eye", "4f4"),
+        ("ahead", "4f4"),
+        ("sun_to", "4f4"),
+        ("sun", "4f4"),
+        ("sky", "4f4"),
+        ("ground", "4f4"),
+        ("horizon", "4f4"),
+        ("zenith", "4f4"),
+        ("fog_m", "f4"),
+        ("cloud", "f4"),
+        ("exposure", "f4"),
+        ("shadow_lift", "f4"),
+    ]
+)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -41,8 +59,21 @@ class Rendering:
     instances: NDArray[np.uint8]
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Uploaded:
+    """A scene in the context's memory: its triangles as each way of painting reads them, and as the shadow map does."""
+
+    buffers: tuple[Any, Any]
+    runs: tuple[tuple[Run, Any], ...]
+    shadow: Any
+
+    def release(self) -> None:
+        for resource in (*(array for _, array in self.runs), self.shadow, *self.buffers):
+            resource.release()
+
+
 class Renderer:
-    """Draws scenes at one size. Not thread-safe; one a process.
+    """Draws scenes at one size. Not thread-safe, and one scene at a time; each has an OpenGL context of its own.
 
     oversample: pixels drawn per output pixel along each side; colours are averaged, depth and labels are picked.
     Raises RenderError without a headless OpenGL.
@@ -51,18 +82,17 @@ class Renderer:
     def __init__(self, width: int, height: int, *, oversample: int = 2) -> None:
         self._width, self._height, self._oversample = width, height, oversample
         self._context = _context()
-        self._program = self._context.program(vertex_shader=VERTEX_SHADER, fragment_shader=FRAGMENT)
         self._shadow_program = self._context.program(vertex_shader=SHADOW_VERTEX, fragment_shader=SHADOW_FRAGMENT)
-        size = (width * oversample, height * oversample)
-        self._colour = self._context.renderbuffer(size, 4)
-        self._facts = self._context.renderbuffer(size, 2, dtype="f4")
-        depth = self._context.depth_renderbuffer(size)
-        self._target = self._context.framebuffer([self._colour, self._facts], depth)
-        self._shadow = self._context.depth_texture((_SHADOW_PIXELS, _SHADOW_PIXELS))
-        self._shadow.compare_func = "<="
-        self._shadow_target = self._context.framebuffer(depth_attachment=self._shadow)
+        self._programs: dict[tuple[int, bool], Any] = {}
+        self._size = (width * oversample, height * oversample)
+        colour = self._context.renderbuffer(self._size, 4)
+        facts = self._context.renderbuffer(self._size, 2, dtype="f4")
+        self._target = self._context.framebuffer([colour, facts], self._context.depth_renderbuffer(self._size))
+        self._shadow: Any = None
         self._bodies = self._context.texture((3, _BODIES), 4, dtype="f4")
         self._bodies.filter = (self._context.NEAREST, self._context.NEAREST)
+        self._frame = np.zeros((), _Frame)
+        self._frame_block = self._context.buffer(reserve=_Frame.itemsize, dynamic=True)
 
     def render(self, scene: Scene) -> dict[str, list[Rendering]]:
         """Every camera of a scene, at every time step.
@@ -84,20 +114,55 @@ class Renderer:
         """
         if scene.poses.shape[1] > _BODIES:
             raise RenderError(f"a scene may have {_BODIES} bodies, got {scene.poses.shape[1]}; split it")
-        buffer = self._context.buffer(scene.vertices.tobytes())
-        full = self._context.vertex_array(self._program, [(buffer, _FORMAT, *_NAMES)])
-        shadow_format = f"3f4 {VERTEX.itemsize - 16}x 4u1"
-        shadow = self._context.vertex_array(self._shadow_program, [(buffer, shadow_format, "position", "tags")])
+        with self._context:  # the one in use may be another renderer's
+            drawn = self._uploaded(scene)
+            self._set_scene(scene.light, scene.extent)
         try:
-            self._set_light(scene.light)
             for step in range(scene.frames):
-                self._move(scene.poses[step])
-                self._cast(scene.light, scene.focus[step], shadow)
+                with self._context:
+                    self._move(scene.poses[step])
+                    self._cast(scene, step, drawn.shadow)
                 for name, poses in cameras.items():
-                    yield step, name, self._view(poses[step], scene.hfov_deg, full)
+                    with self._context:
+                        view = self._view(poses[step], scene, drawn.runs)
+                    yield step, name, view
         finally:
-            for resource in (full, shadow, buffer):
-                resource.release()
+            with self._context:
+                drawn.release()
+
+    def _uploaded(self, scene: FrozenScene) -> "_Uploaded":
+        corners, indices = indexed(scene.vertices)
+        buffer, index = self._context.buffer(corners.tobytes()), self._context.buffer(indices.tobytes())
+        return _Uploaded(
+            buffers=(buffer, index),
+            runs=tuple((run, self._array(buffer, index, run)) for run in runs_of(scene.vertices)),
+            shadow=self._context.vertex_array(self._shadow_program, [_taking(buffer, "position", "tags")], index),
+        )
+
+    def _array(self, buffer: Any, index: Any, run: Run) -> Any:
+        """The buffer as the program of a run reads it; programs are made when first needed."""
+        key = run.pattern, run.glossy
+        if key not in self._programs:
+            shader = fragment(run.pattern, glossy=run.glossy)
+            program = self._context.program(vertex_shader=VERTEX_SHADER, fragment_shader=shader)
+            program["Frame"].binding = 0
+            _set(program, bodies=0, shadow=1)
+            self._programs[key] = program
+        program = self._programs[key]
+        wanted = [name for name in _FIELDS if name in program]
+        return self._context.vertex_array(program, [_taking(buffer, *wanted)], index)
+
+    def _set_scene(self, light: Light, extent: Extent) -> None:
+        for name in ("sun_to", "sun", "sky", "ground", "horizon", "zenith"):
+            self._frame[name] = (*getattr(light, name), 0.0)
+        for name in ("fog_m", "cloud", "exposure"):
+            self._frame[name] = getattr(light, name)
+        self._frame["shadow_lift"] = _LIFT * extent.shadow_radius_m
+        pixels = (extent.shadow_pixels, extent.shadow_pixels)
+        if self._shadow is None or self._shadow.size != pixels:
+            self._shadow = self._context.depth_texture(pixels)
+            self._shadow.compare_func = "<="
+            self._shadow_target = self._context.framebuffer(depth_attachment=self._shadow)
 
     def _move(self, poses: Floats) -> None:
         rows = np.zeros((_BODIES, 3, 4), np.float32)
@@ -105,54 +170,46 @@ class Renderer:
         self._bodies.write(rows.tobytes())
         self._bodies.use(0)
 
-    def _cast(self, light: Light, focus: Floats, array: Any) -> None:
-        light_from_world = _sun_matrix(np.asarray(light.sun_to), focus.astype(np.float64))
+    def _cast(self, scene: FrozenScene, step: int, array: Any) -> None:
+        sun_to, focus = np.asarray(scene.light.sun_to), scene.focus[step].astype(np.float64)
+        light_from_world = _sun_matrix(sun_to, focus, scene.extent)
         self._shadow_target.use()
         self._context.enable_only(self._context.DEPTH_TEST)
         self._shadow_target.clear(depth=1.0)
         _set(self._shadow_program, clip_from_world=light_from_world, bodies=0)
         array.render()
-        _set(self._program, light_from_world=light_from_world)
+        self._frame["light_from_world"] = light_from_world.T.ravel()
 
-    def _view(self, world_from_camera: NDArray[np.float64], hfov_deg: float, array: Any) -> Rendering:
+    def _view(
+        self, world_from_camera: NDArray[np.float64], scene: FrozenScene, runs: tuple[tuple[Run, Any], ...]
+    ) -> Rendering:
         self._target.use()
         self._context.enable_only(self._context.DEPTH_TEST | self._context.CULL_FACE)
         self._target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
         self._shadow.use(1)
-        aspect = self._width / self._height
-        matrix = _clip_from_camera(hfov_deg, aspect) @ np.linalg.inv(world_from_camera)
-        eye, ahead = world_from_camera[:3, 3], world_from_camera[:3, 2]
-        _set(self._program, clip_from_world=matrix, eye=eye, ahead=ahead, bodies=0, shadow=1)
-        array.render()
+        lens = _clip_from_camera(scene.hfov_deg, self._width / self._height, scene.extent)
+        self._frame["clip_from_world"] = (lens @ np.linalg.inv(world_from_camera)).T.ravel()
+        self._frame["eye"][:3] = world_from_camera[:3, 3]
+        self._frame["ahead"][:3] = world_from_camera[:3, 2]
+        self._frame_block.write(self._frame.tobytes())
+        self._frame_block.bind_to_uniform_block(0)
+        for run, array in runs:
+            array.render(vertices=run.count, first=run.first)
         return self._read()
 
     def _read(self) -> Rendering:
         n = self._oversample
-        shape = (self._height * n, self._width * n)
-        colour = np.frombuffer(self._target.read(components=3, attachment=0), np.uint8).reshape(*shape, 3)[::-1]
-        facts = np.frombuffer(self._target.read(components=2, attachment=1, dtype="f4"), np.float32)
-        picked = facts.reshape(*shape, 2)[::-1][n // 2 :: n, n // 2 :: n]
-        labels = picked[..., 1].astype(np.int32)
-        averaged = colour.reshape(self._height, n, self._width, n, 3).mean((1, 3), dtype=np.float32)
+        wide, high = self._size
+        # four components and whole pixels are copied as they are; any other choice is converted one by one
+        colour = np.frombuffer(self._target.read(components=4, attachment=0), np.uint8).reshape(high, wide, 4)
+        facts = np.frombuffer(self._target.read(components=2, attachment=1, dtype="f4"), np.uint64)
+        picked = facts.reshape(high, wide)[::-1][n // 2 :: n, n // 2 :: n].copy().view(np.float32)
+        labels = picked[:, 1::2].astype(np.uint16)
         return Rendering(
-            rgb=np.rint(averaged).astype(np.uint8),
-            depth=np.ascontiguousarray(picked[..., 0]),
+            rgb=_averaged(colour, n),
+            depth=np.ascontiguousarray(picked[:, ::2]),
             classes=(labels & 255).astype(np.uint8),
             instances=(labels >> 8).astype(np.uint8),
-        )
-
-    def _set_light(self, light: Light) -> None:
-        _set(
-            self._program,
-            sun_to=light.sun_to,
-            sun=light.sun,
-            sky=light.sky,
-            ground=light.ground,
-            horizon=light.horizon,
-            zenith=light.zenith,
-            fog_m=light.fog_m,
-            cloud=light.cloud,
-            exposure=light.exposure,
         )
 
     def close(self) -> None:
@@ -181,6 +238,22 @@ def _context() -> Any:
         ) from error
 
 
+def _taking(buffer: Any, *names: str) -> tuple[Any, ...]:
+    """A vertex buffer with the fields that a program wants; the others are stepped over."""
+    layout = [_FIELDS[name] if name in names else f"{VERTEX[name].itemsize}x" for name in _FIELDS]
+    return (buffer, " ".join(layout), *names)
+
+
+def _averaged(colour: NDArray[np.uint8], n: int) -> NDArray[np.uint8]:
+    """The picture as OpenGL has it, the right way up, n x n pixels averaged: u8 [H * n, W * n, 4] as [H, W, 3]."""
+    opaque = np.asarray(cv2.flip(cv2.cvtColor(colour, cv2.COLOR_RGBA2RGB), 0), np.uint8)
+    if n == 1:
+        return opaque
+    size = (colour.shape[1] // n, colour.shape[0] // n)
+    averaged = cv2.resize(opaque.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return np.rint(averaged).astype(np.uint8)
+
+
 def _set(program: Any, **uniforms: Any) -> None:
     """Set what the compiler kept; matrices are given row by row, OpenGL wants columns."""
     for name, value in uniforms.items():
@@ -190,29 +263,31 @@ def _set(program: Any, **uniforms: Any) -> None:
         program[name].value = value if array.ndim == 0 else tuple(array.astype(float).T.flatten().tolist())
 
 
-def _clip_from_camera(hfov_deg: float, aspect: float) -> NDArray[np.float64]:
+def _clip_from_camera(hfov_deg: float, aspect: float, extent: Extent) -> NDArray[np.float64]:
     """From camera axes (x right, y down, z ahead) to OpenGL's clip space."""
+    near, far = extent.near_m, extent.far_m
     focal = 1 / math.tan(math.radians(hfov_deg) / 2)
     matrix = np.zeros((4, 4))
     matrix[0, 0], matrix[1, 1] = focal, -focal * aspect
-    matrix[2, 2] = (_FAR_M + _NEAR_M) / (_FAR_M - _NEAR_M)
-    matrix[2, 3] = -2 * _FAR_M * _NEAR_M / (_FAR_M - _NEAR_M)
+    matrix[2, 2] = (far + near) / (far - near)
+    matrix[2, 3] = -2 * far * near / (far - near)
     matrix[3, 2] = 1
     return matrix
 
 
-def _sun_matrix(sun_to: NDArray[np.float64], focus: NDArray[np.float64]) -> NDArray[np.float64]:
+def _sun_matrix(sun_to: NDArray[np.float64], focus: NDArray[np.float64], extent: Extent) -> NDArray[np.float64]:
     """Orthographic view along the sunlight around `focus`, snapped to whole shadow pixels against flicker."""
     aside = [0.0, 0.0, 1.0] if abs(sun_to[2]) < 0.99 else [1.0, 0.0, 0.0]  # any axis that is not the sun's
     right = np.cross(aside, sun_to)
     right /= np.linalg.norm(right)
     up = np.cross(sun_to, right)
     turn = np.stack([right, up, sun_to])
-    pixel = 2 * _SHADOW_RADIUS_M / _SHADOW_PIXELS
+    radius = extent.shadow_radius_m
+    pixel = 2 * radius / extent.shadow_pixels
     centre = np.round(turn @ focus / pixel) * pixel
     matrix = np.eye(4)
-    matrix[:2, :3] = turn[:2] / _SHADOW_RADIUS_M
-    matrix[:2, 3] = -centre[:2] / _SHADOW_RADIUS_M
-    matrix[2, :3] = -turn[2] / 150.0
-    matrix[2, 3] = centre[2] / 150.0
+    matrix[:2, :3] = turn[:2] / radius
+    matrix[:2, 3] = -centre[:2] / radius
+    matrix[2, :3] = -turn[2] / extent.shadow_depth_m
+    matrix[2, 3] = centre[2] / extent.shadow_depth_m
     return matrix

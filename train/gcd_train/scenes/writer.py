@@ -8,13 +8,11 @@ A data folder holds `world.json` (what it is) and `shard-<first seed>.zip` files
 import json
 import os
 import re
-import signal
 import time
 import zipfile
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +22,7 @@ import numpy as np
 
 from gcd_model.config import DRIVING_CLASSES, SemanticClass
 from gcd_train.errors import DataError
+from gcd_train.map_items import map_items, one_thread_each
 from gcd_train.scenes.description import Scene
 from gcd_train.scenes.renderer import Renderer, Rendering
 from gcd_train.scenes.worlds import WORLDS, WorldOptions
@@ -60,20 +59,20 @@ class Progress:
     total: int
 
 
-def generate(out: Path, world: World, seeds: range, workers: int) -> Iterator[Progress]:
-    """Make the clips of `seeds`; finished shards of an earlier run are kept.
+def generate(out: Path, world: World, seeds: range, workers: int, ray_address: str | None = None) -> Iterator[Progress]:
+    """Make the clips of `seeds`; finished shards of an earlier run are kept. workers, ray_address: see `map_items`.
 
     Raises:
         DataError: the folder holds another kind of data.
-        RenderError: nothing can be drawn on this machine.
+        RenderError: nothing can be drawn on this machine. RunError: anything else that ends a shard.
     """
     out.mkdir(parents=True, exist_ok=True)
     _agree(out, world)
     missing = _missing_shards(out, seeds, world.clips_per_shard)
     done = len(seeds) - sum(map(len, missing))
     yield Progress(done=done, total=len(seeds))
-    os.environ["LP_NUM_THREADS"] = "1"  # one core a worker: software OpenGL would take them all
-    for made in _written(out, world, missing, workers):
+    one_thread_each()
+    for made in _written(out, world, missing, workers, ray_address):
         done += made
         yield Progress(done=done, total=len(seeds))
 
@@ -102,26 +101,12 @@ def _missing_shards(out: Path, seeds: range, size: int) -> list[range]:
     return shards
 
 
-def _written(out: Path, world: World, shards: list[range], workers: int) -> Iterator[int]:
-    """How many clips each shard added, as it is finished; one worker is this process."""
-    if workers == 1:
-        for shard in shards:
-            write_shard(out, world, shard)
-            yield len(shard)
-        return
-    with ProcessPoolExecutor(workers, get_context("spawn"), initializer=_leave_stopping_to_the_parent) as pool:
-        jobs = {pool.submit(write_shard, out, world, shard): len(shard) for shard in shards}
-        try:
-            for job in as_completed(jobs):
-                job.result()
-                yield jobs[job]
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _leave_stopping_to_the_parent() -> None:
-    """Ctrl-C reaches every process of a terminal; workers finish their shard and are not given another."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _written(out: Path, world: World, shards: list[range], workers: int, ray_address: str | None) -> Iterator[int]:
+    """How many clips each shard added, as it is finished; the first that fails ends the run."""
+    outcomes = map_items(partial(write_shard, out.resolve(), world), shards, workers=workers, ray_address=ray_address)
+    for outcome in outcomes:
+        outcome.unwrap()
+        yield len(outcome.item)
 
 
 def shard_path(out: Path, seeds: range) -> Path:

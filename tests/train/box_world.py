@@ -1,0 +1,103 @@
+"""A world that is made in a millisecond: a red box that stands, a green one that slides and turns, ground, sky."""
+
+import numpy as np
+
+from gcd_model.geometry import sphere_poses
+from gcd_train.errors import DataError
+from gcd_train.scenes.description import Light, Part, Pattern, Scene, SceneObject, Sheet, upright
+from gcd_train.scenes.worlds import SceneWorld
+
+RED, GREEN = 9, 4
+"""Instance ids; out of order, so that renumbering shows."""
+HFOV_DEG = float(np.degrees(2 * np.arctan(0.5)))
+
+
+def box_scene(seed: int, frames: int) -> Scene:
+    """Seed n: the green box is n / 10 m further to the left."""
+    import torch
+
+    slide = np.zeros((frames, 3, 4), np.float32)
+    slide[:, 1] = (2.0, -1.5, 1.0, 0.0)
+    slide[:, 2, 0], slide[:, 2, 1], slide[:, 2, 3] = 0.5 * np.arange(frames), 2.0 + seed / 10, 0.3 * np.arange(frames)
+    slide[:, 2, 2] = 0.5
+    angles = torch.tensor([[90.0, 45.0, 15.0], [15.0, 5.0, 15.0]], dtype=torch.float64)
+    return Scene(
+        parts=(
+            Part(shape="box", centre=(0, 0, 0), size=(2, 2, 2), colour=(0.9, 0.1, 0.1), label=5, instance=RED, body=1),
+            Part(
+                shape="box", centre=(0, 0, 0), size=(1, 3, 1), colour=(0.1, 0.9, 0.1), label=8, instance=GREEN, body=2
+            ),
+            Part(
+                shape="sphere", centre=(0, 0, 0), size=(600, 600, 600), colour=(0, 0, 0), label=0, pattern=Pattern.SKY
+            ),
+        ),
+        sheets=(Sheet(corners=_square(40.0), colour=(0.4, 0.4, 0.4), label=1),),
+        poses=upright(slide),
+        focus=np.zeros((frames, 3), np.float32),
+        cameras={f"view{n}": np.tile(pose, (frames, 1, 1)) for n, pose in enumerate(sphere_poses(angles).numpy())},
+        hfov_deg=HFOV_DEG,
+        light=_LIGHT,
+        facts={"seed": seed},
+        objects=(
+            _object("red box", RED, 1, (2.0, 2.0, 2.0), slide[:, 1]),
+            _object("green box", GREEN, 2, (1.0, 3.0, 1.0), slide[:, 2]),
+        ),
+    )
+
+
+def odd_box_scene(seed: int, frames: int) -> Scene:
+    """Fails for odd seeds."""
+    if seed % 2:
+        raise DataError(f"seed {seed} is odd")
+    return box_scene(seed, frames)
+
+
+def box_world(make: object = box_scene) -> SceneWorld:
+    return SceneWorld(
+        name="boxes",
+        layout="kubric4d",
+        make=make,  # pyright: ignore[reportArgumentType]
+        edition=1,
+        frames=2,
+        fps=24.0,
+        width=48,
+        height=32,
+    )
+
+
+def _object(name: str, instance: int, body: int, size: tuple[float, float, float], path: np.ndarray) -> SceneObject:
+    frames, half = len(path), path[:, 3] / 2
+    turns = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], -1).astype(np.float64)
+    return SceneObject(
+        name=name,
+        instance=instance,
+        body=body,
+        label=body,
+        size=size,
+        dynamic=body == 2,
+        mass_kg=2.0,
+        friction=0.5,
+        restitution=0.1,
+        positions=path[:, :3].astype(np.float64),
+        quaternions=turns,
+        velocities=np.zeros((frames, 3)),
+        angular_velocities=np.zeros((frames, 3)),
+    )
+
+
+def _square(half: float) -> np.ndarray:
+    a, b, c, d = (-half, -half, 0), (half, -half, 0), (half, half, 0), (-half, half, 0)
+    return np.array([[a, b, c], [a, c, d]], np.float32)
+
+
+_LIGHT = Light(
+    sun_to=(0.3, 0.2, 0.93),
+    sun=(2.0, 2.0, 2.0),
+    sky=(0.5, 0.6, 0.7),
+    ground=(0.2, 0.2, 0.2),
+    horizon=(0.7, 0.8, 0.9),
+    zenith=(0.2, 0.4, 0.8),
+    fog_m=500.0,
+    cloud=0.2,
+    exposure=1.0,
+)

@@ -1,0 +1,63 @@
+"""A driving set small enough to cache in a blink: three scenes of seven frames, clips of three."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gcd_train.errors import DataError
+from gcd_train.latent_cache import CacheIdentity, ClipPlan, EncoderChoice, Encoders, MomentPictures
+from gcd_train.latent_cache.encoders import load_encoders
+
+HEIGHT, WIDTH, FRAMES, CLIP = 32, 48, 7, 3
+PLAN = ClipPlan(clip_frames=CLIP)
+CHOICE = EncoderChoice(weights="random:driving", device="cpu", batch=8)
+
+
+@dataclass(frozen=True)
+class FakePictures:
+    """Flat colours that say scene, frame and position. broken: (scene, frame) that cannot be read."""
+
+    scenes: tuple[str, ...] = tuple(f"scene_{number:06d}" for number in range(3))
+    broken: frozenset[tuple[str, int]] = frozenset()
+    origin: str = "fake"
+    semantic: bool = False
+    fps: float = 10.0
+
+    def frames(self, scene: str, /) -> int:
+        return FRAMES
+
+    def moment(self, scene: str, time: int, positions: tuple[int, ...], /) -> MomentPictures:
+        if (scene, time) in self.broken:
+            raise DataError(f"{scene}/rgb/yaw-0/{time}.png is cut")
+        shade = 20 * self.scenes.index(scene) + 10 * time
+        return MomentPictures(
+            source=_picture(shade, 0), targets=np.stack([_picture(shade, 1 + position) for position in positions])
+        )
+
+
+def _picture(shade: int, hue: int) -> np.ndarray:
+    picture = np.full((HEIGHT, WIDTH, 3), shade, np.uint8)
+    picture[:, : WIDTH // 2, 1] = 30 * hue
+    return picture
+
+
+def tiny_encoders() -> Encoders:
+    return load_encoders(CHOICE)
+
+
+def tiny_identity(**changes: object) -> CacheIdentity:
+    told: dict[str, object] = {
+        "encoders": tiny_encoders().digest,
+        "dtype": "float32",
+        "pictures": "fake",
+        "fps": 10.0,
+        "plan": PLAN,
+        "copies": 2,
+        "augmentation": 0.02,
+        "moments": "both",
+        "seed": 5,
+        "height": HEIGHT,
+        "width": WIDTH,
+        "scale": 0.18215,
+    }
+    return CacheIdentity(**(told | changes))  # pyright: ignore[reportArgumentType]

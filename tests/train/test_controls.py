@@ -1,0 +1,189 @@
+"""Splits, scene lists and control lists, tiny ones and, where they lie beside the clone, the published ones."""
+
+import json
+import logging
+from pathlib import Path
+
+import pytest
+
+from gcd_train.datasets.controls import read_controls
+from gcd_train.datasets.skips import FileFault, Skips
+from gcd_train.datasets.splits import Part, kubric_split, present, read_scene_list, read_split
+from gcd_train.errors import DataError
+
+OFFICIAL = Path(__file__).parents[2].parent / "shared" / "spec" / "official"
+needs_official = pytest.mark.skipif(
+    not OFFICIAL.is_dir(), reason="needs the published lists in ../shared/spec/official beside the clone"
+)
+
+
+def test_every_kubric_scene_is_in_one_part() -> None:
+    scenes = [f"scn{number:05d}" for number in range(3000)]
+    parts: list[Part] = ["train", "val", "test"]
+    split = [kubric_split(scenes, part) for part in parts]
+    assert [len(part) for part in split] == [2800, 100, 100]
+    assert sorted(scene for part in split for scene in part) == scenes
+    assert split[2][0] == "scn02900"
+
+
+def test_an_unknown_part_is_refused() -> None:
+    with pytest.raises(DataError, match="train, val and test, got 'dev'"):
+        kubric_split(["scn00000"], "dev")  # pyright: ignore[reportArgumentType]
+
+
+def test_a_split_file_is_read_by_base_name(tmp_path: Path) -> None:
+    path = tmp_path / "split.json"
+    path.write_text(json.dumps({"seed": 1, "train": ["data/scene_000001"], "val": [], "test": ["scene_000003"]}))
+    assert read_split(path, "train") == ("scene_000001",)
+    assert read_split(path, "val") == ()
+
+
+@pytest.mark.parametrize("content", ["{", '{"train": []}', '{"train": [1], "val": [], "test": []}'])
+def test_a_damaged_split_file_is_named(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "split.json"
+    path.write_text(content)
+    with pytest.raises(DataError, match=r"split\.json is no split file"):
+        read_split(path, "train")
+    with pytest.raises(DataError, match=r"gone\.json is no split file"):
+        read_split(tmp_path / "gone.json", "train")
+
+
+def test_a_scene_in_two_parts_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "split.json"
+    path.write_text(json.dumps({"train": ["scene_000001"], "val": ["x/scene_000001"], "test": []}))
+    with pytest.raises(DataError, match="1 scenes in more than one part, first: scene_000001"):
+        read_split(path, "train")
+
+
+def test_a_list_is_stripped_of_comments_and_counts_what_it_leaves_out(tmp_path: Path) -> None:
+    path = tmp_path / "list.txt"
+    path.write_text(
+        "\n# a comment, invalid or not\n/data/scene_000048\n  data/test/scene_000072/  # good\n"
+        "/d/scene_000452  # invalid\n# /d/scene_000453 # invalid\nREADME\n/d/scene_000048\n# /d/scene_000777\n"
+    )
+    skips = Skips()
+    listed = read_scene_list(path, skips)
+    assert listed.scenes == ("scene_000048", "scene_000072")
+    assert listed.left_out == skips.total == 4
+    told = "\n".join(skips.lines())
+    assert f"scene_000452: {path} line 5: is marked invalid" in told
+    assert f"scene_000453: {path} line 6: is marked invalid" in told
+    assert f"README: {path} line 7: is no scene name" in told
+    assert f"scene_000048: {path} line 8: stands there twice" in told
+
+
+def test_a_list_of_nothing_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "list.txt").write_text("# nothing\n")
+    with pytest.raises(DataError, match="lists no scene"):
+        read_scene_list(tmp_path / "list.txt", Skips())
+    with pytest.raises(DataError, match="is no list of scenes"):
+        read_scene_list(tmp_path / "gone.txt", Skips())
+
+
+def test_scenes_that_are_not_there_are_counted() -> None:
+    skips = Skips()
+    assert present(["b", "gone", "a"], ["a", "b"], skips, "list.txt") == ("b", "a")
+    assert skips.scenes == {"gone": 1}
+
+
+def test_kubric_controls_say_cameras_and_driving_ones_do_not(tmp_path: Path) -> None:
+    path = tmp_path / "controls.json"
+    sample = {"frame_start": 2, "frame_skip": 3, "spherical_start": [15, 5, 15], "spherical_end": [100, 20.5, 14]}
+    path.write_text(json.dumps({"test/scn02900": {"sample_01": sample | {"note": 1}, "sample_00": sample}}))
+    first, second = read_controls(path)["scn02900"]
+    assert (first.name, second.name) == ("sample_00", "sample_01")
+    assert first.start is not None
+    assert first.goal is not None
+    assert (first.start.azimuth_deg, first.goal.elevation_deg, first.goal.radius_m) == (15.0, 20.5, 14.0)
+    assert first.frame_numbers(3) == (2, 5, 8)
+    assert first.fps(24.0) == 8.0
+
+
+@pytest.mark.parametrize(
+    ("sample", "match"),
+    [
+        ({"frame_start": -1, "frame_skip": 1}, "is no control list"),
+        ({"frame_start": 0, "frame_skip": 0}, "is no control list"),
+        ({"frame_start": 0}, "is no control list"),
+        ({"frame_start": 0, "frame_skip": 1, "spherical_start": [0, 0, 1]}, "a, s has only one of"),
+        (
+            {"frame_start": 0, "frame_skip": 1, "spherical_start": [0, 0, 0], "spherical_end": [0, 0, 1]},
+            "a, s asks for a camera that cannot be",
+        ),
+    ],
+)
+def test_a_damaged_control_list_is_named(tmp_path: Path, sample: dict[str, object], match: str) -> None:
+    path = tmp_path / "controls.json"
+    path.write_text(json.dumps({"a": {"s": sample}}))
+    with pytest.raises(DataError, match=rf"controls\.json.*{match}"):
+        read_controls(path)
+
+
+def test_an_empty_control_list_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "controls.json").write_text("{}")
+    with pytest.raises(DataError, match="lists no scene"):
+        read_controls(tmp_path / "controls.json")
+
+
+def test_skips_are_counted_logged_once_and_merged(caplog: pytest.LogCaptureFixture) -> None:
+    skips, other = Skips(), Skips()
+    with caplog.at_level(logging.WARNING):
+        for _ in range(3):
+            skips.add("scene_a", "a.png", "is missing")
+        other.extend([skips.add("scene_b", "b.png", "is damaged")])
+    assert (skips.total, other.total) == (4, 1)
+    assert skips.scenes == {"scene_a": 3, "scene_b": 1}
+    assert [record.getMessage() for record in caplog.records].count("left out scene_a: a.png is missing") == 1
+    assert skips.lines(most=1) == [
+        "left out 4 times, 2 distinct faults in 2 scenes:",
+        "  3 x scene_a: a.png is missing",
+        "  and 1 more",
+    ]
+    assert Skips().lines() == []
+
+
+def test_a_fault_survives_the_way_between_processes() -> None:
+    import pickle
+
+    fault = pickle.loads(pickle.dumps(FileFault(Path("a.png"), "is missing")))
+    assert (str(fault), fault.path, fault.reason) == ("a.png is missing", Path("a.png"), "is missing")
+
+
+@needs_official
+def test_the_published_split_has_its_published_sizes() -> None:
+    path = OFFICIAL / "pardom_datasplit.json"
+    parts: list[Part] = ["train", "val", "test"]
+    assert [len(read_split(path, part)) for part in parts] == [1411, 61, 61]
+
+
+@needs_official
+@pytest.mark.parametrize(
+    ("name", "scenes", "left_out"),
+    [
+        ("kubric_test20.txt", 20, 0),
+        ("kubric_test50.txt", 50, 0),
+        ("kubric_test100.txt", 100, 0),
+        ("pardom_test20.txt", 20, 1),
+        ("pardom_test61.txt", 60, 1),
+    ],
+)
+def test_the_published_lists_have_their_usable_scenes(name: str, scenes: int, left_out: int) -> None:
+    skips = Skips()
+    listed = read_scene_list(OFFICIAL / name, skips)
+    assert (len(listed.scenes), listed.left_out, skips.total) == (scenes, left_out, left_out)
+
+
+@needs_official
+def test_the_published_driving_tests_are_of_the_test_split() -> None:
+    listed = read_scene_list(OFFICIAL / "pardom_test61.txt", Skips()).scenes
+    assert set(listed) < set(read_split(OFFICIAL / "pardom_datasplit.json", "test"))
+
+
+@needs_official
+def test_the_published_controls_fit_the_clips_they_are_for() -> None:
+    controls = read_controls(OFFICIAL / "pardom_valtest_controls.json")
+    assert len(controls) == 2150
+    assert all(len(samples) == 8 for samples in controls.values())
+    every = [control for samples in controls.values() for control in samples]
+    assert max(control.frame_numbers(14)[-1] for control in every) == 48  # the last frame is never reached
+    assert {control.fps(10.0) for control in every} == {5.0, 10.0}

@@ -1,0 +1,286 @@
+"""A whole drive through the grown driving world: the rig, and what holds at every time step, before it is drawn."""
+
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from headless import needs_egl
+from numpy.typing import NDArray
+
+from gcd_model.geometry import driving_trajectory
+from gcd_train.errors import DataError
+from gcd_train.scenes.description import Part, Scene
+from gcd_train.scenes.driving import FPS, ONTOLOGY, class_ids, driving_drive, vehicle_from_camera
+from gcd_train.scenes.driving.fleet import STYLES, Lamps, grown_bus
+from gcd_train.scenes.driving.flow import Crowd, random_drive
+from gcd_train.scenes.driving.grown import GrownWorld, grown_world
+from gcd_train.scenes.driving.roadside import Place, Plot
+from gcd_train.scenes.driving.street import random_street
+from gcd_train.scenes.driving.weather import WEATHERS, random_weather
+from gcd_train.scenes.labels import Label
+from gcd_train.scenes.renderer import Renderer
+from gcd_train.scenes.world_sheet import Look, write_world_sheet
+
+SEEDS = (1, 6, 11)
+FRAMES = 50
+VEHICLES = (
+    Label.CAR, Label.TRUCK, Label.BUS, Label.OWN_CAR, Label.MOTORCYCLIST, Label.CYCLIST, Label.MOTORCYCLE, Label.BICYCLE
+)  # fmt: skip
+PUBLISHED = {
+    "Bicyclist": (64, 64, 64), "Motorcyclist": (128, 128, 128), "Pedestrian": (220, 20, 60), "Bus": (0, 60, 100),
+    "Car": (0, 0, 142), "Bicycle": (119, 11, 32), "Motorcycle": (0, 0, 230), "OwnCar(EgoCar)": (128, 230, 128),
+    "Truck": (0, 0, 70),
+}  # fmt: skip
+
+
+@cache
+def drive(seed: int) -> Scene:
+    return driving_drive(seed)
+
+
+@cache
+def world(seed: int) -> GrownWorld:
+    return grown_world(seed, FRAMES)
+
+
+def test_the_rig_has_the_cameras_and_the_two_poses_of_the_paper() -> None:
+    rig = vehicle_from_camera()
+    assert set(rig) == {f"camera{i}" for i in range(16)} | {"yaw-0", "yaw-60", "yaw-neg-60"}
+    np.testing.assert_allclose(rig["yaw-0"][:3, 3], [1.6, 0.0, 1.55])
+    np.testing.assert_allclose(rig["yaw-0"][:3, 2], [1.0, 0.0, 0.0], atol=1e-12)
+    path = driving_trajectory(frames=14, move_time=13).source_from_target.numpy()
+    np.testing.assert_allclose(rig["yaw-0"] @ path[-1], rig["camera0"], atol=1e-9)
+    np.testing.assert_allclose(rig["camera0"][:3, 3], [-8.0, 0.0, 8.0])
+    left, right = rig["yaw-60"], rig["yaw-neg-60"]
+    assert left[1, 2] == pytest.approx(np.sin(np.radians(60)))
+    assert right[1, 2] == pytest.approx(-np.sin(np.radians(60)))
+
+
+def test_all_cameras_are_upright_rigid_and_apart() -> None:
+    poses = np.stack(list(vehicle_from_camera().values()))
+    turns = poses[:, :3, :3]
+    np.testing.assert_allclose(turns @ turns.transpose(0, 2, 1), np.tile(np.eye(3), (19, 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(poses[:, 2, 0], 0.0, atol=1e-9)
+    assert len({tuple(np.round(pose[:3, 2:].ravel(), 3)) for pose in poses}) == 19
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_drive_lasts_five_seconds_and_its_cameras_ride_on_the_vehicle(seed: int) -> None:
+    scene = drive(seed)
+    assert (scene.frames, FPS, scene.hfov_deg) == (50, 10.0, 85.0)
+    vehicle = np.tile(np.eye(4), (50, 1, 1))
+    vehicle[:, :3] = scene.poses[:, 1]
+    for name, pose in vehicle_from_camera().items():
+        np.testing.assert_allclose(scene.cameras[name], vehicle @ pose, atol=1e-4)
+
+
+def test_a_drive_depends_on_its_seed_alone() -> None:
+    first, again, other = (driving_drive(seed, frames=3) for seed in (3, 3, 0))
+    assert first.parts == again.parts
+    assert first.poses.tobytes() == again.poses.tobytes()
+    assert first.facts != other.facts
+
+
+def test_a_shorter_drive_is_not_longer_than_asked() -> None:
+    assert driving_drive(3, frames=2).frames == 2
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_road_users_never_touch(seed: int) -> None:
+    """Judged by OpenCV's intersection of rotated rectangles around the parts that are drawn."""
+    boxes = [_boxes(user.assembly.parts, user.rows) for user in world(seed).users]
+    rows = np.array(boxes)  # [N, T, 5]: x, y, length, width, degrees
+    reach = np.hypot(rows[..., 2], rows[..., 3]) / 2
+    checked = 0
+    for i in range(len(rows)):
+        near = np.hypot(*(rows[i, :, :2] - rows[:i, :, :2]).transpose(2, 0, 1)) < reach[i] + reach[:i]
+        for j, t in np.argwhere(near):
+            kind, _ = cv2.rotatedRectangleIntersection(_rectangle(rows[i, t]), _rectangle(rows[j, t]))
+            assert kind == cv2.INTERSECT_NONE, (i, int(j), int(t))
+            checked += 1
+    assert checked > 0
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_no_camera_is_ever_inside_a_solid(seed: int) -> None:
+    scene = drive(seed)
+    eyes = np.stack([poses[:, :3, 3] for poses in scene.cameras.values()], 1)  # [T, C, 3]
+    by_body: dict[int, list[Part]] = {}
+    for part in scene.parts:
+        if part.label != Label.SKY:
+            by_body.setdefault(part.body, []).append(part)
+    for body, parts in by_body.items():
+        pose = scene.poses[:, body].astype(float)
+        local = np.einsum("tij,tci->tcj", pose[:, :, :3], eyes - pose[:, None, :, 3])
+        assert not _inside(parts, local.reshape(-1, 3)).any(), body
+
+
+def test_the_check_of_cameras_notices_a_wall_across_the_street() -> None:
+    parts = [part for part in drive(1).parts if part.label == Label.BUILDING]
+    eye = np.array([parts[0].centre])
+    assert _inside(parts, eye).any()
+
+
+def test_nothing_is_put_where_a_camera_passes() -> None:
+    street = random_street(np.random.default_rng(3))
+    place = Place(road=street.main, s=0.0, side=1.0, away=40.0)
+    house = place.put([Part(shape="box", centre=(0, 0, 4), size=(8, 8, 8), colour=(1, 1, 1), label=Label.BUILDING)])
+    inside = np.array([house[0].centre])
+    above = inside + np.array([0.0, 0.0, 6.0])
+    assert not Plot(street=street, cameras=inside).put(house)
+    assert Plot(street=street, cameras=above).put(house)
+
+
+def test_no_vehicle_drives_through_a_camera() -> None:
+    random = np.random.default_rng(3)
+    street = random_street(random)
+    way = random_drive(street, 5, random)
+    bus = grown_bus(random, Lamps(), near=False)
+    rows = np.array([[t, 100.0, 0.0, 0.0] for t in range(5)], np.float32)
+    for height, kept in ((2.0, False), (6.0, True)):
+        cameras = np.tile([4.0, 100.0, height], (5, 1, 1))
+        crowd = Crowd(street=street, drive=way, obstacles=np.zeros((0, 5)), cameras=cameras, camera_room_m=0.5)
+        assert crowd.add(bus, rows) is kept
+        assert not crowd.add(bus, rows + np.array([1, 0, 0, 0], np.float32))  # there is one, or the camera still is
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_houses_keep_off_the_road(seed: int) -> None:
+    scene = drive(seed)
+    roads = np.concatenate([sheet.corners for sheet in scene.sheets if sheet.label == Label.ROAD])[..., :2].mean(1)
+    for house in (part for part in scene.parts if part.label == Label.BUILDING and part.shape == "box"):
+        cos, sin = np.cos(house.yaw), np.sin(house.yaw)
+        away = roads - house.centre[:2]
+        x, y = away[:, 0] * cos + away[:, 1] * sin, away[:, 1] * cos - away[:, 0] * sin
+        assert not ((np.abs(x) < house.size[0] / 2) & (np.abs(y) < house.size[1] / 2)).any(), house
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_street_reaches_beyond_the_drive(seed: int) -> None:
+    scene = drive(seed)
+    roads = np.concatenate([sheet.corners for sheet in scene.sheets if sheet.label == Label.ROAD])[..., :2].reshape(
+        -1, 2
+    )
+    end = scene.poses[-1, 1]
+    ahead = (roads - end[:2, 3]) @ end[:2, 0]
+    assert ahead.max() > 120.0
+    assert ahead.min() < -100.0
+
+
+def test_instances_are_the_road_users_own() -> None:
+    for seed in SEEDS:
+        labels: dict[int, set[int]] = {}
+        for part in drive(seed).parts:
+            if part.instance:
+                labels.setdefault(part.instance, set()).add(part.label)
+        assert set(labels) == set(range(1, len(labels) + 1))
+        assert all(len(kinds) == 1 for kinds in labels.values())
+        assert labels[1] == {Label.OWN_CAR}
+        assert drive(seed).poses.shape[1] <= 256
+
+
+def test_drives_vary_in_what_there_is() -> None:
+    scenes = [driving_drive(seed, frames=1) for seed in (0, 1, 4, 6, 8)]
+    facts = [scene.facts for scene in scenes]
+    assert len({each["district"] for each in facts}) >= 3
+    assert len({each["weather"] for each in facts}) >= 5
+    assert {each["crossings"] for each in facts} >= {0, 1, 2}
+    assert {each["waits"] for each in facts} == {0, 1}
+    shown = {part.label for scene in scenes for part in scene.parts} | {s.label for each in scenes for s in each.sheets}
+    assert shown == set(Label)
+    assert len(STYLES) >= 8
+
+
+def test_every_weather_occurs_and_its_light_can_be_drawn() -> None:
+    drawn = [random_weather(np.random.default_rng(seed)) for seed in range(200)]
+    assert {weather.kind for weather in drawn} == set(WEATHERS)
+    for weather in drawn:
+        light = weather.light
+        assert np.linalg.norm(light.sun_to) == pytest.approx(1.0)
+        assert light.sun_to[2] > 0
+        assert light.fog_m > 30
+        assert min(*light.sun, *light.sky, *light.ground, *light.horizon, *light.zenith) >= 0
+        assert 0 <= weather.wetness <= 1
+
+
+def test_the_ontology_names_every_label_once_in_colours_of_its_own() -> None:
+    assert sorted(item.label for item in ONTOLOGY) == sorted(Label)
+    assert [item.id for item in ONTOLOGY] == sorted({item.id for item in ONTOLOGY})
+    assert len({item.name for item in ONTOLOGY}) == len(ONTOLOGY)
+    colours = np.array([item.colour for item in ONTOLOGY], float)
+    apart = np.abs(colours[:, None] - colours[None]).mean(-1) + 255 * np.eye(len(colours))
+    assert apart.min() > 2 * 2.55  # or the training's colour masks would take one class for another
+
+
+def test_people_and_vehicles_have_the_published_colours() -> None:
+    colours = {item.name: item.colour for item in ONTOLOGY}
+    assert {name: colours[name] for name in PUBLISHED} == PUBLISHED
+
+
+def test_a_map_of_labels_becomes_a_map_of_class_ids() -> None:
+    labels = np.array([[Label.SKY, Label.CAR], [Label.PERSON, Label.OWN_CAR]], np.uint8)
+    np.testing.assert_array_equal(class_ids(labels), [[29, 5], [22, 20]])
+
+
+@needs_egl
+def test_the_forward_camera_sees_the_road_and_the_top_down_one_its_own_car() -> None:
+    scene = driving_drive(11, frames=1)
+    with Renderer(96, 72, oversample=1) as renderer:
+        views = renderer.render(scene)
+    assert Label.OWN_CAR not in views["yaw-0"][0].classes
+    assert {Label.ROAD, Label.SKY} <= set(np.unique(views["yaw-0"][0].classes).tolist())
+    assert {Label.ROAD, Label.OWN_CAR} <= set(np.unique(views["camera0"][0].classes).tolist())
+    assert all(view[0].depth.max() > 5.0 for view in views.values())
+
+
+@needs_egl
+def test_a_sheet_shows_a_row_for_every_scene(tmp_path: Path) -> None:
+    palette = (np.arange(768) % 32 * 8 + 4).astype(np.uint8).reshape(256, 3)  # colours the sheet keeps as they are
+    out = tmp_path / "docs" / "sheet.png"
+    looks = (Look(camera="yaw-0", step=0), Look(camera="camera0", step=0, shown="classes"))
+    write_world_sheet(out, _short_drive, (3, 0), looks, width=48, height=36, palette=palette)
+    picture = cv2.imread(str(out))
+    assert picture is not None
+    assert picture.shape == (75, 99, 3)
+    shown = {tuple(row) for row in picture[:36, 51:, ::-1].reshape(-1, 3).tolist()}
+    assert shown <= {tuple(row) for row in palette.tolist()}
+    with pytest.raises(DataError, match="no camera 'yaw-9'"):
+        write_world_sheet(out, _short_drive, (3,), (Look(camera="yaw-9", step=0),), width=48, height=36)
+
+
+def _short_drive(seed: int) -> Scene:
+    return driving_drive(seed, frames=1)
+
+
+def _inside(parts: list[Part], points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether points [N, 3] of a body's frame are in its parts' boxes, [N, P]."""
+    away = points[:, None] - np.array([part.centre for part in parts])
+    yaw = np.array([part.yaw for part in parts])
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    x, y = away[..., 0] * cos + away[..., 1] * sin, away[..., 1] * cos - away[..., 0] * sin
+    half = np.abs([part.size for part in parts]) / 2 + 0.05
+    return np.all(np.abs(np.stack([x, y, away[..., 2]], -1)) < half, axis=-1)
+
+
+def _boxes(parts: tuple[Part, ...], rows: NDArray[np.float32]) -> NDArray[np.float64]:
+    """The rectangle around parts as drawn, at every time step [T, 5]: x, y, length, width, degrees."""
+    corners = np.concatenate([_corners(part) for part in parts])
+    low, high = corners.min(0), corners.max(0)
+    middle, size = (low + high) / 2, high - low
+    cos, sin = np.cos(rows[:, 3]), np.sin(rows[:, 3])
+    x = rows[:, 0] + cos * middle[0] - sin * middle[1]
+    y = rows[:, 1] + sin * middle[0] + cos * middle[1]
+    return np.stack([x, y, 0 * x + size[0], 0 * x + size[1], np.degrees(rows[:, 3])], -1).astype(float)
+
+
+def _corners(part: Part) -> NDArray[np.float64]:
+    half = np.array([(a, b) for a in (-0.5, 0.5) for b in (-0.5, 0.5)]) * part.size[:2]
+    cos, sin = np.cos(part.yaw), np.sin(part.yaw)
+    return half @ np.array([[cos, sin], [-sin, cos]]) + part.centre[:2]
+
+
+def _rectangle(row: NDArray[np.float64]) -> tuple[tuple[float, float], tuple[float, float], float]:
+    x, y, length, width, degrees = (float(value) for value in row)
+    return (x, y), (length, width), degrees

@@ -1,0 +1,319 @@
+"""Scenes on disk: whole or not there, continued, checked; and the command that makes them."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+from box_world import box_scene, box_world, odd_box_scene
+from headless import needs_egl
+from typer.testing import CliRunner
+
+from gcd_train.cli.main import app
+from gcd_train.errors import DataError, RecipeError, RunError
+from gcd_train.layouts import kubric4d_names
+from gcd_train.layouts.manifest import GEOMETRY, MANIFEST, read_manifest, verify
+from gcd_train.layouts.scene_files import SceneFiles
+from gcd_train.layouts.scene_folder import new_scene, remove_leftovers
+from gcd_train.layouts.scene_run import GIVE_UP_AFTER, generate_scenes
+from gcd_train.layouts.scene_writer import SceneFormat, write_scene
+from gcd_train.scenes.frozen import FrozenScene
+from gcd_train.scenes.renderer import Renderer
+
+HERE = Path(__file__).parent
+FORM = SceneFormat(width=48, height=32, frames=2, oversample=1)
+
+
+def inside(root: Path) -> list[str]:
+    return sorted(os.listdir(root))
+
+
+class TestSceneFolder:
+    def test_a_scene_appears_at_the_end(self, tmp_path: Path) -> None:
+        root = tmp_path / "new" / "data"
+        with new_scene(root, "scn00001") as folder:
+            (folder / "a").write_bytes(b"1")
+            assert folder.name == "scn00001"
+            assert not (root / "scn00001").exists()
+            assert all(name.startswith(".") for name in inside(root))
+        assert inside(root) == ["scn00001"]
+        assert (root / "scn00001" / "a").read_bytes() == b"1"
+
+    @pytest.mark.parametrize("error", [DataError, SystemExit, KeyboardInterrupt])
+    def test_a_failure_leaves_nothing(self, tmp_path: Path, error: type[BaseException]) -> None:
+        def broken() -> None:
+            with new_scene(tmp_path, "scn00001") as folder:
+                (folder / "a").write_bytes(b"1")
+                raise error("broken")
+
+        with pytest.raises(error, match="broken"):
+            broken()
+        assert inside(tmp_path) == []
+
+    def test_the_first_of_two_stays(self, tmp_path: Path) -> None:
+        with new_scene(tmp_path, "scn00001") as slow:
+            (slow / "a").write_bytes(b"slow")
+            with new_scene(tmp_path, "scn00001") as fast:
+                (fast / "a").write_bytes(b"fast")
+        assert inside(tmp_path) == ["scn00001"]
+        assert (tmp_path / "scn00001" / "a").read_bytes() == b"fast"
+
+    def test_a_file_in_the_way_is_named(self, tmp_path: Path) -> None:
+        (tmp_path / "scn00001").write_text("notes")
+        with pytest.raises(RunError, match=r"scn00001 is in the way"), new_scene(tmp_path, "scn00001") as folder:
+            (folder / "a").write_bytes(b"1")
+        assert (tmp_path / "scn00001").read_text() == "notes"
+
+    def test_a_place_that_is_no_folder_is_named(self, tmp_path: Path) -> None:
+        (tmp_path / "data").write_text("notes")
+        with pytest.raises(RunError, match="data cannot be written"), new_scene(tmp_path / "data", "scn00001"):
+            pass
+
+    def test_what_others_are_making_is_no_leftover(self, tmp_path: Path) -> None:
+        with new_scene(tmp_path, "scn00001") as folder:
+            (folder / "a").write_bytes(b"1")
+            assert remove_leftovers(tmp_path) == 0
+        assert inside(tmp_path) == ["scn00001"]
+
+    def test_what_a_killed_process_left_is_removed(self, tmp_path: Path) -> None:
+        code = (
+            "import os, sys; from pathlib import Path; from gcd_train.layouts.scene_folder import new_scene\n"
+            "with new_scene(Path(sys.argv[1]), 'scn00001') as folder:\n"
+            "    (folder / 'a').write_bytes(b'1'); os.kill(os.getpid(), 9)\n"
+        )
+        killed = subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False)
+        assert killed.returncode == -signal.SIGKILL
+        assert len(inside(tmp_path)) == 1
+        assert inside(tmp_path)[0].startswith(".scn00001.")
+        assert remove_leftovers(tmp_path, "scn00002") == 0
+        assert remove_leftovers(tmp_path) == 1
+        assert inside(tmp_path) == []
+
+
+@needs_egl
+class TestWriteScene:
+    def test_a_scene_is_whole_and_knows_its_checksums(self, tmp_path: Path) -> None:
+        made = write_scene(tmp_path, box_world(), FORM, 3)
+        assert made.made
+        assert made.folder == tmp_path / "scn00003"
+        manifest = verify(made.folder)
+        assert (manifest.world, manifest.seed, manifest.layout, manifest.frames) == ("boxes", 3, "kubric4d", 2)
+        assert manifest.cameras == ("view0", "view1")
+        assert manifest.facts == {"seed": 3}
+        files = {path.relative_to(made.folder).as_posix() for path in made.folder.rglob("*") if path.is_file()}
+        assert files == set(manifest.files) | {MANIFEST}
+        assert len(files) == 2 * 2 * 3 + 2 + 2  # views, frames, layers; metadata; geometry and manifest
+        assert made.size == sum((made.folder / name).stat().st_size for name in files)
+
+    def test_pictures_are_those_of_the_renderer(self, tmp_path: Path) -> None:
+        folder = write_scene(tmp_path, box_world(), FORM, 0).folder
+        with Renderer(48, 32, oversample=1) as renderer:
+            drawn = renderer.render(box_scene(0, 2))["view1"][1]
+        rgba = cv2.imread(str(kubric4d_names.frame_path(folder, 1, "rgba", 1)), cv2.IMREAD_UNCHANGED)
+        assert rgba is not None
+        np.testing.assert_array_equal(rgba[..., 2::-1], drawn.rgb)
+        assert {0, 4, 9} == set(np.unique(drawn.instances).tolist()), "the picture shows ground, both boxes"
+
+    def test_the_kept_geometry_draws_the_same_picture(self, tmp_path: Path) -> None:
+        folder = write_scene(tmp_path, box_world(), FORM, 0).folder
+        frozen = FrozenScene.load(folder / GEOMETRY)
+        with Renderer(48, 32, oversample=1) as renderer:
+            first = next(iter(renderer.views(frozen, box_scene(0, 2).cameras)))[2]
+        rgba = cv2.imread(str(kubric4d_names.frame_path(folder, 0, "rgba", 0)), cv2.IMREAD_UNCHANGED)
+        assert rgba is not None
+        np.testing.assert_array_equal(rgba[..., 2::-1], first.rgb)
+
+    def test_a_scene_that_is_there_is_kept(self, tmp_path: Path) -> None:
+        write_scene(tmp_path, box_world(), FORM, 0)
+        before = (tmp_path / "scn00000" / MANIFEST).stat().st_mtime_ns
+        assert not write_scene(tmp_path, box_world(), FORM, 0).made
+        assert (tmp_path / "scn00000" / MANIFEST).stat().st_mtime_ns == before
+
+    def test_a_scene_of_another_kind_is_refused(self, tmp_path: Path) -> None:
+        write_scene(tmp_path, box_world(), FORM, 0)
+        other = SceneFormat(width=48, height=32, frames=2, oversample=1, compact=True)
+        with pytest.raises(DataError, match="with compact False, wanted True; choose another folder"):
+            write_scene(tmp_path, box_world(), other, 0)
+        newer = msgspec.structs.replace(read_manifest(tmp_path / "scn00000"), edition=2)
+        (tmp_path / "scn00000" / MANIFEST).write_bytes(msgspec.json.encode(newer))
+        with pytest.raises(DataError, match="edition 2, wanted 1"):
+            write_scene(tmp_path, box_world(), FORM, 0)
+
+    def test_a_folder_of_something_else_is_left_alone(self, tmp_path: Path) -> None:
+        (tmp_path / "scn00000").mkdir()
+        (tmp_path / "scn00000" / "mine").write_text("precious")
+        with pytest.raises(DataError, match="has no gcd-manifest"):
+            write_scene(tmp_path, box_world(), FORM, 0)
+        assert (tmp_path / "scn00000" / "mine").read_text() == "precious"
+
+    def test_a_changed_file_is_named(self, tmp_path: Path) -> None:
+        folder = write_scene(tmp_path, box_world(), FORM, 0).folder
+        depth = kubric4d_names.frame_path(folder, 1, "depth", 0)
+        depth.write_bytes(depth.read_bytes()[:-1] + b"x")
+        with pytest.raises(DataError, match=r"depth_00000.tiff is not as it was written"):
+            verify(folder)
+        depth.unlink()
+        with pytest.raises(DataError, match=r"depth_00000.tiff cannot be read"):
+            verify(folder)
+        (folder / MANIFEST).write_text("{")
+        with pytest.raises(DataError, match=r"gcd-manifest.json cannot be read"):
+            verify(folder)
+
+    def test_a_full_disk_leaves_what_was_finished(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        write_scene(tmp_path, box_world(), FORM, 0)
+        whole = SceneFiles.write
+
+        def full(self: SceneFiles, path: Path, data: bytes) -> None:
+            if len(self.checksums) == 5:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(data[:10])
+                raise OSError(28, "No space left on device", str(path))
+            whole(self, path, data)
+
+        monkeypatch.setattr(SceneFiles, "write", full)
+        accounts = [
+            (run.written, run.there, dict(run.failures))
+            for run in generate_scenes(tmp_path, box_world(), FORM, range(2))
+        ]
+        assert accounts[0] == (0, 1, {})
+        assert accounts[1][:2] == (0, 1)
+        assert "No space left on device" in accounts[1][2][1]
+        assert inside(tmp_path) == ["scn00000"]
+        verify(tmp_path / "scn00000")
+
+    def test_a_file_size_limit_leaves_nothing_half_done(self, tmp_path: Path) -> None:
+        """The kernel refuses the sixth kibibyte of any file: what a quota or a full disk does, for real."""
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        try:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (5120, before[1]))
+            *_, last = generate_scenes(tmp_path, box_world(), FORM, range(1))
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+            signal.signal(signal.SIGXFSZ, handler)
+        assert "File too large" in last.failures[0]
+        assert inside(tmp_path) == []
+
+
+@needs_egl
+class TestRuns:
+    def test_failures_are_counted_and_end_nothing(self, tmp_path: Path) -> None:
+        for run in generate_scenes(tmp_path, box_world(odd_box_scene), FORM, range(4)):
+            last = run
+        assert (last.written, last.there, last.done, last.gave_up) == (2, 0, 4, False)
+        assert last.failures == {1: "seed 1 is odd", 3: "seed 3 is odd"}
+        assert last.exit_code == DataError.exit_code
+        assert inside(tmp_path) == ["scn00000", "scn00002"]
+        assert "2 written" in last.lines()[0]
+        assert last.lines()[1] == "  seed 1: seed 1 is odd"
+
+    def test_a_run_in_which_everything_fails_stops(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        def full(self: SceneFiles, path: Path, data: bytes) -> None:
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(SceneFiles, "write", full)
+        *_, last = generate_scenes(tmp_path, box_world(), FORM, range(1000))
+        assert (last.done, last.gave_up) == (GIVE_UP_AFTER, True)
+        assert "gave up" in last.lines()[-1]
+
+    @pytest.mark.slow
+    def test_two_workers_make_what_one_makes(self, tmp_path: Path) -> None:
+        for name, workers in (("one", 1), ("two", 2)):
+            list(generate_scenes(tmp_path / name, box_world(), FORM, range(3), workers=workers))
+        for scene in ("scn00000", "scn00001", "scn00002"):
+            one, two = (verify(tmp_path / name / scene) for name in ("one", "two"))
+            assert one == two
+
+    def test_a_killed_run_leaves_no_half_scene_and_goes_on(self, tmp_path: Path) -> None:
+        """The process is killed while it is between the first and the last file of its second scene."""
+        code = (
+            "import os, sys; sys.path.insert(0, sys.argv[1]); from pathlib import Path\n"
+            "from box_world import box_world\n"
+            "from gcd_train.layouts.scene_files import SceneFiles\n"
+            "from gcd_train.layouts.scene_run import generate_scenes\n"
+            "from gcd_train.layouts.scene_writer import SceneFormat\n"
+            "whole = SceneFiles.write\n"
+            "def write(self, path, data):\n"
+            "    whole(self, path, data)\n"
+            "    if self.folder.name == 'scn00001' and len(self.checksums) == 7: os.kill(os.getpid(), 9)\n"
+            "SceneFiles.write = write\n"
+            "form = SceneFormat(width=48, height=32, frames=2, oversample=1)\n"
+            "list(generate_scenes(Path(sys.argv[2]), box_world(), form, range(3)))\n"
+        )
+        killed = subprocess.run([sys.executable, "-c", code, str(HERE), str(tmp_path)], check=False, timeout=100)
+        assert killed.returncode == -signal.SIGKILL
+        assert [name for name in inside(tmp_path) if not name.startswith(".")] == ["scn00000"]
+        assert len(inside(tmp_path)) == 2
+        *_, last = generate_scenes(tmp_path, box_world(), FORM, range(3))
+        assert (last.written, last.there) == (2, 1)
+        assert inside(tmp_path) == ["scn00000", "scn00001", "scn00002"]
+        for name in inside(tmp_path):
+            verify(tmp_path / name)
+
+
+SMALL = ["--width", "48", "--height", "32", "--frames", "2", "--oversample", "1", "--workers", "1"]
+
+
+@needs_egl
+class TestCommand:
+    def test_driving_scenes_with_a_contact_sheet(self, tmp_path: Path) -> None:
+        sheet = tmp_path / "sheet.png"
+        line = [
+            "generate",
+            "driving",
+            str(tmp_path / "data"),
+            "--scenes",
+            "1",
+            "--compact",
+            "--first-seed",
+            "5",
+            *SMALL,
+        ]
+        made = CliRunner().invoke(app, [*line, "--contact-sheet", str(sheet)])
+        assert made.exit_code == 0, made.output
+        assert "1 written" in made.output
+        assert inside(tmp_path / "data") == ["scene_000005"]
+        manifest = verify(tmp_path / "data" / "scene_000005")
+        assert len(manifest.cameras) == 19
+        assert len(manifest.world_from_vehicle or ()) == 2
+        assert cv2.imread(str(sheet)).shape[1] == 7 * 320  # pyright: ignore[reportOptionalMemberAccess]
+        again = CliRunner().invoke(app, line)
+        assert again.exit_code == 0
+        assert "0 written; 1 there already; 0 failed" in again.output
+        other = CliRunner().invoke(app, ["generate", "driving", str(tmp_path / "data"), "--first-seed", "5", *SMALL])
+        assert other.exit_code == DataError.exit_code
+        assert "seed 5" in other.output
+        assert "choose another folder" in other.output
+
+    @pytest.mark.parametrize("world", ["drop", "tabletop"])
+    def test_scenes_on_a_stage(self, tmp_path: Path, world: str) -> None:
+        pytest.importorskip("mujoco", reason="needs the extra `scenes`")
+        made = CliRunner().invoke(app, ["generate", world, str(tmp_path), "--scenes", "1", "--compact", *SMALL])
+        assert made.exit_code == 0, made.output
+        manifest = verify(tmp_path / "scn00000")
+        assert (manifest.world, len(manifest.cameras)) == (world, 16)
+        told = msgspec.json.decode(kubric4d_names.metadata_path(tmp_path / "scn00000", 4).read_bytes())
+        assert len(told["instances"]) == told["scene"]["num_instances"] > 0
+        assert "bboxes_3d" not in told["instances"][0]
+
+    @pytest.mark.parametrize(
+        ("options", "said"),
+        [
+            (["data", "--out", "data"], "give one folder"),
+            ([], "give one folder"),
+            (["data", "--clips", "2", "--scenes", "2"], "give one"),
+            (["data", "--pairs", "--compact"], "give one"),
+        ],
+    )
+    def test_contradictions_are_refused(self, tmp_path: Path, options: list[str], said: str) -> None:
+        options = [str(tmp_path / "data") if option == "data" else option for option in options]
+        made = CliRunner().invoke(app, ["generate", "driving", *options])
+        assert made.exit_code == RecipeError.exit_code
+        assert said in made.output
+        assert inside(tmp_path) == []

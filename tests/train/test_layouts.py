@@ -1,0 +1,325 @@
+"""Files of both published layouts: names, numbers worked out by hand, and what other programs will find in them."""
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from box_world import HFOV_DEG, box_scene
+
+from gcd_model.geometry import Intrinsics, sphere_poses
+from gcd_train.errors import DataError
+from gcd_train.layouts import encodings, kubric4d_names, parallel_domain4d_names
+from gcd_train.layouts.camera_facts import blender_pose, project, quaternions, ray_lengths
+from gcd_train.layouts.depth_code import FAR_M, NEAR_M, SKY_M, decode_depth, encode_depth, with_sky
+from gcd_train.layouts.instance_tracks import InstanceTracks
+from gcd_train.layouts.kubric4d import Kubric4DWriter, distance_of, segment_ids
+from gcd_train.layouts.kubric4d_metadata import camera_metadata
+from gcd_train.layouts.parallel_domain4d import ParallelDomain4DWriter, calibration, ontology
+from gcd_train.layouts.scene_files import SceneFiles
+from gcd_train.scenes.description import rotations
+from gcd_train.scenes.driving import ONTOLOGY
+from gcd_train.scenes.labels import Label
+from gcd_train.scenes.renderer import Rendering
+
+LENS = Intrinsics.from_hfov(HFOV_DEG, 48, 32)
+
+
+def drawing(instance: int = 9, depth: float = 10.0) -> Rendering:
+    """A picture with an instance in rows 4..7 and columns 6..17, and sky in the first two rows."""
+    instances = np.zeros((32, 48), np.uint8)
+    instances[4:8, 6:18] = instance
+    metres = np.full((32, 48), depth, np.float32)
+    metres[:2] = 0
+    rows, columns = np.mgrid[:32, :48]
+    rgb = np.stack([7 * rows, 5 * columns, 200 - 3 * rows], -1).astype(np.uint8)
+    return Rendering(rgb=rgb, depth=metres, classes=np.full((32, 48), Label.CAR, np.uint8), instances=instances)
+
+
+def picture(path: Path) -> Any:
+    return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+
+
+class TestNames:
+    def test_kubric4d_as_published(self) -> None:
+        scene = Path("data") / kubric4d_names.scene_name(42)
+        assert str(kubric4d_names.metadata_path(scene, 3)) == "data/scn00042/scn00042_p0_v3.json"
+        path = kubric4d_names.frame_path(scene, 15, "depth", 7)
+        assert str(path) == "data/scn00042/frames_p0_v15/depth_00007.tiff"
+        assert kubric4d_names.frame_path(scene, 0, "rgba", 59).name == "rgba_00059.png"
+        assert kubric4d_names.frame_path(scene, 0, "rgba", 59, compact=True).name == "rgba_00059.webp"
+        assert kubric4d_names.frame_path(scene, 0, "segmentation", 0).name == "segmentation_00000.png"
+
+    def test_parallel_domain4d_as_published(self) -> None:
+        names = parallel_domain4d_names
+        scene = Path("data") / names.scene_name(42)
+        path = names.frame_path(scene, "yaw-0", "rgb", 7)
+        assert str(path) == "data/scene_000042/rgb/yaw-0/000000000000000075.png"
+        assert names.frame_path(scene, "camera3", "depth", 0).name == "000000000000000005.npz"
+        assert names.frame_path(scene, "camera3", "depth", 0, compact=True).suffix == ".png"
+        assert names.CAMERAS[:4] == ("camera0", "camera1", "camera10", "camera11")
+        assert names.CAMERAS[15:] == ("camera9", "yaw-0", "yaw-60", "yaw-neg-60")
+        assert len(names.CAMERAS) == 19
+
+    @pytest.mark.parametrize("number", [0, 42, 2999, 1_000_000])
+    def test_numbers_survive_the_round_trip(self, number: int) -> None:
+        for names in (kubric4d_names, parallel_domain4d_names):
+            assert names.scene_number(names.scene_name(number)) == number
+        assert parallel_domain4d_names.frame_time(parallel_domain4d_names.frame_stem(number)) == number
+
+    @pytest.mark.parametrize("name", ["scn1", "scene_12", ".scn00001.partial", "scn00001x", "test"])
+    def test_other_folders_are_no_scenes(self, name: str) -> None:
+        assert kubric4d_names.scene_number(name) is None
+        assert parallel_domain4d_names.scene_number(name) is None
+
+    def test_other_files_are_no_frames(self) -> None:
+        assert parallel_domain4d_names.frame_time("000000000000000074") is None
+        assert parallel_domain4d_names.frame_time("75") is None
+
+
+class TestDepthCode:
+    def test_the_error_is_half_a_thousandth_everywhere(self) -> None:
+        metres = np.geomspace(NEAR_M, FAR_M, 4001).astype(np.float32)
+        np.testing.assert_allclose(decode_depth(encode_depth(metres)), metres, rtol=5.1e-4)
+
+    def test_codes_by_hand(self) -> None:
+        metres = np.array([0.0, -1.0, np.nan, 0.01, 0.05, 0.05 * np.e, SKY_M, 1e9, np.inf], np.float32)
+        assert encode_depth(metres).tolist() == [0, 0, 0, 1, 1, 1001, 13306, 13306, 13306]
+        assert decode_depth(np.array([0, 1, 13306, 65535], np.uint16)).tolist() == [
+            0.0,
+            np.float32(0.05),
+            30000.0,
+            30000.0,
+        ]
+
+    def test_further_is_never_nearer(self) -> None:
+        metres = decode_depth(np.arange(2**16).astype(np.uint16))
+        assert (np.diff(metres) >= 0).all()
+        assert (np.diff(metres[:13306]) > 0).all()
+
+    def test_the_sky_is_far(self) -> None:
+        assert with_sky(np.array([0.0, 2.5], np.float32)).tolist() == [30000.0, 2.5]
+
+
+class TestCameraFacts:
+    def test_quaternions_survive_the_round_trip(self) -> None:
+        random = np.random.default_rng(0)
+        wanted = random.normal(size=(500, 4))
+        wanted[:4] = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+        wanted /= np.linalg.norm(wanted, axis=-1, keepdims=True)
+        came = quaternions(rotations(wanted))
+        np.testing.assert_allclose(np.abs((came * wanted).sum(-1)), 1, atol=1e-12)
+        np.testing.assert_allclose(rotations(came), rotations(wanted), atol=1e-12)
+        assert (came[:, 0] >= 0).all()
+
+    def test_a_turn_about_the_vertical_by_hand(self) -> None:
+        quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+        np.testing.assert_allclose(quaternions(quarter), [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], atol=1e-12)
+
+    def test_distance_and_depth_by_hand(self) -> None:
+        """Focal length 48: the first pixel's middle lies 23.5 to the left and 15.5 above the axis."""
+        rays = ray_lengths(LENS)
+        assert rays[0, 0] == pytest.approx(np.sqrt(1 + (23.5 / 48) ** 2 + (15.5 / 48) ** 2))
+        assert rays[16, 24] == pytest.approx(np.sqrt(1 + 2 * (0.5 / 48) ** 2))
+        distance = distance_of(np.full((32, 48), 4.0, np.float32), rays)
+        assert distance[0, 0] == pytest.approx(4 * 1.159296, rel=1e-5)
+        assert distance_of(np.zeros((32, 48), np.float32), rays).max() == SKY_M == 30000
+
+    def test_a_published_view_by_hand(self) -> None:
+        """Azimuth 15, elevation 5, radius 15: Blender's camera has its y axis up and looks along -z."""
+        pose = sphere_poses(torch.tensor([[15.0, 5.0, 15.0]], dtype=torch.float64)).numpy()
+        told = camera_metadata(pose, Intrinsics.from_hfov(HFOV_DEG, 576, 384))
+        np.testing.assert_allclose(told["positions"][0], [14.433753, 3.867512, 2.307336], atol=1e-6)
+        axes = rotations(np.array(told["quaternions"]))[0]
+        np.testing.assert_allclose(axes[:, 0], [-0.258819, 0.965926, 0], atol=1e-6)
+        np.testing.assert_allclose(axes[:, 1], [-0.084186, -0.022558, 0.996195], atol=1e-6)
+        np.testing.assert_allclose(axes[:, 2], [0.96225, 0.257834, 0.087156], atol=1e-6)
+        np.testing.assert_allclose(np.array(told["R"])[:3, :3], axes, atol=1e-9)
+        np.testing.assert_allclose(told["K"], [[1, 0, -0.5], [0, -1.5, -0.5], [0, 0, -1]], atol=1e-12)
+        assert told["focal_length"] == pytest.approx(32)
+        assert told["field_of_view"] == pytest.approx(0.9272952)
+
+    def test_the_stored_matrix_projects_as_the_lens_does(self) -> None:
+        pose = sphere_poses(torch.tensor([[40.0, 30.0, 12.0]], dtype=torch.float64)).numpy()
+        told = camera_metadata(pose, LENS)
+        point = np.array([[[1.0, -2.0, 0.5]]])
+        local = np.linalg.inv(np.array(told["R"])) @ [1.0, -2.0, 0.5, 1.0]
+        at = np.array(told["K"]) @ local[:3]
+        seen = project(point, pose, LENS)
+        np.testing.assert_allclose(seen.at[0, 0], at[:2] / at[2], atol=1e-12)
+        assert seen.ahead[0, 0] == pytest.approx(-local[2])
+        np.testing.assert_allclose(blender_pose(blender_pose(pose)), pose)
+
+
+class TestEncodings:
+    def test_the_segmentation_is_a_palette_picture(self) -> None:
+        ids = drawing().instances
+        data = encodings.indexed_png(ids, encodings.instance_palette())
+        width, height, depth, kind = struct.unpack(">IIBB", data[16:26])
+        assert (width, height, depth, kind) == (48, 32, 8, 3)
+        assert data[33 + 4 : 33 + 8] == b"PLTE"
+        shown = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        palette = np.array(encodings.instance_palette(), np.uint8)
+        np.testing.assert_array_equal(shown[..., ::-1], palette[ids])  # pyright: ignore[reportOptionalSubscript]
+
+    def test_pillow_finds_the_ids(self, tmp_path: Path) -> None:
+        image = pytest.importorskip("PIL.Image", reason="needs Pillow, which other packages bring")
+        ids = np.random.default_rng(0).integers(0, 256, (7, 5)).astype(np.uint8)
+        (tmp_path / "ids.png").write_bytes(encodings.indexed_png(ids, encodings.instance_palette()))
+        with image.open(tmp_path / "ids.png") as opened:
+            assert opened.mode == "P"
+            np.testing.assert_array_equal(np.asarray(opened), ids)
+        (tmp_path / "rgba.png").write_bytes(encodings.rgba_png(drawing().rgb))
+        with image.open(tmp_path / "rgba.png") as opened:
+            assert opened.mode == "RGBA"
+            np.testing.assert_array_equal(np.asarray(opened)[..., :3], drawing().rgb)
+
+    def test_palette_colours_are_distinct(self) -> None:
+        assert len(set(encodings.instance_palette())) == 256
+        assert encodings.instance_palette()[0] == (0, 0, 0)
+
+    @pytest.mark.parametrize("encode", [encodings.id_png, encodings.packed_id_png])
+    def test_ids_are_told_by_red(self, encode: Any) -> None:
+        ids = np.arange(256, dtype=np.uint8).reshape(8, 32)
+        shown = cv2.imdecode(np.frombuffer(encode(ids), np.uint8), cv2.IMREAD_COLOR)
+        assert shown is not None
+        blue, green, red = np.moveaxis(shown.astype(int), -1, 0)
+        np.testing.assert_array_equal(red + 256 * green + 65536 * blue, ids)
+
+
+class TestInstanceTracks:
+    def test_counts_and_boxes_are_those_of_a_plain_loop(self) -> None:
+        random = np.random.default_rng(0)
+        pictures = random.integers(0, 256, (3, 20, 30)).astype(np.uint8)
+        pictures[0][pictures[0] == 200] = 0
+        pictures[1] %= 5
+        pictures[2] = 0
+        tracks = InstanceTracks(3)
+        for time, ids in enumerate(pictures):
+            tracks.add(time, ids)
+        for time, ids in enumerate(pictures):
+            for number in range(256):
+                rows, columns = np.nonzero(ids == number)
+                box = [rows.min(), columns.min(), rows.max() + 1, columns.max() + 1] if len(rows) else [0] * 4
+                assert tracks.boxes[time, number].tolist() == box
+                assert tracks.pixels[time, number] == len(rows)
+
+
+class TestKubric4D:
+    @pytest.mark.parametrize("compact", [False, True])
+    def test_a_view_is_stored_as_it_was_drawn(self, tmp_path: Path, compact: bool) -> None:
+        scene, view = box_scene(0, 2), drawing()
+        folder = tmp_path / "scn00007"
+        writer = Kubric4DWriter(SceneFiles(folder), scene, LENS, seed=7, fps=24.0, compact=compact)
+        for time in range(2):
+            for camera in scene.cameras:
+                writer.add(time, camera, view)
+        writer.finish()
+        colour = picture(kubric4d_names.frame_path(folder, 1, "rgba", 1, compact=compact))
+        depth = picture(kubric4d_names.frame_path(folder, 1, "depth", 1, compact=compact))
+        if compact:
+            assert np.abs(colour.astype(int) - view.rgb[..., ::-1]).mean() < 8
+            np.testing.assert_allclose(decode_depth(depth), with_sky(view.depth), rtol=6e-4)
+        else:
+            assert (colour.dtype, depth.dtype, colour.shape) == (np.uint8, np.float32, (32, 48, 4))
+            np.testing.assert_array_equal(colour[..., :3], view.rgb[..., ::-1])
+            assert (colour[..., 3] == 255).all()
+            np.testing.assert_allclose(depth[2:], (10 * ray_lengths(LENS))[2:], rtol=1e-6)
+            assert (depth[:2] == 30000).all()
+
+    def test_metadata_has_every_published_field(self, tmp_path: Path) -> None:
+        scene = box_scene(0, 2)
+        folder = tmp_path / "scn00007"
+        writer = Kubric4DWriter(SceneFiles(folder), scene, LENS, seed=7, fps=24.0, compact=False)
+        for time in range(2):
+            for camera in scene.cameras:
+                writer.add(time, camera, drawing(instance=9 if time == 0 else 0))
+        writer.finish()
+        told = json.loads(kubric4d_names.metadata_path(folder, 0).read_text())
+        assert set(told) == {"scene", "camera", "instances", "dome", "random_seed", "collisions"}
+        assert told["scene"]["resolution"] == [48, 32]
+        assert (told["scene"]["frame_rate"], told["scene"]["num_frames"], told["random_seed"]) == (24.0, 2, 7)
+        assert (told["scene"]["num_instances"], told["scene"]["num_valo_instances"]) == (2, 1)
+        assert set(told["scene"]) >= {"step_rate", "gravity", "background"}
+        green, red = told["instances"]  # by the renderer's instance id: 4, then 9
+        assert (green["asset_id"], red["asset_id"]) == ("green box", "red box")
+        assert red["visibility"] == [48, 0]
+        assert red["bbox_frames"] == [0]
+        assert red["bboxes"] == [[4 / 32, 6 / 48, 8 / 32, 18 / 48]]
+        assert (red["mass"], red["friction"], red["restitution"]) == (2.0, 0.5, 0.1)
+        assert np.shape(red["bboxes_3d"]) == (2, 8, 3)
+        assert np.min(red["bboxes_3d"], axis=(0, 1)).tolist() == [1.0, -2.5, 0.0]
+        assert np.shape(red["positions"]) == np.shape(red["velocities"]) == (2, 3)
+        assert np.shape(red["quaternions"]) == (2, 4)
+        assert np.shape(red["image_positions"]) == (2, 2)
+        assert "collisions" not in json.loads(kubric4d_names.metadata_path(folder, 1).read_text())
+
+    def test_segments_are_numbered_as_the_list_of_objects(self) -> None:
+        table = segment_ids((4, 9))
+        assert table[[0, 4, 9, 1, 2, 3, 5, 10]].tolist() == [0, 1, 2, 3, 4, 5, 6, 10]
+        assert sorted(table.tolist()) == list(range(256))
+        np.testing.assert_array_equal(segment_ids(()), np.arange(256))
+
+    @pytest.mark.parametrize("instances", [(3, 3), (0,), (256,)])
+    def test_objects_that_cannot_be_told_apart_are_refused(self, instances: tuple[int, ...]) -> None:
+        with pytest.raises(DataError, match="distinct instance ids"):
+            segment_ids(instances)
+
+
+class TestParallelDomain4D:
+    @pytest.mark.parametrize("compact", [False, True])
+    def test_a_view_is_stored_as_it_was_drawn(self, tmp_path: Path, compact: bool) -> None:
+        names, view = parallel_domain4d_names, drawing()
+        folder = tmp_path / "scene_000007"
+        writer = ParallelDomain4DWriter(SceneFiles(folder), LENS, {"yaw-0": np.eye(4)}, ONTOLOGY, compact=compact)
+        writer.add(3, "yaw-0", view)
+        writer.finish()
+        classes = cv2.imread(str(names.frame_path(folder, "yaw-0", "semantic_segmentation_2d", 3)))
+        assert classes is not None
+        assert np.unique(classes.reshape(-1, 3), axis=0).tolist() == [[0, 0, 5]]  # Car, told in red
+        instances = cv2.imread(str(names.frame_path(folder, "yaw-0", "instance_segmentation_2d", 3)))
+        assert instances is not None
+        np.testing.assert_array_equal(instances[..., 2], view.instances)
+        depth_path = names.frame_path(folder, "yaw-0", "depth", 3, compact=compact)
+        if compact:
+            np.testing.assert_allclose(decode_depth(picture(depth_path)), with_sky(view.depth), rtol=6e-4)
+            return
+        with np.load(depth_path) as kept:
+            np.testing.assert_array_equal(kept["data"], with_sky(view.depth))
+            assert kept["data"].dtype == np.float32
+        colour = picture(names.frame_path(folder, "yaw-0", "rgb", 3))
+        np.testing.assert_array_equal(colour, view.rgb[..., ::-1])
+
+    def test_what_has_no_class_is_void(self, tmp_path: Path) -> None:
+        folder = tmp_path / "scene_000007"
+        cars = [item for item in ONTOLOGY if item.label == Label.CAR]
+        writer = ParallelDomain4DWriter(SceneFiles(folder), LENS, {"yaw-0": np.eye(4)}, cars, compact=False)
+        view = drawing()
+        view.classes[:5] = Label.ROAD
+        writer.add(0, "yaw-0", view)
+        path = parallel_domain4d_names.frame_path(folder, "yaw-0", "semantic_segmentation_2d", 0)
+        assert np.unique(picture(path)[:5, :, 2]).tolist() == [255]
+        assert np.unique(picture(path)[5:, :, 2]).tolist() == [5]
+
+    def test_calibration_by_hand(self) -> None:
+        """A camera 1.6 m ahead and 1.55 m up that looks along the vehicle's x axis."""
+        pose = np.array([[0, 0, 1, 1.6], [-1, 0, 0, 0], [0, -1, 0, 1.55], [0, 0, 0, 1.0]])
+        told = calibration({"yaw-0": pose, "yaw-60": pose}, LENS)
+        assert told["names"] == ["yaw-0", "yaw-60"]
+        assert len(told["intrinsics"]) == len(told["extrinsics"]) == 2
+        assert told["intrinsics"][0]["fx"] == pytest.approx(48)
+        assert (told["intrinsics"][0]["cx"], told["intrinsics"][0]["cy"]) == (24, 16)
+        rotation = told["extrinsics"][0]["rotation"]
+        assert [rotation[name] for name in ("qw", "qx", "qy", "qz")] == pytest.approx([0.5, -0.5, 0.5, -0.5])
+        assert told["extrinsics"][0]["translation"] == {"x": 1.6, "y": 0.0, "z": 1.55}
+
+    def test_the_ontology_lists_classes_by_their_ids(self) -> None:
+        items = {item["id"]: item for item in ontology(ONTOLOGY)["items"]}
+        assert items[5]["name"] == "Car"
+        assert items[5]["color"] == {"r": 0, "g": 0, "b": 142}
+        assert items[255]["name"] == "Void"
+        assert len(items) == len(ONTOLOGY) + 1

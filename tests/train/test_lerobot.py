@@ -1,0 +1,432 @@
+"""LeRobot data sets: what the tabletop world exports is read back, and what is wrong with a set is named."""
+
+import json
+import shutil
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from headless import needs_egl
+from typer.testing import CliRunner
+
+from gcd_train.cli.main import app
+from gcd_train.datasets.skips import FileFault
+from gcd_train.errors import DataError, RecipeError, RunError
+from gcd_train.lerobot.cameras import CAMERA_FILE, CameraCalibration
+from gcd_train.lerobot.pairs import LeRobotOptions, LeRobotPairs
+from gcd_train.lerobot.tabletop_export import TabletopExport, export_tabletop
+from gcd_train.lerobot.writer import ExportOptions, LeRobotWriter, LoggedEpisode
+
+pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra `lerobot`: pip install 'gcd-node[lerobot]'")
+av = pytest.importorskip("av", reason="needs the extra `lerobot`: pip install 'gcd-node[lerobot]'")
+pa = pytest.importorskip("pyarrow", reason="needs the extra `lerobot`: pip install 'gcd-node[lerobot]'")
+
+WIDTH, HEIGHT, FPS, ROWS = 64, 48, 20, 20
+LEFT, RIGHT, HAND = (f"observation.images.{name}" for name in ("left", "right", "hand"))
+POSE = "observation.hand_pose"
+OPTIONS = LeRobotOptions(frames=6, size=(WIDTH, HEIGHT), repeats=10)
+
+
+def _pose(x: float, turn: float = 0.3) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    pose[:3, 3] = x, 0.25, 1.5
+    return pose
+
+
+def _calibrations() -> dict[str, CameraCalibration]:
+    numbers = {"width": WIDTH, "height": HEIGHT, "fx": 60.0, "fy": 60.0, "cx": 32.0, "cy": 24.0}
+    rows = {LEFT: _pose(0.1), RIGHT: _pose(0.7, -0.4)}
+    standing = {
+        name: CameraCalibration(**numbers, base_from_camera=tuple(map(tuple, pose.tolist())))
+        for name, pose in rows.items()
+    }
+    return {**standing, HAND: CameraCalibration(**numbers, pose_feature=POSE)}
+
+
+def _picture(episode: int, row: int, camera: int) -> np.ndarray:
+    """Smooth, so that the codec keeps it, and different in each row, so that a wrong one is noticed."""
+    ramp = np.linspace(0, 120, WIDTH)[None, :, None] + np.zeros((HEIGHT, 1, 3))
+    return (ramp + np.array([6 * row, 40 * episode, 40 * camera])).astype(np.uint8)
+
+
+def _pictures(episode: int, rows: int) -> Iterator[Mapping[str, np.ndarray]]:
+    for row in range(rows):
+        yield {name: _picture(episode, row, camera) for camera, name in enumerate((LEFT, RIGHT, HAND))}
+
+
+def _episode(number: int) -> LoggedEpisode:
+    poses = np.stack([_pose(0.05 * row + number) for row in range(ROWS)])
+    state = np.arange(ROWS * 2).reshape(ROWS, 2) / 10
+    return LoggedEpisode(
+        features={"observation.state": state, "action": state + 0.1, POSE: poses.reshape(ROWS, 16)},
+        task=f"task {number % 2}",
+    )
+
+
+def _write(folder: Path, episodes: int = 3, episodes_a_file: int = 2) -> Path:
+    options = ExportOptions(robot="test", fps=FPS, names={}, episodes_a_file=episodes_a_file, crf=4)
+    with LeRobotWriter(folder, _calibrations(), options) as writer:
+        for number in range(episodes):
+            writer.add(_episode(number), _pictures(number, ROWS))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _write(tmp_path_factory.mktemp("lerobot") / "set")
+
+
+@pytest.fixture
+def copied(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "set"))
+
+
+def _only(folder: Path, first: str, second: str, **changes: Any) -> LeRobotPairs:
+    return LeRobotPairs(
+        folder, options=LeRobotOptions(frames=6, size=(WIDTH, HEIGHT), cameras=(first, second), **changes)
+    )
+
+
+def test_pictures_come_back_within_the_error_of_the_codec_and_from_the_right_rows(made: Path) -> None:
+    pairs = _only(made, LEFT, RIGHT)
+    for index in range(6):
+        sample = pairs.sample(index)
+        episode = int(sample.scene.removeprefix("episode_"))
+        swapped = sample.source_from_target[0, 0, 1] < 0
+        for camera, pictures in ((int(swapped), sample.source), (int(not swapped), sample.target)):
+            wanted = np.stack([_picture(episode, row, camera) for row in sample.frame_numbers]).astype(int)
+            assert np.abs(pictures - wanted).mean() < 3.0
+    assert pairs.skips.total == 0
+
+
+def test_poses_of_standing_cameras_are_exact(made: Path) -> None:
+    sample = _only(made, LEFT, RIGHT).sample(0)
+    one_way = np.linalg.inv(_pose(0.1)) @ _pose(0.7, -0.4)
+    other_way = np.linalg.inv(one_way)
+    nearer = min((one_way, other_way), key=lambda pose: np.abs(sample.source_from_target[0] - pose).max())
+    np.testing.assert_allclose(sample.source_from_target, np.tile(nearer, (6, 1, 1)), atol=1e-12)
+
+
+def test_the_pose_of_a_moving_camera_is_that_of_its_row(made: Path) -> None:
+    pairs = _only(made, LEFT, HAND)
+    for index in range(4):
+        sample = pairs.sample(index)
+        number = int(sample.scene.removeprefix("episode_"))
+        hands = np.stack([_pose(0.05 * row + number) for row in sample.frame_numbers])
+        between = np.linalg.inv(_pose(0.1)) @ hands
+        found = sample.source_from_target
+        wrong = min(np.abs(found - pose).max() for pose in (between, np.linalg.inv(between)))
+        assert wrong < 1e-6  # rows are float32
+
+
+def test_a_sample_depends_on_seed_and_index_alone(made: Path) -> None:
+    first, again = LeRobotPairs(made, 5, OPTIONS), LeRobotPairs(made, 5, OPTIONS)
+    backwards = {index: again.sample(index) for index in reversed(range(4))}
+    for index in range(4):
+        sample = first.sample(index)
+        assert sample.frame_numbers == backwards[index].frame_numbers
+        np.testing.assert_array_equal(sample.target, backwards[index].target)
+    other = [LeRobotPairs(made, 6, OPTIONS).sample(index).frame_numbers for index in range(4)]
+    assert other != [backwards[index].frame_numbers for index in range(4)]
+
+
+def test_a_lower_rate_takes_the_rows_nearest_in_time(made: Path) -> None:
+    sample = _only(made, LEFT, RIGHT, fps=10.0).sample(0)
+    assert set(np.diff(sample.frame_numbers)) == {2}
+    assert sample.fps == 10.0
+    with pytest.raises(DataError, match="30 frames per second were wanted"):
+        _only(made, LEFT, RIGHT, fps=30.0)
+
+
+def test_pictures_are_cropped_to_the_wanted_shape_and_resized(made: Path) -> None:
+    sample = LeRobotPairs(made, options=LeRobotOptions(frames=2, size=(30, 20))).sample(0)
+    assert sample.source.shape == sample.target.shape == (2, 20, 30, 3)
+
+
+def test_the_layout_is_that_of_version_three(made: Path) -> None:
+    info = json.loads((made / "meta/info.json").read_text())
+    assert info["codebase_version"] == "v3.0"
+    assert [info["total_episodes"], info["total_frames"], info["total_tasks"]] == [3, 60, 2]
+    files = {str(path.relative_to(made)) for path in made.rglob("*") if path.is_file()}
+    assert files == {
+        "meta/info.json",
+        "meta/stats.json",
+        "meta/tasks.parquet",
+        CAMERA_FILE,
+        *(f"{room}/chunk-000/file-00{k}.parquet" for room in ("data", "meta/episodes") for k in (0, 1)),
+        *(f"videos/{name}/chunk-000/file-00{k}.mp4" for name in (LEFT, RIGHT, HAND) for k in (0, 1)),
+    }
+    rows = pq.read_table(made / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert [row["dataset_from_index"] for row in rows] == [0, 20]
+    assert [row[f"videos/{LEFT}/from_timestamp"] for row in rows] == [0.0, 1.0]
+    data = pq.read_table(made / "data/chunk-000/file-001.parquet")
+    assert data["index"].to_pylist() == list(range(40, 60))
+    assert set(data.column_names) | {LEFT, RIGHT, HAND} == set(info["features"])
+    tasks = pq.read_table(made / "meta/tasks.parquet")
+    assert tasks.to_pydict() == {"task_index": [0, 1], "task": ["task 0", "task 1"]}
+    assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["task"]
+    stats = json.loads((made / "meta/stats.json").read_text())
+    assert stats["observation.state"]["max"] == pytest.approx([3.8, 3.9])
+    assert np.shape(stats[LEFT]["mean"]) == (3, 1, 1)
+
+
+def test_a_set_of_version_two_is_read_alike(made: Path, tmp_path: Path) -> None:
+    old = _as_version_two(made, tmp_path / "old")
+    new_pairs, old_pairs = LeRobotPairs(made, 1, OPTIONS), LeRobotPairs(old, 1, OPTIONS)
+    assert len(old_pairs) == 10
+    np.testing.assert_array_equal(new_pairs.sample(0).source_from_target, old_pairs.sample(0).source_from_target)
+    np.testing.assert_array_equal(new_pairs.sample(0).target, old_pairs.sample(0).target)
+
+
+def _as_version_two(made: Path, folder: Path) -> Path:
+    """The first episode alone, in the layout with one file an episode."""
+    info = json.loads((made / "meta/info.json").read_text())
+    info["codebase_version"] = "v2.1"
+    info["data_path"] = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
+    info["video_path"] = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
+    (folder / "meta").mkdir(parents=True)
+    (folder / "data/chunk-000").mkdir(parents=True)
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    (folder / "meta/episodes.jsonl").write_text('{"episode_index": 0, "tasks": ["task 0"], "length": 20}\n')
+    shutil.copy(made / CAMERA_FILE, folder / CAMERA_FILE)
+    table = pq.read_table(made / "data/chunk-000/file-000.parquet").slice(0, ROWS)
+    pq.write_table(table, folder / "data/chunk-000/episode_000000.parquet")
+    for name in (LEFT, RIGHT, HAND):
+        (folder / "videos/chunk-000" / name).mkdir(parents=True)
+        shutil.copy(
+            made / f"videos/{name}/chunk-000/file-000.mp4", folder / f"videos/chunk-000/{name}/episode_000000.mp4"
+        )
+    return folder
+
+
+# --- what can be wrong -----------------------------------------------------------------------------------------------
+
+
+def test_a_set_without_calibration_is_told_which_file_to_write(copied: Path) -> None:
+    (copied / CAMERA_FILE).unlink()
+    with pytest.raises(DataError, match=r"meta/cameras\.json is missing.*--calibration FILE.*base_from_camera"):
+        LeRobotPairs(copied)
+
+
+def test_a_calibration_can_be_given_as_a_file(copied: Path, tmp_path: Path) -> None:
+    (copied / CAMERA_FILE).rename(tmp_path / "mine.json")
+    pairs = LeRobotPairs(copied, options=LeRobotOptions(frames=2, calibration=tmp_path / "mine.json"))
+    assert pairs.sample(0).source.shape == (2, 256, 384, 3)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"base_from_camera": None}, "either base_from_camera or pose_feature"),
+        ({"base_from_camera": (np.eye(4) * 2).tolist()}, "last row|rigid"),
+        ({"base_from_camera": [[1, 2], [3, 4]]}, r"must be \[\.\.\., 4, 4\]"),
+        ({"fx": -3.0}, "focal lengths must be positive"),
+        ({"focal": 3.0}, "focal"),
+    ],
+)
+def test_a_wrong_calibration_is_named(copied: Path, change: dict[str, Any], said: str) -> None:
+    told = json.loads((copied / CAMERA_FILE).read_text())
+    told["cameras"][LEFT].update(change)
+    (copied / CAMERA_FILE).write_text(json.dumps(told))
+    with pytest.raises(FileFault, match=said) as caught:
+        LeRobotPairs(copied)
+    assert caught.value.path == copied / CAMERA_FILE
+
+
+def test_a_camera_that_the_set_does_not_have_is_an_error(made: Path) -> None:
+    with pytest.raises(DataError, match="not calibrated"):
+        _only(made, LEFT, "observation.images.roof")
+
+
+def _skipped(folder: Path, **changes: Any) -> str:
+    """What sample 0 says was left out; its episode is the first, the others are whole."""
+    pairs = _only(folder, LEFT, RIGHT, **changes)
+    assert pairs.folder.episodes[0].name == "episode_000000"
+    sample = pairs.sample(0)
+    assert sample.scene == "episode_000002"
+    assert pairs.skips.total == len(sample.skipped) > 0
+    return str(sample.skipped[0])
+
+
+def test_a_damaged_parquet_is_skipped_and_named(copied: Path) -> None:
+    path = copied / "data/chunk-000/file-000.parquet"
+    path.write_bytes(path.read_bytes()[:300])
+    assert f"{path} is damaged" in _skipped(copied)
+
+
+def test_a_missing_parquet_is_skipped_and_named(copied: Path) -> None:
+    path = copied / "data/chunk-000/file-000.parquet"
+    path.unlink()
+    assert f"{path} is missing" in _skipped(copied)
+
+
+@pytest.mark.parametrize("package", ["av", "pyarrow"])
+def test_a_missing_package_is_said_at_once_with_its_extra(
+    made: Path, monkeypatch: pytest.MonkeyPatch, package: str
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(DataError, match=rf"gcd-node\[lerobot\].*{package} is missing"):
+        LeRobotPairs(made)
+
+
+def test_a_damaged_list_of_episodes_is_an_error_that_names_it(copied: Path) -> None:
+    path = copied / "meta/episodes/chunk-000/file-001.parquet"
+    path.write_bytes(b"PAR1 and nothing more")
+    with pytest.raises(FileFault, match="is damaged") as caught:
+        LeRobotPairs(copied)
+    assert caught.value.path == path
+
+
+def test_a_missing_video_is_skipped_and_named(copied: Path) -> None:
+    path = copied / f"videos/{LEFT}/chunk-000/file-000.mp4"
+    path.unlink()
+    assert f"{path} is missing" in _skipped(copied)
+
+
+def test_a_damaged_video_is_skipped_and_named(copied: Path) -> None:
+    path = copied / f"videos/{RIGHT}/chunk-000/file-000.mp4"
+    path.write_bytes(path.read_bytes()[:500])
+    assert f"{path} is damaged" in _skipped(copied)
+
+
+def _encode(path: Path, rows: int, rate: int, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=rate)
+        stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
+        for _ in range(rows):
+            frame = av.VideoFrame.from_ndarray(np.zeros((size[1], size[0], 3), np.uint8), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def test_a_video_shorter_than_its_rows_is_skipped_and_named(copied: Path) -> None:
+    path = copied / f"videos/{LEFT}/chunk-000/file-000.mp4"
+    _encode(path, 3, FPS)
+    said = _skipped(copied)
+    assert str(path) in said
+    assert "has no picture within" in said
+    assert "it ends at" in said
+
+
+def test_a_camera_of_another_rate_is_skipped_and_named(copied: Path) -> None:
+    path = copied / f"videos/{LEFT}/chunk-000/file-000.mp4"
+    _encode(path, 20, FPS // 2)
+    said = _skipped(copied, tolerance_s=0.01)
+    assert str(path) in said
+    assert "the nearest is at" in said
+
+
+def test_a_video_of_another_size_than_calibrated_is_skipped_and_named(copied: Path) -> None:
+    path = copied / f"videos/{LEFT}/chunk-000/file-000.mp4"
+    _encode(path, 40, FPS, (32, 32))
+    assert f"{path} is 32 x 32, its calibration says 64 x 48" in _skipped(copied)
+
+
+def _edit_times(folder: Path, change: Any) -> Path:
+    path = folder / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    times = table["timestamp"].to_numpy().copy()
+    change(times)
+    place = table.column_names.index("timestamp")
+    pq.write_table(table.set_column(place, "timestamp", pa.array(times)), path)
+    return path
+
+
+def test_timestamps_out_of_order_are_skipped_and_named(copied: Path) -> None:
+    def swap(times: np.ndarray) -> None:
+        for first in (4, 24):
+            times[[first, first + 1]] = times[[first + 1, first]]
+
+    path = _edit_times(copied, swap)
+    assert f"{path} has timestamps out of order at row 5" in _skipped(copied)
+
+
+def test_a_gap_in_the_timestamps_is_skipped_and_named(copied: Path) -> None:
+    def widen(times: np.ndarray) -> None:
+        for first in (0, 20):
+            times[first + 1 : first + 20] += 5.0 * np.arange(1, 20)
+
+    path = _edit_times(copied, widen)
+    said = _skipped(copied)
+    assert str(path) in said
+    assert "a gap in its timestamps" in said
+
+
+def test_an_episode_shorter_than_the_window_is_left_out_and_a_set_of_such_is_an_error(made: Path) -> None:
+    pairs = LeRobotPairs(made, options=LeRobotOptions(frames=40))
+    with pytest.raises(DataError, match=r"101 samples in a row.*40 frames at 20 a second take 1\.95 s"):
+        pairs.sample(0)
+
+
+def test_rows_that_meta_does_not_know_are_skipped_and_named(copied: Path) -> None:
+    path = copied / "data/chunk-000/file-000.parquet"
+    pq.write_table(pq.read_table(path).slice(1, 30), path)
+    assert "meta says 20" in _skipped(copied)
+
+
+def test_a_template_may_not_lead_out_of_the_set(copied: Path) -> None:
+    info = json.loads((copied / "meta/info.json").read_text())
+    info["data_path"] = "../../{chunk_index}/{file_index}"
+    (copied / "meta/info.json").write_text(json.dumps(info))
+    with pytest.raises(FileFault, match="leads out of the data set"):
+        LeRobotPairs(copied)
+
+
+@pytest.mark.parametrize(("told", "said"), [("{", "cannot be read"), ("{}", "missing required field")])
+def test_a_damaged_description_is_an_error_that_names_it(copied: Path, told: str, said: str) -> None:
+    (copied / "meta/info.json").write_text(told)
+    with pytest.raises(FileFault, match=said):
+        LeRobotPairs(copied)
+
+
+def test_another_version_or_no_set_at_all_is_said(copied: Path, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="is no LeRobot data set"):
+        LeRobotPairs(tmp_path / "nothing")
+    info = json.loads((copied / "meta/info.json").read_text())
+    (copied / "meta/info.json").write_text(json.dumps({**info, "codebase_version": "v1.6"}))
+    with pytest.raises(DataError, match=r"says version v1\.6"):
+        LeRobotPairs(copied)
+
+
+# --- the tabletop world ----------------------------------------------------------------------------------------------
+
+
+@needs_egl
+def test_a_tabletop_episode_is_exported_and_read_back(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco", reason="needs the extra `scenes`: pip install 'gcd-node[scenes]'")
+    out = tmp_path / "robot"
+    export = TabletopExport(seeds=range(3, 4), frames=20, cameras=("view0", "wrist"), width=64, height=48, oversample=1)
+    assert list(export_tabletop(out, export)) == [1]
+    assert [path.name for path in tmp_path.iterdir()] == ["robot"]
+    sample = LeRobotPairs(out, options=LeRobotOptions(size=(64, 48))).sample(0)
+    assert sample.source.shape == (14, 48, 64, 3)
+    assert sample.source.std() > 10
+    assert np.ptp(sample.source_from_target[:, :3, 3], axis=0).max() > 0.01  # the hand moves
+    told = json.loads((out / CAMERA_FILE).read_text())["cameras"]["observation.images.view0"]
+    base_from_camera = np.asarray(told["base_from_camera"])
+    np.testing.assert_allclose(base_from_camera[:3, 3], [0.36 + 1.5 * np.sqrt(0.5), 0.0, 0.22 + 1.5 * np.sqrt(0.5)])
+    with pytest.raises(RunError, match="is there already"):
+        list(export_tabletop(out, export))
+
+
+def test_cameras_that_the_world_does_not_have_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match=r"view0\.\.view15 and wrist"):
+        list(export_tabletop(tmp_path / "x", TabletopExport(seeds=range(1), cameras=("view0", "roof"))))
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_says_what_it_read(made: Path) -> None:
+    done = CliRunner().invoke(app, ["lerobot", str(made), "--samples", "2", "--frames", "4"])
+    assert done.exit_code == 0, done.output
+    assert "3 episodes at 20 frames per second" in done.output
+    assert done.output.count("m apart") == 2
+
+
+def test_the_command_refuses_an_odd_size(tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["export", "lerobot", str(tmp_path / "x"), "--width", "65"])
+    assert done.exit_code == 2
+    assert "even width" in done.output

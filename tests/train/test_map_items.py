@@ -1,0 +1,126 @@
+"""Items mapped in processes: one outcome each, whatever raises or is killed."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from mapped_work import always_killed, killed_once, square, unsendable
+
+from gcd_train.errors import DataError, RunError
+from gcd_train.map_items import Outcome, map_items
+
+HERE = Path(__file__).parent
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_each_item_has_one_outcome_and_errors_end_nothing(workers: int) -> None:
+    outcomes = {outcome.item: outcome for outcome in map_items(square, range(6), workers=workers)}
+    assert sorted(outcomes) == [0, 1, 2, 3, 4, 5]
+    assert [outcomes[n].value for n in (0, 3, 5)] == [0, 9, 25]
+    assert (outcomes[1].error, outcomes[1].kind) == ("one is refused", "DataError")
+    assert "No space left" in (outcomes[2].error or "")
+    assert "ZeroDivisionError" in (outcomes[4].error or "")
+    assert "mapped_work.py, line" in (outcomes[4].error or "")
+
+
+def test_an_outcome_gives_its_value_or_raises_its_error() -> None:
+    assert Outcome(item=3, value=9).unwrap() == 9
+    with pytest.raises(DataError, match="refused"):
+        Outcome(item=3, error="refused", kind="DataError").unwrap()
+    with pytest.raises(RunError, match="disk"):
+        Outcome(item=3, error="disk", kind="OSError").unwrap()
+
+
+def test_what_a_killed_worker_had_is_done_again(tmp_path: Path) -> None:
+    items = [(str(tmp_path), number) for number in range(6)]
+    outcomes = list(map_items(killed_once, items, workers=2))
+    assert sorted((outcome.item[1], outcome.value) for outcome in outcomes) == [(n, n * n) for n in range(6)]
+    attempts = {n: len((tmp_path / f"{n}-attempts").read_text().split()) for n in range(6)}
+    assert attempts == {0: 1, 1: 1, 2: 1, 3: 2, 4: 1, 5: 1}
+
+
+def test_an_item_that_kills_every_worker_is_given_up() -> None:
+    outcomes = {outcome.item: outcome for outcome in map_items(always_killed, range(4), workers=2, retries=1)}
+    assert {item: outcome.value for item, outcome in outcomes.items()} == {0: 0, 1: 1, 2: None, 3: 9}
+    assert "killed 2 times (exit code -9)" in (outcomes[2].error or "")
+    assert outcomes[2].kind == "WorkerLost"
+
+
+def test_a_result_that_cannot_travel_is_an_error() -> None:
+    (outcome,) = map_items(unsendable, [1], workers=2)
+    assert "cannot be sent" in (outcome.error or "")
+
+
+def test_items_are_taken_as_workers_come_free() -> None:
+    taken: list[int] = []
+
+    def items() -> object:
+        for number in range(100):
+            taken.append(number)
+            yield number
+
+    outcomes = map_items(square, items(), workers=2)  # pyright: ignore[reportArgumentType]
+    next(outcomes)
+    assert len(taken) <= 4
+    outcomes.close()  # pyright: ignore[reportAttributeAccessIssue]
+    assert len(taken) <= 4
+
+
+def test_leaving_early_stops_the_workers_in_an_orderly_way(tmp_path: Path) -> None:
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "from mapped_work import wait_for_ever\n"
+        "from gcd_train.map_items import map_items\n"
+        "if __name__ == '__main__':\n"
+        "    list(map_items(wait_for_ever, [sys.argv[2]] * 3, workers=2))\n"
+    )
+    script = tmp_path / "run.py"
+    script.write_text(code)
+    running = subprocess.Popen([sys.executable, str(script), str(HERE), str(tmp_path)], stderr=subprocess.DEVNULL)
+    pids = _wait_for(tmp_path, "begun-*", 2)
+    running.send_signal(2)  # Ctrl-C
+    running.wait(timeout=40)
+    assert {path.name.split("-")[1] for path in tmp_path.glob("cleaned-*")} == pids
+    assert not any(Path("/proc", pid).exists() for pid in pids)
+
+
+def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
+    (tmp_path / "items").mkdir()
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "from mapped_work import mark_and_square\n"
+        "from gcd_train.map_items import map_items\n"
+        "if __name__ == '__main__':\n"
+        "    list(map_items(mark_and_square, [(sys.argv[2], n) for n in range(10_000)], workers=2))\n"
+    )
+    script = tmp_path / "run.py"
+    script.write_text(code)
+    place = tmp_path / "items"
+    running = subprocess.Popen([sys.executable, str(script), str(HERE), str(place)], stderr=subprocess.DEVNULL)
+    _wait_for(place, "*", 2)
+    running.kill()
+    running.wait(timeout=30)
+    pids = {path.name.split("-")[1] for path in place.iterdir()}
+    deadline = time.monotonic() + 30
+    while any(_is_running(pid) for pid in pids) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not any(_is_running(pid) for pid in pids)
+
+
+def _is_running(pid: str) -> bool:
+    """A process that nobody waited for is over, too."""
+    try:
+        return Path("/proc", pid, "stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def _wait_for(folder: Path, pattern: str, count: int) -> set[str]:
+    deadline = time.monotonic() + 60
+    while len(list(folder.glob(pattern))) < count:
+        assert time.monotonic() < deadline, os.listdir(folder)
+        time.sleep(0.05)
+    return {path.name.split("-")[1] for path in folder.glob(pattern)}

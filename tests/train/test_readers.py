@@ -1,0 +1,450 @@
+"""Reading Kubric-4D and ParallelDomain-4D in their published layouts."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from tiny_scenes4d import (
+    BOX,
+    DRIVING_LENS,
+    DRIVING_POSES,
+    HEIGHT,
+    KUBRIC_LENS,
+    SKY,
+    WIDTH,
+    draw,
+    driving_pose,
+    kubric_poses,
+    palette_png,
+    write_driving,
+    write_kubric,
+    write_png,
+)
+
+from gcd_model.geometry import Intrinsics
+from gcd_train.datasets.kubric4d import Kubric4D
+from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
+from gcd_train.datasets.picture_files import bytes_read, read_depth, read_ids, read_palette_indices
+from gcd_train.datasets.skips import FileFault
+from gcd_train.errors import DataError
+from gcd_train.layouts.depth_code import encode_depth
+
+VIEWS = tuple(f"view{number}" for number in range(4))
+CAMERAS = tuple(DRIVING_POSES)
+
+
+@pytest.fixture(scope="module")
+def kubric_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("kubric")
+    write_kubric(root, 7, frames=2)
+    write_kubric(root, 2801, views=1, frames=1)  # a gap in the numbers
+    return root
+
+
+@pytest.fixture(scope="module")
+def driving_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("driving")
+    write_driving(root, 4, frames=2)
+    write_driving(root, 2143, frames=2, spelling=1)
+    return root
+
+
+@pytest.fixture
+def kubric(kubric_root: Path, tmp_path: Path) -> Path:
+    """A scene that a test may damage."""
+    shutil.copytree(kubric_root / "scn00007", tmp_path / "scn00007")
+    return tmp_path / "scn00007"
+
+
+@pytest.fixture
+def driving(driving_root: Path, tmp_path: Path) -> Path:
+    """A scene that a test may damage."""
+    shutil.copytree(driving_root / "scene_000004", tmp_path / "scene_000004")
+    return tmp_path / "scene_000004"
+
+
+def open_kubric(root: Path, **options: bool) -> Kubric4D:
+    return Kubric4D.open(root, cameras=VIEWS, **options)
+
+
+def open_driving(root: Path, **options: bool) -> ParallelDomain4D:
+    return ParallelDomain4D.open(root, cameras=CAMERAS, **options)
+
+
+def test_kubric_views_are_what_was_drawn(kubric_root: Path) -> None:
+    views = open_kubric(kubric_root, instances=True).views("scn00007", 1)
+    for view, pose in zip(views, kubric_poses(), strict=True):
+        drawn = draw(pose, KUBRIC_LENS, time=1)
+        np.testing.assert_array_equal(view.rgb, drawn.rgb)
+        near = drawn.depth < 30_000
+        np.testing.assert_allclose(view.depth[near], drawn.depth[near], rtol=2e-6)
+        np.testing.assert_allclose(view.world_from_camera, pose, atol=1e-6)
+        assert view.instances is not None
+        np.testing.assert_array_equal(view.instances > 0, drawn.ids == BOX)
+        assert view.classes is None
+
+
+def test_kubric_lens_has_its_published_angle(kubric_root: Path) -> None:
+    lens = open_kubric(kubric_root).lens("scn00007")
+    assert (lens.fx, lens.fy) == pytest.approx((WIDTH, WIDTH))
+    assert lens.hfov_deg == pytest.approx(53.13, abs=0.01)
+    assert (lens.cx, lens.cy, lens.width, lens.height) == (WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
+
+
+def test_the_published_depth_is_near_the_exact_one_but_not_it(kubric_root: Path) -> None:
+    exact = open_kubric(kubric_root).views("scn00007", 0)[0].depth
+    published = open_kubric(kubric_root, published=True).views("scn00007", 0)[0].depth
+    difference = np.abs(published / exact - 1)
+    assert 1e-4 < float(difference.max()) < 0.03  # tiny pictures: half a pixel is much
+
+
+def test_driving_views_are_what_was_drawn(driving_root: Path) -> None:
+    views = open_driving(driving_root, instances=True).views("scene_000004", 1)
+    for view, camera in zip(views, CAMERAS, strict=True):
+        drawn = draw(driving_pose(camera), DRIVING_LENS, time=1, box_x=9.0)
+        np.testing.assert_array_equal(view.rgb, drawn.rgb)
+        np.testing.assert_array_equal(view.depth, drawn.depth)
+        assert view.classes is not None
+        assert view.instances is not None
+        np.testing.assert_array_equal(view.classes, drawn.ids)
+        np.testing.assert_array_equal(view.instances, np.where(drawn.ids == BOX, 300, 0))
+        np.testing.assert_allclose(view.world_from_camera, driving_pose(camera), atol=1e-6)
+
+
+def test_both_spellings_of_a_calibration_say_the_same(driving_root: Path) -> None:
+    dataset = open_driving(driving_root)
+    for camera in CAMERAS:
+        np.testing.assert_array_equal(dataset.pose("scene_000004", camera), dataset.pose("scene_002143", camera))
+    lens = dataset.lens("scene_002143")
+    assert lens == Intrinsics(fx=lens.fx, fy=lens.fx, cx=24.0, cy=18.0, width=48, height=36)
+    assert lens.hfov_deg == pytest.approx(85.0)
+
+
+def test_scenes_come_by_number_whatever_gaps_there_are(kubric_root: Path, driving_root: Path) -> None:
+    assert open_kubric(kubric_root).scenes == ("scn00007", "scn02801")
+    assert open_driving(driving_root).scenes == ("scene_000004", "scene_002143")
+
+
+def test_some_cameras_alone_come_in_the_order_asked_for(driving_root: Path) -> None:
+    views = open_driving(driving_root).views("scene_000004", 0, ["camera0", "yaw-0"])
+    np.testing.assert_allclose(views[0].world_from_camera, driving_pose("camera0"), atol=1e-6)
+    np.testing.assert_allclose(views[1].world_from_camera, driving_pose("yaw-0"), atol=1e-6)
+
+
+def test_bytes_read_are_those_of_the_files(driving_root: Path) -> None:
+    dataset = open_driving(driving_root)
+    dataset.lens("scene_000004")
+    before = bytes_read()
+    dataset.views("scene_000004", 0, ["yaw-0"])
+    layers = ("rgb", "depth", "semantic_segmentation_2d")
+    files = [*(driving_root / "scene_000004").glob("*/yaw-0/000000000000000005.*")]
+    assert bytes_read() - before == sum(path.stat().st_size for path in files if path.parts[-3] in layers)
+
+
+def test_layers_that_were_not_downloaded_are_none(kubric: Path, driving: Path) -> None:
+    for path in kubric.glob("*/segmentation_*"):
+        path.unlink()
+    shutil.rmtree(driving / "semantic_segmentation_2d")
+    assert open_kubric(kubric.parent, instances=True).views("scn00007", 0)[0].instances is None
+    assert open_driving(driving.parent).views("scene_000004", 0)[0].classes is None
+
+
+def test_compact_files_are_read_where_the_published_ones_are_not(driving: Path) -> None:
+    drawn = draw(driving_pose("yaw-0"), DRIVING_LENS, box_x=9.0)
+    colour, depth = (driving / layer / "yaw-0" / "000000000000000005" for layer in ("rgb", "depth"))
+    colour.with_suffix(".png").unlink()
+    depth.with_suffix(".npz").unlink()
+    assert cv2.imwrite(str(colour.with_suffix(".webp")), drawn.rgb[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 90])
+    assert cv2.imwrite(str(depth.with_suffix(".png")), encode_depth(drawn.depth))
+    view = open_driving(driving.parent).views("scene_000004", 0, ["yaw-0"])[0]
+    np.testing.assert_allclose(view.depth, drawn.depth, rtol=6e-4)
+    assert np.abs(view.rgb.astype(int) - drawn.rgb).mean() < 15
+
+
+def test_far_depth_is_cut_as_published(driving: Path) -> None:
+    path = driving / "depth" / "yaw-0" / "000000000000000005.npz"
+    np.savez(path, data=np.where(draw(driving_pose("yaw-0"), DRIVING_LENS).ids == SKY, np.inf, 7.0).astype("f4"))
+    assert float(open_driving(driving.parent).views("scene_000004", 0, ["yaw-0"])[0].depth.max()) == 30_000.0
+
+
+@pytest.mark.parametrize("bits", [1, 2, 4, 8])
+def test_palette_pictures_give_their_indices_not_their_colours(tmp_path: Path, bits: int) -> None:
+    ids = np.random.default_rng(bits).integers(0, 2**bits, (9, 13), dtype=np.uint8)
+    colours = [(number * 7 % 256, number * 13 % 256, 99) for number in range(2**bits)]
+    (tmp_path / "a.png").write_bytes(palette_png(ids, colours, bits))
+    np.testing.assert_array_equal(read_palette_indices(tmp_path / "a.png"), ids)
+
+
+def test_grey_pictures_count_as_indices_and_colours_do_not(tmp_path: Path) -> None:
+    ids = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    assert cv2.imwrite(str(tmp_path / "grey.png"), ids)
+    np.testing.assert_array_equal(read_palette_indices(tmp_path / "grey.png"), ids)
+    write_png(tmp_path / "rgb.png", np.zeros((3, 4, 3), np.uint8))
+    with pytest.raises(FileFault, match=r"rgb\.png holds colours, not a palette"):
+        read_palette_indices(tmp_path / "rgb.png")
+
+
+def test_ids_count_red_then_green_then_blue(tmp_path: Path) -> None:
+    write_png(tmp_path / "ids.png", np.array([[[1, 0, 0], [0, 1, 0], [3, 2, 1]]], np.uint8))
+    np.testing.assert_array_equal(read_ids(tmp_path / "ids.png"), [[1, 256, 3 + 512 + 65536]])
+
+
+def kubric_file(name: str) -> str:
+    return f"frames_p0_v2/{name}_00001.{'tiff' if name == 'depth' else 'png'}"
+
+
+def driving_file(layer: str) -> str:
+    return f"{layer}/yaw-60/000000000000000015.{'npz' if layer == 'depth' else 'png'}"
+
+
+def expect_kubric_fault(scene: Path, path: str, match: str) -> None:
+    dataset = open_kubric(scene.parent, instances=True)
+    with pytest.raises(FileFault, match=match) as caught:
+        dataset.views("scn00007", 1)
+    assert caught.value.path == scene / path
+    assert str(scene / path) in str(caught.value)
+
+
+def expect_driving_fault(scene: Path, path: str, match: str) -> None:
+    dataset = open_driving(scene.parent, instances=True)
+    with pytest.raises(FileFault, match=match) as caught:
+        dataset.views("scene_000004", 1)
+    assert caught.value.path == scene / path
+    assert str(scene / path) in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["rgba", "depth", "segmentation"])
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.95])
+def test_a_cut_off_kubric_file_is_named(kubric: Path, name: str, share: float) -> None:
+    path = kubric / kubric_file(name)
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    expect_kubric_fault(kubric, kubric_file(name), "is empty" if share == 0 else "damaged")
+
+
+@pytest.mark.parametrize("layer", ["rgb", "depth", "semantic_segmentation_2d", "instance_segmentation_2d"])
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.95])
+def test_a_cut_off_driving_file_is_named(driving: Path, layer: str, share: float) -> None:
+    path = driving / driving_file(layer)
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    expect_driving_fault(driving, driving_file(layer), "is empty" if share == 0 else "damaged")
+
+
+@pytest.mark.parametrize("layer", ["rgb", "depth", "semantic_segmentation_2d"])
+def test_a_missing_driving_frame_is_named(driving: Path, layer: str) -> None:
+    (driving / driving_file(layer)).unlink()
+    expect_driving_fault(driving, driving_file(layer), "is missing")
+
+
+def test_a_flipped_byte_in_a_png_is_noticed(driving: Path) -> None:
+    path = driving / driving_file("rgb")
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    path.write_bytes(content)
+    expect_driving_fault(driving, driving_file("rgb"), "damaged")
+
+
+def test_a_missing_view_is_named(kubric: Path, driving: Path) -> None:
+    shutil.rmtree(kubric / "frames_p0_v3")
+    expect_kubric_fault(kubric, "frames_p0_v3/rgba_00001.png", "is missing")
+    (kubric / "scn00007_p0_v1.json").unlink()
+    expect_kubric_fault(kubric, "scn00007_p0_v1.json", "is missing")
+    shutil.rmtree(driving / "rgb" / "camera0")
+    expect_driving_fault(driving, "rgb/camera0/000000000000000015.png", "is missing")
+    shutil.rmtree(driving / "rgb" / "yaw-0")
+    expect_driving_fault(driving, "rgb/yaw-0", "is missing")
+
+
+@pytest.mark.parametrize("value", [np.nan, -1.0])
+def test_depth_that_is_none_is_named(driving: Path, kubric: Path, value: float) -> None:
+    depth = np.full((36, 48), 5.0, np.float32)
+    depth[3, 4:7] = value
+    np.savez(driving / driving_file("depth"), data=depth)
+    expect_driving_fault(driving, driving_file("depth"), "3 of 1728 depths that are NaN or negative")
+    assert cv2.imwrite(str(kubric / kubric_file("depth")), depth[:32])
+    expect_kubric_fault(kubric, kubric_file("depth"), "3 of 1536 depths")
+
+
+def test_depth_without_any_is_named(driving: Path) -> None:
+    np.savez(driving / driving_file("depth"), data=np.zeros((36, 48), np.float32))
+    expect_driving_fault(driving, driving_file("depth"), "no depth above 0")
+
+
+def test_an_archive_of_something_else_is_named(driving: Path) -> None:
+    np.savez(driving / driving_file("depth"), other=np.ones((36, 48), np.float32))
+    expect_driving_fault(driving, driving_file("depth"), "lacks its array `data`")
+    np.savez(driving / driving_file("depth"), data=np.ones((36, 48, 2), np.float32))
+    expect_driving_fault(driving, driving_file("depth"), "should hold float depth")
+
+
+def test_eight_bit_depth_is_named(kubric: Path) -> None:
+    assert cv2.imwrite(str(kubric / kubric_file("depth")), np.ones((32, 48), np.uint8))
+    expect_kubric_fault(kubric, kubric_file("depth"), "should hold float32 depth, got uint8")
+
+
+def test_mixed_sizes_are_named(kubric: Path, driving: Path) -> None:
+    write_png(driving / driving_file("rgb"), np.zeros((30, 40, 3), np.uint8))
+    expect_driving_fault(driving, driving_file("rgb"), "40 x 30 where .* 48 x 36: sizes are mixed")
+    write_png(kubric / kubric_file("rgba"), np.zeros((30, 40, 3), np.uint8), alpha=True)
+    expect_kubric_fault(kubric, kubric_file("rgba"), "40 x 30 where .* 48 x 32: sizes are mixed")
+    path = kubric / "scn00007_p0_v2.json"
+    told = json.loads(path.read_text())
+    told["scene"]["resolution"] = [96, 64]
+    path.write_text(json.dumps(told))
+    expect_kubric_fault(kubric, "scn00007_p0_v2.json", "96 x 64 pixels, .* sizes are mixed")
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (lambda told: told.pop("camera"), "is damaged or lacks"),
+        (lambda told: told["camera"].update(K="none"), "is damaged or lacks"),
+        (lambda told: told["camera"].update(quaternions=[[0.0, 0.0, 0.0, 0.0]] * 2), "length 1"),
+        (lambda told: told["camera"].update(positions=[[0.0, 0.0, 0.0]]), "in 1 frames of 2"),
+        (lambda told: told["scene"].update(resolution=[0, 0]), "is damaged or lacks"),
+    ],
+)
+def test_damaged_kubric_metadata_is_named(kubric: Path, change: object, match: str) -> None:
+    path = kubric / "scn00007_p0_v1.json"
+    told = json.loads(path.read_text())
+    change(told)  # pyright: ignore[reportCallIssue]
+    path.write_text(json.dumps(told))
+    expect_kubric_fault(kubric, "scn00007_p0_v1.json", match)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b'{"scene": {}}', b"\xff\xfe", b"null"])
+def test_json_that_is_none_is_named(kubric: Path, driving: Path, content: bytes) -> None:
+    (kubric / "scn00007_p0_v1.json").write_bytes(content)
+    expect_kubric_fault(kubric, "scn00007_p0_v1.json", "is empty|is damaged")
+    dataset = open_driving(driving.parent)
+    (driving / "ontology" / "d4e5f6.json").write_bytes(content)
+    with pytest.raises(FileFault, match=r"d4e5f6\.json is (empty|no ontology)"):
+        dataset.views("scene_000004", 0)
+    (driving / "calibration" / "a1b2c3.json").write_bytes(content)
+    with pytest.raises(FileFault, match=r"a1b2c3\.json is (empty|no calibration)"):
+        dataset.views("scene_000004", 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (lambda told: told["names"].__setitem__(3, "other"), "lacks 1 of 3 cameras, first: camera0"),
+        (lambda told: told["names"].pop(), "differ in length"),
+        (lambda told: told["extrinsics"][1].pop("rotation"), "without rotation or orientation"),
+        (lambda told: told["extrinsics"][1]["rotation"].pop("qw"), "without a number for qw or w"),
+        (lambda told: told["extrinsics"][1]["rotation"].update(qw=9.0), "length 1"),
+        (lambda told: told["extrinsics"].__setitem__(1, None), "without rotation"),
+        (lambda told: told["intrinsics"][1].update(fx=0.0), "impossible lens"),
+        (lambda told: told["intrinsics"][1].update(cx=320.0), "resized"),
+        (lambda told: told["intrinsics"].__setitem__(1, None), "without a number for fx"),
+    ],
+)
+def test_a_damaged_calibration_is_named(driving: Path, change: object, match: str) -> None:
+    path = driving / "calibration" / "a1b2c3.json"
+    told = json.loads(path.read_text())
+    change(told)  # pyright: ignore[reportCallIssue]
+    path.write_text(json.dumps(told))
+    expect_driving_fault(driving, "calibration/a1b2c3.json", match)
+
+
+def test_a_missing_calibration_is_named(driving: Path) -> None:
+    shutil.rmtree(driving / "calibration")
+    expect_driving_fault(driving, "calibration", "holds no JSON")
+
+
+def test_a_scene_with_another_ontology_is_refused(driving_root: Path, tmp_path: Path) -> None:
+    shutil.copytree(driving_root, tmp_path / "set")
+    path = tmp_path / "set" / "scene_002143" / "ontology" / "d4e5f6.json"
+    told = json.loads(path.read_text())
+    told["items"][0]["name"] = "Moon"
+    path.write_text(json.dumps(told))
+    dataset = open_driving(tmp_path / "set")
+    with pytest.raises(FileFault, match=r"wrong ontology: it differs from the first scene's by Moon, Road"):
+        dataset.views("scene_002143", 0)
+    assert len(dataset.views("scene_000004", 0)) == 3
+
+
+def test_the_instance_layer_in_the_place_of_the_class_layer_is_noticed(driving: Path) -> None:
+    shutil.rmtree(driving / "semantic_segmentation_2d")
+    shutil.copytree(driving / "instance_segmentation_2d", driving / "semantic_segmentation_2d")
+    dataset = open_driving(driving.parent)
+    with pytest.raises(FileFault, match="holds id 300, beyond 255: is it another layer"):
+        dataset.views("scene_000004", 0)
+
+
+def test_a_scene_deleted_while_reading_is_named(kubric: Path, driving: Path) -> None:
+    sets = open_kubric(kubric.parent), open_driving(driving.parent)
+    for dataset in sets:
+        scene = dataset.scenes[0]
+        assert dataset.views(scene, 0)
+        shutil.rmtree(dataset.folder(scene))
+        with pytest.raises(FileFault, match=f"{scene}.* is missing"):
+            dataset.views(scene, 1)
+
+
+def test_a_frame_beyond_the_end_is_refused(kubric_root: Path, driving_root: Path) -> None:
+    with pytest.raises(FileFault, match="tells of 2 frames, wanted frame 2"):
+        open_kubric(kubric_root).views("scn00007", 2)
+    with pytest.raises(FileFault, match="is missing"):
+        open_driving(driving_root).views("scene_000004", 2)
+
+
+@pytest.mark.parametrize("kind", [Kubric4D, ParallelDomain4D])
+def test_a_folder_without_scenes_is_refused(tmp_path: Path, kind: type[Kubric4D | ParallelDomain4D]) -> None:
+    with pytest.raises(DataError, match="holds no"):
+        kind.open(tmp_path)
+    with pytest.raises(DataError, match="cannot be read"):
+        kind.open(tmp_path / "nowhere")
+
+
+def test_depth_codes_are_read_back_within_their_step(tmp_path: Path) -> None:
+    metres = np.geomspace(0.06, 29_000.0, 600, dtype=np.float32).reshape(20, 30)
+    assert cv2.imwrite(str(tmp_path / "depth.png"), encode_depth(metres))
+    np.testing.assert_allclose(read_depth(tmp_path / "depth.png"), metres, rtol=6e-4)
+
+
+@pytest.mark.parametrize("layer", ["rgb", "depth", "semantic_segmentation_2d", "kubric depth", "kubric segmentation"])
+def test_whatever_a_file_holds_it_is_read_or_named(driving: Path, kubric: Path, layer: str) -> None:
+    if layer.startswith("kubric"):
+        path = kubric / kubric_file(layer.split()[1])
+        dataset, scene = open_kubric(kubric.parent, instances=True), "scn00007"
+    else:
+        path = driving / driving_file(layer)
+        dataset, scene = open_driving(driving.parent), "scene_000004"
+    camera = "view2" if layer.startswith("kubric") else "yaw-60"
+    whole, rng = path.read_bytes(), np.random.default_rng(len(layer))
+    named: list[Path] = []
+    for _ in range(40):
+        content = bytearray(whole)
+        for _ in range(int(rng.integers(1, 5))):
+            content[int(rng.integers(len(content)))] = int(rng.integers(256))
+        path.write_bytes(content)
+        try:
+            (view,) = dataset.views(scene, 1, [camera])
+        except FileFault as fault:
+            named.append(fault.path)
+        else:
+            assert view.rgb.shape[:2] == view.depth.shape
+    assert set(named) == {path}
+
+
+def test_classes_that_share_a_colour_are_reported(driving: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = driving / "ontology" / "d4e5f6.json"
+    told = json.loads(path.read_text())
+    told["items"][1]["color"] = told["items"][0]["color"]
+    path.write_text(json.dumps(told))
+    dataset = open_driving(driving.parent)
+    assert dataset.ontology is not None
+    assert dataset.ontology.duplicates == ((5, 24),)
+    assert "classes of one colour are merged in decoding: Car (5), Road (24)" in caplog.text
+
+
+def test_a_damaged_first_picture_does_not_spoil_the_others(driving: Path) -> None:
+    path = driving / "rgb" / "yaw-0" / "000000000000000005.png"
+    path.write_bytes(path.read_bytes()[:99])
+    dataset = open_driving(driving.parent)
+    assert dataset.views("scene_000004", 1)[0].rgb.shape == (36, 48, 3)
+    with pytest.raises(FileFault, match="is damaged"):
+        dataset.views("scene_000004", 0)

@@ -1,0 +1,178 @@
+"""What our own writers write, the readers read: the same pictures, depths, labels and poses; and exact pairs of it."""
+
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from headless import needs_egl
+
+from gcd_model.geometry import Intrinsics, Spherical, to_pose
+from gcd_train.datasets.clip_frames import FrameSampling
+from gcd_train.datasets.kubric4d import Kubric4D
+from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
+from gcd_train.datasets.trajectories import DRIVING, MAX90, generator
+from gcd_train.datasets.view_pairs import ViewPairs
+from gcd_train.errors import DataError
+from gcd_train.layouts.depth_code import SKY_M
+from gcd_train.layouts.scene_writer import SceneFormat, write_scene
+from gcd_train.scenes.description import Light, Part, Scene, upright
+from gcd_train.scenes.driving import class_ids, driving_drive
+from gcd_train.scenes.frozen import freeze
+from gcd_train.scenes.renderer import Renderer, Rendering
+from gcd_train.scenes.worlds import SCENE_WORLDS
+
+SEED, FRAMES, WIDTH, HEIGHT = 3, 2, 48, 36
+CLIP = FrameSampling(clip=2, reach_last=True)
+
+LIGHT = Light(
+    sun_to=(0.0, 0.0, 1.0),
+    sun=(1.0, 1.0, 1.0),
+    sky=(0.4, 0.4, 0.4),
+    ground=(0.2, 0.2, 0.2),
+    horizon=(0.7, 0.8, 0.9),
+    zenith=(0.3, 0.5, 0.8),
+    fog_m=1e6,
+    cloud=0.0,
+    exposure=1.0,
+)
+
+pytestmark = needs_egl
+
+
+def stage(seed: int, frames: int) -> Scene:
+    """A floor with a box that slides over it; no physics."""
+    path = np.zeros((frames, 2, 4), np.float32)
+    path[:, 1, 0] = np.arange(frames) + seed
+    angles = [(90.0 * view, 45.0) for view in range(4)] + [(15.0 + 30.0 * view, 5.0) for view in range(12)]
+    poses = [to_pose(Spherical(azimuth_deg=a, elevation_deg=e, radius_m=15.0)).numpy() for a, e in angles]
+    floor = Part(shape="box", centre=(0.0, 0.0, -0.5), size=(60.0, 60.0, 1.0), colour=(0.5, 0.4, 0.3), label=1)
+    box = Part(shape="box", centre=(0, 0, 1), size=(2, 2, 2), colour=(0.2, 0.3, 0.8), label=2, instance=7, body=1)
+    return Scene(
+        parts=(floor, box),
+        sheets=(),
+        poses=upright(path),
+        focus=np.zeros((frames, 3), np.float32),
+        cameras={f"view{view}": np.repeat(pose[None], frames, 0) for view, pose in enumerate(poses)},
+        hfov_deg=float(2 * np.degrees(np.arctan(0.5))),
+        light=LIGHT,
+    )
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["published", "compact"])
+def stage_root(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("stage")
+    world = replace(SCENE_WORLDS["drop"], name="stage", make=stage)
+    form = SceneFormat(width=48, height=32, frames=FRAMES, oversample=1, compact=request.param)
+    write_scene(root, world, form, 0)
+    return root
+
+
+def test_a_kubric_scene_is_read_as_it_was_drawn(stage_root: Path) -> None:
+    dataset = Kubric4D.open(stage_root, instances=True)
+    scene = stage(0, FRAMES)
+    with Renderer(48, 32, oversample=1) as renderer:
+        drawn = {(step, name): view for step, name, view in renderer.views(freeze(scene), scene.cameras)}
+    assert dataset.frames("scn00000") == FRAMES
+    compact = any(stage_root.rglob("*.webp"))
+    for time in range(FRAMES):
+        for camera, view in zip(dataset.cameras, dataset.views("scn00000", time), strict=True):
+            wanted = drawn[time, camera]
+            near = wanted.depth > 0
+            assert np.abs(view.rgb.astype(int) - wanted.rgb).mean() <= (6 if compact else 0)
+            np.testing.assert_allclose(view.depth[near], wanted.depth[near], rtol=6e-4 if compact else 1e-6)
+            assert float(view.depth[~near].min(initial=SKY_M)) > 20_000
+            np.testing.assert_array_equal(view.instances, wanted.instances)
+            np.testing.assert_allclose(view.world_from_camera, scene.cameras[camera][time], atol=1e-6)
+            assert view.lens.fx == pytest.approx(48.0)
+
+
+def test_an_exact_orbit_looks_like_its_point_cloud(stage_root: Path) -> None:
+    dataset, orbit = Kubric4D.open(stage_root), replace(MAX90, frames=CLIP)
+    exact = ViewPairs(dataset, orbit, 4, (48, 32), exact=True, visible=True).sample(2)
+    splatted = ViewPairs(dataset, orbit, 4, (48, 32), visible=True).sample(2)
+    assert exact.skipped == splatted.skipped == ()
+    np.testing.assert_array_equal(exact.source_from_target, splatted.source_from_target)
+    np.testing.assert_array_equal(exact.source[0], exact.target[0])
+    for one, other in ((exact.source, splatted.source), (exact.target, splatted.target)):
+        assert np.abs(one.astype(int) - other).mean() < 12
+    assert exact.visible is not None
+    assert splatted.visible is not None
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["published", "compact"])
+def root(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("driving")
+    form = SceneFormat(width=WIDTH, height=HEIGHT, frames=FRAMES, oversample=1, compact=request.param)
+    write_scene(root, SCENE_WORLDS["driving"], form, SEED)
+    return root
+
+
+@pytest.fixture(scope="module")
+def drawn() -> dict[tuple[int, str], Rendering]:
+    scene = driving_drive(SEED, frames=FRAMES)
+    with Renderer(WIDTH, HEIGHT, oversample=1) as renderer:
+        return {(step, name): view for step, name, view in renderer.views(freeze(scene), scene.cameras)}
+
+
+def test_a_driving_scene_is_read_as_it_was_drawn(root: Path, drawn: dict[tuple[int, str], Rendering]) -> None:
+    dataset = ParallelDomain4D.open(root, instances=True)
+    (scene,) = dataset.scenes
+    compact = any((root / scene / "rgb").rglob("*.webp"))
+    vehicle_from_camera = SCENE_WORLDS["driving"].vehicle_from_camera
+    assert vehicle_from_camera is not None
+    for time in range(FRAMES):
+        for camera, view in zip(dataset.cameras, dataset.views(scene, time), strict=True):
+            wanted = drawn[time, camera]
+            depth = np.where(wanted.depth > 0, wanted.depth, np.float32(SKY_M))
+            if compact:
+                np.testing.assert_allclose(view.depth, depth, rtol=6e-4)
+                assert np.abs(view.rgb.astype(int) - wanted.rgb).mean() < 12
+            else:
+                np.testing.assert_array_equal(view.depth, depth)
+                np.testing.assert_array_equal(view.rgb, wanted.rgb)
+            np.testing.assert_array_equal(view.classes, class_ids(wanted.classes))
+            np.testing.assert_array_equal(view.instances, wanted.instances)
+            np.testing.assert_allclose(view.world_from_camera, vehicle_from_camera()[camera], atol=1e-6)
+            assert view.lens == Intrinsics.from_hfov(85.0, WIDTH, HEIGHT)
+
+
+def test_the_driving_source_stands_where_the_path_starts(root: Path) -> None:
+    dataset = ParallelDomain4D.open(root)
+    draw = DRIVING.draw(generator(0, 0), 50, 10.0)
+    np.testing.assert_allclose(dataset.pose(dataset.scenes[0], "yaw-0"), draw.world_from_source, atol=1e-6)
+
+
+def test_exact_pairs_start_with_the_same_picture_and_read_hardly_anything(root: Path) -> None:
+    dataset = ParallelDomain4D.open(root)
+    sampling = replace(DRIVING, frames=CLIP)
+    pairs = ViewPairs(dataset, sampling, 0, (WIDTH, 24), exact=True, visible=True, class_ids=True)
+    sample = pairs.sample(0)
+    assert sample.skipped == ()
+    np.testing.assert_array_equal(sample.source[0], sample.target[0])
+    assert np.abs(sample.source[1].astype(int) - sample.target[1]).mean() > 5
+    assert sample.visible is not None
+    assert sample.target_classes is not None
+    known = sample.target_classes[0] != 29  # the sky has no depth
+    assert sample.visible[0][known].mean() > 0.98
+    assert sample.visible[1].mean() < sample.visible[0].mean()
+    assert sample.bytes_read < 3_000_000
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(pairs)).sample(0).target, sample.target)
+    splatted = ViewPairs(dataset, sampling, 0, (WIDTH, 24), class_ids=True).sample(0)
+    assert np.abs(splatted.target.astype(int) - sample.target).mean() < 25
+    assert splatted.target_classes is not None
+    assert np.mean(splatted.target_classes == sample.target_classes) > 0.6
+
+
+def test_exact_pairs_of_a_damaged_geometry_are_left_out_by_name(root: Path, tmp_path: Path) -> None:
+    dataset = ParallelDomain4D.open(root)
+    geometry = dataset.folder(dataset.scenes[0]) / "geometry.npz"
+    content = geometry.read_bytes()
+    try:
+        geometry.write_bytes(content[:1000])
+        pairs = ViewPairs(dataset, replace(DRIVING, frames=CLIP), 0, (WIDTH, 24), exact=True)
+        with pytest.raises(DataError, match=r"geometry\.npz is no drawable scene"):
+            pairs.sample(0)
+    finally:
+        geometry.write_bytes(content)

@@ -1,0 +1,238 @@
+"""`gcd-train show`: what is on the sheet is what is in the files, and a broken file is named."""
+
+import json
+import sys
+import zipfile
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+from headless import needs_egl
+from tiny_scenes4d import write_driving, write_kubric
+from typer.testing import CliRunner
+
+from gcd_train.cli.main import app
+from gcd_train.errors import DataError, RecipeError
+from gcd_train.scenes.writer import DEPTH_UNIT_M, World
+from gcd_train.show.clips import ShowOptions
+from gcd_train.show.colours import SKY_M, UNKNOWN, depth_colours, depth_ticks, instance_colour
+from gcd_train.show.footage import UNSEEN, Footage
+from gcd_train.show.open_scene import open_scene
+
+FRAMES = 4
+
+
+@pytest.fixture(scope="module")
+def orbit(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_kubric(tmp_path_factory.mktemp("orbit"), 7, views=5, frames=FRAMES)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_driving(tmp_path_factory.mktemp("drive"), 7, frames=FRAMES)
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("pairs")
+    write_pairs(folder)
+    return folder
+
+
+def write_pairs(folder: Path, height: int = 32, width: int = 48) -> None:
+    """One shard with one clip of three frames: a wall 10 m ahead; the target stands where the source does."""
+    world = World(
+        name="driving", width=width, height=height, frames=3, fps=10.0, hfov_deg=85.0, oversample=1, clips_per_shard=1
+    )
+    (folder / "world.json").write_bytes(msgspec.json.encode(world))
+    depth = np.full((3 * height, width), round(10 / DEPTH_UNIT_M), np.uint16)
+    ids = np.ones((3 * height, width), np.uint8)
+    colour = np.full((3 * height, width, 3), 90, np.uint8)
+    poses = {camera: [np.eye(4).tolist()] * 3 for camera in ("source", "target")}
+    with zipfile.ZipFile(folder / "shard-00000005-1.zip", "w") as archive:
+        archive.writestr("00000005/scene.json", json.dumps({"facts": {"hfov_deg": 85.0}, "world_from_camera": poses}))
+        for camera in poses:
+            for kind, strip in {"rgb": colour, "depth": depth, "classes": ids, "instances": ids}.items():
+                archive.writestr(f"00000005/{camera}.{kind}.png", cv2.imencode(".png", strip)[1].tobytes())
+
+
+def opened(path: Path, **options: object) -> Footage:
+    return open_scene(path, ShowOptions(**options))  # pyright: ignore[reportArgumentType]
+
+
+def shown(*arguments: object) -> tuple[int, str]:
+    """Exit code and everything printed, on one line."""
+    result = CliRunner().invoke(app, ["show", *map(str, arguments)], env={"COLUMNS": "240"})
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result.exit_code, " ".join(result.output.split())
+
+
+# laws
+
+
+@pytest.mark.parametrize("layout", ["orbit", "drive", "pairs"])
+def test_every_layout_gives_a_clip_whose_path_begins_at_the_source(layout: str, request: pytest.FixtureRequest) -> None:
+    footage = opened(request.getfixturevalue(layout))
+    t, h, w = footage.depth.shape
+    assert footage.source.shape == footage.target.shape == footage.splat.shape == (t, h, w, 3)
+    assert footage.visible.shape == footage.surface.shape == (t, h, w)
+    assert footage.labels is not None
+    assert footage.labels.shape == (t, h, w)
+    assert len(footage.frame_numbers) == t
+    np.testing.assert_allclose(footage.world_from_target[0], footage.world_from_source[0], atol=1e-3)
+    assert footage.seen_shares[0] > 0.97  # from where the source stands, everything was seen by it
+    assert np.abs(footage.splat[0].astype(int) - footage.source[0])[footage.depth[0] < SKY_M].mean() < 12
+
+
+@pytest.mark.parametrize("layout", ["orbit", "drive", "pairs"])
+def test_pixel_shares_of_the_labels_make_a_whole(layout: str, request: pytest.FixtureRequest) -> None:
+    footage = opened(request.getfixturevalue(layout))
+    shares = [share for _, share in footage.shares()]
+    assert sum(shares) == pytest.approx(1.0)
+    assert shares == sorted(shares, reverse=True)
+
+
+def test_nearer_is_nearer_to_red_and_sky_has_no_depth() -> None:
+    metres = np.geomspace(2, 50, 40).astype(np.float32)
+    colours = depth_colours(metres, 2, 50).astype(int)
+    assert len({tuple(colour) for colour in colours.tolist()}) == 40
+    assert colours[0, 0] > colours[0, 2]
+    assert colours[-1, 0] < colours[-1, 2]
+    assert depth_colours(np.array([0.0, 2 * SKY_M], np.float32), 2, 50).tolist() == [list(UNKNOWN)] * 2
+
+
+@pytest.mark.parametrize(("near", "far"), [(0.3, 1.2), (2.5, 93.0), (1.0, 240.0), (13.0, 17.0)])
+def test_the_depth_bar_has_a_few_round_metres_within_its_range(near: float, far: float) -> None:
+    ticks = depth_ticks(near, far)
+    assert 1 <= len(ticks) <= 8
+    assert all(near <= tick <= far for tick in ticks)
+
+
+def test_instances_that_follow_each_other_differ_in_colour() -> None:
+    colours = [np.array(instance_colour(number)) for number in range(25)]
+    assert all(np.abs(a - b).sum() > 60 for a, b in pairwise(colours))
+
+
+def test_only_surfaces_that_were_not_seen_turn_orange(pairs: Path) -> None:
+    footage = opened(pairs)
+    visible, surface = footage.visible.copy(), footage.surface.copy()
+    visible[:, :, :8] = False
+    surface[:, :, :4] = False  # sky
+    painted = replace(footage, visible=visible, surface=surface).seen()
+    assert np.array_equal(painted[:, :, 8:], footage.target[:, :, 8:])
+    assert np.array_equal(painted[:, :, :4], footage.target[:, :, :4])
+    assert np.abs(painted[:, :, 4:8].astype(int) - UNSEEN).max() < 100
+    assert replace(footage, visible=visible, surface=surface).seen_shares[0] == pytest.approx(40 / 44)
+
+
+# which clip
+
+
+def test_frames_are_those_asked_for(tmp_path: Path) -> None:
+    scene = write_kubric(tmp_path, 0, views=5, frames=16)
+    assert opened(scene, start=1, stride=1).frame_numbers == tuple(range(1, 15))
+    with pytest.raises(RecipeError, match=r"may start at 0 to 2, got 3"):
+        opened(scene, start=3)
+    with pytest.raises(RecipeError, match=r"with stride 2 .* got 0"):
+        opened(scene, start=0, stride=2)
+
+
+def test_the_path_follows_from_the_seed(orbit: Path) -> None:
+    one, again, other = (opened(orbit, seed=seed).world_from_target for seed in (4, 4, 5))
+    assert np.array_equal(one, again)
+    assert not np.allclose(one, other)
+
+
+def test_a_scene_that_is_too_short_is_shown_whole(drive: Path) -> None:
+    footage = opened(drive)
+    assert footage.frame_numbers == tuple(range(FRAMES))
+    assert footage.cameras == ("camera0", "yaw-0", "yaw-60")
+    assert footage.names[0].name == "Car"
+    assert footage.kind_plural == "classes"
+
+
+# what goes wrong
+
+
+@pytest.mark.parametrize(
+    ("file", "damage"),
+    [
+        ("frames_p0_v4/rgba_00002.png", "cut"),
+        ("frames_p0_v4/depth_00001.tiff", "gone"),
+        ("frames_p0_v4/segmentation_00003.png", "cut"),
+        ("scn00007_p0_v4.json", "cut"),
+        ("scn00007_p0_v2.json", "cut"),
+    ],
+)
+def test_a_broken_file_is_named_and_there_is_no_traceback(tmp_path: Path, file: str, damage: str) -> None:
+    path = write_kubric(tmp_path, 7, views=5, frames=FRAMES) / file
+    if damage == "gone":
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[:60])
+    code, told = shown(path.parents[len(Path(file).parts) - 1], "--out", tmp_path / "out")
+    assert code == DataError.exit_code
+    assert path.name in told
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_is_no_scene_is_refused_with_what_to_give_instead(orbit: Path, tmp_path: Path) -> None:
+    assert f"show one, such as {orbit}" in shown(orbit.parent)[1]
+    assert "neither scnNNNNN" in shown(tmp_path)[1]
+    assert "is no folder" in shown(tmp_path / "scn00001")[1]
+
+
+def test_pair_shards_name_an_unknown_clip_and_a_damaged_shard(pairs: Path, tmp_path: Path) -> None:
+    code, told = shown(pairs, "--clip", 9)
+    assert (code, "no clip of seed 9" in told) == (RecipeError.exit_code, True)
+    assert "leave out --start" in shown(pairs, "--start", 0)[1]
+    write_pairs(tmp_path)
+    shard = tmp_path / "shard-00000005-1.zip"
+    shard.write_bytes(shard.read_bytes()[:-40])
+    code, told = shown(tmp_path)
+    assert (code, shard.name in told) == (DataError.exit_code, True)
+
+
+def test_without_matplotlib_the_extra_is_named(orbit: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    code, told = shown(orbit)
+    assert code != 0
+    assert "gcd-node[train]" in told
+
+
+# the whole command
+
+
+def test_the_command_writes_sheet_path_and_video_and_tells_facts_with_units(drive: Path, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="figures need the extra `train`")
+    code, told = shown(drive, "--out", tmp_path)
+    assert code == 0
+    for words in ("4 frames at 10 fps", "3 cameras", "hfov 85.0°", "m (1st to 99th percentile)", "Car", "Road", "%"):
+        assert words in told
+    for name in ("sheet.png", "trajectory.png"):
+        picture = cv2.imread(str(tmp_path / name))
+        assert picture is not None
+        assert min(picture.shape[:2]) > 400
+        assert picture.std() > 20  # something is drawn on it
+    video = cv2.VideoCapture(str(tmp_path / "video.mp4"))
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 2 * (FRAMES + 7)
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(10.0)
+
+
+@needs_egl
+@pytest.mark.parametrize("encoding", ["--compact", pytest.param("--no-compact", marks=pytest.mark.slow)])
+def test_a_scene_of_ours_is_wholly_seen_from_where_its_source_stands(encoding: str, tmp_path: Path) -> None:
+    """Fails where what the writer means by depth is not what the reader takes it for."""
+    pytest.importorskip("mujoco", reason="the drop world needs the extra `scenes`")
+    made = CliRunner().invoke(
+        app,
+        f"generate drop {tmp_path} --scenes 1 --frames 2 --width 96 --height 64 --workers 1 {encoding}".split(),
+    )
+    assert made.exit_code == 0, made.output
+    footage = opened(tmp_path / "scn00000")
+    assert footage.target_is.startswith("rendered")
+    assert footage.seen_shares[0] > 0.9

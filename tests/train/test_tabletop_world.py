@@ -1,0 +1,199 @@
+"""The tabletop world: what holds in every scene, and that grasps hold by friction alone."""
+
+import importlib.util
+import sys
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from headless import needs_egl
+
+from gcd_train.errors import DataError, RecipeError, RenderError
+from gcd_train.scenes.compile import vertices_of
+from gcd_train.scenes.frozen import freeze
+from gcd_train.scenes.renderer import Renderer
+from gcd_train.scenes.tabletop import CLASS_NAMES, Episode, TabletopClass, tabletop_episode, tabletop_scene
+from gcd_train.scenes.tabletop.arm import primitive_arm
+from gcd_train.scenes.tabletop.furniture import random_table
+from gcd_train.scenes.tabletop.layout import random_things
+from gcd_train.scenes.tabletop.model import build_model
+from gcd_train.scenes.tabletop.panda import panda_arm
+from gcd_train.scenes.tabletop.simulation import Simulation
+
+pytest.importorskip("mujoco", reason="needs the extra `scenes`: pip install 'gcd-node[scenes]'")
+
+LONG = 88
+"""Frames: over three seconds, a whole pick and place."""
+
+
+@cache
+def episode(seed: int, frames: int = 2) -> Episode:
+    return tabletop_episode(seed, frames=frames, skipped_s=0.0)
+
+
+def test_a_scene_depends_on_its_seed_alone() -> None:
+    first, again = (tabletop_scene(4, frames=2) for _ in range(2))
+    assert vertices_of(first).tobytes() == vertices_of(again).tobytes()
+    np.testing.assert_array_equal(first.poses, again.poses)
+    other = episode(5).scene
+    assert vertices_of(first).tobytes() != vertices_of(other).tobytes()
+
+
+def test_the_cameras_are_the_sixteen_of_kubric() -> None:
+    scene = episode(0).scene
+    assert list(scene.cameras) == [f"view{index}" for index in range(16)]
+    from_centre = np.stack([poses[0, :3, 3] for poses in scene.cameras.values()]) - [0.0, 0.0, 1.0]
+    np.testing.assert_allclose(np.linalg.norm(from_centre, axis=1), 15.0)
+    elevations = np.degrees(np.arcsin(from_centre[:, 2] / 15.0))
+    np.testing.assert_allclose(elevations, [45.0] * 4 + [5.0] * 12)
+    azimuths = np.degrees(np.arctan2(from_centre[:, 1], from_centre[:, 0])) % 360
+    np.testing.assert_allclose(azimuths, [0, 90, 180, 270, *range(15, 360, 30)], atol=1e-9)
+    assert scene.hfov_deg == pytest.approx(53.130102)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_there_are_five_to_twelve_things_and_clutter_on_the_table(seed: int) -> None:
+    scene = episode(seed).scene
+    things, clutter = (
+        [thing for thing in scene.objects if thing.label == label]
+        for label in (TabletopClass.OBJECT, TabletopClass.CLUTTER)
+    )
+    assert 5 <= len(things) <= 12
+    assert 2 <= len(clutter) <= 5
+    assert all(thing.positions[0, 2] > -1.2 for thing in (*things, *clutter))  # the table's surface, decimetres
+    assert not any(thing.dynamic for thing in clutter)
+
+
+def test_each_link_of_the_arm_is_an_instance_of_its_own_and_the_hand_is_a_gripper() -> None:
+    scene = episode(0).scene
+    arm = [thing for thing in scene.objects if thing.label == TabletopClass.ROBOT_ARM]
+    gripper = [thing for thing in scene.objects if thing.label == TabletopClass.GRIPPER]
+    assert [len(arm), len(gripper)] == [6, 3]
+    assert CLASS_NAMES[TabletopClass.ROBOT_ARM] == "robot arm"
+    assert {thing.name.split("/")[0] for thing in arm} == {"robot_arm"}
+    assert {thing.name for thing in gripper} == {f"gripper/{part}" for part in ("palm", "left_finger", "right_finger")}
+    instances = [thing.instance for thing in scene.objects]
+    assert sorted(instances) == list(range(1, len(instances) + 1))
+    drawn = {(part.instance, part.label, part.body) for part in scene.parts if part.instance}
+    assert drawn == {(thing.instance, thing.label, thing.body) for thing in scene.objects}
+
+
+def test_what_is_told_of_an_object_is_where_its_body_is_drawn() -> None:
+    scene = episode(1, LONG).scene
+    for thing in scene.objects:
+        if thing.dynamic:
+            np.testing.assert_allclose(scene.poses[:, thing.body, :, 3], thing.positions, atol=1e-4)
+    moved = max(scene.objects, key=lambda thing: float(np.ptp(thing.positions, axis=0).sum()))
+    by_difference = np.gradient(moved.positions, 1 / 24, axis=0)[2:-2]
+    np.testing.assert_allclose(by_difference, moved.velocities[2:-2], atol=0.15 * np.abs(moved.velocities).max())
+
+
+def test_no_camera_of_the_bounds_stands_in_a_wall_or_in_the_arm() -> None:
+    walls = [part for part in episode(0).scene.parts if part.label == TabletopClass.WALL]
+    assert min(max(abs(part.centre[0]), abs(part.centre[1])) - max(part.size[:2]) / 2 for part in walls) < 36
+    inner = min(max(abs(part.centre[0]), abs(part.centre[1])) - min(part.size[:2]) for part in walls)
+    assert inner > 18.0 + 2.0  # cameras are at most 18 away
+    for seed in range(3):
+        scene = episode(seed).scene
+        links = [thing for thing in scene.objects if thing.label in (TabletopClass.ROBOT_ARM, TabletopClass.GRIPPER)]
+        assert max(np.linalg.norm(link.positions - [0.0, 0.0, 1.0], axis=1).max() for link in links) < 11.0
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_grasped_thing_is_lifted_follows_the_gripper_and_stays_where_it_is_put(seed: int) -> None:
+    done = episode(seed, LONG)
+    grasp = done.motion.grasps[0]
+    assert grasp.held
+    thing = done.scene.objects[grasp.thing]
+    steps = np.array(done.motion.steps)
+    first_carry = int(np.flatnonzero(steps == "carry")[0])
+    first_open = int(np.flatnonzero(steps[first_carry:] == "open")[0]) + first_carry
+    carried = np.flatnonzero(steps[:first_open] == "carry")
+    tips = [part for part in done.scene.objects if "finger" in part.name]
+    between = (tips[0].positions + tips[1].positions) / 2
+    rest = thing.positions[0, 2]
+    assert (thing.positions[carried, 2] > rest + 0.5).all()  # five centimetres above the table
+    apart = np.linalg.norm(thing.positions[carried] - between[carried], axis=1)
+    assert np.ptp(apart) < 0.3  # it follows
+    assert np.linalg.norm(np.ptp(thing.positions[carried, :2], axis=0)) > 0.8  # and it went somewhere
+    after = np.flatnonzero(steps[first_open:] == "retreat") + first_open
+    placed = thing.positions[[row for row in after if row - after[0] < 6]]
+    assert len(placed) > 2
+    assert np.linalg.norm(placed[-1] - placed[0]) < 0.05
+    assert abs(placed[-1, 2] - rest) < 0.15
+
+
+def test_nothing_is_welded_an_arm_without_grip_lifts_nothing() -> None:
+    random = np.random.default_rng(3)
+    arm = primitive_arm(random)
+    things = random_things(random, arm, [])
+    model = build_model(arm, random_table(random), [], things)
+    assert model.model.neq == 1  # the two fingers move alike; nothing else is tied to anything
+    model.model.actuator_forcerange[model.grips] = [-1e-3, 1e-3]
+    motion = Simulation(model, things, random, 0.9).run(72, 0.0)
+    assert motion.grasps
+    assert not any(grasp.held for grasp in motion.grasps)
+
+
+def test_physics_that_diverges_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log where it runs
+    random = np.random.default_rng(3)
+    arm = primitive_arm(random)
+    things = random_things(random, arm, [])
+    model = build_model(arm, random_table(random), [], things)
+    model.model.opt.gravity[2] = np.nan
+    with pytest.raises(RenderError, match="became unstable"):
+        Simulation(model, things, random, 0.9).run(2, 0.0)
+
+
+def test_clips_begin_at_different_points_of_the_work() -> None:
+    begun = [tabletop_scene(seed, frames=2).facts["steps"] for seed in (1, 3, 7)]
+    assert len(set(begun)) >= 2
+
+
+@needs_egl
+def test_arm_and_gripper_and_things_are_seen() -> None:
+    scene = episode(0).scene
+    cameras = {name: scene.cameras[name][:1] for name in ("view0", "view4", "view9")}
+    frozen = freeze(scene)
+    short = replace(frozen, poses=frozen.poses[:1], focus=frozen.focus[:1])
+    with Renderer(96, 64, oversample=1) as renderer:
+        views = [view for _, _, view in renderer.views(short, cameras)]
+    seen = set(np.unique(np.stack([view.classes for view in views])).tolist())
+    wanted = set(TabletopClass) - {TabletopClass.SKY}
+    assert seen >= wanted
+    assert len(np.unique(np.stack([view.instances for view in views]))) > 10
+    assert all((view.depth[view.classes != TabletopClass.SKY] > 0).all() for view in views)
+
+
+def test_an_arm_that_is_not_there_is_refused() -> None:
+    with pytest.raises(RecipeError, match="choose one of primitive, panda"):
+        tabletop_scene(0, frames=2, arm="tentacle")
+
+
+def test_a_panda_without_its_package_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(RenderError, match="pip install gymnasium-robotics"):
+        panda_arm()
+
+
+def test_a_panda_is_read_from_the_installed_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = tmp_path / "gymnasium_robotics"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "gymnasium_robotics", raising=False)
+    with pytest.raises(DataError, match=r"chain\.xml"):
+        panda_arm()
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("gymnasium_robotics") is None,
+    reason="needs the package gymnasium-robotics with its Franka model: pip install gymnasium-robotics",
+)
+def test_the_real_panda_grasps_too() -> None:
+    done = tabletop_episode(0, frames=LONG, arm="panda", skipped_s=0.0)
+    assert done.motion.grasps[0].held
+    assert "Apache-2.0" in str(done.scene.facts["arm_licence"])

@@ -1,0 +1,330 @@
+"""Training pairs out of scenes in the published layouts: what they show, and what happens to bad data."""
+
+import pickle
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tiny_scenes4d import (
+    BOX,
+    COLOURS,
+    DRIVING_LENS,
+    DRIVING_POSES,
+    GROUND,
+    KUBRIC_LENS,
+    draw,
+    driving_pose,
+    write_driving,
+    write_kubric,
+)
+from torch.utils.data import DataLoader
+
+from gcd_model.geometry import SphericalDelta, relative_pose, to_pose
+from gcd_train.datasets.clip_frames import FrameSampling
+from gcd_train.datasets.clip_source import ClipSource
+from gcd_train.datasets.controls import Control
+from gcd_train.datasets.kubric4d import Kubric4D
+from gcd_train.datasets.pair_clips import DrivingClips
+from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
+from gcd_train.datasets.pictures_of_draws import trained_lens, trained_picture
+from gcd_train.datasets.trajectories import DRIVING, MAX90, generator
+from gcd_train.datasets.view_pairs import PairSample, ViewPairs, collate
+from gcd_train.errors import DataError, RenderError
+from gcd_train.pointcloud import render_lens
+
+VIEWS = tuple(f"view{number}" for number in range(4))
+CAMERAS = tuple(DRIVING_POSES)
+SIZE = (48, 32)
+FRAMES = 6
+CLIP = FrameSampling(clip=4)
+ORBIT, PATH = replace(MAX90, frames=CLIP), replace(DRIVING, frames=CLIP)
+
+
+@pytest.fixture(scope="module")
+def kubric_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("kubric")
+    write_kubric(root, 3, frames=FRAMES)
+    return root
+
+
+@pytest.fixture(scope="module")
+def driving_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("driving")
+    write_driving(root, 4, frames=FRAMES)
+    shutil.copytree(root / "scene_000004", root / "scene_000009")
+    return root
+
+
+@pytest.fixture
+def two_scenes(driving_root: Path, tmp_path: Path) -> Path:
+    """Scenes 4 and 9, which a test may damage."""
+    shutil.copytree(driving_root, tmp_path / "set")
+    return tmp_path / "set"
+
+
+@pytest.fixture(scope="module")
+def kubric(kubric_root: Path) -> Kubric4D:
+    return Kubric4D.open(kubric_root, cameras=VIEWS)
+
+
+def driving_pairs(root: Path, **options: object) -> ViewPairs:
+    dataset = ParallelDomain4D.open(root, cameras=CAMERAS)
+    return ViewPairs(dataset, PATH, 5, SIZE, **options)  # pyright: ignore[reportArgumentType]
+
+
+def similar(one: np.ndarray, other: np.ndarray) -> float:
+    """PSNR in dB."""
+    return float(-10 * np.log10(np.mean((one.astype(float) - other) ** 2) / 255**2))
+
+
+def test_a_kubric_pair_shows_the_scene_from_the_drawn_cameras(kubric: Kubric4D) -> None:
+    sample = ViewPairs(kubric, ORBIT, 1, SIZE).sample(8)
+    assert sample.source.shape == sample.target.shape == (4, 32, 48, 3)
+    assert sample.start is not None
+    assert sample.deltas is not None
+    lens = render_lens(KUBRIC_LENS, *SIZE)
+    for step in (1, 3):
+        target = sample.start + SphericalDelta(
+            azimuth_deg=float(sample.deltas[step, 0]),
+            elevation_deg=float(sample.deltas[step, 1]),
+            radius_m=float(sample.deltas[step, 2]),
+        )
+        time = sample.frame_numbers[step]
+        source_truth = draw(to_pose(sample.start).numpy(), lens, time=time).rgb
+        target_truth = draw(to_pose(target).numpy(), lens, time=time).rgb
+        other_truth = draw(to_pose(target + SphericalDelta(azimuth_deg=45.0)).numpy(), lens, time=time).rgb
+        assert similar(sample.source[step], source_truth) > 15  # what lies far away no camera sees sharply
+        assert similar(sample.target[step], target_truth) > 15
+        assert similar(sample.target[step], target_truth) > similar(sample.target[step], other_truth) + 2
+
+
+def test_the_relative_poses_are_those_of_the_angles(kubric: Kubric4D) -> None:
+    sample = ViewPairs(kubric, ORBIT, 1, SIZE).sample(3)
+    assert sample.start is not None
+    assert sample.deltas is not None
+    azimuth, elevation, radius = sample.deltas[-1].tolist()
+    goal = sample.start + SphericalDelta(azimuth_deg=azimuth, elevation_deg=elevation, radius_m=radius)
+    wanted = relative_pose(to_pose(sample.start), to_pose(goal))
+    np.testing.assert_allclose(sample.source_from_target[-1], wanted, atol=1e-9)
+    np.testing.assert_allclose(sample.source_from_target[0], np.eye(4), atol=1e-9)
+    np.testing.assert_allclose(sample.target[0], sample.source[0], atol=1)
+
+
+def test_a_driving_source_is_the_cameras_own_picture(driving_root: Path) -> None:
+    sample = driving_pairs(driving_root).sample(0)
+    own = draw(driving_pose("yaw-0"), DRIVING_LENS, time=sample.frame_numbers[2], box_x=9.0).rgb
+    np.testing.assert_array_equal(sample.source[2], trained_picture(own, *SIZE))
+    np.testing.assert_allclose(sample.source_from_target[0], np.eye(4), atol=1e-6)
+    assert sample.start is None
+    assert sample.deltas is None
+    assert sample.motion == 127
+
+
+def test_the_trained_lens_is_that_of_the_trained_picture() -> None:
+    pose = driving_pose("yaw-0")
+    large = DRIVING_LENS.resized(480, 360)
+    made = trained_picture(draw(pose, large, box_x=9.0).rgb, 96, 64)
+    wanted = draw(pose, trained_lens(large, 96, 64), box_x=9.0).rgb
+    np.testing.assert_array_equal(made, wanted)  # five times smaller: a pixel's middle is a pixel's middle
+
+
+def test_classes_come_as_colours_and_as_ids(driving_root: Path) -> None:
+    painted = driving_pairs(driving_root, modality="classes", class_ids=True).sample(1)
+    coloured = driving_pairs(driving_root, class_ids=True).sample(1)
+    assert painted.target_classes is not None
+    assert coloured.target_classes is not None
+    np.testing.assert_array_equal(painted.target_classes, coloured.target_classes)
+    np.testing.assert_array_equal(painted.source, coloured.source)
+    assert {BOX, GROUND} <= set(np.unique(painted.target_classes).tolist()) <= set(COLOURS)
+    inside = painted.target_classes == GROUND
+    assert np.abs(painted.target[inside].astype(int) - COLOURS[GROUND]).mean() < 12
+    assert similar(painted.target, coloured.target) < 25
+    truth = draw(driving_pose("yaw-0"), render_lens(DRIVING_LENS, *SIZE), box_x=9.0).ids
+    assert np.mean(painted.target_classes[0] == truth) > 0.9
+
+
+def test_what_the_source_saw_is_all_at_first_and_less_later(kubric: Kubric4D, driving_root: Path) -> None:
+    orbit = ViewPairs(kubric, ORBIT, 1, SIZE, visible=True).sample(8).visible
+    path = driving_pairs(driving_root, visible=True).sample(8).visible
+    assert orbit is not None
+    assert path is not None
+    assert orbit.shape == path.shape == (4, 32, 48)
+    assert orbit[0].mean() > 0.8  # not where no camera looked
+    assert path[0].mean() > 0.99
+    assert 0.3 < orbit[-1].mean() < 1.0
+    assert 0.3 < path[-1].mean() < 0.7
+
+
+def test_a_sample_is_the_same_in_any_order(kubric: Kubric4D) -> None:
+    first, second = ViewPairs(kubric, ORBIT, 2, SIZE), ViewPairs(kubric, ORBIT, 2, SIZE)
+    ahead = [first.sample(index) for index in (0, 1)]
+    back = [second.sample(index) for index in (1, 0)][::-1]
+    for one, other in zip(ahead, back, strict=True):
+        np.testing.assert_array_equal(one.target, other.target)
+        assert one.frame_numbers == other.frame_numbers
+    assert not np.array_equal(ahead[0].target, ahead[1].target)
+
+
+def test_workers_of_a_loader_give_what_one_process_gives(driving_root: Path) -> None:
+    pairs = driving_pairs(driving_root, repeats=2)
+    alone = [pairs.sample(index) for index in range(4)]
+    loaded = list(DataLoader(pairs, batch_size=2, num_workers=2, collate_fn=collate))
+    assert [batch.scenes for batch in loaded] == [("scene_000004", "scene_000009")] * 2
+    together = torch.cat([batch.target for batch in loaded])
+    np.testing.assert_array_equal(together, np.stack([sample.target for sample in alone]))
+    assert loaded[0].source_from_target.shape == (2, 4, 4, 4)
+    assert loaded[0].deltas is None
+    assert loaded[0].bytes_read > 0
+
+
+def test_pairs_can_be_sent_to_another_process(driving_root: Path) -> None:
+    pairs = driving_pairs(driving_root)
+    sample = pairs.sample(3)
+    again = pickle.loads(pickle.dumps(pairs)).sample(3)
+    np.testing.assert_array_equal(again.target, sample.target)
+
+
+def test_the_virtual_length_repeats_the_scenes(driving_root: Path) -> None:
+    pairs = driving_pairs(driving_root)
+    assert len(pairs) == 800
+    assert pairs[799].scene == "scene_000009"
+    with pytest.raises(IndexError, match="800 is beyond the 800 samples"):
+        pairs[800]
+
+
+def test_bytes_are_counted_for_each_sample(driving_root: Path) -> None:
+    pairs = driving_pairs(driving_root)
+    pairs.sample(0)  # reads calibration and ontology too
+    sample = pairs.sample(2)
+    layers = ("rgb", "depth", "semantic_segmentation_2d")
+    stems = [f"{10 * number + 5:018d}" for number in sample.frame_numbers]
+    files = [path for layer in layers for path in (driving_root / "scene_000004" / layer).glob("*/*")]
+    assert sample.bytes_read == sum(path.stat().st_size for path in files if path.stem in stems)
+
+
+def cut_off(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:100])
+
+
+def delete_scene(path: Path) -> None:
+    shutil.rmtree(path.parents[2])
+
+
+def no_depth(path: Path) -> None:
+    path = path.parents[2] / "depth" / path.parent.name / f"{path.stem}.npz"
+    np.savez(path, data=np.full((36, 48), np.nan, np.float32))
+
+
+@pytest.mark.parametrize(
+    ("damage", "match"),
+    [
+        (cut_off, "is damaged"),
+        (Path.unlink, "is missing"),
+        (delete_scene, "is missing|holds no JSON"),
+        (no_depth, "NaN or negative"),
+    ],
+)
+def test_a_bad_sample_is_replaced_counted_and_named(
+    two_scenes: Path, damage: Callable[[Path], None], match: str
+) -> None:
+    pairs = driving_pairs(two_scenes)
+    numbers = PATH.draw(generator(5, 0), FRAMES, 10.0).frame_numbers
+    path = two_scenes / "scene_000004" / "rgb" / "camera0" / f"{10 * numbers[0] + 5:018d}.png"
+    damage(path)
+    sample = pairs.sample(0)
+    assert isinstance(sample, PairSample)
+    assert len(sample.skipped) >= 1
+    assert {skipped.scene for skipped in sample.skipped} == {"scene_000004"}
+    assert pairs.skips.total == len(sample.skipped)
+    first = sample.skipped[0]
+    assert first.file.startswith(str(two_scenes / "scene_000004"))
+    assert any(word in first.reason for word in match.split("|"))
+    np.testing.assert_array_equal(pairs.sample(0).target, sample.target)  # the replacement is drawn, not chanced upon
+
+
+def test_a_set_in_which_nothing_can_be_read_ends_with_the_last_faults(two_scenes: Path) -> None:
+    pairs = driving_pairs(two_scenes)
+    for path in two_scenes.glob("*/rgb/yaw-0/*.png"):
+        cut_off(path)
+    with pytest.raises(DataError, match=r"101 samples in a row cannot be read, the last: scene_00000\d: .*is damaged"):
+        pairs.sample(0)
+    assert pairs.skips.total == 101
+
+
+def test_what_is_wrong_with_the_machine_is_not_blamed_on_the_data(
+    driving_root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def cannot(*_: object) -> None:
+        raise RenderError("no headless OpenGL")
+
+    pairs = driving_pairs(driving_root)
+    monkeypatch.setattr(pairs.dataset, "views", cannot)
+    with pytest.raises(RenderError, match="no headless OpenGL"):
+        pairs.sample(0)
+    assert pairs.skips.total == 0
+
+
+def test_a_short_scene_is_left_out_by_name(two_scenes: Path) -> None:
+    for path in (two_scenes / "scene_000004" / "rgb" / "yaw-0").iterdir():
+        if int(path.stem) > 30:
+            path.unlink()
+    sample = driving_pairs(two_scenes).sample(0)
+    assert sample.scene == "scene_000009"
+    assert "is too short: 3 frames" in sample.skipped[0].reason
+    assert sample.skipped[0].file == str(two_scenes / "scene_000004")
+
+
+def test_a_control_is_followed_and_not_replaced(two_scenes: Path) -> None:
+    pairs = driving_pairs(two_scenes)
+    control = Control(name="sample_00", frame_start=1, frame_skip=1)
+    assert pairs.controlled("scene_000009", control).frame_numbers == (1, 2, 3, 4)
+    shutil.rmtree(two_scenes / "scene_000009" / "depth")
+    with pytest.raises(DataError, match=r"depth/.*is missing"):
+        pairs.controlled("scene_000009", control)
+
+
+def test_classes_of_a_set_without_any_are_refused(kubric: Kubric4D) -> None:
+    with pytest.raises(DataError, match="Kubric-4D tells instances only"):
+        ViewPairs(kubric, ORBIT, 0, SIZE, modality="classes")
+
+
+def test_a_scene_without_its_class_layer_is_left_out(two_scenes: Path) -> None:
+    shutil.rmtree(two_scenes / "scene_000004" / "semantic_segmentation_2d")
+    sample = driving_pairs(two_scenes, modality="classes").sample(0)
+    assert sample.scene == "scene_000009"
+    assert "lacks its layer semantic_segmentation_2d" in sample.skipped[0].reason
+
+
+def test_a_set_reduced_to_a_list_keeps_its_options(driving_root: Path) -> None:
+    dataset = ParallelDomain4D.open(driving_root, cameras=CAMERAS, instances=True).only(["scene_000009"])
+    assert dataset.scenes == ("scene_000009",)
+    assert dataset.views("scene_000009", 0)[0].instances is not None
+    with pytest.raises(DataError, match="no scene of the list or split"):
+        dataset.only([])
+
+
+def test_the_trainer_reads_a_driving_set_as_clips(driving_root: Path) -> None:
+    dataset = ParallelDomain4D.open(driving_root, cameras=CAMERAS)
+    clips: ClipSource = DrivingClips(dataset, SIZE, clips_of_scene=2, frames=CLIP)
+    assert len(clips) == 4
+    assert [clips.seed(number) for number in range(4)] == [4000, 9000, 4001, 9001]
+    assert clips.fps == 10.0
+    source, target = clips.rgb(1)
+    ids = clips.target_classes(1)
+    assert source.shape == target.shape == (*ids.shape, 3) == (4, 32, 48, 3)
+    assert [kind.name for kind in clips.classes] == ["Car", "Road", "Sky", "Void"]
+    assert set(np.unique(ids).tolist()) <= {0, 1, 2, 3}
+    mount = clips.mount
+    assert (mount.height_m, mount.forward_m, mount.left_m) == pytest.approx((1.55, 1.6, 0.0))
+    assert (mount.tilt_deg, mount.hfov_deg) == pytest.approx((0.0, 85.0), abs=1e-4)
+    assert clips.origin == DrivingClips(dataset, SIZE, frames=CLIP).origin
+    assert clips.origin != DrivingClips(dataset, (96, 64), frames=CLIP).origin
+
+
+def test_a_set_without_classes_gives_no_clips(driving_root: Path) -> None:
+    with pytest.raises(DataError, match="open the set with classes=True"):
+        DrivingClips(ParallelDomain4D.open(driving_root, cameras=CAMERAS, classes=False))

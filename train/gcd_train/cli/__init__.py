@@ -1,0 +1,1 @@
+"""`gcd-train`, the command line: one file a command."""

@@ -1,0 +1,175 @@
+"""`gcd-train cache`: the frozen encoders run once over the driving set."""
+
+import shutil
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
+
+from rich.console import Console
+from typer import Argument, Option
+
+from gcd_train.cli.errors import errors_shown
+from gcd_train.errors import DataError, RecipeError
+
+if TYPE_CHECKING:
+    from gcd_train.datasets.splits import Part
+    from gcd_train.datasets.view_pairs import Dataset4D
+    from gcd_train.latent_cache import CacheJob, CacheProgress
+
+Data: TypeAlias = Annotated[Path, Argument(help="Folder with scene_000000 and so on (ParallelDomain-4D's layout).")]
+Weights: TypeAlias = Annotated[str, Option(help="Checkpoint with the encoders: a path, package:NAME, random:FAMILY.")]
+Out: TypeAlias = Annotated[Path, Option(help="Folder of the cache; run the same line again to go on.")]
+Workers: TypeAlias = Annotated[int, Option(min=1, help="Processes; each loads the encoders.")]
+Ray: TypeAlias = Annotated[str | None, Option("--ray", help="Address of a Ray cluster (extra `cluster`).")]
+Split: TypeAlias = Annotated[Literal["train", "val", "test"] | None, Option(help="Part of the set; all without.")]
+SplitFile: TypeAlias = Annotated[Path | None, Option(help="JSON that says which scene is in which part.")]
+Copies: TypeAlias = Annotated[int, Option(min=1, help="Differently noised latents of every source frame.")]
+PathChoice: TypeAlias = Annotated[Literal["gradual", "direct", "both"], Option(help="Which clips are to be had.")]
+Kept: TypeAlias = Annotated[Literal["both", "mean"], Option(help="Of the targets' posterior: mean and variance.")]
+Semantic: TypeAlias = Annotated[bool, Option("--semantic", help="Targets show the classes instead of colour.")]
+Exact: TypeAlias = Annotated[bool, Option("--exact", help="Targets from the geometry our own scenes keep.")]
+Limit: TypeAlias = Annotated[int | None, Option(min=1, help="Only the first so many scenes.")]
+Seed: TypeAlias = Annotated[int, Option(min=0, help="Of the pixel noise.")]
+FamilyName: TypeAlias = Annotated[str | None, Option("--family", help="Of the weights, where the file does not tell.")]
+Device: TypeAlias = Annotated[str, Option(help="auto, cpu, cuda or cuda:N.")]
+Dtype: TypeAlias = Annotated[str, Option(help="Of the encoders: float32, bfloat16 or float16.")]
+Batch: TypeAlias = Annotated[int, Option(min=1, help="Pictures an encoder call; memory only.")]
+
+_OUT = Console(highlight=False, soft_wrap=True)
+
+
+def cache(
+    data: Data,
+    weights: Weights,
+    out: Out,
+    workers: Workers = 1,
+    ray: Ray = None,
+    split: Split = None,
+    split_file: SplitFile = None,
+    copies: Copies = 4,
+    path: PathChoice = "both",
+    moments: Kept = "both",
+    semantic: Semantic = False,
+    exact: Exact = False,
+    limit: Limit = None,
+    seed: Seed = 0,
+    family: FamilyName = None,
+    device: Device = "auto",
+    dtype: Dtype = "float32",
+    batch: Batch = 2,
+) -> None:
+    """Encode a driving set once, so that training never runs the frozen encoders again."""
+    from gcd_train.latent_cache import CacheJob, CacheOptions, ClipPlan, EncoderChoice, identity_of, load_encoders
+    from gcd_train.latent_cache.driving import DrivingPictures, exact_targets
+
+    with errors_shown():
+        choice = EncoderChoice(weights=weights, family=family, device=device, dtype=dtype, batch=batch)
+        encoders = load_encoders(choice)
+        config = encoders.config
+        plan = ClipPlan(clip_frames=config.frames, paths=("gradual", "direct") if path == "both" else (path,))
+        scenes = _dataset(data, split, split_file, limit, semantic)
+        pictures = DrivingPictures(
+            data=scenes,
+            clip_frames=config.frames,
+            width=config.width,
+            height=config.height,
+            semantic=semantic,
+            exact=exact_targets(scenes, config.width, config.height, semantic=semantic) if exact else None,
+        )
+        options = CacheOptions(plan=plan, copies=copies, moments=moments, seed=seed)
+        job = CacheJob(folder=out, pictures=pictures, choice=choice, identity=identity_of(encoders, pictures, options))
+        _run(job, workers, ray)
+
+
+def _dataset(
+    root: Path, split: "Part | None", split_file: Path | None, limit: int | None, semantic: bool
+) -> "Dataset4D":
+    from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
+    from gcd_train.datasets.skips import Skips
+    from gcd_train.datasets.splits import present, read_split
+
+    data = ParallelDomain4D.open(root, classes=semantic)
+    if (split is None) != (split_file is None):
+        raise RecipeError("a part of the set is named with both --split and --split-file; give both or neither")
+    scenes = data.scenes
+    if split_file is not None and split is not None:
+        skips = Skips()
+        scenes = present(read_split(split_file, split), data.scenes, skips, split_file)
+        for line in skips.lines():
+            _OUT.print(line, markup=False)
+    return data.only(scenes[:limit])
+
+
+def _run(job: "CacheJob", workers: int, ray: str | None) -> None:
+    from gcd_train.latent_cache import cache_scenes, only_writer
+
+    folder, scenes = job.folder, job.pictures.scenes
+    with only_writer(folder):
+        account = _Account(total=len(scenes))
+        steps = cache_scenes(
+            job, scenes, workers=workers, ray_address=ray, free_bytes=lambda: shutil.disk_usage(folder).free
+        )
+        for step in steps:
+            account = account.after(step)
+            _OUT.print(account.line(step), markup=False)
+    _close(folder, scenes, account)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Account:
+    """What a run did. encoded: scenes in this run. bytes, seconds: of these. started: clock of the run."""
+
+    total: int
+    encoded: int = 0
+    failed: int = 0
+    bytes: int = 0
+    seconds: float = 0.0
+    started: float = field(default_factory=time.perf_counter)
+
+    def after(self, step: "CacheProgress") -> "_Account":
+        if step.entry is None:
+            return replace(self, failed=self.failed + 1)
+        return replace(
+            self,
+            encoded=self.encoded + 1,
+            bytes=self.bytes + step.entry.bytes,
+            seconds=self.seconds + step.entry.seconds,
+        )
+
+    def line(self, step: "CacheProgress") -> str:
+        """A scene's size and seconds, and what that makes for the whole set."""
+        if step.entry is None:
+            return f"{step.scene}  left out: {step.error}"
+        size, left = self.bytes / self.encoded, step.total - step.done - step.failed
+        pace = (time.perf_counter() - self.started) / (self.encoded + self.failed)
+        missing = f"  {len(step.entry.missing)} frames missing" if step.entry.missing else ""
+        return (
+            f"{step.scene}  {step.entry.bytes / 1e6:.2f} MB  {step.entry.seconds:.1f} s{missing}   {step.done} of "
+            f"{step.total} scenes, all: {_size(size * step.total)}, {pace * left / 60:.0f} min left"
+        )
+
+
+def _size(count: float) -> str:
+    """Bytes in words."""
+    return f"{count / 1e9:.2f} GB" if count >= 1e9 else f"{count / 1e6:.2f} MB"
+
+
+def _close(folder: Path, scenes: Sequence[str], account: _Account) -> None:
+    from gcd_train.latent_cache import read_index
+
+    index = read_index(folder)
+    kept = {} if index is None else {name: index.scenes[name] for name in scenes if name in index.scenes}
+    if kept:
+        size, seconds = (sum(numbers) for numbers in zip(*((e.bytes, e.seconds) for e in kept.values()), strict=True))
+        missing = sum(len(entry.missing) for entry in kept.values())
+        _OUT.print(
+            f"{folder}: {len(kept)} scenes, {_size(size)}, {size / len(kept) / 1e6:.2f} MB and "
+            f"{seconds / len(kept):.1f} s a scene, {missing} frames missing (named in index.json)",
+            markup=False,
+        )
+    if account.failed:
+        raise DataError(
+            f"{account.failed} of {len(scenes)} scenes could not be cached, see above; the others are whole"
+        )

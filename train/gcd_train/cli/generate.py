@@ -1,0 +1,213 @@
+"""`gcd-train generate`: make data."""
+
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from gcd_model.geometry import CameraMount
+from gcd_train.cli.errors import errors_shown
+from gcd_train.cli.progress_bar import progress_bar
+from gcd_train.errors import RecipeError
+from gcd_train.layouts.scene_run import SceneRun, generate_scenes
+from gcd_train.layouts.scene_sheet import write_scene_sheet
+from gcd_train.layouts.scene_writer import SceneFormat
+from gcd_train.scenes.contact_sheet import write_contact_sheet
+from gcd_train.scenes.driving import FPS, HFOV_DEG
+from gcd_train.scenes.film import write_film
+from gcd_train.scenes.worlds import SCENE_WORLDS, WorldOptions
+from gcd_train.scenes.writer import World, generate
+
+app = typer.Typer(no_args_is_help=True, help="Make training data with a procedural world (extra `scenes`).")
+
+Folder = Annotated[Path, typer.Argument(help="Folder for the scenes; those that are there are kept.")]
+Scenes = Annotated[int | None, typer.Option(min=1, help="How many scenes, one a seed; by default 1.")]
+FirstSeed = Annotated[int, typer.Option(min=0, help="Seed of the first; held-out sets start at 1000000.")]
+Workers = Annotated[int | None, typer.Option(min=1, help="Processes; by default one a core.")]
+Ray = Annotated[str | None, typer.Option("--ray", help="Run on this Ray cluster (auto, HOST:PORT; extra `cluster`).")]
+Compact = Annotated[bool, typer.Option(help="WebP and 16-bit depth: a tenth of the size.")]
+Oversample = Annotated[int, typer.Option(min=1, max=4, help="Anti-aliasing: pixels drawn per pixel and side.")]
+Frames = Annotated[int | None, typer.Option(min=2, help="Time steps; by default as published.")]
+Width = Annotated[int | None, typer.Option(min=16, help="Pixels; by default as published.")]
+Height = Annotated[int | None, typer.Option(min=16, help="Pixels; by default as published.")]
+Sheet = Annotated[Path | None, typer.Option(help="Also draw the first scenes into this PNG.")]
+
+
+@app.callback()
+def about() -> None:
+    """Keep `generate` a command with sub-commands, one for each world."""
+
+
+@app.command()
+def drop(
+    out: Folder,
+    scenes: Scenes = 1,
+    first_seed: FirstSeed = 0,
+    workers: Workers = None,
+    ray: Ray = None,
+    compact: Compact = False,
+    oversample: Oversample = 2,
+    frames: Frames = None,
+    width: Width = None,
+    height: Height = None,
+    contact_sheet: Sheet = None,
+) -> None:
+    """Things that fall and collide, seen by 16 cameras, in Kubric-4D's layout (60 frames at 24 Hz)."""
+    with errors_shown():
+        form = _form("drop", compact, oversample, frames, width, height)
+        _make_scenes("drop", out, form, _seeds(first_seed, scenes), workers, ray, contact_sheet)
+
+
+@app.command()
+def tabletop(
+    out: Folder,
+    scenes: Scenes = 1,
+    first_seed: FirstSeed = 0,
+    workers: Workers = None,
+    ray: Ray = None,
+    compact: Compact = False,
+    oversample: Oversample = 2,
+    frames: Frames = None,
+    width: Width = None,
+    height: Height = None,
+    contact_sheet: Sheet = None,
+) -> None:
+    """A robot arm at work on a table, seen by 16 cameras, in Kubric-4D's layout (60 frames at 24 Hz)."""
+    with errors_shown():
+        form = _form("tabletop", compact, oversample, frames, width, height)
+        _make_scenes("tabletop", out, form, _seeds(first_seed, scenes), workers, ray, contact_sheet)
+
+
+@app.command()
+def driving(
+    folder: Annotated[Path | None, typer.Argument(help="As --out.", metavar="[OUT]")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the data; an unfinished one is continued.")] = None,
+    scenes: Scenes = None,
+    pairs: Annotated[bool, typer.Option(help="Pairs of clips in shards, not whole scenes.")] = False,
+    clips: Annotated[int | None, typer.Option(min=1, help="How many pairs, one scene each: implies --pairs.")] = None,
+    first_seed: FirstSeed = 0,
+    workers: Workers = None,
+    ray: Ray = None,
+    compact: Compact = False,
+    oversample: Oversample = 2,
+    frames: Frames = None,
+    width: Width = None,
+    height: Height = None,
+    clips_per_shard: Annotated[int, typer.Option(min=1, help="Pairs a file.")] = 8,
+    mount_height: Annotated[float, typer.Option(help="Pairs: true height of the source camera, metres.")] = 1.55,
+    mount_tilt: Annotated[float, typer.Option(help="Pairs: true tilt of the source camera, degrees down.")] = 0.0,
+    contact_sheet: Sheet = None,
+) -> None:
+    """Road scenes. Whole, in ParallelDomain-4D's layout (19 cameras, 50 frames at 10 Hz), with OUT or --scenes.
+
+    With --pairs or --clips: a forward camera, and the path to the view from above, 192x128 and 14 frames by default.
+    """
+    with errors_shown():
+        place = _one_folder(folder, out)
+        mount = WorldOptions(height_m=mount_height, tilt_deg=mount_tilt)
+        if not (pairs or clips is not None or mount != WorldOptions()):
+            form = _form("driving", compact, oversample, frames, width, height)
+            _make_scenes("driving", place, form, _seeds(first_seed, scenes), workers, ray, contact_sheet)
+            return
+        if scenes is not None or compact:
+            raise RecipeError("--scenes and --compact make whole scenes, --clips, --pairs and a mount pairs; give one")
+        world = _pair_world(mount, width or 192, height or 128, frames or 14, oversample, clips_per_shard)
+        _make_pairs(place, world, _seeds(first_seed, clips or 100), workers, ray, contact_sheet)
+
+
+@app.command()
+def film(
+    out: Annotated[Path, typer.Option(help="An .mp4 file.")],
+    seed: Annotated[int, typer.Option(min=0, help="Scene; those from 2000000 on are in no data set.")] = 2_000_021,
+    frames: Annotated[int, typer.Option(min=2, help="Time steps at 10 Hz.")] = 42,
+    width: Annotated[int, typer.Option(min=16, help="Pixels.")] = 432,
+    height: Annotated[int, typer.Option(min=16, help="Pixels.")] = 288,
+) -> None:
+    """One longer drive as a video, seen from the forward camera; the packaged drive was made so."""
+    with errors_shown():
+        write_film(out, seed, frames=frames, width=width, height=height)
+
+
+def _one_folder(argument: Path | None, option: Path | None) -> Path:
+    if (argument is None) == (option is None):
+        raise RecipeError("give one folder for the data: gcd-train generate driving OUT, or --out OUT")
+    return argument or option or Path()
+
+
+def _seeds(first: int, count: int | None) -> range:
+    return range(first, first + (count or 1))
+
+
+def _form(
+    world: str, compact: bool, oversample: int, frames: int | None, width: int | None, height: int | None
+) -> SceneFormat:
+    published = SCENE_WORLDS[world]
+    return SceneFormat(
+        width=width or published.width,
+        height=height or published.height,
+        frames=frames or published.frames,
+        oversample=oversample,
+        compact=compact,
+    )
+
+
+def _make_scenes(
+    world: str, out: Path, form: SceneFormat, seeds: range, workers: int | None, ray: str | None, sheet: Path | None
+) -> None:
+    """Exit code: that of the last failure, 0 without."""
+    _stop_as_by_ctrl_c()
+    run = SceneRun()
+    console = Console(stderr=True, highlight=False)
+    started = time.monotonic()
+    columns = (TextColumn(world), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"))
+    with Progress(*columns, TimeRemainingColumn(), console=console) as bar:
+        task = bar.add_task(world, total=len(seeds), rate="")
+        account = generate_scenes(
+            out, SCENE_WORLDS[world], form, seeds, workers=workers or os.cpu_count() or 1, ray_address=ray
+        )
+        for run in account:
+            rate = f"{(run.done - run.there) / (time.monotonic() - started):.3g} scenes/s"
+            bar.update(task, completed=run.done, rate=rate)
+    for line in run.lines():
+        console.print(line, markup=False, soft_wrap=True)
+    if sheet is not None:
+        write_scene_sheet([out / SCENE_WORLDS[world].scene_name(seed) for seed in seeds], sheet)
+    if run.failures:
+        raise typer.Exit(run.exit_code)
+
+
+def _pair_world(
+    mount: WorldOptions, width: int, height: int, frames: int, oversample: int, clips_per_shard: int
+) -> World:
+    CameraMount(height_m=mount.height_m, tilt_deg=mount.tilt_deg)  # refuses what is no mount before anything is made
+    return World(
+        name="driving",
+        width=width,
+        height=height,
+        frames=frames,
+        fps=FPS,
+        hfov_deg=HFOV_DEG,
+        oversample=oversample,
+        clips_per_shard=clips_per_shard,
+        options=mount,
+    )
+
+
+def _make_pairs(
+    out: Path, world: World, seeds: range, workers: int | None, ray: str | None, sheet: Path | None
+) -> None:
+    _stop_as_by_ctrl_c()
+    with progress_bar("clips", len(seeds), keep=True) as show:
+        for progress in generate(out, world, seeds, workers or os.cpu_count() or 1, ray):
+            show(progress.done)
+    if sheet is not None:
+        write_contact_sheet(out, sheet)
+
+
+def _stop_as_by_ctrl_c() -> None:
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that no worker is left behind

@@ -1,0 +1,90 @@
+"""`gcd-train`: data, training and evaluation from the command line."""
+
+from typing import Annotated
+
+import typer
+from rich.box import SIMPLE
+from rich.console import Console
+from rich.table import Table
+
+from gcd_model import DRIVING_SMALL, FAMILIES, SMALL, SVD_14, Family, ModelConfig
+from gcd_train.cli import bench, generate, lerobot
+from gcd_train.cli.cache import cache
+from gcd_train.cli.evaluate import evaluate_command
+from gcd_train.cli.show import show
+from gcd_train.cli.train import train
+
+app = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    help="Data, training and evaluation for virtual camera views.",
+)
+
+
+app.add_typer(generate.app, name="generate")
+app.add_typer(bench.app, name="bench")
+app.add_typer(lerobot.app, name="export")
+app.command()(cache)
+app.command("evaluate")(evaluate_command)
+app.command("lerobot")(lerobot.lerobot_command)
+app.command()(show)
+app.command()(train)
+
+
+@app.callback()
+def about() -> None:
+    """Keep `gcd-train` a command with sub-commands, however many there are."""
+
+
+@app.command()
+def families(
+    name: Annotated[str | None, typer.Argument(help="Show one family only.", metavar="FAMILY")] = None,
+) -> None:
+    """List the model families: how each was trained, and what a finetuned checkpoint will accept."""
+    if name is not None and name not in FAMILIES:
+        raise typer.BadParameter(f"no family is called {name!r}; there are {', '.join(FAMILIES)}")
+    table = Table(title="Model families", box=SIMPLE, pad_edge=False, padding=(0, 0))
+    for column in ("family", "camera", "az / el / r", "rates", "hfov", "size"):
+        table.add_column(column, no_wrap=True)
+    for family in FAMILIES.values():
+        if name in (None, family.name):
+            table.add_row(*_family_row(family))
+    Console().print(table)
+
+
+@app.command()
+def architectures() -> None:
+    """List the network set-ups with their sizes."""
+    table = Table(title="Network set-ups")
+    for column in ("set-up", "size", "frames", "U-Net widths", "VAE widths", "image tower", "steps"):
+        table.add_column(column)
+    for name, config in (("SVD_14", SVD_14), ("DRIVING_SMALL", DRIVING_SMALL), ("SMALL", SMALL)):
+        table.add_row(name, *_config_row(config))
+    Console().print(table)
+
+
+def _family_row(family: Family) -> tuple[str, ...]:
+    limits = family.limits
+    span = "fixed"
+    if limits is not None:
+        span = f"±{limits.azimuth_deg:g}° ±{limits.elevation_deg:g}° ±{limits.radius_m:g}"
+    rates = ", ".join(f"{rate:g}" for rate in family.rates) or "any"
+    hfov = "any" if family.hfov_deg is None else f"{family.hfov_deg:g}°"
+    return family.name, family.camera, span, rates, hfov, f"{family.width}x{family.height}"
+
+
+def _config_row(config: ModelConfig) -> tuple[str, ...]:
+    tower = config.image_encoder
+    return (
+        f"{config.width}x{config.height}",
+        str(config.frames),
+        ", ".join(map(str, config.unet.widths)),
+        ", ".join(map(str, config.vae.widths)),
+        "none" if tower is None else f"{tower.layers} x {tower.width}",
+        str(config.sampling.steps),
+    )
+
+
+def main() -> None:
+    """Entry point."""
+    app()

@@ -1,0 +1,67 @@
+"""`gcd-train show`: a scene to look at."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeAlias
+
+from rich.box import SIMPLE
+from rich.console import Console
+from rich.table import Table
+from typer import Argument, Option
+
+from gcd_train.cli.errors import errors_shown
+
+if TYPE_CHECKING:
+    from gcd_train.show.footage import Footage
+
+SceneFolder: TypeAlias = Annotated[
+    Path, Argument(metavar="SCENE", help="Folder scnNNNNN or scene_NNNNNN, or pair shards (folder or one zip).")
+]
+Out: TypeAlias = Annotated[Path, Option(help="Folder for sheet.png, trajectory.png and video.mp4.")]
+Start: TypeAlias = Annotated[int | None, Option(min=0, help="First frame of the clip; drawn with the seed without.")]
+Stride: TypeAlias = Annotated[int | None, Option(min=1, help="Every how many frames; drawn with the seed without.")]
+Seed: TypeAlias = Annotated[int, Option(min=0, help="Of the clip and the camera path.")]
+Clip: TypeAlias = Annotated[int | None, Option(min=0, help="Pair shards: the clip of this seed, else the first.")]
+Video: TypeAlias = Annotated[bool, Option(help="Also write the video.")]
+Points: TypeAlias = Annotated[bool, Option("--points", help="Target from points, not from kept geometry.")]
+
+
+def show(
+    scene: SceneFolder,
+    out: Out = Path("show"),
+    start: Start = None,
+    stride: Stride = None,
+    seed: Seed = 0,
+    clip: Clip = None,
+    video: Video = True,
+    points: Points = False,
+) -> None:
+    """Contact sheet, video, camera path and facts of one clip of a scene (extra `train`)."""
+    with errors_shown():
+        from gcd_train.show.clips import ShowOptions
+        from gcd_train.show.facts import facts_of
+        from gcd_train.show.matplotlib_door import require_matplotlib
+        from gcd_train.show.open_scene import open_scene
+        from gcd_train.show.sheet import write_sheet, write_trajectory
+        from gcd_train.show.video import write_video
+
+        require_matplotlib()
+        footage = open_scene(scene, ShowOptions(start=start, stride=stride, seed=seed, exact=not points), clip)
+        _print_facts(footage, facts_of(footage))
+        write_sheet(footage, out / "sheet.png", facts_of(footage))
+        write_trajectory(footage, out / "trajectory.png")
+        if video:
+            write_video(footage, out / "video.mp4")
+        written = "sheet.png, trajectory.png" + (", video.mp4" if video else "")
+        Console(stderr=True, highlight=False).print(f"wrote {out}: {written}", markup=False, soft_wrap=True)
+
+
+def _print_facts(footage: "Footage", facts: list[tuple[str, str]]) -> None:
+    table = Table(title=footage.title, box=SIMPLE, show_header=False, title_justify="left")
+    table.add_column(no_wrap=True)
+    table.add_column()
+    for name, value in [("folder", footage.layout), *facts, ("axes", footage.world)]:
+        table.add_row(name, value.replace("\n(", " (").replace(",\n", ", ").replace("\n", ", "))
+    shares = [f"{label.name} {100 * share:.1f} %" for label, share in footage.shares()]
+    if shares:
+        table.add_row(footage.kind_plural, ", ".join(shares))
+    Console(highlight=False).print(table)

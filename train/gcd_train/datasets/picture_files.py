@@ -1,0 +1,191 @@
+"""Decoding of the picture files of 4D data sets: colour, depth, ids. Every fault names the file.
+
+What each thread reads is counted, see `bytes_read`.
+"""
+
+import io
+import struct
+import threading
+import zlib
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gcd_train.datasets.skips import FileFault
+from gcd_train.layouts.depth_code import FAR_M, decode_depth
+
+Bytes = NDArray[np.uint8]
+Floats = NDArray[np.float32]
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_PNG_PALETTE, _PNG_GREY = 3, 0
+
+
+class _Tally(threading.local):
+    count: int = 0
+
+
+_read = _Tally()
+
+
+def bytes_read() -> int:
+    """Bytes of files that this thread has read so far; the difference over a call is what the call read."""
+    return _read.count
+
+
+def read(path: Path) -> bytes:
+    """A whole file. Raises FileFault if it is not there, empty or unreadable."""
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError as error:
+        raise FileFault(path, "is missing: download or generate the scene again") from error
+    except OSError as error:
+        raise FileFault(path, f"cannot be read ({error})") from error
+    if not content:
+        raise FileFault(path, "is empty: download or generate the scene again")
+    _read.count += len(content)
+    return content
+
+
+def count_read(path: Path) -> None:
+    """Count a file that something else has read."""
+    _read.count += path.stat().st_size
+
+
+def one_of(*paths: Path) -> Path:
+    """The first of several spellings of a file that is there. Raises FileFault naming the first if none is."""
+    for path in paths:
+        if path.exists():
+            return path
+    raise FileFault(paths[0], "is missing: download or generate the scene again")
+
+
+def read_colour(path: Path) -> Bytes:
+    """RGB picture of a PNG, WebP or JPEG file, u8 [H, W, 3]; alpha is dropped. Raises FileFault."""
+    picture = _decoded(path, read(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+
+
+def read_depth(path: Path, key: str = "data") -> Floats:
+    """Metres, f32 [H, W], of a float TIFF, an npz with array `key`, or a 16-bit PNG of ours (`depth_code`).
+
+    0 is kept as "nothing known"; beyond 30 000 m is cut there, as published.
+    Raises: FileFault if it is damaged, or holds NaN, negative numbers, or nothing that is known.
+    """
+    match path.suffix:
+        case ".npz":
+            metres = _npz(path, key)
+        case ".png":
+            metres = decode_depth(_sixteen_bit(path))
+        case _:
+            metres = _float_tiff(path)
+    if not float(metres.min()) >= 0:  # NaN is the least of all
+        bad = int(np.count_nonzero(~(metres >= 0)))
+        raise FileFault(path, f"has {bad} of {metres.size} depths that are NaN or negative")
+    farthest = float(metres.max())
+    if farthest == 0:
+        raise FileFault(path, "has no depth above 0 in any pixel")
+    return np.minimum(metres, np.float32(FAR_M)) if farthest > FAR_M else metres
+
+
+def read_ids(path: Path) -> NDArray[np.int32]:
+    """Ids, i32 [H, W], of a PNG that stores them as R + 256 G + 65536 B. Raises FileFault."""
+    content = read(path)
+    _require_whole_png(path, content)
+    picture = _decoded(path, content, cv2.IMREAD_COLOR)
+    ids = cv2.extractChannel(picture, 2).astype(np.int32)
+    for channel, unit in ((1, 256), (0, 65536)):
+        more = cv2.extractChannel(picture, channel)
+        if cv2.countNonZero(more):  # mostly there is nothing in them
+            ids += more.astype(np.int32) * unit
+    return ids
+
+
+def read_palette_indices(path: Path) -> Bytes:
+    """Indices, u8 [H, W], of a palette PNG; of a grey one its values. Raises FileFault.
+
+    OpenCV would give the palette's colours. A palette picture without its palette is a grey picture, though, so the
+    header is rewritten to say that before it is decoded.
+    """
+    content = read(path)
+    _require_whole_png(path, content)
+    depth, kind = content[24], content[25]
+    if kind == _PNG_PALETTE:
+        content = _as_grey(content)
+    elif kind != _PNG_GREY:
+        raise FileFault(path, "holds colours, not a palette: instance numbers cannot be told from it")
+    picture = _decoded(path, content, cv2.IMREAD_UNCHANGED)
+    if picture.dtype != np.uint8 or picture.ndim != 2:
+        raise FileFault(path, f"should hold 8-bit indices, got {picture.dtype} {list(picture.shape)}")
+    step = 255 // (2**depth - 1) if depth < 8 else 1  # fewer bits are spread over 0..255 when they are decoded
+    return np.ascontiguousarray(picture // step, dtype=np.uint8)
+
+
+def require_size(path: Path, picture: NDArray[np.generic], height: int, width: int, other: str) -> None:
+    """Raises FileFault if a picture has another size than `other` says."""
+    if picture.shape[:2] != (height, width):
+        got = f"{picture.shape[1]} x {picture.shape[0]}"
+        raise FileFault(path, f"is {got} where {other} says {width} x {height}: sizes are mixed")
+
+
+def _decoded(path: Path, content: bytes, flags: int) -> NDArray[Any]:
+    try:
+        picture = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    except cv2.error as error:
+        raise FileFault(path, f"cannot be decoded ({error.err or error})") from error
+    if picture is None:  # pyright: ignore[reportUnnecessaryComparison]  the stub does not tell
+        raise FileFault(path, f"is damaged: its {len(content)} bytes hold no whole picture")
+    return picture  # pyright: ignore[reportReturnType]
+
+
+def _float_tiff(path: Path) -> Floats:
+    picture = _decoded(path, read(path), cv2.IMREAD_UNCHANGED)
+    if picture.dtype.kind != "f" or picture.size != picture.shape[0] * picture.shape[1]:
+        raise FileFault(path, f"should hold float32 depth, got {picture.dtype} {list(picture.shape)}")
+    return picture.reshape(picture.shape[:2]).astype(np.float32, copy=False)
+
+
+def _npz(path: Path, key: str) -> Floats:
+    try:
+        with np.load(io.BytesIO(read(path)), allow_pickle=False) as arrays:
+            array = arrays[key]
+    except FileFault:
+        raise
+    except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
+        raise FileFault(path, f"is damaged or lacks its array `{key}` ({error})") from error
+    if array.dtype.kind != "f" or array.ndim < 2 or array.size == 0 or array.size != array.shape[0] * array.shape[1]:
+        raise FileFault(path, f"should hold float depth [H, W], got {array.dtype} {list(array.shape)}")
+    return array.reshape(array.shape[:2]).astype(np.float32, copy=False)
+
+
+def _sixteen_bit(path: Path) -> NDArray[np.uint16]:
+    content = read(path)
+    _require_whole_png(path, content)
+    picture = _decoded(path, content, cv2.IMREAD_UNCHANGED)
+    if picture.dtype != np.uint16 or picture.ndim != 2:
+        raise FileFault(path, f"should hold 16-bit depth, got {picture.dtype} {list(picture.shape)}")
+    return picture.astype(np.uint16, copy=False)
+
+
+def _require_whole_png(path: Path, content: bytes) -> None:
+    """Some versions of libpng fill what is cut off with zeros; those would be ids."""
+    if not content.startswith(_PNG) or len(content) < 33:
+        raise FileFault(path, "is damaged: it is no PNG")
+    if content[-8:-4] != b"IEND":
+        raise FileFault(path, f"is damaged: it is cut off after {len(content)} bytes")
+
+
+def _as_grey(content: bytes) -> bytes:
+    """A palette PNG as a grey PNG of its indices."""
+    header = content[12:25] + bytes([_PNG_GREY]) + content[26:29]
+    rebuilt = [content[:12], header, struct.pack(">I", zlib.crc32(header))]
+    at = 33
+    while at + 8 <= len(content):
+        length, name = struct.unpack_from(">I4s", content, at)
+        if name not in (b"PLTE", b"tRNS", b"bKGD", b"sBIT", b"hIST"):  # mean something else, or nothing, in grey
+            rebuilt.append(content[at : at + 12 + length])
+        at += 12 + length
+    return b"".join(rebuilt)

@@ -1,0 +1,238 @@
+"""What one training sample is: frames and camera path, drawn as Generative Camera Dolly draws them.
+
+A draw depends on nothing but its random generator, so `generator(seed, index)` gives the same sample in any order and
+in any number of workers.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gcd_model.errors import ModelError
+from gcd_model.geometry import (
+    DRIVING_SOURCE_POSITION,
+    DRIVING_SOURCE_TARGET,
+    Spherical,
+    SphericalDelta,
+    driving_trajectory,
+    look_at,
+    motion_bucket,
+    spherical_trajectory,
+    to_pose,
+)
+from gcd_train.datasets.clip_frames import DRIVING_FRAMES, KUBRIC_FRAMES, FrameSampling
+from gcd_train.datasets.controls import Control
+from gcd_train.errors import DataError, RecipeError
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Draw:
+    """One sample of a scene.
+
+    frame_numbers: T numbers of the scene's frames, falling where the clip is `reversed`. fps: of the clip.
+    world_from_source: f64 [4, 4], it stands still. world_from_target: f64 [T, 4, 4]. The world is the scene's, or the
+    vehicle in driving. start: the source on the sphere, deltas: f64 [T, 3] target minus source in azimuth and elevation
+    in degrees and radius in metres; None in driving. motion: the number that tells the network how far it goes.
+    """
+
+    frame_numbers: tuple[int, ...]
+    fps: float
+    reversed: bool
+    world_from_source: NDArray[np.float64]
+    world_from_target: NDArray[np.float64]
+    start: Spherical | None
+    deltas: NDArray[np.float64] | None
+    motion: int
+
+
+class Sampling(Protocol):
+    """Draws samples."""
+
+    def draw(self, rng: np.random.Generator, frames: int, fps: float) -> Draw:
+        """A sample of a scene with so many frames at this rate. Raises DataError if the scene is too short."""
+        ...
+
+    def controlled(self, control: Control, frames: int, fps: float) -> Draw:
+        """The sample that a control list asks for. Raises DataError if the scene is too short for it."""
+        ...
+
+
+def generator(seed: int, index: int, attempt: int = 0) -> np.random.Generator:
+    """The generator of one sample; of another one for each attempt to replace it."""
+    return np.random.default_rng((seed, index, attempt))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class OrbitSampling:
+    """Source and goal on the sphere about the scene (Kubric-4D).
+
+    azimuth_deg, elevation_deg, radius_m: where the source may stand and the goal too (its azimuth may be any). The
+    source's elevation is uniform in its sine, so that directions are; the goal's is uniform in degrees.
+    max_azimuth_deg, max_elevation_deg, max_radius_m: largest change to the goal.
+    fixed: this change instead of a drawn one, whatever the bounds. goal: this goal instead.
+    gradual: the camera moves all the way through the clip; otherwise it is at the goal from the first frame on.
+    move_time: the frame in which a gradual move is done, the last by default.
+    Source: Van Hoorick et al. 2024 (GCD), section 4; bounds of elevation as released (the paper prints 0..90 for
+    max180: `elevation_deg=(0, 90)`).
+    """
+
+    max_azimuth_deg: float = 90.0
+    max_elevation_deg: float = 30.0
+    max_radius_m: float = 3.0
+    azimuth_deg: Range = (0.0, 360.0)
+    elevation_deg: Range = (0.0, 50.0)
+    radius_m: Range = (12.0, 18.0)
+    fixed: SphericalDelta | None = None
+    goal: Spherical | None = None
+    gradual: bool = True
+    move_time: int | None = None
+    frames: FrameSampling = KUBRIC_FRAMES
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in {
+            "azimuth": self.azimuth_deg,
+            "elevation": self.elevation_deg,
+            "radius": self.radius_m,
+        }.items():
+            if not low <= high:
+                raise RecipeError(f"bounds of the {name} must be low, high, got {low:g}, {high:g}")
+        if self.elevation_deg[0] < -90.0 or self.elevation_deg[1] > 90.0 or self.radius_m[0] <= 0.0:
+            raise RecipeError(
+                f"elevations lie within -90..90 degrees and radii above 0 m, got {self.elevation_deg}, {self.radius_m}"
+            )
+        if min(self.max_azimuth_deg, self.max_elevation_deg, self.max_radius_m) < 0.0:
+            raise RecipeError("largest changes of azimuth, elevation and radius are 0 or more")
+        if self.fixed is not None and self.goal is not None:
+            raise RecipeError("give a fixed change or a fixed goal, not both")
+
+    def draw(self, rng: np.random.Generator, frames: int, fps: float) -> Draw:
+        """A sample. Raises DataError if the scene is too short."""
+        numbers, stride, backwards = self.frames.draw(rng, frames)
+        start = self.source(rng)
+        return self._draw(numbers, fps / stride, backwards, start, self.change(rng, start))
+
+    def controlled(self, control: Control, frames: int, fps: float) -> Draw:
+        """The sample of a control. Raises DataError if the scene is too short or the control has no cameras."""
+        numbers = self.frames.controlled(control, frames)
+        if control.start is None or control.goal is None:
+            raise DataError(f"control {control.name} has no cameras: it is a driving control, give Kubric-4D's")
+        return self._draw(numbers, control.fps(fps), False, control.start, control.goal - control.start)
+
+    def source(self, rng: np.random.Generator) -> Spherical:
+        """Where a source camera stands, uniform over the bounds' part of the sphere and in the radius."""
+        low, high = (math.sin(math.radians(bound)) for bound in self.elevation_deg)
+        return Spherical(
+            azimuth_deg=float(rng.uniform(*self.azimuth_deg)),
+            elevation_deg=math.degrees(math.asin(rng.uniform(low, high))),
+            radius_m=float(rng.uniform(*self.radius_m)),
+        )
+
+    def change(self, rng: np.random.Generator, start: Spherical) -> SphericalDelta:
+        """The way from a source to a goal."""
+        if self.fixed is not None:
+            return self.fixed
+        if self.goal is not None:
+            return self.goal - start
+        return SphericalDelta(
+            azimuth_deg=float(rng.uniform(-self.max_azimuth_deg, self.max_azimuth_deg)),
+            elevation_deg=_step(rng, start.elevation_deg, self.max_elevation_deg, self.elevation_deg),
+            radius_m=_step(rng, start.radius_m, self.max_radius_m, self.radius_m),
+        )
+
+    def _draw(
+        self, numbers: tuple[int, ...], fps: float, backwards: bool, start: Spherical, change: SphericalDelta
+    ) -> Draw:
+        last = len(numbers) - 1
+        move_time = (last if self.move_time is None else self.move_time) if self.gradual else 0
+        try:
+            path = spherical_trajectory(start, change, frames=len(numbers), move_time=move_time)
+        except ModelError as error:
+            raise DataError(f"asks for a camera that cannot be: {error}") from error
+        world_from_source = to_pose(start).numpy()
+        deltas = None if path.delta is None else path.delta.numpy()
+        return Draw(
+            frame_numbers=numbers,
+            fps=fps,
+            reversed=backwards,
+            world_from_source=world_from_source,
+            world_from_target=world_from_source @ path.source_from_target.numpy(),
+            start=start,
+            deltas=deltas,
+            motion=self._motion(change),
+        )
+
+    def _motion(self, change: SphericalDelta) -> int:
+        if not (self.max_azimuth_deg or self.max_elevation_deg):
+            return 0
+        return motion_bucket(change, max_azimuth_deg=self.max_azimuth_deg, max_elevation_deg=self.max_elevation_deg)
+
+
+MAX90 = OrbitSampling()
+"""Kubric-4D, up to 90 degrees of azimuth and 30 of elevation, gradual."""
+MAX180 = OrbitSampling(max_azimuth_deg=180.0, max_elevation_deg=60.0)
+"""Kubric-4D, up to 180 degrees of azimuth and 60 of elevation, gradual."""
+MAX90_DIRECT = OrbitSampling(gradual=False)
+"""As MAX90, at the goal from the first frame on."""
+MAX180_DIRECT = OrbitSampling(max_azimuth_deg=180.0, max_elevation_deg=60.0, gradual=False)
+"""As MAX180, at the goal from the first frame on."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DrivingSampling:
+    """ParallelDomain-4D's one path, from the forward camera up and back, at a sine pace; only the frames are drawn.
+
+    gradual, move_time: as in OrbitSampling. motion: the constant number the network is told.
+    """
+
+    gradual: bool = True
+    move_time: int | None = None
+    motion: int = 127
+    frames: FrameSampling = DRIVING_FRAMES
+
+    def draw(self, rng: np.random.Generator, frames: int, fps: float) -> Draw:
+        """A sample. Raises DataError if the scene is too short."""
+        numbers, stride, backwards = self.frames.draw(rng, frames)
+        return self._draw(numbers, fps / stride, backwards)
+
+    def controlled(self, control: Control, frames: int, fps: float) -> Draw:
+        """The sample of a control. Raises DataError if the scene is too short for it."""
+        return self._draw(self.frames.controlled(control, frames), control.fps(fps), False)
+
+    def _draw(self, numbers: tuple[int, ...], fps: float, backwards: bool) -> Draw:
+        last = len(numbers) - 1
+        move_time = (last if self.move_time is None else self.move_time) if self.gradual else 0
+        path = driving_trajectory(frames=len(numbers), move_time=move_time)
+        vehicle_from_source = _vehicle_from_source()
+        return Draw(
+            frame_numbers=numbers,
+            fps=fps,
+            reversed=backwards,
+            world_from_source=vehicle_from_source,
+            world_from_target=vehicle_from_source @ path.source_from_target.numpy(),
+            start=None,
+            deltas=None,
+            motion=self.motion,
+        )
+
+
+DRIVING = DrivingSampling()
+"""ParallelDomain-4D, gradual."""
+DRIVING_DIRECT = DrivingSampling(gradual=False)
+"""ParallelDomain-4D, at the goal from the first frame on."""
+
+
+def _vehicle_from_source() -> NDArray[np.float64]:
+    position, target = (torch.tensor(p, dtype=torch.float64) for p in (DRIVING_SOURCE_POSITION, DRIVING_SOURCE_TARGET))
+    return look_at(position, target).numpy()
+
+
+def _step(rng: np.random.Generator, at: float, most: float, bounds: Range) -> float:
+    """A change that stays within the bounds and is at most `most`; the nearest end for a start outside of them."""
+    low, high = max(at - most, bounds[0]), min(at + most, bounds[1])
+    return float(np.clip(rng.uniform(low, max(low, high)), *bounds)) - at

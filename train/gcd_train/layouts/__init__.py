@@ -1,0 +1,1 @@
+"""Published data layouts on disk: names, metadata, encodings, and folders that appear whole."""

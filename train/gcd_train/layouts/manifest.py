@@ -1,0 +1,84 @@
+"""`gcd-manifest.json`: what one of our scene folders says about itself, with a checksum of every file."""
+
+import hashlib
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from gcd_train.errors import DataError
+
+MANIFEST = "gcd-manifest.json"
+GEOMETRY = "geometry.npz"
+"""The scene ready to draw (`FrozenScene`), beside the manifest."""
+
+Matrix = tuple[tuple[float, float, float, float], ...]
+
+
+class SceneManifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Written last, so that a scene that has one is whole.
+
+    layout: which names and encodings. world, seed, edition: what was drawn; the edition rises whenever a world draws
+    another scene for the same seed. version: of this package. compact: WebP and 16-bit depth in place of the
+    published encodings. cameras: their names, in order. hfov_deg: of every camera. world_from_vehicle: [T][4][4],
+    where the vehicle is in the frame of `geometry.npz`; None where poses are told in the world itself. facts: what the
+    world tells of the whole scene. files: relative path -> SHA-256, without the manifest.
+    """
+
+    layout: Literal["kubric4d", "parallel_domain4d"]
+    world: str
+    seed: int
+    version: str
+    edition: int
+    frames: int
+    fps: float
+    width: int
+    height: int
+    oversample: int
+    compact: bool
+    hfov_deg: float
+    cameras: tuple[str, ...]
+    files: dict[str, str]
+    world_from_vehicle: tuple[Matrix, ...] | None = None
+    facts: dict[str, float | str] = {}
+    format: int = 1
+
+
+def package_version() -> str:
+    """Of this package; `unknown` in a tree that was never installed."""
+    try:
+        return version("gcd-node")
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def read_manifest(scene: Path) -> SceneManifest:
+    """Of a scene folder. Raises DataError if it has none, or one that cannot be read."""
+    path = scene / MANIFEST
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=SceneManifest)
+    except FileNotFoundError as error:
+        raise DataError(f"{scene} has no {MANIFEST}: it was not made by `gcd-train generate`") from error
+    except (OSError, msgspec.MsgspecError) as error:
+        raise DataError(f"{path} cannot be read ({error}); delete the scene and generate it again") from error
+
+
+def verify(scene: Path) -> SceneManifest:
+    """Compare every file of a scene folder with its checksum; what other programs added is no fault.
+
+    Raises: DataError naming the first missing or changed file.
+    """
+    manifest = read_manifest(scene)
+    for name, wanted in manifest.files.items():
+        try:
+            with (scene / name).open("rb") as file:
+                came = hashlib.file_digest(file, "sha256").hexdigest()
+        except OSError as error:
+            raise DataError(f"{scene / name} cannot be read ({error}); delete the scene, generate it again") from error
+        if came != wanted:
+            raise DataError(
+                f"{scene / name} is not as it was written: SHA-256 {came[:12]}…, wanted {wanted[:12]}…; delete the "
+                "scene and generate it again"
+            )
+    return manifest

@@ -1,0 +1,224 @@
+"""Pairs of calibrated cameras of LeRobot data sets: training with real robots, without the package lerobot.
+
+Both cameras filmed the same moments, so one is the source, the other the target, and the calibration says how they
+stand to each other. See `cameras` for what the calibration file holds.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gcd_model.errors import ModelError
+from gcd_model.geometry import center_crop_box, relative_pose, require_rigid
+from gcd_train.datasets.dataset4d import PairSample
+from gcd_train.datasets.skips import FileFault, Skipped, Skips
+from gcd_train.datasets.trajectories import generator
+from gcd_train.errors import DataError, TrainError
+from gcd_train.lerobot.cameras import CameraCalibration, read_cameras
+from gcd_train.lerobot.extra import load_arrow, load_av
+from gcd_train.lerobot.folder import EpisodePlace, LeRobotFolder, read_rows
+from gcd_train.lerobot.video import read_pictures
+
+__all__ = ["LeRobotOptions", "LeRobotPairs"]
+
+_TRIES, _TOLD = 100, 5
+_SLACK_S = 1e-4
+Bytes = NDArray[np.uint8]
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class LeRobotOptions:
+    """How pairs are taken.
+
+    frames: T. fps: of the clips, at most the set's own, which is the default; rows and pictures are taken that are
+    nearest in time. size: width and height of the samples; pictures are cropped about their middle to its shape and
+    resized, so cameras of one field of view make the best pairs. tolerance_s: how far a row or picture may be from the
+    wanted time; by default half a frame of the set.
+    cameras: features to choose from, by default all that are calibrated; source and target are drawn from them.
+    calibration: a file in place of the set's meta/cameras.json. repeats: the set counts as so many times its episodes.
+    motion: the number that tells the network how far the camera goes.
+    """
+
+    frames: int = 14
+    fps: float | None = None
+    size: tuple[int, int] = (384, 256)
+    tolerance_s: float | None = None
+    cameras: tuple[str, ...] | None = None
+    calibration: Path | None = None
+    repeats: int = 400
+    motion: int = 127
+
+
+@dataclass(frozen=True, slots=True)
+class _Window:
+    """Rows of an episode. times_s: of each, in the episode. poses: camera -> base_from_camera [T, 4, 4]."""
+
+    rows: tuple[int, ...]
+    times_s: tuple[float, ...]
+    poses: Mapping[str, Floats]
+
+
+class LeRobotPairs:
+    """Samples of a LeRobot data set by number. The same (seed, index) gives the same sample, in any process.
+
+    An episode that cannot be read is counted in `skips` and replaced by another, at most 100 times.
+    Raises: DataError, FileFault: no data set, no calibration, or an option does not fit.
+    """
+
+    def __init__(self, folder: Path, seed: int = 0, options: LeRobotOptions | None = None) -> None:
+        load_arrow()  # what is not installed is said now, not sample by sample
+        load_av()
+        self.options = options or LeRobotOptions()
+        self.folder, self.seed, self.skips = LeRobotFolder.open(folder), seed, Skips()
+        self._calibrations = read_cameras(folder, self.options.calibration)
+        self.cameras = self._chosen_cameras()
+        info = self.folder.info
+        self.fps = self.options.fps or info.fps
+        if self.fps > info.fps * 1.001:
+            raise DataError(f"clips of {self.fps:g} frames per second were wanted, {folder} has {info.fps:g}")
+        self._tolerance_s = self.options.tolerance_s or 0.5 / info.fps + _SLACK_S
+
+    def __len__(self) -> int:
+        return self.options.repeats * len(self.folder.episodes)
+
+    def __getitem__(self, index: int) -> PairSample:
+        """As `sample`, for a loader. Raises IndexError beyond the end."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"{index} is beyond the {len(self)} samples")
+        return self.sample(index)
+
+    def sample(self, index: int) -> PairSample:
+        """The sample of a number, or of the one that replaces it.
+
+        Raises: DataError naming the last faults if a hundred in a row cannot be read.
+        """
+        skipped: list[Skipped] = []
+        for number in self._numbers(index):
+            episode = self.folder.episodes[number % len(self.folder.episodes)]
+            try:
+                return self._pair(episode, generator(self.seed, number), tuple(skipped))
+            except FileFault as fault:
+                skipped.append(self.skips.add(episode.name, fault.path, fault.reason))
+            except (TrainError, ModelError, OSError) as error:
+                skipped.append(self.skips.add(episode.name, episode.data, str(error)))
+        last = "; ".join(map(str, skipped[-_TOLD:]))
+        raise DataError(f"{len(skipped)} samples in a row cannot be read, the last: {last}")
+
+    def _numbers(self, index: int) -> Iterator[int]:
+        """The sample's own number, then others in its stead."""
+        yield index
+        for attempt in range(1, _TRIES + 1):
+            yield int(generator(self.seed, index, attempt).integers(len(self)))
+
+    def _chosen_cameras(self) -> tuple[str, ...]:
+        """Calibrated cameras that the set has."""
+        wanted = self.options.cameras or tuple(self._calibrations)
+        uncalibrated = [name for name in wanted if name not in self._calibrations]
+        missing = [name for name in wanted if name not in self.folder.cameras]
+        if uncalibrated or missing:
+            raise DataError(
+                f"{', '.join(uncalibrated or missing)}: {'not calibrated' if uncalibrated else 'no video of the set'}; "
+                f"calibrated are {', '.join(self._calibrations)}, videos are {', '.join(self.folder.cameras)}"
+            )
+        if len(set(wanted)) < 2:
+            raise DataError(f"pairs need two cameras or more, got {', '.join(wanted)}")
+        return tuple(sorted(set(wanted)))
+
+    def _pair(self, episode: EpisodePlace, random: np.random.Generator, skipped: tuple[Skipped, ...]) -> PairSample:
+        source, target = (self.cameras[int(k)] for k in random.choice(len(self.cameras), 2, replace=False))
+        window = self._window(episode, (source, target), random)
+        seen, seen_bytes = self._pictures(episode, source, window)
+        aimed, aimed_bytes = self._pictures(episode, target, window)
+        poses = (torch.from_numpy(window.poses[name]) for name in (source, target))
+        return PairSample(
+            source=seen,
+            target=aimed,
+            target_classes=None,
+            source_from_target=relative_pose(*poses).numpy(),
+            start=None,
+            deltas=None,
+            motion=self.options.motion,
+            fps=self.fps,
+            scene=episode.name,
+            frame_numbers=window.rows,
+            reversed=False,
+            visible=None,
+            skipped=skipped,
+            bytes_read=seen_bytes + aimed_bytes,
+        )
+
+    def _window(self, episode: EpisodePlace, cameras: Sequence[str], random: np.random.Generator) -> _Window:
+        moving = {name: feature for name in cameras if (feature := self._calibrations[name].pose_feature)}
+        rows = read_rows(episode.data, ["timestamp", *sorted(set(moving.values()))], episode.number)
+        times = _checked_times(episode, np.array([_number(row["timestamp"]) for row in rows]))
+        span = (self.options.frames - 1) / self.fps
+        latest = int(np.searchsorted(times, times[-1] - span + self._tolerance_s, side="right"))
+        if latest < 1:
+            raise FileFault(
+                episode.data,
+                f"has only {times[-1] - times[0]:.2f} s of {episode.name}; {self.options.frames} frames at "
+                f"{self.fps:g} a second take {span:.2f} s",
+            )
+        wanted = times[int(random.integers(latest))] + np.arange(self.options.frames) / self.fps
+        chosen = np.abs(times[:, None] - wanted).argmin(0)
+        late = np.abs(times[chosen] - wanted)
+        if late.max() > self._tolerance_s:
+            gap = wanted[int(late.argmax())]
+            raise FileFault(episode.data, f"has no row of {episode.name} near {gap:.3f} s: a gap in its timestamps")
+        poses = {
+            name: _poses(episode, self._calibrations[name], [rows[int(row)] for row in chosen]) for name in cameras
+        }
+        return _Window(tuple(chosen.tolist()), tuple(times[chosen].tolist()), poses)
+
+    def _pictures(self, episode: EpisodePlace, camera: str, window: _Window) -> tuple[Bytes, int]:
+        """[T, H, W, 3] at the wanted size, and the bytes that were read."""
+        path, begin = episode.videos[camera]
+        clip = read_pictures(path, [begin + time for time in window.times_s], self._tolerance_s)
+        height, width = clip.pictures.shape[1:3]
+        told = self._calibrations[camera]
+        if (width, height) != (told.width, told.height):
+            raise FileFault(path, f"is {width} x {height}, its calibration says {told.width} x {told.height}")
+        wide, high = self.options.size
+        left, top, kept_width, kept_height = center_crop_box(width, height, wide / high)
+        kept = clip.pictures[:, top : top + kept_height, left : left + kept_width]
+        how = cv2.INTER_AREA if kept_width >= wide else cv2.INTER_LINEAR
+        sized = [cv2.resize(picture, (wide, high), interpolation=how) for picture in kept]
+        return np.stack(sized).astype(np.uint8), clip.bytes_read
+
+
+def _number(value: float | list[float]) -> float:
+    """A number that some sets keep as a list of one."""
+    return float(value[0] if isinstance(value, list) else value)
+
+
+def _checked_times(episode: EpisodePlace, times: Floats) -> Floats:
+    """Timestamps that rise, as many as the set says. Raises FileFault."""
+    if len(times) != episode.length or not len(times):
+        raise FileFault(episode.data, f"has {len(times)} rows of {episode.name}, meta says {episode.length}")
+    wrong = np.flatnonzero(~(np.diff(times) > 0))
+    if not np.isfinite(times).all() or len(wrong):
+        row = int(wrong[0]) + 1 if len(wrong) else int(np.flatnonzero(~np.isfinite(times))[0])
+        raise FileFault(episode.data, f"has timestamps out of order at row {row} of {episode.name}")
+    return times
+
+
+def _poses(episode: EpisodePlace, camera: CameraCalibration, rows: list[dict[str, list[float]]]) -> Floats:
+    """base_from_camera [T, 4, 4]. Raises FileFault if the feature holds no poses."""
+    if camera.pose is not None:
+        return np.tile(camera.pose, (len(rows), 1, 1))
+    feature = camera.pose_feature or ""
+    numbers = [row[feature] for row in rows]
+    if any(len(pose) != 16 for pose in numbers):
+        raise FileFault(episode.data, f"must have 16 numbers in {feature}, base_from_camera row by row")
+    poses = np.asarray(numbers, np.float64).reshape(-1, 4, 4)
+    try:
+        require_rigid(torch.from_numpy(poses), feature)
+    except ModelError as error:
+        raise FileFault(episode.data, f"holds no poses in {feature}: {error}") from error
+    return poses

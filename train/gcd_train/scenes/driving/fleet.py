@@ -1,0 +1,234 @@
+"""The vehicles of a grown driving world: cars of several kinds, vans, lorries and buses.
+
+x ahead, y left, z up, on the ground at the origin. `near` asks for what only a close look shows.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gcd_train.scenes.description import Colour, Part, Pattern, Point
+from gcd_train.scenes.driving.vehicles import OWN_PAINT, Assembly, varied
+from gcd_train.scenes.labels import Label
+
+_GLASS: Colour = (0.07, 0.09, 0.12)
+TYRE: Colour = (0.055, 0.055, 0.06)
+DARK: Colour = (0.1, 0.1, 0.11)
+_RIM: Colour = (0.62, 0.63, 0.65)
+HEADLIGHT: Colour = (0.93, 0.93, 0.88)
+TAIL: Colour = (0.55, 0.03, 0.03)
+_PAINTS: tuple[tuple[Colour, float], ...] = (
+    ((0.93, 0.93, 0.92), 0.2), ((0.72, 0.73, 0.75), 0.16), ((0.42, 0.43, 0.45), 0.15), ((0.07, 0.07, 0.08), 0.16),
+    ((0.07, 0.13, 0.36), 0.08), ((0.62, 0.06, 0.06), 0.08), ((0.18, 0.34, 0.6), 0.05), ((0.52, 0.46, 0.38), 0.04),
+    ((0.08, 0.27, 0.17), 0.03), ((0.86, 0.6, 0.08), 0.02), ((0.38, 0.1, 0.09), 0.02), ((0.33, 0.5, 0.5), 0.01),
+)  # fmt: skip
+
+
+_LIVERIES: tuple[Colour, ...] = (
+    (0.75, 0.1, 0.08),
+    (0.9, 0.75, 0.1),
+    (0.1, 0.3, 0.6),
+    (0.85, 0.86, 0.88),
+    (0.1, 0.45, 0.3),
+)
+_OWN_BACK_M = 0.56
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Lamps:
+    """lit: headlights and tail lights shine. brakes: the tail lights shine brightly."""
+
+    lit: bool = False
+    brakes: bool = False
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Style:
+    """Proportions, metres. cabin: (rear end, front end) at the belt, shares of the length from the rear.
+
+    glass: the shape of the cabin. bed: the pick-up's open load begins at the rear and ends at the cabin.
+    wheel: radius. closed: share of the length, from the rear, that has no windows.
+    """
+
+    name: str
+    length: float
+    width: float
+    height: float
+    belt: float
+    cabin: tuple[float, float]
+    glass: str = "taper"
+    wheel: float = 0.33
+    bed: bool = False
+    closed: float = 0.0
+
+
+_PICK_UP = _Style(
+    name="pick-up",
+    length=5.35,
+    width=1.95,
+    height=1.82,
+    belt=1.08,
+    cabin=(0.36, 0.74),
+    glass="cabin",
+    wheel=0.39,
+    bed=True,
+)
+_CARS: tuple[tuple[_Style, float], ...] = (
+    (_Style(name="saloon", length=4.6, width=1.82, height=1.45, belt=0.92, cabin=(0.12, 0.72), glass="cabin"), 0.24),
+    (_Style(name="hatchback", length=4.0, width=1.75, height=1.49, belt=0.93, cabin=(0.01, 0.73)), 0.2),
+    (_Style(name="city car", length=3.55, width=1.66, height=1.53, belt=0.95, cabin=(0.0, 0.8)), 0.08),
+    (_Style(name="estate", length=4.75, width=1.84, height=1.48, belt=0.93, cabin=(0.0, 0.7)), 0.11),
+    (_Style(name="off-road", length=4.7, width=1.92, height=1.74, belt=1.08, cabin=(0.0, 0.72), wheel=0.38), 0.17),
+    (_Style(name="people carrier", length=4.85, width=1.92, height=1.8, belt=1.05, cabin=(0.0, 0.84)), 0.07),
+    (_Style(name="van", length=5.4, width=2.0, height=2.3, belt=1.18, cabin=(0.0, 0.86), closed=0.62), 0.08),
+    (_PICK_UP, 0.05),
+)
+STYLES = tuple(style.name for style, _ in _CARS)
+
+
+def grown_car(random: np.random.Generator, lamps: Lamps, near: bool) -> Assembly:
+    """One of eight body styles in one of many paints."""
+    style = _CARS[int(random.choice(len(_CARS), p=[share for _, share in _CARS]))][0]
+    return _car(style, random_paint(random), lamps, near)
+
+
+def grown_own_car() -> Assembly:
+    """The ego car, always the same; its nose ends just behind the forward camera, which therefore never sees it."""
+    car = _car(_CARS[1][0], OWN_PAINT, Lamps(), near=True)
+    parts = tuple(replace(part.placed(-_OWN_BACK_M, 0.0, 0.0, 0.0), label=Label.OWN_CAR) for part in car.parts)
+    return Assembly(parts=parts, length=car.length + 2 * _OWN_BACK_M, width=car.width)
+
+
+def random_paint(random: np.random.Generator) -> Colour:
+    """A vehicle's colour, as often as it is seen."""
+    return varied(_PAINTS[int(random.choice(len(_PAINTS), p=[share for _, share in _PAINTS]))][0], random)
+
+
+def block(
+    at: Point, size: Point, colour: Colour, label: Label, *, gloss: float = 0.0, shape: str = "box", lit: bool = False
+) -> Part:
+    """One piece of a vehicle or a person."""
+    pattern = Pattern.LIT if lit else Pattern.PLAIN
+    return Part(shape=shape, centre=at, size=size, colour=colour, gloss=gloss, label=label, pattern=pattern)
+
+
+def _car(style: _Style, paint: Colour, lamps: Lamps, near: bool) -> Assembly:
+    length, width, label = style.length, style.width, Label.CAR
+    sill = 0.6 * style.belt
+    shoulder = (length * 0.985, width, style.belt - sill)
+    parts = [
+        block((0, 0, (0.2 + sill) / 2), (length, width, sill - 0.2), paint, label, gloss=0.35),
+        block((0, 0, (sill + style.belt) / 2), shoulder, paint, label, gloss=0.35, shape="nose"),
+        *_cabin(style, paint),
+        *_lights(length, width, 0.68 * style.belt, lamps, label, near),
+        *_wheels((-0.3 * length, 0.31 * length), width, style.wheel, label, near),
+    ]  # fmt: skip
+    if near:
+        parts += _fittings(style, paint)
+    return Assembly(parts=tuple(parts), length=length + 0.1, width=width + 0.1)
+
+
+def _cabin(style: _Style, paint: Colour) -> list[Part]:
+    length, width = style.length, style.width
+    start, end = (share * length - length / 2 for share in style.cabin)
+    middle, long, high = (start + end) / 2, end - start, style.height - style.belt
+    z, label = (style.belt + style.height) / 2, Label.CAR
+    roof = (long * (0.72 if style.glass == "taper" else 0.62), width * 0.76, 0.05)
+    lean = -0.04 * long if style.glass == "cabin" else 0.0
+    parts = [
+        block((middle, 0, z), (long, width * 0.95, high), _GLASS, label, gloss=0.45, shape=style.glass),
+        block((middle + lean, 0, style.height), roof, paint, label, gloss=0.35),
+    ]
+    if style.closed:  # a van's load room has no windows
+        room = style.closed * length
+        size = (room, width * 0.97, high + 0.02)
+        parts.append(block((start + room / 2, 0, z), size, paint, label, gloss=0.4))
+    if style.bed:
+        load = start + length / 2 - 0.15
+        parts.append(block((start - load / 2, 0, style.belt - 0.02), (load, width * 0.82, 0.05), DARK, label))
+    return parts
+
+
+def _lights(length: float, width: float, z: float, lamps: Lamps, label: Label, near: bool) -> list[Part]:
+    """Two in front, two behind; far away only those that shine."""
+    if not (near or lamps.lit or lamps.brakes):
+        return []
+    tail: Colour = (0.95, 0.05, 0.04) if lamps.brakes else (0.5, 0.02, 0.02) if lamps.lit else TAIL
+    red = lamps.lit or lamps.brakes
+    parts: list[Part] = []
+    for y in (-width * 0.37, width * 0.37):
+        parts.append(block((length / 2, y, z), (0.07, 0.34, 0.14), HEADLIGHT, label, gloss=0.6, lit=lamps.lit))
+        parts.append(block((-length / 2, y, z + 0.06), (0.07, 0.3, 0.17), tail, label, gloss=0.6, lit=red))
+    return parts
+
+
+def _fittings(style: _Style, paint: Colour) -> list[Part]:
+    """Grille, bumpers, plates and mirrors."""
+    front, width, label = style.length / 2, style.width, Label.CAR
+    mirror = style.cabin[1] * style.length - front - 0.3
+    return [
+        block((front + 0.01, 0, 0.62 * style.belt), (0.05, width * 0.42, 0.16), DARK, label),
+        block((front, 0, 0.3), (0.1, width * 0.96, 0.2), DARK, label),
+        block((-front, 0, 0.3), (0.1, width * 0.96, 0.2), DARK, label),
+        block((-front - 0.02, 0, 0.6 * style.belt), (0.05, 0.5, 0.11), (0.85, 0.85, 0.8), label),
+        block((mirror, 0, style.belt + 0.1), (0.12, width + 0.08, 0.12), paint, label, gloss=0.35),
+    ]
+
+
+def _wheels(axles: tuple[float, ...], width: float, radius: float, label: Label, near: bool) -> list[Part]:
+    """Round wheels with rims, or far away one dark block an axle."""
+    if not near:
+        return [block((x, 0, radius), (1.7 * radius, width + 0.02, 1.9 * radius), TYRE, label) for x in axles]
+    parts: list[Part] = []
+    for x in axles:
+        for y in (-width / 2 + 0.1, width / 2 - 0.1):
+            parts.append(block((x, y, radius), (2 * radius, 0.23, 2 * radius), TYRE, label, shape="wheel"))
+        parts.append(block((x, 0, radius), (radius, width + 0.06, radius), _RIM, label, gloss=0.35, shape="wheel"))
+    return parts
+
+
+def grown_truck(random: np.random.Generator, lamps: Lamps, near: bool) -> Assembly:
+    """A box truck, a tipper or a lorry with a long trailer."""
+    kind = str(random.choice(["box", "tipper", "trailer"], p=[0.55, 0.2, 0.25]))
+    length = float(random.uniform(11, 13.5) if kind == "trailer" else random.uniform(6, 8.5))
+    height = 2.5 if kind == "tipper" else float(random.uniform(2.8, 3.6))
+    white = float(random.uniform(0.6, 0.92))
+    cargo: Colour = (white, white, white) if random.random() < 0.55 else random_paint(random)
+    front, load, label = length / 2, length - 2.35, Label.TRUCK
+    paint = random_paint(random)
+    parts = [
+        block((front - 1.0, 0, 1.4), (2.0, 2.35, 2.0), paint, label, gloss=0.4, shape="nose"),
+        block((front - 0.09, 0, 1.85), (0.12, 2.05, 0.72), _GLASS, label, gloss=0.45),
+        block((-front + load / 2, 0, (height + 1.0) / 2), (load, 2.46, height - 1.0), cargo, label, gloss=0.2),
+        block((0, 0, 0.75), (length * 0.97, 1.1, 0.4), DARK, label),
+        *_lights(length, 2.35, 0.78, lamps, label, near),
+        *_wheels((front - 1.2, -front + 1.3, -front + 2.5), 2.42, 0.5, label, near),
+    ]
+    if kind == "tipper":
+        heap: Colour = (0.45, 0.37, 0.28)
+        parts.append(block((-front + load / 2, 0, height + 0.1), (load * 0.85, 2.1, 0.5), heap, label, shape="taper"))
+    elif near:
+        parts.append(block((-front - 0.01, 0, (height + 1.0) / 2), (0.04, 0.05, height - 1.2), DARK, label))
+        stripe = random_paint(random)
+        parts.append(block((-front + load / 2, 0, 1.35), (load * 0.9, 2.49, 0.35), stripe, label))
+    return Assembly(parts=tuple(parts), length=length + 0.1, width=2.52)
+
+
+def grown_bus(random: np.random.Generator, lamps: Lamps, near: bool) -> Assembly:
+    """A city bus or a coach."""
+    length, label = float(random.uniform(9.5, 12.2)), Label.BUS
+    paint = varied(_LIVERIES[int(random.integers(len(_LIVERIES)))], random)
+    band: Colour = (0.9, 0.9, 0.88)
+    parts = [
+        block((0, 0, 0.95), (length, 2.5, 1.25), paint, label, gloss=0.4),
+        block((0, 0, 2.02), (length * 0.995, 2.46, 0.9), _GLASS, label, gloss=0.45),
+        block((0, 0, 2.72), (length, 2.5, 0.5), band if random.random() < 0.5 else paint, label, gloss=0.4),
+        block((-1.0, 0, 3.05), (length * 0.5, 1.6, 0.22), DARK, label),
+        *_lights(length, 2.5, 0.75, lamps, label, near),
+        *_wheels((-0.28 * length, 0.31 * length), 2.46, 0.49, label, near),
+    ]
+    if near:
+        posts = np.linspace(-0.46, 0.46, 7) * length
+        parts += [block((float(x), 0, 2.02), (0.1, 2.5, 0.9), paint, label) for x in posts]
+        parts.append(block((length / 2, 0, 2.7), (0.05, 1.5, 0.28), (0.95, 0.62, 0.1), label, lit=True))
+    return Assembly(parts=tuple(parts), length=length + 0.1, width=2.55)

@@ -1,0 +1,24 @@
+"""A robot arm at a table: reach, grasp, lift, carry, place and push, with real contact physics."""
+
+from gcd_train.scenes.tabletop.classes import CLASS_NAMES, TabletopClass
+from gcd_train.scenes.tabletop.scene import (
+    ARMS,
+    UNITS_A_METRE,
+    Episode,
+    tabletop_episode,
+    tabletop_scene,
+    upright_base,
+)
+from gcd_train.scenes.tabletop.simulation import FPS
+
+__all__ = [
+    "ARMS",
+    "CLASS_NAMES",
+    "FPS",
+    "UNITS_A_METRE",
+    "Episode",
+    "TabletopClass",
+    "tabletop_episode",
+    "tabletop_scene",
+    "upright_base",
+]

@@ -1,0 +1,217 @@
+"""What stands still: the table or bench, clutter on it, the room around it, and the light."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from gcd_train.scenes.description import Colour, Light, Part, Pattern, Sheet
+from gcd_train.scenes.tabletop.classes import TabletopClass
+from gcd_train.scenes.tabletop.things import Placed, Solid, Thing
+
+TABLE_M = (0.66, 0.72)
+"""Half length along x and half width along y of the table top; its surface is at z = 0."""
+FLOOR_M = -0.76
+_WALL_M = 3.6
+_WOODS: tuple[Colour, ...] = ((0.62, 0.43, 0.26), (0.78, 0.62, 0.42), (0.45, 0.29, 0.18), (0.83, 0.74, 0.60))
+_FLATS: tuple[Colour, ...] = ((0.86, 0.86, 0.84), (0.36, 0.38, 0.40), (0.55, 0.62, 0.60), (0.24, 0.30, 0.36))
+_WALLS: tuple[Colour, ...] = ((0.85, 0.83, 0.78), (0.68, 0.74, 0.76), (0.78, 0.70, 0.62), (0.60, 0.64, 0.58))
+
+
+def random_table(random: np.random.Generator) -> tuple[Solid, ...]:
+    """A table with four legs, or a closed bench; origin in the middle of its surface."""
+    wooden = random.random() < 0.6
+    colour = _pick(_WOODS if wooden else _FLATS, random)
+    dark: Colour = (0.7 * colour[0], 0.7 * colour[1], 0.7 * colour[2])
+    top = Solid(
+        kind="box",
+        size=(*TABLE_M, 0.02),
+        centre=(0.0, 0.0, -0.02),
+        colour=colour,
+        accent=dark,
+        pattern=Pattern.PLANKS if wooden else Pattern.PLAIN,
+        grain_m=float(random.uniform(0.09, 0.2)),
+        gloss=float(random.uniform(0.05, 0.3)),
+    )
+    under = _bench(dark) if random.random() < 0.4 else _legs(dark)
+    return (top, *under)
+
+
+def _legs(colour: Colour) -> tuple[Solid, ...]:
+    half = (-FLOOR_M - 0.04) / 2
+    x, y = TABLE_M[0] - 0.07, TABLE_M[1] - 0.07
+    return tuple(
+        Solid(kind="box", size=(0.03, 0.03, half), centre=(a, b, -0.04 - half), colour=colour)
+        for a in (-x, x)
+        for b in (-y, y)
+    )
+
+
+def _bench(colour: Colour) -> tuple[Solid, ...]:
+    half = (-FLOOR_M - 0.04) / 2
+    size = (TABLE_M[0] - 0.05, TABLE_M[1] - 0.05, half)
+    return (Solid(kind="box", size=size, centre=(0.0, 0.0, -0.04 - half), colour=colour),)
+
+
+def random_clutter(random: np.random.Generator) -> list[Placed]:
+    """Two to five large things along the edges of the table, out of the arm's way."""
+    spots = [(x, y) for x, y in ((0.45, 0.5), (0.48, 0.0), (0.45, -0.5), (-0.05, 0.58), (-0.05, -0.58), (-0.5, 0.52))]
+    chosen = random.choice(len(spots), int(random.integers(2, 6)), replace=False)
+    made: list[Placed] = []
+    for index in chosen:
+        thing = _clutter_thing(random)
+        x, y = spots[int(index)]
+        place = (x + float(random.uniform(-0.03, 0.03)), y + float(random.uniform(-0.03, 0.03)), thing.size[2] / 2)
+        made.append(Placed(thing=thing, place=place, yaw=float(random.uniform(-0.4, 0.4))))
+    return made
+
+
+def _clutter_thing(random: np.random.Generator) -> Thing:
+    kind = int(random.integers(4))
+    colour = (float(random.uniform(0.15, 0.9)), float(random.uniform(0.15, 0.85)), float(random.uniform(0.15, 0.85)))
+    if kind == 0:
+        return _bin(colour, random)
+    if kind == 1:
+        return _books(random)
+    if kind == 2:
+        return _tin(colour, random)
+    size = (float(random.uniform(0.05, 0.09)), float(random.uniform(0.06, 0.11)), float(random.uniform(0.04, 0.12)))
+    card: Colour = (0.72, 0.56, 0.38)
+    tape = Solid(kind="box", size=(size[0] + 0.001, 0.015, size[2] + 0.001), colour=(0.85, 0.78, 0.62), gloss=0.3)
+    return _still("box", (Solid(kind="box", size=size, colour=card), tape), size)
+
+
+def _bin(colour: Colour, random: np.random.Generator) -> Thing:
+    """An open crate: a floor and four walls."""
+    x, y, z = float(random.uniform(0.07, 0.10)), float(random.uniform(0.08, 0.13)), float(random.uniform(0.03, 0.06))
+    walls = [
+        Solid(kind="box", size=(0.004, y, z), centre=(side * (x - 0.004), 0, 0), colour=colour, gloss=0.3)
+        for side in (-1, 1)
+    ]
+    walls += [
+        Solid(kind="box", size=(x, 0.004, z), centre=(0, side * (y - 0.004), 0), colour=colour, gloss=0.3)
+        for side in (-1, 1)
+    ]
+    floor = Solid(kind="box", size=(x, y, 0.004), centre=(0, 0, 0.004 - z), colour=colour, gloss=0.3)
+    return _still("bin", (floor, *walls), (x, y, z))
+
+
+def _books(random: np.random.Generator) -> Thing:
+    """A pile of books, each turned a little by its size."""
+    count = int(random.integers(2, 5))
+    thick = random.uniform(0.010, 0.022, count)
+    low = -float(thick.sum())
+    solids: list[Solid] = []
+    for half in thick.tolist():
+        size = (float(random.uniform(0.06, 0.085)), float(random.uniform(0.09, 0.12)), half)
+        colour = (float(random.uniform(0.1, 0.8)), float(random.uniform(0.1, 0.6)), float(random.uniform(0.1, 0.7)))
+        shift = (float(random.uniform(-0.01, 0.01)), float(random.uniform(-0.01, 0.01)), low + half)
+        solids.append(Solid(kind="box", size=size, centre=shift, colour=colour, gloss=0.15))
+        low += 2 * half
+    return _still("books", tuple(solids), (0.095, 0.13, float(thick.sum())))
+
+
+def _tin(colour: Colour, random: np.random.Generator) -> Thing:
+    radius, half = float(random.uniform(0.04, 0.07)), float(random.uniform(0.05, 0.11))
+    body = Solid(kind="cylinder", size=(radius, half), colour=colour, gloss=0.5)
+    lid = Solid(kind="cylinder", size=(radius * 1.04, 0.006), centre=(0, 0, half - 0.006), colour=(0.75, 0.76, 0.78))
+    return _still("tin", (body, lid), (radius, radius, half))
+
+
+def _still(name: str, solids: tuple[Solid, ...], half: tuple[float, float, float]) -> Thing:
+    size = (2 * half[0], 2 * half[1], 2 * half[2])
+    return Thing(name=name, solids=solids, size=size, mass_kg=1.0, friction=0.8)
+
+
+def room(random: np.random.Generator, table_m: float, scale: float) -> tuple[tuple[Part, ...], tuple[Sheet, ...]]:
+    """Floor, four walls and the sky above them, in scene units; lower than the sun at the table.
+
+    table_m: height of the table's surface in the world, metres. scale: units a metre.
+    """
+    wall, low, high = _WALL_M * scale, (FLOOR_M + table_m) * scale, 1.9 * scale
+    colour = _pick(_WALLS, random)
+    middle, height = (low + high) / 2, high - low
+    parts = [
+        Part(
+            shape="box",
+            centre=(x * wall, y * wall, middle),
+            size=(1.0 if x else 2 * wall, 1.0 if y else 2 * wall, height),
+            colour=colour,
+            accent=(0.9 * colour[0], 0.9 * colour[1], 0.92 * colour[2]),
+            pattern=Pattern.CLOUDY,
+            grain_m=5.0,
+            label=TabletopClass.WALL,
+        )
+        for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1))
+    ]
+    parts += _panels(random, wall, low, scale)
+    size = (-5.5 * wall, 5.5 * wall, 5.5 * wall)  # its inside faces the cameras, hence the negative size
+    parts.append(
+        Part(shape="ball", centre=(0, 0, 0), size=size, colour=(1, 1, 1), pattern=Pattern.SKY, label=TabletopClass.SKY)
+    )
+    return tuple(parts), (_floor(random, wall, low),)
+
+
+def _panels(random: np.random.Generator, wall: float, low: float, scale: float) -> list[Part]:
+    """Cupboards, pictures and doors along the walls, so that the background tells where it is."""
+    made: list[Part] = []
+    for side in range(4):
+        for along in np.arange(-0.75, 0.76, 0.5) + random.uniform(-0.12, 0.12, 4):
+            wide, deep = float(random.uniform(5, 11)), float(random.uniform(0.6, 4.5))
+            high = float(random.uniform(6, 22)) * scale / 10
+            colour = (
+                float(random.uniform(0.2, 0.85)),
+                float(random.uniform(0.2, 0.8)),
+                float(random.uniform(0.2, 0.8)),
+            )
+            lift = 0.0 if deep > 1.5 else 8.0
+            grey = 0.5 * (colour[0] + colour[1])
+            part = Part(
+                shape="box",
+                centre=(float(along) * wall, wall - 0.5 - deep / 2, low + lift + high / 2),
+                size=(wide, deep, high),
+                colour=((colour[0] + grey) / 2, (colour[1] + grey) / 2, (colour[2] + grey) / 2),
+                accent=(0.4, 0.35, 0.3),
+                pattern=Pattern(int(random.choice([Pattern.PLAIN, Pattern.WOOD, Pattern.STRIPES]))),
+                grain_m=2.0,
+                label=TabletopClass.WALL,
+            )
+            made.append(part.placed(0.0, 0.0, 0.0, side * math.pi / 2))
+    return made
+
+
+def _floor(random: np.random.Generator, wall: float, low: float) -> Sheet:
+    a, b, c, d = ((-wall, -wall, low), (wall, -wall, low), (wall, wall, low), (-wall, wall, low))
+    pattern = Pattern(int(random.choice([Pattern.PLANKS, Pattern.TERRAZZO, Pattern.CHECKER, Pattern.CLOUDY])))
+    colour = _pick(_WOODS if pattern == Pattern.PLANKS else _FLATS, random)
+    return Sheet(
+        corners=np.array([(a, b, c), (a, c, d)], np.float32),
+        colour=colour,
+        accent=(0.8 * colour[0], 0.8 * colour[1], 0.8 * colour[2]),
+        pattern=pattern,
+        grain_m=3.0,
+        gloss=0.1,
+        label=TabletopClass.FLOOR,
+    )
+
+
+def random_light(random: np.random.Generator) -> Light:
+    """A lamp high above, as parallel light, and the bright room around it."""
+    height, round_ = float(random.uniform(0.85, 1.35)), float(random.uniform(0, 2 * math.pi))
+    warm, strength = float(random.uniform(0.0, 0.3)), float(random.uniform(0.8, 1.5))
+    fill = float(random.uniform(0.55, 0.85))
+    return Light(
+        sun_to=(math.cos(height) * math.cos(round_), math.cos(height) * math.sin(round_), math.sin(height)),
+        sun=(strength, strength * (1 - 0.4 * warm), strength * (1 - 0.8 * warm)),
+        sky=(fill, fill * (1 - 0.1 * warm), fill * (1 - 0.2 * warm)),
+        ground=(0.45 * fill, 0.43 * fill, 0.40 * fill),
+        horizon=(0.72, 0.72, 0.70),
+        zenith=(0.80, 0.80, 0.79),
+        fog_m=4000.0,
+        cloud=0.0,
+        exposure=float(random.uniform(1.1, 1.5)),
+    )
+
+
+def _pick(colours: Sequence[Colour], random: np.random.Generator) -> Colour:
+    return colours[int(random.integers(len(colours)))]

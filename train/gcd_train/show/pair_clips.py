@@ -1,0 +1,76 @@
+"""A clip of pair shards (`gcd-train generate driving --pairs`), ready to look at."""
+
+import json
+import zipfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcd_model.geometry import DRIVING_GOAL_TARGET, Intrinsics
+from gcd_train.datasets.paired import PairedClips
+from gcd_train.errors import DataError, RecipeError
+from gcd_train.pointcloud import depth_visibility, splat
+from gcd_train.scene_view import SceneView
+from gcd_train.show.colours import SKY_M
+from gcd_train.show.footage import Footage, LabelName
+
+
+def pair_clip(folder: Path, seed: int | None) -> Footage:
+    """The clip of a seed, by default the first. Raises: DataError naming the shard, RecipeError for an unknown seed."""
+    clips = PairedClips.open(folder)
+    seeds = [clips.seed(number) for number in range(len(clips))]
+    if seed is not None and seed not in seeds:
+        raise RecipeError(f"{folder} has no clip of seed {seed}; it has {len(seeds)}, {seeds[0]} to {seeds[-1]}")
+    index = 0 if seed is None else seeds.index(seed)
+    clip = clips[index]
+    poses, hfov_deg = _told(*clips.places[index])
+    lens = Intrinsics.from_hfov(hfov_deg, clips.width, clips.height)
+    views = [
+        SceneView(rgb=rgb, depth=depth, classes=None, instances=None, world_from_camera=pose, lens=lens)
+        for rgb, depth, pose in zip(clip.source, clip.source_depth, poses["source"], strict=True)
+    ]
+    targets = list(zip(views, clip.target_depth, poses["target"], strict=True))
+    vehicle_from_source = clips.mount.vehicle_from_camera.numpy()
+    return Footage(
+        title=f"pair shard, {clips.world.name} world, seed {clip.seed}",
+        layout=str(clips.places[index][0]),
+        path="the driving path, up and back\nat a sine pace",
+        frame_numbers=tuple(range(clips.frames)),
+        fps=clips.fps,
+        scene_frames=clips.frames,
+        scene_fps=clips.fps,
+        cameras=tuple(poses),
+        source_camera="source",
+        hfov_deg=lens.hfov_deg,
+        source=clip.source,
+        target=clip.target,
+        target_is="rendered exactly",
+        splat=np.stack(
+            [(splat([view], pose, lens).colour * 255).round().byte().cpu().numpy() for view, _, pose in targets]
+        ),
+        visible=np.stack([depth_visibility(view, depth, pose, lens) for view, depth, pose in targets]),
+        visible_is="depths agree within 2 %",
+        surface=(clip.target_depth > 0) & (clip.target_depth < SKY_M),
+        labels=clip.source_classes.astype(np.int32),
+        kind="class",
+        names=tuple(LabelName(id=i, name=kind.name, colour=kind.colour) for i, kind in enumerate(clips.classes)),
+        depth=clip.source_depth,
+        world_from_source=np.repeat(vehicle_from_source[None], clips.frames, axis=0),
+        world_from_target=vehicle_from_source @ np.linalg.inv(poses["source"]) @ poses["target"],
+        look_at=DRIVING_GOAL_TARGET,
+        world="vehicle: x ahead, y left, z up, ground at z = 0",
+    )
+
+
+def _told(shard: Path, name: str) -> tuple[dict[str, NDArray[np.float64]], float]:
+    """Poses [T, 4, 4] by camera, and the horizontal field of view, of a clip's `scene.json`."""
+    try:
+        with zipfile.ZipFile(shard) as archive:
+            told = json.loads(archive.read(f"{name}/scene.json"))
+        poses = {camera: np.array(rows, np.float64) for camera, rows in told["world_from_camera"].items()}
+        return {camera: poses[camera] for camera in ("source", "target")}, float(told["facts"]["hfov_deg"])
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise DataError(
+            f"{shard}: {name}/scene.json is damaged ({error}); delete the shard, generate it again"
+        ) from error
