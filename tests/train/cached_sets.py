@@ -22,9 +22,10 @@ class FakePictures:
     origin: str = "fake"
     semantic: bool = False
     fps: float = 10.0
+    length: int = FRAMES
 
     def frames(self, scene: str, /) -> int:
-        return FRAMES
+        return self.length
 
     def moment(self, scene: str, time: int, positions: tuple[int, ...], /) -> MomentPictures:
         if (scene, time) in self.broken:

@@ -1,11 +1,14 @@
 """Scenes on disk: whole or not there, continued, checked; and the command that makes them."""
 
 import os
+import re
 import resource
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import msgspec
@@ -16,17 +19,17 @@ from headless import needs_egl
 from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
-from gcd_train.errors import DataError, RecipeError, RunError
-from gcd_train.layouts import kubric4d_names
+from gcd_train.errors import DataError, RecipeError, RenderError, RunError
+from gcd_train.layouts import kubric4d_names, scene_writer
 from gcd_train.layouts.manifest import GEOMETRY, MANIFEST, read_manifest, verify
 from gcd_train.layouts.scene_files import SceneFiles
 from gcd_train.layouts.scene_folder import new_scene, remove_leftovers
 from gcd_train.layouts.scene_run import GIVE_UP_AFTER, generate_scenes
 from gcd_train.layouts.scene_writer import SceneFormat, write_scene
+from gcd_train.scenes.description import Scene
 from gcd_train.scenes.frozen import FrozenScene
-from gcd_train.scenes.renderer import Renderer
+from gcd_train.scenes.renderer import Renderer, Rendering
 
-HERE = Path(__file__).parent
 FORM = SceneFormat(width=48, height=32, frames=2, oversample=1)
 
 
@@ -94,6 +97,19 @@ class TestSceneFolder:
         assert remove_leftovers(tmp_path, "scn00002") == 0
         assert remove_leftovers(tmp_path) == 1
         assert inside(tmp_path) == []
+
+
+def test_without_opengl_nothing_is_simulated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_opengl() -> None:
+        raise RenderError("no headless OpenGL")
+
+    def simulated(seed: int, frames: int) -> Scene:
+        raise AssertionError("simulated for nothing")
+
+    monkeypatch.setattr(scene_writer, "require_drawing", no_opengl)
+    with pytest.raises(RenderError, match="no headless OpenGL"):
+        write_scene(tmp_path, box_world(simulated), FORM, 0)
+    assert inside(tmp_path) == []
 
 
 @needs_egl
@@ -198,14 +214,14 @@ class TestWriteScene:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
             signal.signal(signal.SIGXFSZ, handler)
         assert "File too large" in last.failures[0]
+        assert re.search(r"scn00000/(frames_p0_v\d/\w+_0000\d\.\w+|geometry\.npz)", last.failures[0])
         assert inside(tmp_path) == []
 
 
 @needs_egl
 class TestRuns:
     def test_failures_are_counted_and_end_nothing(self, tmp_path: Path) -> None:
-        for run in generate_scenes(tmp_path, box_world(odd_box_scene), FORM, range(4)):
-            last = run
+        *_, last = generate_scenes(tmp_path, box_world(odd_box_scene), FORM, range(4))
         assert (last.written, last.there, last.done, last.gave_up) == (2, 0, 4, False)
         assert last.failures == {1: "seed 1 is odd", 3: "seed 3 is odd"}
         assert last.exit_code == DataError.exit_code
@@ -232,22 +248,13 @@ class TestRuns:
 
     def test_a_killed_run_leaves_no_half_scene_and_goes_on(self, tmp_path: Path) -> None:
         """The process is killed while it is between the first and the last file of its second scene."""
-        code = (
-            "import os, sys; sys.path.insert(0, sys.argv[1]); from pathlib import Path\n"
-            "from box_world import box_world\n"
-            "from gcd_train.layouts.scene_files import SceneFiles\n"
-            "from gcd_train.layouts.scene_run import generate_scenes\n"
-            "from gcd_train.layouts.scene_writer import SceneFormat\n"
-            "whole = SceneFiles.write\n"
-            "def write(self, path, data):\n"
-            "    whole(self, path, data)\n"
-            "    if self.folder.name == 'scn00001' and len(self.checksums) == 7: os.kill(os.getpid(), 9)\n"
-            "SceneFiles.write = write\n"
-            "form = SceneFormat(width=48, height=32, frames=2, oversample=1)\n"
-            "list(generate_scenes(Path(sys.argv[2]), box_world(), form, range(3)))\n"
-        )
-        killed = subprocess.run([sys.executable, "-c", code, str(HERE), str(tmp_path)], check=False, timeout=100)
-        assert killed.returncode == -signal.SIGKILL
+        child = os.fork()  # a new interpreter would take seconds to import everything
+        if child == 0:
+            try:
+                _killed_in_its_second_scene(tmp_path)
+            finally:
+                os._exit(1)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
         assert [name for name in inside(tmp_path) if not name.startswith(".")] == ["scn00000"]
         assert len(inside(tmp_path)) == 2
         *_, last = generate_scenes(tmp_path, box_world(), FORM, range(3))
@@ -255,6 +262,38 @@ class TestRuns:
         assert inside(tmp_path) == ["scn00000", "scn00001", "scn00002"]
         for name in inside(tmp_path):
             verify(tmp_path / name)
+
+
+def _killed_in_its_second_scene(root: Path) -> None:
+    """What is drawn does not matter, and OpenGL does not outlive a fork: the pictures are grey."""
+    whole = SceneFiles.write
+
+    def write(self: SceneFiles, path: Path, data: bytes) -> None:
+        whole(self, path, data)
+        if self.folder.name == "scn00001" and len(self.checksums) == 7:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    scene_writer.Renderer = GreyRenderer  # pyright: ignore[reportAttributeAccessIssue]
+    SceneFiles.write = write
+    list(generate_scenes(root, box_world(), FORM, range(3)))
+
+
+class GreyRenderer:
+    """As much of a renderer as a scene's writer uses."""
+
+    def __init__(self, width: int, height: int, *, oversample: int) -> None:
+        labels = np.ones((height, width), np.uint8)
+        depth = np.ones((height, width), np.float32)
+        self.drawn = Rendering(rgb=labels[..., None].repeat(3, -1), depth=depth, classes=labels, instances=labels)
+
+    def __enter__(self) -> "GreyRenderer":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
+    def views(self, frozen: FrozenScene, cameras: dict[str, Any]) -> Iterator[tuple[int, str, Rendering]]:
+        return ((time, name, self.drawn) for name, poses in cameras.items() for time in range(len(poses)))
 
 
 SMALL = ["--width", "48", "--height", "32", "--frames", "2", "--oversample", "1", "--workers", "1"]
@@ -294,11 +333,15 @@ class TestCommand:
     @pytest.mark.parametrize("world", ["drop", "tabletop"])
     def test_scenes_on_a_stage(self, tmp_path: Path, world: str) -> None:
         pytest.importorskip("mujoco", reason="needs the extra `scenes`")
-        made = CliRunner().invoke(app, ["generate", world, str(tmp_path), "--scenes", "1", "--compact", *SMALL])
+        few_things = "7"
+        made = CliRunner().invoke(
+            app, ["generate", world, str(tmp_path), "--first-seed", few_things, "--compact", *SMALL]
+        )
         assert made.exit_code == 0, made.output
-        manifest = verify(tmp_path / "scn00000")
+        manifest = verify(tmp_path / "scn00007")
         assert (manifest.world, len(manifest.cameras)) == (world, 16)
-        told = msgspec.json.decode(kubric4d_names.metadata_path(tmp_path / "scn00000", 4).read_bytes())
+        assert manifest.facts.get("arm") == (None if world == "drop" else "primitive")
+        told = msgspec.json.decode(kubric4d_names.metadata_path(tmp_path / "scn00007", 4).read_bytes())
         assert len(told["instances"]) == told["scene"]["num_instances"] > 0
         assert "bboxes_3d" not in told["instances"][0]
 

@@ -3,14 +3,14 @@
 import errno
 import os
 import pickle
-import subprocess
-import sys
+import signal
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 import torch
+from cache_process import killed_run
 from cached_sets import CHOICE, CLIP, FRAMES, HEIGHT, PLAN, WIDTH, FakePictures, tiny_encoders, tiny_identity
 from tiny_scenes4d import DRIVING_POSES, write_driving
 from tiny_world import tiny_recipe
@@ -205,19 +205,10 @@ def test_a_job_travels_to_another_process(tmp_path: Path) -> None:
 
 
 def test_a_run_killed_at_any_moment_goes_on_to_the_same_result(tmp_path: Path, folder: Path) -> None:
-    script = Path(__file__).parent / "cache_process.py"
-    moments = ["5", "7"]  # a shard that the index does not know; half a shard beside a known one
-    told = subprocess.run(
-        [sys.executable, str(script), str(tmp_path), *moments],
-        capture_output=True,
-        text=True,
-        timeout=100,
-        check=True,
-    )
-    assert told.stdout.split() == [word for moment in moments for word in (moment, "killed")]
     wanted = _lasting(folder)
-    for moment in moments:
-        halfway = tmp_path / moment
+    for moment in (5, 7):  # a shard that the index does not know; half a shard beside a known one
+        halfway = tmp_path / str(moment)
+        assert killed_run(halfway, moment) == -signal.SIGKILL
         done = {name for name in _lasting(halfway) if name != "index.json"}
         assert len(done) < 3
         cached(halfway)
@@ -286,6 +277,12 @@ def test_pictures_of_another_size_are_refused_by_scene(tmp_path: Path) -> None:
     (step,) = cached(tmp_path, FakePictures(scenes=("a",)), height=2 * HEIGHT)
     assert step.error is not None
     assert f"({HEIGHT}, {WIDTH})" in step.error
+
+
+def test_a_scene_too_short_for_a_clip_is_refused_by_name(tmp_path: Path) -> None:
+    (step,) = cached(tmp_path, FakePictures(scenes=("a",), length=2))
+    assert step.error is not None
+    assert "a: 2 frames are too few for a clip" in step.error
 
 
 def test_two_runs_never_write_to_one_folder(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from gcd_train.layouts.camera_facts import blender_pose, project, quaternions, r
 from gcd_train.layouts.depth_code import FAR_M, NEAR_M, SKY_M, decode_depth, encode_depth, with_sky
 from gcd_train.layouts.instance_tracks import InstanceTracks
 from gcd_train.layouts.kubric4d import Kubric4DWriter, distance_of, segment_ids
-from gcd_train.layouts.kubric4d_metadata import camera_metadata
+from gcd_train.layouts.kubric4d_metadata import camera_metadata, view_metadata
 from gcd_train.layouts.parallel_domain4d import ParallelDomain4DWriter, calibration, ontology
 from gcd_train.layouts.scene_files import SceneFiles
 from gcd_train.scenes.description import rotations
@@ -244,7 +245,7 @@ class TestKubric4D:
         assert told["scene"]["resolution"] == [48, 32]
         assert (told["scene"]["frame_rate"], told["scene"]["num_frames"], told["random_seed"]) == (24.0, 2, 7)
         assert (told["scene"]["num_instances"], told["scene"]["num_valo_instances"]) == (2, 1)
-        assert set(told["scene"]) >= {"step_rate", "gravity", "background"}
+        assert (told["scene"]["gravity"], told["scene"]["background"]) == ([0.0, 0.0, -9.81], "procedural")
         green, red = told["instances"]  # by the renderer's instance id: 4, then 9
         assert (green["asset_id"], red["asset_id"]) == ("green box", "red box")
         assert red["visibility"] == [48, 0]
@@ -257,6 +258,17 @@ class TestKubric4D:
         assert np.shape(red["quaternions"]) == (2, 4)
         assert np.shape(red["image_positions"]) == (2, 2)
         assert "collisions" not in json.loads(kubric4d_names.metadata_path(folder, 1).read_text())
+
+    def test_physics_is_told_in_the_scenes_own_units(self) -> None:
+        pytest.importorskip("mujoco", reason="needs the extra `scenes`")
+        from gcd_train.scenes.drop import physics
+        from gcd_train.scenes.tabletop import model
+
+        scene = replace(box_scene(0, 2), facts={"metres_a_unit": 0.1})
+        told = view_metadata(scene, "view0", (), InstanceTracks(2), LENS, {"seed": 0, "fps": 24.0})["scene"]
+        assert told["gravity"] == pytest.approx([0, 0, -98.1])
+        assert told["step_rate"] == pytest.approx(1 / model.STEP_S)
+        assert vars(physics)["_STEP_S"] == model.STEP_S
 
     def test_segments_are_numbered_as_the_list_of_objects(self) -> None:
         table = segment_ids((4, 9))
@@ -319,6 +331,8 @@ class TestParallelDomain4D:
 
     def test_the_ontology_lists_classes_by_their_ids(self) -> None:
         items = {item["id"]: item for item in ontology(ONTOLOGY)["items"]}
+        assert items[5]["isthing"]
+        assert not items[24]["isthing"]  # the road
         assert items[5]["name"] == "Car"
         assert items[5]["color"] == {"r": 0, "g": 0, "b": 142}
         assert items[255]["name"] == "Void"

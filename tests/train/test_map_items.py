@@ -71,7 +71,8 @@ def test_items_are_taken_as_workers_come_free() -> None:
 
 def test_leaving_early_stops_the_workers_in_an_orderly_way(tmp_path: Path) -> None:
     code = (
-        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "import signal, sys; sys.path.insert(0, sys.argv[1])\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # background jobs of a shell ignore it
         "from mapped_work import wait_for_ever\n"
         "from gcd_train.map_items import map_items\n"
         "if __name__ == '__main__':\n"
@@ -90,7 +91,8 @@ def test_leaving_early_stops_the_workers_in_an_orderly_way(tmp_path: Path) -> No
 def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
     (tmp_path / "items").mkdir()
     code = (
-        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "import signal, sys; sys.path.insert(0, sys.argv[1])\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # background jobs of a shell ignore it
         "from mapped_work import mark_and_square\n"
         "from gcd_train.map_items import map_items\n"
         "if __name__ == '__main__':\n"

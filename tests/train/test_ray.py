@@ -120,6 +120,7 @@ class TestWithoutACluster:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(400)  # Ray notices a lost node after its own patience; workers import everything anew
 class TestTwoNodes:
     @pytest.fixture
     def cluster(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:

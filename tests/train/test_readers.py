@@ -272,6 +272,12 @@ def test_depth_without_any_is_named(driving: Path) -> None:
     expect_driving_fault(driving, driving_file("depth"), "no depth above 0")
 
 
+@pytest.mark.parametrize("absurd", [np.inf, 1e30])
+def test_depth_that_is_absurd_everywhere_is_named(driving: Path, absurd: float) -> None:
+    np.savez(driving / driving_file("depth"), data=np.full((36, 48), absurd, np.float32))
+    expect_driving_fault(driving, driving_file("depth"), "beyond 30000 m in every pixel")
+
+
 def test_an_archive_of_something_else_is_named(driving: Path) -> None:
     np.savez(driving / driving_file("depth"), other=np.ones((36, 48), np.float32))
     expect_driving_fault(driving, driving_file("depth"), "lacks its array `data`")

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from headless import needs_egl
+from stage_world import STAGE, stage
 
-from gcd_model.geometry import Intrinsics, Spherical, to_pose
+from gcd_model.geometry import Intrinsics
 from gcd_train.datasets.clip_frames import FrameSampling
 from gcd_train.datasets.kubric4d import Kubric4D
 from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
@@ -17,7 +18,6 @@ from gcd_train.datasets.view_pairs import ViewPairs
 from gcd_train.errors import DataError
 from gcd_train.layouts.depth_code import SKY_M
 from gcd_train.layouts.scene_writer import SceneFormat, write_scene
-from gcd_train.scenes.description import Light, Part, Scene, upright
 from gcd_train.scenes.driving import class_ids, driving_drive
 from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.renderer import Renderer, Rendering
@@ -26,56 +26,30 @@ from gcd_train.scenes.worlds import SCENE_WORLDS
 SEED, FRAMES, WIDTH, HEIGHT = 3, 2, 48, 36
 CLIP = FrameSampling(clip=2, reach_last=True)
 
-LIGHT = Light(
-    sun_to=(0.0, 0.0, 1.0),
-    sun=(1.0, 1.0, 1.0),
-    sky=(0.4, 0.4, 0.4),
-    ground=(0.2, 0.2, 0.2),
-    horizon=(0.7, 0.8, 0.9),
-    zenith=(0.3, 0.5, 0.8),
-    fog_m=1e6,
-    cloud=0.0,
-    exposure=1.0,
-)
-
 pytestmark = needs_egl
 
 
-def stage(seed: int, frames: int) -> Scene:
-    """A floor with a box that slides over it; no physics."""
-    path = np.zeros((frames, 2, 4), np.float32)
-    path[:, 1, 0] = np.arange(frames) + seed
-    angles = [(90.0 * view, 45.0) for view in range(4)] + [(15.0 + 30.0 * view, 5.0) for view in range(12)]
-    poses = [to_pose(Spherical(azimuth_deg=a, elevation_deg=e, radius_m=15.0)).numpy() for a, e in angles]
-    floor = Part(shape="box", centre=(0.0, 0.0, -0.5), size=(60.0, 60.0, 1.0), colour=(0.5, 0.4, 0.3), label=1)
-    box = Part(shape="box", centre=(0, 0, 1), size=(2, 2, 2), colour=(0.2, 0.3, 0.8), label=2, instance=7, body=1)
-    return Scene(
-        parts=(floor, box),
-        sheets=(),
-        poses=upright(path),
-        focus=np.zeros((frames, 3), np.float32),
-        cameras={f"view{view}": np.repeat(pose[None], frames, 0) for view, pose in enumerate(poses)},
-        hfov_deg=float(2 * np.degrees(np.arctan(0.5))),
-        light=LIGHT,
-    )
+@pytest.fixture(scope="module")
+def stage_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The stage in the published layout."""
+    return write_stage(tmp_path_factory.mktemp("stage"))
 
 
-@pytest.fixture(scope="module", params=[False, True], ids=["published", "compact"])
-def stage_root(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("stage")
-    world = replace(SCENE_WORLDS["drop"], name="stage", make=stage)
-    form = SceneFormat(width=48, height=32, frames=FRAMES, oversample=1, compact=request.param)
-    write_scene(root, world, form, 0)
+def write_stage(root: Path, *, compact: bool = False) -> Path:
+    form = SceneFormat(width=48, height=32, frames=FRAMES, oversample=1, compact=compact)
+    write_scene(root, STAGE, form, 0)
     return root
 
 
-def test_a_kubric_scene_is_read_as_it_was_drawn(stage_root: Path) -> None:
+@pytest.mark.parametrize("compact", [False, True])
+def test_a_kubric_scene_is_read_as_it_was_drawn(stage_root: Path, tmp_path: Path, compact: bool) -> None:
+    stage_root = write_stage(tmp_path, compact=True) if compact else stage_root
     dataset = Kubric4D.open(stage_root, instances=True)
     scene = stage(0, FRAMES)
     with Renderer(48, 32, oversample=1) as renderer:
         drawn = {(step, name): view for step, name, view in renderer.views(freeze(scene), scene.cameras)}
     assert dataset.frames("scn00000") == FRAMES
-    compact = any(stage_root.rglob("*.webp"))
+    assert any(stage_root.rglob("*.webp")) == compact
     for time in range(FRAMES):
         for camera, view in zip(dataset.cameras, dataset.views("scn00000", time), strict=True):
             wanted = drawn[time, camera]
@@ -101,10 +75,14 @@ def test_an_exact_orbit_looks_like_its_point_cloud(stage_root: Path) -> None:
     assert splatted.visible is not None
 
 
-@pytest.fixture(scope="module", params=[False, True], ids=["published", "compact"])
-def root(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("driving")
-    form = SceneFormat(width=WIDTH, height=HEIGHT, frames=FRAMES, oversample=1, compact=request.param)
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A drive in the published layout."""
+    return write_drive(tmp_path_factory.mktemp("driving"))
+
+
+def write_drive(root: Path, *, compact: bool = False) -> Path:
+    form = SceneFormat(width=WIDTH, height=HEIGHT, frames=FRAMES, oversample=1, compact=compact)
     write_scene(root, SCENE_WORLDS["driving"], form, SEED)
     return root
 
@@ -116,10 +94,14 @@ def drawn() -> dict[tuple[int, str], Rendering]:
         return {(step, name): view for step, name, view in renderer.views(freeze(scene), scene.cameras)}
 
 
-def test_a_driving_scene_is_read_as_it_was_drawn(root: Path, drawn: dict[tuple[int, str], Rendering]) -> None:
+@pytest.mark.parametrize("compact", [False, True])
+def test_a_driving_scene_is_read_as_it_was_drawn(
+    root: Path, drawn: dict[tuple[int, str], Rendering], tmp_path: Path, compact: bool
+) -> None:
+    root = write_drive(tmp_path, compact=True) if compact else root
     dataset = ParallelDomain4D.open(root, instances=True)
     (scene,) = dataset.scenes
-    compact = any((root / scene / "rgb").rglob("*.webp"))
+    assert any((root / scene / "rgb").rglob("*.webp")) == compact
     vehicle_from_camera = SCENE_WORLDS["driving"].vehicle_from_camera
     assert vehicle_from_camera is not None
     for time in range(FRAMES):

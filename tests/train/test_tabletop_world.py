@@ -90,6 +90,15 @@ def test_what_is_told_of_an_object_is_where_its_body_is_drawn() -> None:
     np.testing.assert_allclose(by_difference, moved.velocities[2:-2], atol=0.15 * np.abs(moved.velocities).max())
 
 
+def test_the_box_that_is_told_of_a_link_holds_what_is_drawn_of_it() -> None:
+    scene = episode(0).scene
+    for thing in scene.objects:
+        told = np.asarray(thing.size) / 2
+        if thing.dynamic:  # the others' parts are told in the table's frame
+            for part in (part for part in scene.parts if part.instance == thing.instance):
+                assert (np.abs(np.asarray(part.centre) - thing.middle) < told + 1e-6).all(), thing.name
+
+
 def test_no_camera_of_the_bounds_stands_in_a_wall_or_in_the_arm() -> None:
     walls = [part for part in episode(0).scene.parts if part.label == TabletopClass.WALL]
     assert min(max(abs(part.centre[0]), abs(part.centre[1])) - max(part.size[:2]) / 2 for part in walls) < 36

@@ -18,24 +18,43 @@ if TYPE_CHECKING:
     from gcd_train.datasets.view_pairs import Dataset4D
     from gcd_train.latent_cache import CacheJob, CacheProgress
 
-Data: TypeAlias = Annotated[Path, Argument(help="Folder with scene_000000 and so on (ParallelDomain-4D's layout).")]
-Weights: TypeAlias = Annotated[str, Option(help="Checkpoint with the encoders: a path, package:NAME, random:FAMILY.")]
+Data: TypeAlias = Annotated[
+    Path, Argument(metavar="DATA", help="Folder with scene_000000 and so on (ParallelDomain-4D's layout).")
+]
+Weights: TypeAlias = Annotated[
+    str, Option(help="Checkpoint with the encoders: a path, package:NAME; random:driving, small ones, to try it out.")
+]
 Out: TypeAlias = Annotated[Path, Option(help="Folder of the cache; run the same line again to go on.")]
 Workers: TypeAlias = Annotated[int, Option(min=1, help="Processes; each loads the encoders.")]
 Ray: TypeAlias = Annotated[str | None, Option("--ray", help="Address of a Ray cluster (extra `cluster`).")]
-Split: TypeAlias = Annotated[Literal["train", "val", "test"] | None, Option(help="Part of the set; all without.")]
-SplitFile: TypeAlias = Annotated[Path | None, Option(help="JSON that says which scene is in which part.")]
+Split: TypeAlias = Annotated[
+    Literal["train", "val", "test"] | None,
+    Option(help="Part of the set, needs --split-file; the whole set if left out."),
+]
+SplitFile: TypeAlias = Annotated[Path | None, Option(help="JSON with the scenes of train, val and test.")]
 Copies: TypeAlias = Annotated[int, Option(min=1, help="Differently noised latents of every source frame.")]
-PathChoice: TypeAlias = Annotated[Literal["gradual", "direct", "both"], Option(help="Which clips are to be had.")]
-Kept: TypeAlias = Annotated[Literal["both", "mean"], Option(help="Of the targets' posterior: mean and variance.")]
+PathChoice: TypeAlias = Annotated[
+    Literal["gradual", "direct", "both"],
+    Option(help="Clips to encode for: the camera moves (gradual), or is there at once (direct)."),
+]
+Kept: TypeAlias = Annotated[
+    Literal["both", "mean"], Option(help="What to keep of the targets' latents: mean and variance, or the mean.")
+]
 Semantic: TypeAlias = Annotated[bool, Option("--semantic", help="Targets show the classes instead of colour.")]
-Exact: TypeAlias = Annotated[bool, Option("--exact", help="Targets from the geometry our own scenes keep.")]
+Exact: TypeAlias = Annotated[
+    bool, Option("--exact", help="Draw targets from geometry.npz, which generated scenes have, not from points.")
+]
 Limit: TypeAlias = Annotated[int | None, Option(min=1, help="Only the first so many scenes.")]
-Seed: TypeAlias = Annotated[int, Option(min=0, help="Of the pixel noise.")]
-FamilyName: TypeAlias = Annotated[str | None, Option("--family", help="Of the weights, where the file does not tell.")]
+Seed: TypeAlias = Annotated[int, Option(min=0, help="Seed of the pixel noise.")]
+FamilyName: TypeAlias = Annotated[
+    str | None,
+    Option("--family", help="Family of the weights, where the file does not tell (see `gcd-train families`)."),
+]
 Device: TypeAlias = Annotated[str, Option(help="auto, cpu, cuda or cuda:N.")]
-Dtype: TypeAlias = Annotated[str, Option(help="Of the encoders: float32, bfloat16 or float16.")]
-Batch: TypeAlias = Annotated[int, Option(min=1, help="Pictures an encoder call; memory only.")]
+Dtype: TypeAlias = Annotated[str, Option(help="Type the encoders run in: float32, bfloat16 or float16.")]
+Batch: TypeAlias = Annotated[
+    int, Option(min=1, help="Pictures in one call of the encoder; changes memory, not the latents.")
+]
 
 _OUT = Console(highlight=False, soft_wrap=True)
 

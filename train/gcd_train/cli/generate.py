@@ -20,7 +20,7 @@ from gcd_train.layouts.scene_writer import SceneFormat
 from gcd_train.scenes.contact_sheet import write_contact_sheet
 from gcd_train.scenes.driving import FPS, HFOV_DEG
 from gcd_train.scenes.film import write_film
-from gcd_train.scenes.worlds import SCENE_WORLDS, WorldOptions
+from gcd_train.scenes.worlds import SCENE_WORLDS, SceneWorld, WorldOptions, tabletop_world
 from gcd_train.scenes.writer import World, generate
 
 app = typer.Typer(no_args_is_help=True, help="Make training data with a procedural world (extra `scenes`).")
@@ -35,6 +35,7 @@ Oversample = Annotated[int, typer.Option(min=1, max=4, help="Anti-aliasing: pixe
 Frames = Annotated[int | None, typer.Option(min=2, help="Time steps; by default as published.")]
 Width = Annotated[int | None, typer.Option(min=16, help="Pixels; by default as published.")]
 Height = Annotated[int | None, typer.Option(min=16, help="Pixels; by default as published.")]
+Arm = Annotated[str, typer.Option(help="primitive, or panda (needs the package gymnasium-robotics).")]
 Sheet = Annotated[Path | None, typer.Option(help="Also draw the first scenes into this PNG.")]
 
 
@@ -59,13 +60,15 @@ def drop(
 ) -> None:
     """Things that fall and collide, seen by 16 cameras, in Kubric-4D's layout (60 frames at 24 Hz)."""
     with errors_shown():
-        form = _form("drop", compact, oversample, frames, width, height)
-        _make_scenes("drop", out, form, _seeds(first_seed, scenes), workers, ray, contact_sheet)
+        world = SCENE_WORLDS["drop"]
+        form = _form(world, compact, oversample, frames, width, height)
+        _make_scenes(world, out, form, _seeds(first_seed, scenes), workers, ray, contact_sheet)
 
 
 @app.command()
 def tabletop(
     out: Folder,
+    arm: Arm = "primitive",
     scenes: Scenes = 1,
     first_seed: FirstSeed = 0,
     workers: Workers = None,
@@ -79,8 +82,9 @@ def tabletop(
 ) -> None:
     """A robot arm at work on a table, seen by 16 cameras, in Kubric-4D's layout (60 frames at 24 Hz)."""
     with errors_shown():
-        form = _form("tabletop", compact, oversample, frames, width, height)
-        _make_scenes("tabletop", out, form, _seeds(first_seed, scenes), workers, ray, contact_sheet)
+        world = tabletop_world(arm)
+        form = _form(world, compact, oversample, frames, width, height)
+        _make_scenes(world, out, form, _seeds(first_seed, scenes), workers, ray, contact_sheet)
 
 
 @app.command()
@@ -111,8 +115,9 @@ def driving(
         place = _one_folder(folder, out)
         mount = WorldOptions(height_m=mount_height, tilt_deg=mount_tilt)
         if not (pairs or clips is not None or mount != WorldOptions()):
-            form = _form("driving", compact, oversample, frames, width, height)
-            _make_scenes("driving", place, form, _seeds(first_seed, scenes), workers, ray, contact_sheet)
+            drive = SCENE_WORLDS["driving"]
+            form = _form(drive, compact, oversample, frames, width, height)
+            _make_scenes(drive, place, form, _seeds(first_seed, scenes), workers, ray, contact_sheet)
             return
         if scenes is not None or compact:
             raise RecipeError("--scenes and --compact make whole scenes, --clips, --pairs and a mount pairs; give one")
@@ -144,39 +149,42 @@ def _seeds(first: int, count: int | None) -> range:
 
 
 def _form(
-    world: str, compact: bool, oversample: int, frames: int | None, width: int | None, height: int | None
+    world: SceneWorld, compact: bool, oversample: int, frames: int | None, width: int | None, height: int | None
 ) -> SceneFormat:
-    published = SCENE_WORLDS[world]
     return SceneFormat(
-        width=width or published.width,
-        height=height or published.height,
-        frames=frames or published.frames,
+        width=width or world.width,
+        height=height or world.height,
+        frames=frames or world.frames,
         oversample=oversample,
         compact=compact,
     )
 
 
 def _make_scenes(
-    world: str, out: Path, form: SceneFormat, seeds: range, workers: int | None, ray: str | None, sheet: Path | None
+    world: SceneWorld,
+    out: Path,
+    form: SceneFormat,
+    seeds: range,
+    workers: int | None,
+    ray: str | None,
+    sheet: Path | None,
 ) -> None:
     """Exit code: that of the last failure, 0 without."""
     _stop_as_by_ctrl_c()
     run = SceneRun()
     console = Console(stderr=True, highlight=False)
     started = time.monotonic()
-    columns = (TextColumn(world), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"))
+    columns = (TextColumn(world.name), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"))
     with Progress(*columns, TimeRemainingColumn(), console=console) as bar:
-        task = bar.add_task(world, total=len(seeds), rate="")
-        account = generate_scenes(
-            out, SCENE_WORLDS[world], form, seeds, workers=workers or os.cpu_count() or 1, ray_address=ray
-        )
-        for run in account:
+        task = bar.add_task(world.name, total=len(seeds), rate="")
+        processes = workers or os.cpu_count() or 1
+        for run in generate_scenes(out, world, form, seeds, workers=processes, ray_address=ray):
             rate = f"{(run.done - run.there) / (time.monotonic() - started):.3g} scenes/s"
             bar.update(task, completed=run.done, rate=rate)
     for line in run.lines():
         console.print(line, markup=False, soft_wrap=True)
-    if sheet is not None:
-        write_scene_sheet([out / SCENE_WORLDS[world].scene_name(seed) for seed in seeds], sheet)
+    if sheet is not None and run.written + run.there:
+        write_scene_sheet([out / world.scene_name(seed) for seed in seeds], sheet)
     if run.failures:
         raise typer.Exit(run.exit_code)
 

@@ -22,14 +22,14 @@ def about() -> None:
 
 @app.command()
 def lerobot(
-    out: Annotated[Path, typer.Argument(help="Folder of the data set; it must not be there yet.")],
-    episodes: Annotated[int, typer.Option(min=1, help="How many, one seed each.")] = 10,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the data set, new or empty.")],
+    episodes: Annotated[int, typer.Option(min=1, help="How many episodes, one seed each.")] = 10,
     first_seed: Annotated[int, typer.Option(min=0, help="Seed of the first episode.")] = 0,
-    frames: Annotated[int, typer.Option(min=2, help="Time steps an episode, at 24 Hz.")] = 120,
-    width: Annotated[int, typer.Option(min=32, help="Pixels, even.")] = 320,
-    height: Annotated[int, typer.Option(min=32, help="Pixels, even.")] = 240,
+    frames: Annotated[int, typer.Option(min=2, help="Time steps of an episode, at 24 Hz.")] = 120,
+    width: Annotated[int, typer.Option(min=32, help="Of the pictures, pixels, even.")] = 320,
+    height: Annotated[int, typer.Option(min=32, help="Of the pictures, pixels, even.")] = 240,
     cameras: Annotated[
-        str, typer.Option(help="Of view0 .. view15 and wrist, with commas.")
+        str, typer.Option(help="Two or more of view0 to view15 and wrist, with commas.")
     ] = "view0,view4,view9,wrist",
     arm: Annotated[str, typer.Option(help="primitive, or panda (needs the package gymnasium-robotics).")] = "primitive",
     oversample: Annotated[int, typer.Option(min=1, max=4, help="Anti-aliasing: pixels drawn per pixel and side.")] = 2,
@@ -49,15 +49,19 @@ def lerobot(
     with errors_shown(), progress_bar("episodes", episodes, keep=True) as show:
         for done in export_tabletop(out, export):
             show(done)
+    told = f"wrote {out}; look at it with `gcd-train lerobot {out}`"
+    Console(stderr=True, highlight=False).print(told, markup=False, soft_wrap=True)
 
 
 def lerobot_command(
-    folder: Annotated[Path, typer.Argument(help="A LeRobot data set, v3.0 or v2.1.")],
-    calibration: Annotated[Path | None, typer.Option(help="Cameras, if the set has no meta/cameras.json.")] = None,
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="A LeRobot data set, v3.0 or v2.1.")],
+    calibration: Annotated[
+        Path | None, typer.Option(help="JSON file with the cameras, if the set has no meta/cameras.json.")
+    ] = None,
     samples: Annotated[int, typer.Option(min=1, help="How many pairs to read.")] = 8,
-    frames: Annotated[int, typer.Option(min=2, help="Of a pair.")] = 14,
-    fps: Annotated[float | None, typer.Option(help="Of a pair; the set's own by default.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the choice of cameras and windows.")] = 0,
+    frames: Annotated[int, typer.Option(min=2, help="Frames of a pair.")] = 14,
+    fps: Annotated[float | None, typer.Option(help="Rate of a pair; the set's own if left out.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Draws the cameras and windows.")] = 0,
 ) -> None:
     """Read pairs of cameras of a LeRobot data set as training would, and say what was left out."""
     say = Console(highlight=False, soft_wrap=True).print

@@ -13,6 +13,7 @@ from gcd_train.cli.cache import cache
 from gcd_train.cli.evaluate import evaluate_command
 from gcd_train.cli.show import show
 from gcd_train.cli.train import train
+from gcd_train.cli.verify import verify_command
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -29,6 +30,7 @@ app.command("evaluate")(evaluate_command)
 app.command("lerobot")(lerobot.lerobot_command)
 app.command()(show)
 app.command()(train)
+app.command("verify")(verify_command)
 
 
 @app.callback()

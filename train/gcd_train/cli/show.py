@@ -1,5 +1,6 @@
 """`gcd-train show`: a scene to look at."""
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
@@ -9,6 +10,7 @@ from rich.table import Table
 from typer import Argument, Option
 
 from gcd_train.cli.errors import errors_shown
+from gcd_train.errors import RunError
 
 if TYPE_CHECKING:
     from gcd_train.show.footage import Footage
@@ -17,12 +19,16 @@ SceneFolder: TypeAlias = Annotated[
     Path, Argument(metavar="SCENE", help="Folder scnNNNNN or scene_NNNNNN, or pair shards (folder or one zip).")
 ]
 Out: TypeAlias = Annotated[Path, Option(help="Folder for sheet.png, trajectory.png and video.mp4.")]
-Start: TypeAlias = Annotated[int | None, Option(min=0, help="First frame of the clip; drawn with the seed without.")]
-Stride: TypeAlias = Annotated[int | None, Option(min=1, help="Every how many frames; drawn with the seed without.")]
-Seed: TypeAlias = Annotated[int, Option(min=0, help="Of the clip and the camera path.")]
-Clip: TypeAlias = Annotated[int | None, Option(min=0, help="Pair shards: the clip of this seed, else the first.")]
+Start: TypeAlias = Annotated[int | None, Option(min=0, help="First frame of the clip; drawn by --seed if left out.")]
+Stride: TypeAlias = Annotated[int | None, Option(min=1, help="Every how many frames; drawn by --seed if left out.")]
+Seed: TypeAlias = Annotated[int, Option(min=0, help="Draws the clip and the camera path.")]
+Clip: TypeAlias = Annotated[
+    int | None, Option(min=0, help="In pair shards: seed of the clip to show; the first if left out.")
+]
 Video: TypeAlias = Annotated[bool, Option(help="Also write the video.")]
-Points: TypeAlias = Annotated[bool, Option("--points", help="Target from points, not from kept geometry.")]
+Points: TypeAlias = Annotated[
+    bool, Option("--points", help="Draw the target from the cameras' points, not from geometry.npz.")
+]
 
 
 def show(
@@ -45,6 +51,7 @@ def show(
         from gcd_train.show.video import write_video
 
         require_matplotlib()
+        _refuse_unwritable(out)
         footage = open_scene(scene, ShowOptions(start=start, stride=stride, seed=seed, exact=not points), clip)
         _print_facts(footage, facts_of(footage))
         write_sheet(footage, out / "sheet.png", facts_of(footage))
@@ -55,13 +62,22 @@ def show(
         Console(stderr=True, highlight=False).print(f"wrote {out}: {written}", markup=False, soft_wrap=True)
 
 
+def _refuse_unwritable(folder: Path) -> None:
+    """Said before minutes are spent on what would go there; nothing is made yet."""
+    place = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not place.is_dir() or not os.access(place, os.W_OK):
+        raise RunError(f"{folder} cannot be written to; give a folder that takes files with --out")
+
+
 def _print_facts(footage: "Footage", facts: list[tuple[str, str]]) -> None:
+    from gcd_train.show.sheet import percent
+
     table = Table(title=footage.title, box=SIMPLE, show_header=False, title_justify="left")
     table.add_column(no_wrap=True)
     table.add_column()
     for name, value in [("folder", footage.layout), *facts, ("axes", footage.world)]:
         table.add_row(name, value.replace("\n(", " (").replace(",\n", ", ").replace("\n", ", "))
-    shares = [f"{label.name} {100 * share:.1f} %" for label, share in footage.shares()]
+    shares = [f"{label.name} {percent(share)}" for label, share in footage.shares()]
     if shares:
         table.add_row(footage.kind_plural, ", ".join(shares))
     Console(highlight=False).print(table)

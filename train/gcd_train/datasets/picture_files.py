@@ -73,7 +73,7 @@ def read_depth(path: Path, key: str = "data") -> Floats:
     """Metres, f32 [H, W], of a float TIFF, an npz with array `key`, or a 16-bit PNG of ours (`depth_code`).
 
     0 is kept as "nothing known"; beyond 30 000 m is cut there, as published.
-    Raises: FileFault if it is damaged, or holds NaN, negative numbers, or nothing that is known.
+    Raises: FileFault if it is damaged, or holds NaN, negative numbers, or nothing that is known or within those.
     """
     match path.suffix:
         case ".npz":
@@ -88,6 +88,8 @@ def read_depth(path: Path, key: str = "data") -> Floats:
     farthest = float(metres.max())
     if farthest == 0:
         raise FileFault(path, "has no depth above 0 in any pixel")
+    if float(metres.min()) > FAR_M:
+        raise FileFault(path, f"has depths beyond {FAR_M:g} m in every pixel: no scene is so far away")
     return np.minimum(metres, np.float32(FAR_M)) if farthest > FAR_M else metres
 
 

@@ -46,6 +46,8 @@ def encode_scene(encoders: Encoders, pictures: PathPictures, identity: CacheIden
     positions: dict[int, list[int]] = defaultdict(list)
     for time, position in identity.plan.pairs(frames, range(frames)):
         positions[time].append(position)
+    if not positions:
+        raise DataError(f"{scene}: {frames} frames are too few for a clip; generate or download it whole")
     rows: dict[str, list[Tensor]] = defaultdict(list)
     times: list[int] = []
     pairs: list[tuple[int, int]] = []

@@ -11,6 +11,9 @@ from gcd_train.layouts.camera_facts import Doubles, blender_pose, project, quate
 from gcd_train.layouts.instance_tracks import InstanceTracks
 from gcd_train.scenes.description import Scene, SceneObject, rotations
 
+STEP_RATE_HZ = 480
+"""Of the physics of both worlds in this layout."""
+_GRAVITY_M_S2 = 9.81
 _SENSOR_MM = 32.0
 _DIGITS = 5
 """Decimals of metres and shares: hundredths of a millimetre."""
@@ -33,8 +36,8 @@ def view_metadata(
         "scene": {
             "resolution": [lens.width, lens.height],
             "frame_rate": facts["fps"],
-            "step_rate": scene.facts.get("step_rate", 240),
-            "gravity": [0.0, 0.0, -float(scene.facts.get("gravity", 9.81))],
+            "step_rate": STEP_RATE_HZ,
+            "gravity": [0.0, 0.0, -_GRAVITY_M_S2 / float(scene.facts.get("metres_a_unit", 1.0))],
             "num_frames": scene.frames,
             "background": background,
             "num_instances": len(objects),
@@ -76,6 +79,7 @@ def _instance(thing: SceneObject, number: int, tracks: InstanceTracks, poses: Do
         "label": thing.label,
         "dynamic": thing.dynamic,
         "size": _rounded(np.asarray(thing.size)),
+        "middle": _rounded(np.asarray(thing.middle)),
         "mass": thing.mass_kg,
         "friction": thing.friction,
         "restitution": thing.restitution,
@@ -93,7 +97,7 @@ def _instance(thing: SceneObject, number: int, tracks: InstanceTracks, poses: Do
 
 def _corners(thing: SceneObject) -> Doubles:
     """[T, 8, 3] in the world."""
-    unit = np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * thing.size
+    unit = np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * thing.size + thing.middle
     return np.einsum("tij,kj->tki", rotations(thing.quaternions), unit) + thing.positions[:, None]
 
 

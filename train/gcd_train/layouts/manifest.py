@@ -1,6 +1,7 @@
 """`gcd-manifest.json`: what one of our scene folders says about itself, with a checksum of every file."""
 
 import hashlib
+from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Literal
@@ -70,15 +71,19 @@ def verify(scene: Path) -> SceneManifest:
     Raises: DataError naming the first missing or changed file.
     """
     manifest = read_manifest(scene)
+    for fault in faults(scene, manifest):
+        raise DataError(f"{fault}; delete the scene and generate it again")
+    return manifest
+
+
+def faults(scene: Path, manifest: SceneManifest) -> Iterator[str]:
+    """One line for every file of a scene folder that is missing, cannot be read, or is not as it was written."""
     for name, wanted in manifest.files.items():
         try:
             with (scene / name).open("rb") as file:
                 came = hashlib.file_digest(file, "sha256").hexdigest()
         except OSError as error:
-            raise DataError(f"{scene / name} cannot be read ({error}); delete the scene, generate it again") from error
+            yield f"{scene / name} cannot be read ({error.strerror})"
+            continue
         if came != wanted:
-            raise DataError(
-                f"{scene / name} is not as it was written: SHA-256 {came[:12]}…, wanted {wanted[:12]}…; delete the "
-                "scene and generate it again"
-            )
-    return manifest
+            yield f"{scene / name} is not as it was written: SHA-256 {came[:12]}…, wanted {wanted[:12]}…"

@@ -74,15 +74,14 @@ def calibration(vehicle_from_camera: Mapping[str, Doubles], lens: Intrinsics) ->
 
 def ontology(classes: Sequence[OntologyItem]) -> dict[str, Any]:
     """Names and colours by id, and 255 for what has no class."""
-    return {
-        "items": [*(_item(kind.id, kind.name, kind.colour) for kind in classes), _item(_VOID_ID, "Void", (0, 0, 0))]
-    }
+    items = [_item(kind.id, kind.name, kind.colour, kind.is_thing) for kind in classes]
+    return {"items": [*items, _item(_VOID_ID, "Void", (0, 0, 0), is_thing=False)]}
 
 
-def _item(number: int, name: str, colour: tuple[int, int, int]) -> dict[str, Any]:
+def _item(number: int, name: str, colour: tuple[int, int, int], is_thing: bool) -> dict[str, Any]:
     red, green, blue = colour
     shade = {"r": red, "g": green, "b": blue}
-    return {"id": number, "name": name, "color": shade, "isthing": False, "supercategory": ""}
+    return {"id": number, "name": name, "color": shade, "isthing": is_thing, "supercategory": ""}
 
 
 def _extrinsics(pose: Doubles) -> dict[str, dict[str, float]]:

@@ -14,10 +14,13 @@ class SceneFiles:
         self._made: set[Path] = set()
 
     def write(self, path: Path, data: bytes) -> None:
-        """One file; its folder is made when needed. Raises OSError, for one if the disk is full."""
+        """One file; its folder is made when needed. Raises OSError, which names it, for one if the disk is full."""
         if path.parent not in self._made:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._made.add(path.parent)
-        path.write_bytes(data)
+        try:
+            path.write_bytes(data)
+        except OSError as error:  # a full disk does not say for which file
+            raise OSError(error.errno, error.strerror, str(path)) from error
         self.checksums[path.relative_to(self.folder).as_posix()] = hashlib.sha256(data).hexdigest()
         self.size += len(data)

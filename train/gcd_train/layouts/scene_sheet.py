@@ -22,14 +22,17 @@ _MOST_ROWS = 8
 def write_scene_sheet(scenes: Sequence[Path], out: Path) -> None:
     """First, middle and last frame of one camera, another camera, depth and labels, of the first 8 scenes, as PNG.
 
-    Raises: DataError if none of the scenes is there, or a picture cannot be read.
+    Raises:
+        DataError: none of the scenes is there, or a picture cannot be read.
+        OSError: the sheet cannot be written.
     """
     there = [scene for scene in scenes if (scene / MANIFEST).exists()][:_MOST_ROWS]
     if not there:
         raise DataError(f"there is no finished scene to draw into {out.name}; look at the failures above")
     rows = [np.concatenate(_row(scene), axis=1) for scene in there]
+    _, data = cv2.imencode(".png", np.concatenate([row for row in rows if row.shape == rows[0].shape]))
     out.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(out), np.concatenate([row for row in rows if row.shape == rows[0].shape]))
+    out.write_bytes(data.tobytes())
 
 
 def _row(scene: Path) -> list[Picture]:

@@ -18,7 +18,7 @@ from gcd_train.layouts.scene_files import SceneFiles
 from gcd_train.layouts.scene_folder import new_scene
 from gcd_train.scenes.description import Scene
 from gcd_train.scenes.frozen import FrozenScene, freeze
-from gcd_train.scenes.renderer import Renderer, Rendering
+from gcd_train.scenes.renderer import Renderer, Rendering, require_drawing
 from gcd_train.scenes.worlds import SceneWorld
 
 _FREE_TO_DIFFER = {"version", "files", "world_from_vehicle", "hfov_deg", "cameras", "facts"}
@@ -79,6 +79,7 @@ def write_scene(root: Path, world: SceneWorld, form: SceneFormat, seed: int) -> 
         _require_alike(place, world, form, seed)
         return SceneMade(folder=place, made=False)
     started = time.process_time()
+    require_drawing()  # before a simulation of many seconds
     scene = world.make(seed, form.frames)
     with new_scene(root, place.name) as folder:
         files = SceneFiles(folder)

@@ -81,7 +81,7 @@ class LeRobotFolder:
 def _read_info(folder: Path) -> Info:
     path = folder / "meta/info.json"
     if not path.is_file():
-        raise DataError(f"{folder} is no LeRobot data set: {path} is missing")
+        raise DataError(f"{folder} is no LeRobot data set: {path} is missing; give the folder that holds `meta`")
     try:
         info = msgspec.json.decode(path.read_bytes(), type=Info)
     except (msgspec.MsgspecError, OSError) as error:

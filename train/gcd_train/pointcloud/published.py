@@ -55,7 +55,8 @@ def published_tensor(
         lens: of the data set's pictures, of any size; see render_lens(). width, height: of the result, pixels.
         kernel, sigma: see fill_holes().
     Returns:
-        float32 [height, width, C] in 0..1. With `options.published` a hole is what is black, in each three channels.
+        float32 [height, width, C] in 0..1. With `options.published` a hole is what is black, in each three channels;
+        also a black surface with colour far behind it, which in the released float64 keeps a trace and counts as seen.
     Raises:
         DataError, RecipeError: see splat().
     Source: Generative Camera Dolly, as released.

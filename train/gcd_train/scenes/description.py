@@ -148,9 +148,10 @@ class SceneObject:
     """What is known of a thing beyond its picture: as the metadata of Kubric-4D tells it.
 
     name: which asset it is. instance: 1..255, as its parts have it. body: index into `Scene.poses`. label: class id.
-    size: its bounding box along its own axes, metres. dynamic: thrown or driven, not laid to rest. positions: [T, 3]
-    of its own origin in the world, metres. quaternions: [T, 4], w, x, y, z, world_from_object. velocities: [T, 3],
-    metres a second. angular_velocities: [T, 3] about the world's axes, radians a second.
+    size: its bounding box along its own axes, metres. middle: of that box, in its own frame, metres. dynamic: thrown or
+    driven, not laid to rest. positions: [T, 3] of its own origin in the world, metres. quaternions: [T, 4], w, x, y, z,
+    world_from_object. velocities: [T, 3], metres a second. angular_velocities: [T, 3] about the world's axes, radians a
+    second.
     """
 
     name: str
@@ -166,6 +167,7 @@ class SceneObject:
     quaternions: NDArray[np.float64]
     velocities: NDArray[np.float64]
     angular_velocities: NDArray[np.float64]
+    middle: Point = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -7,6 +7,7 @@ one call per way of painting (`shaders`), which is a handful. Works on software 
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from types import TracebackType
 from typing import Any, Self
 
@@ -223,6 +224,12 @@ class Renderer:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+@cache
+def require_drawing() -> None:
+    """Raises RenderError where nothing can be drawn; once it could, it is not asked again."""
+    _context().release()
 
 
 def _context() -> Any:

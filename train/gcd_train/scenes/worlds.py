@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import msgspec
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_model.geometry import CameraMount
+from gcd_train.errors import RecipeError
 from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
 from gcd_train.scenes.description import Scene
 from gcd_train.scenes.driving import ONTOLOGY, OntologyItem, driving_drive, driving_scene, vehicle_from_camera
@@ -64,10 +66,10 @@ def _drop(seed: int, frames: int) -> Scene:
     return drop_scene(seed, frames=frames)
 
 
-def _tabletop(seed: int, frames: int) -> Scene:
+def _tabletop(arm: str, seed: int, frames: int) -> Scene:
     from gcd_train.scenes.tabletop import tabletop_scene  # its physics is an extra
 
-    return tabletop_scene(seed, frames=frames)
+    return tabletop_scene(seed, frames=frames, arm=arm)
 
 
 def _drive(seed: int, frames: int) -> Scene:
@@ -88,14 +90,32 @@ def _on_a_stage(name: str, make: Callable[[int, int], Scene], edition: int) -> S
     )
 
 
+def tabletop_world(arm: str = "primitive") -> SceneWorld:
+    """The tabletop world with one of its arms; another arm than the usual is told in the world's name.
+
+    Raises:
+        RecipeError: no such arm.
+        RenderError: the package with the arm is not installed, which is known here before a scene is begun.
+    """
+    from gcd_train.scenes.tabletop import ARMS  # its physics is an extra
+    from gcd_train.scenes.tabletop.panda import panda_arm
+
+    if arm not in ARMS:
+        raise RecipeError(f"there is no arm {arm!r}; choose one of {', '.join(ARMS)}")
+    if arm == "panda":
+        panda_arm()
+    name = "tabletop" if arm == "primitive" else f"tabletop-{arm}"
+    return _on_a_stage(name, partial(_tabletop, arm), edition=1)
+
+
 SCENE_WORLDS: dict[str, SceneWorld] = {
     "drop": _on_a_stage("drop", _drop, edition=1),
-    "tabletop": _on_a_stage("tabletop", _tabletop, edition=1),
+    "tabletop": _on_a_stage("tabletop", partial(_tabletop, "primitive"), edition=1),
     "driving": SceneWorld(
         name="driving",
         layout="parallel_domain4d",
         make=_drive,
-        edition=1,
+        edition=2,  # the first is that of the pairs
         frames=parallel_domain4d_names.FRAMES,
         fps=parallel_domain4d_names.FPS,
         width=parallel_domain4d_names.WIDTH,

@@ -146,7 +146,9 @@ def read_world(folder: Path) -> World:
     """What a data folder says about itself. Raises DataError."""
     path = folder / "world.json"
     if not path.is_file():
-        raise DataError(f"{folder} is no data folder: it has no world.json; make one with `gcd-train generate driving`")
+        raise DataError(
+            f"{folder} is no data folder: it has no world.json; make one with `gcd-train generate driving --pairs`"
+        )
     try:
         return msgspec.json.decode(path.read_bytes(), type=World)
     except msgspec.MsgspecError as error:

@@ -110,7 +110,9 @@ def dataset_clip(data: Dataset4D, scene: str, options: ShowOptions) -> Footage:
 def _title(folder: Path, layout: str) -> str:
     """Scene, layout and, of our own scenes, the world it was made in."""
     try:
-        return f"{folder.name}, {read_manifest(folder).world} world, {layout} layout"
+        world = read_manifest(folder).world
+        scale = " (1 m here is 1 dm)" if world.startswith("tabletop") else ""
+        return f"{folder.name}, {world} world{scale}, {layout} layout"
     except DataError:
         return f"{folder.name}, {layout} layout"
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_train.errors import TrainError
+from gcd_train.errors import RenderError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -17,15 +17,17 @@ DPI = 110
 
 
 def require_matplotlib() -> None:
-    """Raises TrainError, naming the extra, where matplotlib is not installed."""
+    """Raises RenderError, naming the extra, where matplotlib is not installed."""
     try:
         import_module("matplotlib.figure")
     except ImportError as error:
-        raise TrainError(f"figures need matplotlib ({error}); install it with pip install 'gcd-node[train]'") from error
+        raise RenderError(
+            f"figures need matplotlib ({error}); install it with pip install 'gcd-node[train]'"
+        ) from error
 
 
 def new_figure(width_in: float, height_in: float) -> "Figure":
-    """An empty white figure, drawn by Agg, sizes in inches at 110 pixels. Raises TrainError without matplotlib."""
+    """An empty white figure, drawn by Agg, sizes in inches at 110 pixels. Raises RenderError without matplotlib."""
     require_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

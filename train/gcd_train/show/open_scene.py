@@ -81,5 +81,5 @@ def _guess(path: Path) -> str:
         return f"{path} is a set of {len(scenes)} scenes; show one, such as {path / scenes[0]}"
     return (
         f"{path} is no scene: its name is neither scnNNNNN (Kubric-4D) nor scene_NNNNNN (ParallelDomain-4D), and it "
-        "has no world.json (pair shards)"
+        "has no world.json (pair shards); give the folder of one scene, with its own name"
     )

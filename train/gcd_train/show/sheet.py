@@ -39,7 +39,7 @@ def rows_of(footage: Footage) -> list[Row]:
     rows = [
         Row(name="input", told=f"{footage.source_camera}, colour", pictures=footage.source),
         Row(name="target", told=footage.target_is, pictures=footage.target),
-        Row(name="splat", told="the input's points,\nseen by the target", pictures=footage.splat),
+        Row(name="splat", told="the input's points from\nthe target; black: none", pictures=footage.splat),
         Row(name="visibility", told="orange: surfaces\nthe input never saw", pictures=footage.seen()),
         Row(
             name="depth",
@@ -54,7 +54,7 @@ def rows_of(footage: Footage) -> list[Row]:
 
 
 def write_sheet(footage: Footage, out: Path, facts: Sequence[tuple[str, str]]) -> None:
-    """One page as PNG. Raises: TrainError without matplotlib, OSError where it cannot be written."""
+    """One page as PNG. Raises: RenderError without matplotlib, OSError where it cannot be written."""
     rows = rows_of(footage)
     height, width = footage.source.shape[1:3]
     tall = 1.84 * height / width
@@ -79,11 +79,14 @@ def write_trajectory(footage: Footage, out: Path) -> None:
 
 
 def _draw_rows(grid: "SubFigure", footage: Footage, rows: Sequence[Row]) -> None:
-    """All pictures in one piece (thirty axes would take longer than all else), names and times around them."""
+    """All pictures in one piece (thirty axes would take longer than all else), names and times around them.
+
+    Always as wide as five moments, so that a shorter clip leaves white and no picture is stretched.
+    """
     moments = np.unique(np.linspace(0, footage.frames - 1, _COLUMNS).round().astype(int))
     height, width = footage.source.shape[1:3]
     gap = round(width / 60)
-    mosaic = np.full((len(rows) * (height + gap) - gap, len(moments) * (width + gap) - gap, 3), 255, np.uint8)
+    mosaic = np.full((len(rows) * (height + gap) - gap, _COLUMNS * (width + gap) - gap, 3), 255, np.uint8)
     axes: Axes = grid.add_axes((0.128, 0.012, 0.807, 0.906))
     axes.set_axis_off()
     for number, row in enumerate(rows):
@@ -150,20 +153,19 @@ def _legend(side: "SubFigure", footage: Footage, top: float) -> None:
         side.text(0.03, top, f"{footage.kind_plural}, share of the input's pixels", fontsize=8, color=FAINT, va="top")
         top -= 0.027
     for label, share in shares[:_LEGEND_ROWS]:
-        _swatch(side, top, label.colour, f"{label.name}", _percent(share))
+        _swatch(side, top, label.colour, f"{label.name}", percent(share))
         top -= 0.0195
     if len(shares) > _LEGEND_ROWS:
-        rest = 100 * sum(share for _, share in shares[_LEGEND_ROWS:])
-        side.text(
-            0.09, top, f"and {len(shares) - _LEGEND_ROWS} more, {rest:.1f} %", fontsize=7.5, color=FAINT, va="top"
-        )
+        rest = percent(sum(share for _, share in shares[_LEGEND_ROWS:]))
+        side.text(0.09, top, f"and {len(shares) - _LEGEND_ROWS} more, {rest}", fontsize=7.5, color=FAINT, va="top")
         top -= 0.0195
     top -= 0.008
     _swatch(side, top, UNSEEN, "surfaces the input never saw", "")
     _swatch(side, top - 0.0195, UNKNOWN, "sky, or no depth", "")
 
 
-def _percent(share: float) -> str:
+def percent(share: float) -> str:
+    """A share of 0 to 1 in words; what is there is never told as nothing."""
     return f"{100 * share:.1f} %" if share >= 0.0005 else "< 0.1 %"
 
 

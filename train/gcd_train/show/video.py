@@ -22,7 +22,7 @@ _HOLD_S = 0.7  # at the end of each play
 def write_video(footage: Footage, out: Path) -> None:
     """The clip at its own speed, twice over, as MP4 (MPEG-4 part 2).
 
-    Raises: TrainError without matplotlib, DataError if the file cannot be written.
+    Raises: RenderError without matplotlib, DataError if the file cannot be written.
     """
     rows = rows_of(footage)
     height, width = footage.source.shape[1:3]
@@ -56,7 +56,7 @@ def _page(footage: Footage, rows: Sequence[Row], places: Sequence[tuple[int, int
         at = (left / across, 1 - (top - 7) / down)
         figure.text(*at, row.name, fontsize=9.5, fontweight="bold", color=INK)
         told = row.told.replace("\n", " ")
-        figure.text((left + 82) / across, at[1], told, fontsize=7.5, color=FAINT)
+        figure.text((left + 92) / across, at[1], told, fontsize=7.5, color=FAINT)
     left, top = places[-1]
     depth_bar(
         figure.add_axes(((left + width + 8) / across, 1 - (top + height) / down, 10 / across, (height - 14) / down)),

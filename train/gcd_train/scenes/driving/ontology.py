@@ -21,6 +21,24 @@ class OntologyItem:
     colour: tuple[int, int, int]
     label: Label
 
+    @property
+    def is_thing(self) -> bool:
+        """Whether its instances are counted: road users are."""
+        return self.label in _ROAD_USERS
+
+
+_ROAD_USERS = {
+    Label.BICYCLE,
+    Label.BUS,
+    Label.CAR,
+    Label.CYCLIST,
+    Label.MOTORCYCLE,
+    Label.MOTORCYCLIST,
+    Label.OWN_CAR,
+    Label.PERSON,
+    Label.TRUCK,
+}
+
 
 def _item(number: int, name: str, colour: tuple[int, int, int], label: Label) -> OntologyItem:
     return OntologyItem(id=number, name=name, colour=colour, label=label)

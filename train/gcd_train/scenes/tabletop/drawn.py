@@ -71,13 +71,16 @@ def solids_of_body(mujoco: Any, model: Any, body: int) -> list[Solid]:
     return found
 
 
-def bounding_size(solids: list[Solid]) -> Point:
-    """Of the box along the body's axes that holds all solids' own boxes, metres."""
+def bounding_box(solids: list[Solid]) -> tuple[Point, Point]:
+    """Middle and size of the box along the body's axes that holds all solids' own boxes, metres."""
     corners: list[np.ndarray[Any, Any]] = []
     for solid in solids:
         half = np.abs(rotations(np.asarray(solid.turn))) @ (np.asarray(_full_size(solid)) / 2)
         corners += [np.asarray(solid.centre) - half, np.asarray(solid.centre) + half]
-    return _point(np.ptp(np.stack(corners), axis=0)) if corners else (0.0, 0.0, 0.0)
+    if not corners:
+        return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+    return _point((low + high) / 2), _point(high - low)
 
 
 def _full_size(solid: Solid) -> Point:

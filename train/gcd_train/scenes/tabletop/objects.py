@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from gcd_train.scenes.description import Part, SceneObject
 from gcd_train.scenes.tabletop.classes import CLASS_NAMES, TabletopClass
-from gcd_train.scenes.tabletop.drawn import bounding_size, parts_of, solids_of_body
+from gcd_train.scenes.tabletop.drawn import bounding_box, parts_of, solids_of_body
 from gcd_train.scenes.tabletop.model import Model
 from gcd_train.scenes.tabletop.simulation import Motion
 from gcd_train.scenes.tabletop.things import Placed, Solid, Thing
@@ -71,7 +71,8 @@ def objects(model: Model, motion: Motion, world: Floats, setting: Setting) -> It
     spoken = tuple(model.arm.links.values())
     for index, (solids, instance, body, label) in enumerate(_links(model, len(setting.things))):
         mass = float(model.model.body_mass[body - _TABLE])
-        kept = _Kept(_asset(label, spoken[index]), instance, body, label, bounding_size(solids), mass, 0.8)
+        middle, size = bounding_box(solids)
+        kept = _Kept(_asset(label, spoken[index]), instance, body, label, size, mass, 0.8, middle)
         yield _object(kept, motion, world)
     first = 1 + len(setting.things) + len(model.links)
     for instance, placed in enumerate(setting.clutter, start=first):
@@ -92,6 +93,7 @@ class _Kept:
     size_m: tuple[float, float, float]
     mass_kg: float
     friction: float
+    middle_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 def _object(kept: _Kept, motion: Motion, world: Floats) -> SceneObject:
@@ -132,13 +134,15 @@ def _standing(placed: Placed, instance: int, motion: Motion, world: Floats) -> S
 def _scene_object(
     kept: _Kept, *, positions: Floats, quaternions: Floats, velocities: Floats, angular: Floats, dynamic: bool
 ) -> SceneObject:
-    x, y, z = kept.size_m
+    x, y, z = (UNITS_A_METRE * metres for metres in kept.size_m)
+    right, ahead, up = (UNITS_A_METRE * metres for metres in kept.middle_m)
     return SceneObject(
         name=kept.name,
         instance=kept.instance,
         body=kept.body,
         label=kept.label,
-        size=(UNITS_A_METRE * x, UNITS_A_METRE * y, UNITS_A_METRE * z),
+        size=(x, y, z),
+        middle=(right, ahead, up),
         dynamic=dynamic,
         mass_kg=kept.mass_kg,
         friction=kept.friction,

@@ -1,0 +1,44 @@
+"""A world of a floor and a sliding box, for our own writers and renderer: no physics."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from gcd_model.geometry import Spherical, to_pose
+from gcd_train.scenes.description import Light, Part, Scene, upright
+from gcd_train.scenes.worlds import SCENE_WORLDS
+
+LIGHT = Light(
+    sun_to=(0.0, 0.0, 1.0),
+    sun=(1.0, 1.0, 1.0),
+    sky=(0.4, 0.4, 0.4),
+    ground=(0.2, 0.2, 0.2),
+    horizon=(0.7, 0.8, 0.9),
+    zenith=(0.3, 0.5, 0.8),
+    fog_m=1e6,
+    cloud=0.0,
+    exposure=1.0,
+)
+
+
+def stage(seed: int, frames: int) -> Scene:
+    """A floor with a box that slides over it; no physics."""
+    path = np.zeros((frames, 2, 4), np.float32)
+    path[:, 1, 0] = np.arange(frames) + seed
+    angles = [(90.0 * view, 45.0) for view in range(4)] + [(15.0 + 30.0 * view, 5.0) for view in range(12)]
+    poses = [to_pose(Spherical(azimuth_deg=a, elevation_deg=e, radius_m=15.0)).numpy() for a, e in angles]
+    floor = Part(shape="box", centre=(0.0, 0.0, -0.5), size=(60.0, 60.0, 1.0), colour=(0.5, 0.4, 0.3), label=1)
+    box = Part(shape="box", centre=(0, 0, 1), size=(2, 2, 2), colour=(0.2, 0.3, 0.8), label=2, instance=7, body=1)
+    return Scene(
+        parts=(floor, box),
+        sheets=(),
+        poses=upright(path),
+        focus=np.zeros((frames, 3), np.float32),
+        cameras={f"view{view}": np.repeat(pose[None], frames, 0) for view, pose in enumerate(poses)},
+        hfov_deg=float(2 * np.degrees(np.arctan(0.5))),
+        light=LIGHT,
+    )
+
+
+STAGE = replace(SCENE_WORLDS["drop"], name="stage", make=stage)
+"""In Kubric-4D's layout."""
