@@ -24,9 +24,9 @@ def made(folder: Path, first_seed: int, clips: int) -> PairedClips:
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Evaluation]:
-    """The model and the baselines on three held-out scenes, by name."""
+    """The model and the baselines on four held-out scenes, by name."""
     folder = tmp_path_factory.mktemp("scenes")
-    clips, training = made(folder / "held-out", 1_000_000, 3), made(folder / "train", 0, 2)
+    clips, training = made(folder / "held-out", 1_000_000, 4), made(folder / "train", 0, 4)
     model = SynthesizedViews.of(load_synthesizer("package:driving-small", device="cpu"), clips)
     baselines = driving_baselines(fit_statistics(training), CameraMount(), len(clips.classes))
     return {each.name: each for each in evaluate([model, *baselines], clips)}
@@ -38,7 +38,7 @@ def test_it_is_ahead_of_the_exact_depth(found: dict[str, Evaluation]) -> None:
 
 
 def test_a_view_is_no_blur(found: dict[str, Evaluation]) -> None:
-    assert 0.45 < found["driving-small"].total.gradient_energy < 1.4  # 0.55 over forty scenes
+    assert 0.5 < found["driving-small"].total.gradient_energy < 1.4
 
 
 def test_the_class_map_is_ahead_of_the_most_frequent_class_of_each_pixel(found: dict[str, Evaluation]) -> None:

@@ -7,26 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from headless import needs_egl
+from stage_world import LIGHT
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.errors import DataError, RenderError
 from gcd_train.scenes.compile import indexed, runs_of, vertices_of
-from gcd_train.scenes.description import DOMES, ORBIT, STREET, Extent, Light, Part, Pattern, Scene, Sheet, upright
+from gcd_train.scenes.description import DOMES, ORBIT, STREET, Extent, Part, Pattern, Scene, Sheet, upright
 from gcd_train.scenes.frozen import FrozenScene, freeze
 from gcd_train.scenes.primitives import CONVEX, SHAPES, shape
 from gcd_train.scenes.renderer import Renderer, Rendering
 
-LIGHT = Light(
-    sun_to=(0.0, 0.0, 1.0),
-    sun=(1.0, 1.0, 1.0),
-    sky=(0.4, 0.4, 0.4),
-    ground=(0.2, 0.2, 0.2),
-    horizon=(0.7, 0.8, 0.9),
-    zenith=(0.3, 0.5, 0.8),
-    fog_m=1e6,
-    cloud=0.0,
-    exposure=1.0,
-)
 FORWARD = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 1.5], [0.0, 0.0, 0.0, 1.0]])
 """world_from_camera of a level camera 1.5 m above the origin that looks along x."""
 

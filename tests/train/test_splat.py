@@ -76,6 +76,25 @@ def test_it_agrees_with_the_plain_float64_renderer_on_a_room(room: list[SceneVie
     assert (made.covered.numpy() == (total > 0)).mean() > 0.999
 
 
+@pytest.mark.parametrize("radius", [0, 1])
+@pytest.mark.parametrize("behind_m", [4.0, 25.0, 50.0, 300.0])
+def test_black_keeps_the_trace_of_what_is_behind_it_where_float64_does(radius: int, behind_m: float) -> None:
+    depth, rgb = (
+        np.full((SOURCE.height, SOURCE.width), 2.0, np.float32),
+        np.zeros((SOURCE.height, SOURCE.width, 3), np.uint8),
+    )
+    rgb[:, 40:] = 200
+    depth[:10] = 0.0
+    back = wall(behind_m, 90)
+    back.depth[:, :20] = 0.0
+    views = [flat_view(depth, rgb), back]
+    wanted, _ = plain_splat(views, HERE, TARGET, radius=radius, published=True)
+    made = splat(views, HERE, TARGET, options=SplatOptions(radius=radius, published=True))
+    np.testing.assert_array_equal(made.lit[..., 0].numpy(), wanted.sum(-1) > 0)
+    assert 0.1 < made.lit.float().mean() < 0.9
+    assert splat(views, HERE, TARGET).lit.shape == (TARGET.height, TARGET.width, 0)
+
+
 def larger(view: SceneView, scale: float) -> SceneView:
     pose = view.world_from_camera.copy()
     pose[:3, 3] *= scale

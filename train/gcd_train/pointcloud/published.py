@@ -56,7 +56,7 @@ def published_tensor(
         kernel, sigma: see fill_holes().
     Returns:
         float32 [height, width, C] in 0..1. With `options.published` a hole is what is black, in each three channels;
-        also a black surface with colour far behind it, which in the released float64 keeps a trace and counts as seen.
+        a black surface with colour behind it is none, as the released float64 keeps a trace of that colour.
     Raises:
         DataError, RecipeError: see splat().
     Source: Generative Camera Dolly, as released.
@@ -65,7 +65,10 @@ def published_tensor(
     larger = render_lens(lens, round(width * OVERSIZE), round(height * OVERSIZE))
     drawn = splat(views, world_from_camera, larger, values=values, options=options, device=device)
     if options.published:
-        parts = [fill_holes(part, part.sum(-1) > 0, kernel=kernel, sigma=sigma) for part in drawn.colour.split(3, -1)]
+        parts = [
+            fill_holes(part, lit, kernel=kernel, sigma=sigma)
+            for part, lit in zip(drawn.colour.split(3, -1), drawn.lit.unbind(-1), strict=True)
+        ]
         filled = torch.cat(parts, dim=-1)
     else:
         filled = fill_holes(drawn.colour, drawn.covered, kernel=kernel, sigma=sigma)

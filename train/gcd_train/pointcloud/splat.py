@@ -33,12 +33,15 @@ class Splatted:
     colour: float32 [H, W, C] in 0..1, 0 where nothing is. covered: bool [H, W], where something is.
     depth: float32 [H, W], metres along the optical axis, of the point that weighs most; 0 where nothing is.
     labels: int32 [H, W], of the same point, 0 where nothing is; None if none were given.
+    lit: bool [H, W, C / 3], where float64 would leave a trace of anything that is not black in three channels, however
+    far behind; with `options.published` alone, else of no channels.
     """
 
     colour: Tensor
     covered: Tensor
     depth: Tensor
     labels: Tensor | None
+    lit: Tensor
 
 
 def splat(
@@ -81,6 +84,7 @@ def splat(
         covered=picture.covered,
         depth=picture.picked[0],
         labels=None if labels is None else picture.picked[1].to(torch.int32),
+        lit=picture.lit.permute(1, 2, 0),
     )
 
 
@@ -88,7 +92,7 @@ def splat(
 class _Canvas:
     """Sums over the points that fell on each pixel, [..., H*W]; see Gathered. is_far: scalar, which rule holds for d.
 
-    nearest_m: depth of the nearest point.
+    nearest_m: depth of the nearest point. lit: [G, H*W], see Gathered.
     """
 
     lens: Intrinsics
@@ -100,6 +104,7 @@ class _Canvas:
     weight: Tensor
     colour: Tensor
     label: Tensor
+    lit: Tensor
 
     @classmethod
     def of(
@@ -124,12 +129,15 @@ class _Canvas:
             weight=torch.zeros(size, device=device),
             colour=torch.zeros(channels, size, device=device),
             label=torch.zeros(size, dtype=torch.int32, device=device),
+            lit=torch.full((-(-channels // 3) if options.published else 0, size), torch.inf, device=device),
         )
 
     def add(self, hits: Hits, values: Bytes, labels: Labels | None) -> None:
         """Weigh the points of a view, and gather what they show."""
         behind = (_d(hits.depth, self.is_far, self.options) - self.nearest.index_select(0, hits.pixel)) * self.rate
         pixel, depth, kept = hits.pixel, hits.depth, hits.source
+        if len(self.lit):
+            self._light(hits, values)
         if kept is None:
             behind = behind.masked_fill(depth.isinf(), torch.inf)
         else:
@@ -144,6 +152,13 @@ class _Canvas:
             others = depth != self.nearest_m.index_select(0, pixel)
             self.label.scatter_reduce_(0, pixel, label.masked_fill(others, 0), "amax")
 
+    def _light(self, hits: Hits, values: Bytes) -> None:
+        """Note how far the nearest points are that are not black, also those that weigh next to nothing."""
+        d = _d(hits.depth, self.is_far, self.options).masked_fill(hits.depth.isinf(), torch.inf)
+        for sums, part in zip(self.lit, _picked(values, hits, hits.source, d.device).split(3, -1), strict=True):
+            black = (part == 0).all(-1)
+            sums.scatter_reduce_(0, hits.pixel, d.masked_fill(black, torch.inf), "amin")
+
     def gathered(self) -> Gathered:
         """The sums, as pictures."""
         shape = (self.lens.height, self.lens.width)
@@ -153,6 +168,7 @@ class _Canvas:
             weight=self.weight.view(shape),
             colour=self.colour.view(-1, *shape),
             picked=torch.stack([self.nearest_m, self.label.float()]).view(-1, *shape),
+            lit=self.lit.view(-1, *shape),
         )
 
     @property

@@ -13,6 +13,9 @@ from torch import Tensor
 
 from gcd_train.pointcloud.options import SplatOptions
 
+_FLOAT64_TRACE = 740.0
+"""A weight e^740 times smaller than the largest is the last that keeps a float64 mean from being 0."""
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Gathered:
@@ -20,7 +23,8 @@ class Gathered:
 
     nearest: [H, W], d of the nearest point, inf where nothing fell. rate: scalar; weights fall by e in d = 1 / rate.
     weight: [H, W], sum of weights, 1 and more where something fell. colour: [C, H, W], sum of weights times values.
-    picked: [L, H, W], numbers of the nearest point itself: its depth, its labels.
+    picked: [L, H, W], numbers of the nearest point itself: its depth, its labels. lit: [G, H, W], d of the
+    nearest point that is not black in three channels, inf where there is none; G is 0 where nobody asks.
     """
 
     nearest: Tensor
@@ -28,15 +32,20 @@ class Gathered:
     weight: Tensor
     colour: Tensor
     picked: Tensor
+    lit: Tensor
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Shown:
-    """colour: [C, H, W], the mean of what shows. picked: [L, H, W], of the heaviest. covered: bool [H, W]."""
+    """colour: [C, H, W], the mean of what shows. picked: [L, H, W], of the heaviest. covered: bool [H, W].
+
+    lit: bool [G, H, W], where float64 would have a trace of what is not black.
+    """
 
     colour: Tensor
     picked: Tensor
     covered: Tensor
+    lit: Tensor
 
 
 def show(gathered: Gathered, options: SplatOptions) -> Shown:
@@ -49,13 +58,15 @@ def show(gathered: Gathered, options: SplatOptions) -> Shown:
     covered = front < torch.inf
     front = front.masked_fill(~covered, 0.0)
     weight, colour = torch.zeros_like(front), torch.zeros_like(gathered.colour)
-    picked = torch.zeros_like(gathered.picked)
+    picked, lit = torch.zeros_like(gathered.picked), torch.full_like(gathered.lit, torch.inf)
     for at, depth in zip(offsets, seeming, strict=True):
         share = torch.exp((front - depth) * gathered.rate)  # 0 where nothing fell
         weight += share * moved(gathered.weight, at, 0.0)
         colour += share * moved(gathered.colour, at, 0.0)
         picked = torch.where(depth == front, moved(gathered.picked, at, 0.0), picked)
-    return Shown(colour=colour / weight.clamp(min=1e-30), picked=picked, covered=covered)
+        lit = torch.minimum(lit, moved(gathered.lit, at, torch.inf) + (handicap if at != (0, 0) else 0.0))
+    trace = (lit - front) * gathered.rate <= _FLOAT64_TRACE
+    return Shown(colour=colour / weight.clamp(min=1e-30), picked=picked, covered=covered, lit=trace)
 
 
 class _Moved:
