@@ -23,6 +23,7 @@ from gcd_node.wire.endpoints import is_ipv6, resolve_endpoint
 from gcd_node.wire.header import PROTO
 
 _SECOND_NS = 1_000_000_000
+_REASON_MS = 1000
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -146,6 +147,7 @@ class ControlClient:
         try:
             self._socket.send(part, zmq.NOBLOCK)
         except zmq.Again as error:
+            self._watch.check(_REASON_MS)  # who is refused loses the pipe a moment before the reason arrives
             raise ControlError(f"{self.endpoint} takes no more requests; is the node running?") from error
 
     def _await(self, request_id: str, deadline_s: float) -> Reply | None:

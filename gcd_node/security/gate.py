@@ -89,9 +89,9 @@ class HandshakeWatch:
         self._endpoint, self._keys = endpoint, keys
         self._heard = 0
 
-    def check(self) -> None:
-        """Raises AuthError if the connection was refused, now or before."""
-        while self.monitor.poll(0):
+    def check(self, wait_ms: int = 0) -> None:
+        """Raises AuthError if the connection was refused, now or before, or within wait_ms if nothing came yet."""
+        while self.monitor.poll(0 if self._heard else wait_ms):
             self._heard |= int(parse_monitor_message(self.monitor.recv_multipart())["event"])
         if self._heard & _REFUSED:
             raise AuthError(f"{self._endpoint} does not let us in: {self._reason()}")

@@ -4,6 +4,7 @@ import os
 import stat
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -126,6 +127,15 @@ def test_f18_a_client_without_keys_gets_no_reply(server: ControlServer, commands
         ask(server, None, "hello")
     assert events.wait("AUTH_DENIED")["fingerprint"] is None
     assert commands.heard == []
+
+
+def test_f18_a_client_refused_before_it_asks_is_told_why(server: ControlServer) -> None:
+    with ControlClient(server.endpoint, timeout_s=20.0) as client:
+        guard_s = time.monotonic() + 20.0
+        while client._socket.poll(10, zmq.POLLOUT) and time.monotonic() < guard_s:  # pyright: ignore[reportPrivateUsage]
+            time.sleep(0.01)
+        with pytest.raises(AuthError, match="it asks for keys, none were given"):
+            client.request("hello")
 
 
 def test_f18_a_client_with_the_wrong_node_key_gets_no_reply(
