@@ -33,11 +33,12 @@ class Progress:
 
 @dataclass(frozen=True, slots=True)
 class StepLoss:
-    """The loss of one update, its named parts for the log, and how many frames it was computed from."""
+    """The loss of one update, its named parts for the log, and how many frames of which clips it was computed from."""
 
     total: Tensor
     parts: dict[str, Tensor]
     frames: int
+    ids: tuple[str, ...] = ()
 
 
 class Task(Protocol):
@@ -153,7 +154,7 @@ class Loop:
             loss = self._task.step_loss(replace(progress, part=part))
             (loss.total / self._options.parts).backward()
             kept = {name: value.detach() for name, value in loss.parts.items()}
-            self._window.losses.append(StepLoss(loss.total.detach(), kept, loss.frames))
+            self._window.losses.append(StepLoss(loss.total.detach(), kept, loss.frames, loss.ids))
         if recipe.clip is not None:
             trained = [p for group in self._optimiser.param_groups for p in group["params"]]
             nn.utils.clip_grad_norm_(trained, recipe.clip)

@@ -22,7 +22,7 @@ from gcd_train.run_folder import RunFolder
 _BASES: dict[str, ModelConfig] = {"driving-small": DRIVING_SMALL, "svd-14": SVD_14, "small": SMALL}
 _PREFIXES: dict[StageName, tuple[str, ...]] = {
     "vae": ("target_encoder.", "decoder."),
-    "unet": ("unet.", "class_head."),
+    "unet": ("unet.", "class_head.", "camera."),
     "decoder": ("plane_mix.",),
 }
 

@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gcd_model.class_head import ClassHead
+from gcd_model.conditioning import CameraEmbedder
 from gcd_model.config import Prediction
 from gcd_model.noise import preconditioning
 from gcd_model.unet import VideoUNet
@@ -22,11 +23,17 @@ from gcd_train.recipe import LossRecipe, NoiseRecipe
 
 
 class Denoiser(nn.Module):
-    """U-Net and class head under the names they have in `Networks`."""
+    """U-Net, class head and camera embedder under the names they have in `Networks`."""
 
-    def __init__(self, unet: VideoUNet, class_head: ClassHead | None, prediction: Prediction) -> None:
+    def __init__(
+        self,
+        unet: VideoUNet,
+        class_head: ClassHead | None,
+        prediction: Prediction,
+        camera: CameraEmbedder | None = None,
+    ) -> None:
         super().__init__()
-        self.unet, self.class_head = unet, class_head
+        self.unet, self.class_head, self.camera = unet, class_head, camera
         self.prediction: Prediction = prediction
 
     def forward(self, noisy: Tensor, sigma: Tensor, batch: "Batch") -> tuple[Tensor, Tensor | None]:
@@ -38,7 +45,8 @@ class Denoiser(nn.Module):
             [N, C, h, w] and [N, K, H', W'] or None, float32.
         """
         levels = preconditioning(sigma, self.prediction)
-        plan = self.unet.plan(levels.c_noise[None], batch.vector, None, batch.tokens)
+        camera = None if self.camera is None or batch.camera is None else self.camera.proj(batch.camera)
+        plan = self.unet.plan(levels.c_noise[None], batch.vector, camera, batch.tokens)
         scaled, image_mode = _column(levels.c_in) * noisy, batch.frames == 1
         features = self.unet.features(scaled, batch.condition, plan.step(0), image_mode=image_mode)
         raw = self.unet.project(features).float()
@@ -52,6 +60,8 @@ class Batch:
 
     target: [N, C, h, w], scaled latents. condition: [N, C', h, w]. vector: [N, V]. tokens: [N, D] or None.
     classes: int64 [N, H', W'] or None. emphasis: [N, 1, h, w] of `class_emphasis`, or None.
+    camera: [N, F], the features a model with camera control is steered by, see `CameraEmbedder`; None without.
+    ids: what the rows were made from, one name a clip, for messages.
     """
 
     target: Tensor
@@ -61,6 +71,8 @@ class Batch:
     classes: Tensor | None
     emphasis: Tensor | None
     frames: int
+    camera: Tensor | None = None
+    ids: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -123,7 +135,7 @@ def diffusion_loss(
     if logits is not None and batch.classes is not None and loss.class_map:
         parts["class_map"] = class_map_loss(logits, batch.classes, sigma >= loss.class_from_sigma, weights.classes)
         total = total + loss.class_map * parts["class_map"]
-    return StepLoss(total, parts, batch.target.shape[0])
+    return StepLoss(total, parts, batch.target.shape[0], batch.ids)
 
 
 def class_map_loss(logits: Tensor, classes: Tensor, counted: Tensor, weights: Tensor | None) -> Tensor:

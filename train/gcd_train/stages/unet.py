@@ -32,11 +32,11 @@ class UNetTask:
         self._networks, self._batches, self._validation = networks, batches, validation
         self._recipe, self._weights, self._precision, self._seed = recipe, weights, precision, seed
         precision.placed(networks)
-        self._denoiser = Denoiser(networks.unet, networks.class_head, networks.config.prediction)
+        self._denoiser = Denoiser(networks.unet, networks.class_head, networks.config.prediction, networks.camera)
 
     @property
     def module(self) -> nn.Module:
-        """U-Net and class head."""
+        """U-Net, class head and camera embedder."""
         return self._denoiser
 
     def parameter_groups(self) -> Sequence[ParameterGroup]:
