@@ -15,6 +15,7 @@ from gcd_node.config import ModelSection, NodeConfig, RecordConfig
 from gcd_node.errors import ConfigError, NodeError, SourceLostError
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.life.live_config import LiveConfig
+from gcd_node.optics.source_pose import in_words
 from gcd_node.recording.folder import LimitReachedError, check_folder
 from gcd_node.rendering.preparation import prepare_run
 from gcd_node.rendering.virtual_view import VirtualViews
@@ -210,6 +211,8 @@ def _views(config: NodeConfig, traits: Traits, info: SourceInfo) -> str:
     run, fps = prepare_run(config, traits, info)
     VirtualViews(traits).following(LiveConfig(config).settings(), run.mount)
     line = f"{', '.join(config.view)}: windows of {traits.config.frames} frames at {fps:g} FPS"
+    camera = in_words(run.mount, config.source.pose, traits)
+    line += f"; {camera}" if camera else ""
     if run.ood:
         raise _DoubtfulError(f"{line}; outside what {traits.name} was trained with: {', '.join(run.ood)}")
     return line

@@ -14,7 +14,7 @@ PACKAGES = {
 SOCKET_FILES = {"publisher.py", "subscriber.py", "control/server.py", "control/client.py", "security/gate.py"}
 OPENING_CALLS = {"open", "safe_open", "save_file", "read_text", "read_bytes", "write_text", "write_bytes"}
 OPENING_LIBRARIES = {"torch", "np", "numpy", "json", "pickle", "safetensors"}  # their load and save open files
-MAY_OPEN_FILES = {"checkpoints.py", "onnx_export.py"}
+MAY_OPEN_FILES = {"checkpoints.py", "weights_export.py", "onnx_export.py"}
 
 
 def files(package: str) -> list[Path]:

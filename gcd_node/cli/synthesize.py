@@ -50,7 +50,7 @@ PathKind: TypeAlias = Annotated[
 ]
 MoveTime: TypeAlias = Annotated[int | None, Option(help="Frame in which the goal is reached.", rich_help_panel=_VIEW)]
 SourceElevation: TypeAlias = Annotated[
-    float | None, Option(help="Where the source camera stands; with --poses. Else 5.", rich_help_panel=_VIEW)
+    float | None, Option(help="Where an orbit's source camera stands, above its centre. Else 5.", rich_help_panel=_VIEW)
 ]
 SourceRadius: TypeAlias = Annotated[
     float | None, Option(help="Its distance to the scene's centre. Else 15.", rich_help_panel=_VIEW)

@@ -1,7 +1,7 @@
 """`gcd-node weights`: look into checkpoints, convert them."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from rich.console import Console
 from rich.progress import Progress
@@ -22,7 +22,7 @@ WeightsPath = Annotated[
 ]
 FamilyOption = Annotated[
     str | None,
-    Option(help="kubric90, kubric180, driving, driving-semantic or svd; else told from the file."),
+    Option(help="kubric90, kubric180, driving, driving-semantic, manipulation or svd; else told from the file."),
 ]
 HeadWidth = Annotated[int | None, Option(help="Width of a U-Net attention head, for unpublished widths.")]
 ImageHeads = Annotated[int | None, Option(help="Attention heads of the image tower, for unpublished widths.")]
@@ -48,14 +48,20 @@ def inspect(
 @weights.command("convert")
 def convert(
     file: WeightsPath,
-    out: Annotated[Path, Argument(metavar="OUT", help="The .safetensors file to write.")],
+    out: Annotated[Path, Argument(metavar="OUT", help="The file to write: .safetensors, or .ckpt.")],
+    layout: Annotated[
+        Literal["gcd-node", "gcd-ckpt"], Option(help="Our .safetensors, or the .ckpt of the released code.")
+    ] = "gcd-node",
     dtype: Annotated[str | None, Option(help="float32, bfloat16 or float16; else as stored.")] = None,
     family: FamilyOption = None,
     head_width: HeadWidth = None,
     image_heads: ImageHeads = None,
     overwrite: Annotated[bool, Option("--overwrite", help="Replace OUT if it is there.")] = False,
 ) -> None:
-    """Strip a checkpoint to what inference needs, with its configuration inside. OUT appears whole or not at all."""
+    """Strip a checkpoint to what inference needs, or write what the released code reads, with the configuration inside.
+
+    OUT appears whole or not at all.
+    """
     errors = Console(stderr=True, markup=False)
     with Progress(console=errors, transient=True, disable=not errors.is_terminal) as progress:
         task = progress.add_task("converting", total=None)
@@ -66,6 +72,7 @@ def convert(
         report = convert_weights(
             file,
             out,
+            layout=layout,
             dtype=dtype,
             family=family,
             head_width=head_width,

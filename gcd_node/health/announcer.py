@@ -12,7 +12,7 @@ from gcd_node.life.live_config import Settings
 from gcd_node.publishing.outbox import Outbox
 from gcd_node.wire.header import OriginHeader
 from gcd_node.wire.record_json import to_json
-from gcd_node.wire.view_message import Run, camera_matrix
+from gcd_node.wire.view_message import Run, camera_matrix, source_pose
 
 _LOG = logging.getLogger(__name__)
 _PERIOD_S = 1.0
@@ -95,12 +95,14 @@ def metadata(run: Run, settings: Settings, fps: float) -> dict[str, object]:
 
 
 def calibration(run: Run) -> dict[str, object]:
-    """The camera of the views, and how the source camera is mounted; None for what nobody knows."""
+    """The camera of the views, and where the source camera is: mounted on a vehicle, or on the sphere; None for what
+    nobody knows."""
     camera, mount, pose = run.intrinsics, run.mount or run.traits.mount, run.config.source.pose
-    assumed = pose is None or not pose.on_vehicle
+    assumed, sphere = pose is None or not pose.on_vehicle, source_pose(run)
     return {
         "K": None if camera is None else list(camera_matrix(camera)),
         "mount": None if mount is None else {**asdict(mount), "assumed": assumed},
+        "src_pose": None if sphere is None else to_json(sphere),
     }
 
 

@@ -7,10 +7,11 @@ _MOUNT_TOLERANCE_M, _MOUNT_TOLERANCE_DEG = 0.05, 0.5
 
 
 def require_usable(pose: SourcePose | None, traits: Traits) -> None:
-    """Refuse a pose in words the model does not know.
+    """Refuse a pose in words the model does not know, or where it cannot use a camera.
 
     Raises:
-        OptionError: angles for a model that is not steered by them, a mount for one that cannot use it.
+        OptionError: angles for a model that is not steered by them, a mount for one that cannot use it; a camera below
+            the ground, for a model that warps by it.
     """
     steered, warps = traits.config.camera != "none", traits.mount is not None
     if pose is None:
@@ -22,6 +23,8 @@ def require_usable(pose: SourcePose | None, traits: Traits) -> None:
     if pose.on_sphere and not steered:
         remedy = "; state the mount instead: height, forward, left, tilt" if warps else "; leave them out"
         raise OptionError(f"{traits.name} is not steered by angles and has no use for elevation and radius{remedy}")
+    if pose.on_sphere:
+        traits.check_source(stated_sphere(pose) or ASSUMED_SOURCE)
 
 
 def stated_sphere(pose: SourcePose | None) -> Spherical | None:
@@ -67,3 +70,22 @@ def is_foreign(mount: CameraMount | None, traits: Traits) -> bool:
     )
     turned_deg = abs(mount.tilt_deg - trained.tilt_deg)
     return max(map(abs, away_m)) > _MOUNT_TOLERANCE_M or turned_deg > _MOUNT_TOLERANCE_DEG
+
+
+def in_words(mount: CameraMount | None, pose: SourcePose | None, traits: Traits) -> str:
+    """Where a model that warps by planes takes the source camera to stand, and whether that is assumed; empty for
+    other models, whose pictures do not depend on it.
+
+    mount: as `stated_mount` gives it.
+    """
+    plane_warp, mount = traits.config.plane_warp, mount or traits.mount
+    if plane_warp is None:
+        return ""
+    if mount is not None:
+        stated = pose is not None and pose.on_vehicle
+        where = f"{mount.height_m:g} m above the ground, {mount.forward_m:g} m ahead, tilted {mount.tilt_deg:g} degrees"
+    else:
+        stated = pose is not None and pose.on_sphere
+        source = stated_sphere(pose) or ASSUMED_SOURCE
+        where = f"at an elevation of {source.elevation_deg:g} degrees and a radius of {source.radius_m:g}"
+    return f"the source camera {where} ({'stated' if stated else 'assumed: state it in [source.pose]'})"

@@ -92,7 +92,7 @@ def _view_camera(camera: Intrinsics | None, traits: Traits) -> Intrinsics | None
     """The generated picture's camera: the source's again, or the trained one if that is unknown, or if the model draws
     for one camera whatever the source is."""
     trained = _trained_hfov_deg(traits)
-    if camera is not None and traits.mount is None:
+    if camera is not None and traits.config.plane_warp is None:
         return camera
     return None if trained is None else Intrinsics.from_hfov(trained, traits.config.width, traits.config.height)
 
@@ -103,8 +103,8 @@ def _is_foreign_field(camera: Intrinsics | None, traits: Traits) -> bool:
 
 
 def _trained_hfov_deg(traits: Traits) -> float | None:
-    if traits.mount is not None:
-        return traits.mount.hfov_deg
+    if traits.config.plane_warp is not None:
+        return traits.config.plane_warp.hfov_deg
     return None if traits.family is None else traits.family.hfov_deg
 
 

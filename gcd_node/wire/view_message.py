@@ -195,7 +195,7 @@ def _header(run: Run, rendered: Rendered) -> ViewHeader:
         pose=_deltas(path),
         source_from_view=_matrices(path) if run.traits.knows_camera else None,
         pose_units="scene" if run.traits.family is None else run.traits.family.pose_units,
-        src_pose=_source_pose(run),
+        src_pose=source_pose(run),
         intrinsics=None if run.intrinsics is None else camera_matrix(run.intrinsics),
     )
 
@@ -240,7 +240,8 @@ def _source(run: Run, window: FrameWindow) -> SourceRecord:
     )
 
 
-def _source_pose(run: Run) -> SourcePoseRecord | None:
+def source_pose(run: Run) -> SourcePoseRecord | None:
+    """Where the source camera of a steered model stands; None for a model with a fixed view."""
     if run.traits.config.camera == "none":
         return None  # a fixed path states its rigid transforms itself
     stated = stated_sphere(run.config.source.pose)

@@ -11,7 +11,16 @@ from gcd_model.checkpoints import WeightsReport, convert_weights, inspect_weight
 from gcd_model.class_head import palette
 from gcd_model.clip import Augmentation, Clip, RenderOptions, View
 from gcd_model.conditioning import SourceFeatures
-from gcd_model.config import DRIVING_CLASSES, DRIVING_SMALL, SMALL, SVD_14, ModelConfig, SemanticClass
+from gcd_model.config import (
+    DRIVING_CLASSES,
+    DRIVING_SEMANTIC_SMALL,
+    DRIVING_SMALL,
+    OBJECTS_SMALL,
+    SMALL,
+    SVD_14,
+    ModelConfig,
+    SemanticClass,
+)
 from gcd_model.errors import (
     Cancelled,
     CheckpointError,
@@ -24,7 +33,7 @@ from gcd_model.errors import (
     ViewFixedError,
     ViewRangeError,
 )
-from gcd_model.families import ASSUMED_SOURCE, FAMILIES, Family, Traits, ViewLimits
+from gcd_model.families import FAMILIES, Family, ViewLimits
 from gcd_model.geometry import (
     CameraMount,
     DeltaFit,
@@ -43,12 +52,15 @@ from gcd_model.geometry import (
 from gcd_model.loading import load_synthesizer
 from gcd_model.settings import explain_settings_error
 from gcd_model.synthesizer import Synthesizer, ViewSynthesizer, synthesize
+from gcd_model.traits import ASSUMED_SOURCE, Traits
 
 __all__ = [
     "ASSUMED_SOURCE",
     "DRIVING_CLASSES",
+    "DRIVING_SEMANTIC_SMALL",
     "DRIVING_SMALL",
     "FAMILIES",
+    "OBJECTS_SMALL",
     "SMALL",
     "SVD_14",
     "Augmentation",

@@ -1,28 +1,28 @@
-"""Weights from files and into files; the only place of the package that opens any.
+"""Weights from files; the only place of the package that opens any to read. `weights_export` writes them.
 
 Layouts are told by content: GCD's Lightning `.ckpt`, `svd.safetensors`, a diffusers folder, and our own
 `.safetensors` with the config in its metadata. Everything is memory-mapped: what is not used, such as optimizer
 state, is never read. Nothing in a file is ever executed, see `restricted_pickle`.
 
-Longer than other files because opening is allowed nowhere else; naming, matching and formats live next door.
+Longer than other files because reading is allowed nowhere else; naming, matching and formats live next door.
 """
 
 import hashlib
 import logging
-import os
 import zipfile
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, BinaryIO, cast
+from typing import Any, BinaryIO, Literal, cast
 
 import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from gcd_model.adapter import Adapter, adapted
 from gcd_model.diffusers_folder import PARTS, chosen_file, folder_hints, shards
-from gcd_model.errors import CheckpointError, OptionError
+from gcd_model.errors import CheckpointError
 from gcd_model.examination import (
     Examined,
     Options,
@@ -32,13 +32,15 @@ from gcd_model.examination import (
     leftover_reports,
     network_reports,
 )
-from gcd_model.families import FAMILIES, Family
+from gcd_model.families import FAMILIES, Family, family_named
 from gcd_model.file_kind import FETCH_AGAIN, HEAD, FileKind, check_archive, file_kind
+from gcd_model.gcd_layout import CARRIED
 from gcd_model.lightning import Contents, contents
-from gcd_model.networks import Networks
-from gcd_model.own_format import FULL_PRECISION, Card, Entry, file_order, header, precision
+from gcd_model.networks import Networks, weights_digest
+from gcd_model.own_format import Card, Entry, precision
 from gcd_model.restricted_pickle import RestrictedPickle, check_storages
-from gcd_model.weights_report import WeightsReport
+from gcd_model.weights_export import Content, Report, write_published, write_safetensors, written_dtype
+from gcd_model.weights_report import Layout, WeightsReport
 
 _log = logging.getLogger(__name__)
 
@@ -52,7 +54,8 @@ class LoadedWeights:
     """Networks with their weights, still in the mapped file, in the stored precision, on the CPU.
 
     family: None if nobody could tell. move_time: frame in which the goal pose is reached.
-    sha256_12: first 12 digits of `digest`.
+    sha256_12: first 12 digits of `digest`. layout: of the file.
+    carried: leftovers of a published file that its next owner may want, by published name; see `gcd_layout.CARRIED`.
     """
 
     name: str
@@ -61,6 +64,8 @@ class LoadedWeights:
     move_time: int
     trained: bool
     sha256_12: str
+    layout: Layout = "gcd-node"
+    carried: Mapping[str, Tensor] = field(default_factory=dict[str, Tensor])
 
 
 def load_weights(
@@ -70,11 +75,13 @@ def load_weights(
     head_width: int | None = None,
     image_heads: int | None = None,
     frames: int | None = None,
+    ask_family: bool = True,
 ) -> LoadedWeights:
     """Load a checkpoint of any layout.
 
     Args:
         family: name of the family, instead of what metadata, file name or a yaml beside the file tell.
+        ask_family: warn where nobody knows it; False for those who only want the weights.
         head_width, image_heads, frames: what published weights do not tell, instead of the published values.
     Raises:
         CheckpointError: the file is missing, damaged, hostile or of another architecture.
@@ -86,7 +93,7 @@ def load_weights(
         networks = examined.networks
         state = {name: examined.tensor(name) for name in examined.match.sources}
         networks.load_state_dict(state, assign=True, strict=True)
-        if examined.family is None:
+        if ask_family and examined.family is None:
             _log.warning(
                 "the family of %s is not known: no limits are checked and --motion-bucket must be given; "
                 "name it with --family %s",
@@ -100,7 +107,34 @@ def load_weights(
             move_time=examined.move_time,
             trained=examined.trained,
             sha256_12=digest(examined.file.files)[:12],
+            layout=examined.file.layout,
+            carried=_carried(examined),
         )
+
+
+def load_adapted(base: LoadedWeights, adapter: Adapter) -> LoadedWeights:
+    """A base and what was trained on it, as one. Raises CheckpointError as `adapted`; OptionError for its family."""
+    card = adapter.card
+    family = None if card.family is None else family_named(card.family)
+    return replace(
+        base,
+        name=card.name,
+        networks=adapted(base.networks, adapter),
+        family=family,
+        move_time=card.move_time,
+        trained=base.trained and card.trained,
+        sha256_12=weights_digest({f"{base.sha256_12}.{name}": tensor for name, tensor in adapter.tensors.items()}),
+    )
+
+
+def read_adapter(path: str | Path) -> Adapter:
+    """Map an adapter's file. Raises CheckpointError if it is missing, damaged or no adapter."""
+    path = Path(path)
+    with _about(path):
+        if not path.exists():
+            raise CheckpointError("there is no such file; check the path")
+        held, metadata = _read_file(path)
+        return Adapter.of_file(metadata or {}, held.tensors)
 
 
 def inspect_weights(
@@ -144,22 +178,25 @@ def convert_weights(
     path: str | Path,
     out: str | Path,
     *,
+    layout: Literal["gcd-node", "gcd-ckpt"] = "gcd-node",
     dtype: str | None = None,
     family: str | None = None,
     head_width: int | None = None,
     image_heads: int | None = None,
     frames: int | None = None,
     overwrite: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Report | None = None,
 ) -> WeightsReport:
-    """Write a checkpoint of any layout as our own `.safetensors`, tensor by tensor; leftovers stay behind.
+    """Write a checkpoint of any layout as our own `.safetensors`, tensor by tensor, or as GCD's `.ckpt`.
 
     Args:
+        layout: "gcd-node" leaves behind what inference does not use; "gcd-ckpt" is for the released code, see
+            `gcd_state`, and holds all weights in memory where `dtype` changes them.
         dtype: store in this precision, else as it is. The decoder, which computes in float32, is never narrowed.
         progress: called with (bytes written, bytes).
     Returns:
         The report of the new file.
-    Raises: as `load_weights`; OptionError if `out` exists and `overwrite` is not set.
+    Raises: as `load_weights`; OptionError if `out` exists and `overwrite` is not set, or the layout cannot hold it.
     """
     wanted = None if dtype is None else precision(dtype)
     options = Options(family=family, head_width=head_width, image_heads=image_heads, frames=frames)
@@ -173,11 +210,15 @@ def convert_weights(
             trained=examined.trained,
             origin=digest(examined.file.files)[:12],
         )
-    entries = {
-        name: Entry(tuple(tensor.shape), _written_dtype(name, examined.stored_dtype(name), wanted))
-        for name, tensor in examined.networks.state_dict().items()
-    }
-    _write(Path(out), _Content(entries, examined.tensor, card), overwrite=overwrite, progress=progress)
+    dtypes = {name: written_dtype(name, examined.stored_dtype(name), wanted) for name in examined.match.sources}
+    if layout == "gcd-ckpt":
+        state = {name: examined.tensor(name).to(dtype) for name, dtype in dtypes.items()}
+        write_published(Path(out), state, card, carried=_carried(examined), overwrite=overwrite)
+    else:
+        shapes = examined.networks.state_dict()
+        entries = {name: Entry(tuple(shapes[name].shape), dtype) for name, dtype in dtypes.items()}
+        content = Content(entries, examined.tensor, card.to_metadata())
+        write_safetensors(Path(out), content, overwrite=overwrite, report=progress)
     return inspect_weights(out)
 
 
@@ -188,7 +229,8 @@ def save_weights(networks: Networks, out: str | Path, card: Card, *, overwrite: 
     """
     state: dict[str, Tensor] = networks.state_dict()
     entries = {name: Entry(tuple(tensor.shape), tensor.dtype) for name, tensor in state.items()}
-    _write(Path(out), _Content(entries, state.__getitem__, card), overwrite=overwrite, progress=None)
+    content = Content(entries, state.__getitem__, card.to_metadata())
+    write_safetensors(Path(out), content, overwrite=overwrite)
 
 
 def digest(files: tuple[Path, ...], *, full: bool = False) -> str:
@@ -231,6 +273,11 @@ def _about(path: str | Path) -> Generator[None]:
         raise CheckpointError(f"{path}: cannot be read: {error.strerror or error}; check the path") from error
 
 
+def _carried(examined: Examined) -> dict[str, Tensor]:
+    leftovers, tensors = examined.match.leftovers, examined.file.tensors
+    return {name: tensors[name] for kind in CARRIED for name in leftovers.get(kind, ())}
+
+
 def _examined(path: Path, options: Options) -> Examined:
     with _about(path):
         return examine(read_weights(path), options)
@@ -248,7 +295,7 @@ def read_weights(path: Path) -> WeightsFile:
         layout=layout_of(held.tensors, metadata),
         files=(path,),
         tensors=held.tensors,
-        metadata=metadata or {},
+        metadata=held.notes if metadata is None else metadata,
         yaml=_yaml_beside(path),
         optimizer_size=held.optimizer_size,
         other_entries=held.other_entries,
@@ -336,62 +383,3 @@ def _yaml_beside(path: Path) -> str:
         return ""
     with yaml.open("rb") as file:
         return file.read(_LARGEST_YAML).decode("utf-8", errors="replace")
-
-
-# --- writing -------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class _Content:
-    """What goes into a file of ours: what is to be written of each tensor, where it comes from, and the card."""
-
-    entries: dict[str, Entry]
-    tensor: Callable[[str], Tensor]
-    card: Card
-
-
-def _written_dtype(name: str, stored: torch.dtype, wanted: torch.dtype | None) -> torch.dtype:
-    """The precision asked for; what computes in float32 is only ever widened."""
-    if wanted is None or (name.partition(".")[0] in FULL_PRECISION and wanted.itemsize < stored.itemsize):
-        return stored
-    return wanted
-
-
-def _write(out: Path, content: _Content, *, overwrite: bool, progress: Callable[[int, int], None] | None) -> None:
-    """Write one tensor after the other: at any time no more than one of them is held twice."""
-    entries = content.entries
-    done, total = 0, sum(entry.size for entry in entries.values())
-    with _whole_or_nothing(out, overwrite=overwrite) as file:
-        file.write(header(entries, content.card.to_metadata()))
-        for name in file_order(entries):
-            tensor = content.tensor(name).detach().to("cpu", entries[name].dtype).contiguous()
-            file.write(tensor.flatten().view(torch.uint8).numpy().data)
-            done += entries[name].size
-            if progress is not None:
-                progress(done, total)
-
-
-@contextmanager
-def _whole_or_nothing(out: Path, *, overwrite: bool) -> Generator[BinaryIO]:
-    """A file that appears under its name only once it is complete."""
-    _require_writable(out, overwrite=overwrite)
-    partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(out)
-    except OSError as error:
-        raise CheckpointError(f"{out}: cannot be written: {error.strerror or error}") from error
-    finally:
-        partial.unlink(missing_ok=True)
-
-
-def _require_writable(out: Path, *, overwrite: bool) -> None:
-    if out.suffix != ".safetensors":
-        raise OptionError(f"{out}: the output is safetensors; give it a name that ends so")
-    if not out.parent.is_dir():
-        raise OptionError(f"{out}: there is no folder {out.parent}; make it first")
-    if out.exists() and not overwrite:
-        raise OptionError(f"{out} exists; give another name, or allow it to be overwritten")

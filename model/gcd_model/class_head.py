@@ -1,6 +1,7 @@
 """A class map beside the picture, read off the U-Net's last features. Ours, not the paper's.
 
-One network, one evaluation: the features that become a clean picture also say what stands where.
+One network, one evaluation: the features that become a clean picture also say what stands where. A model that paints
+its picture in class colours instead has no head: its map is read off the colours.
 """
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor, nn
 
 from gcd_model.config import ClassHeadConfig, SemanticClass
 
-__all__ = ["ClassHead", "ClassHeadConfig", "SemanticClass", "class_map", "palette"]
+__all__ = ["ClassHead", "ClassHeadConfig", "SemanticClass", "class_map", "nearest_classes", "palette"]
 
 
 class ClassHead(nn.Module):
@@ -41,3 +42,18 @@ def class_map(logits: Tensor, height: int, width: int) -> Tensor:
 def palette(classes: tuple[SemanticClass, ...]) -> Tensor:
     """Colours by class id: uint8 [K, 3], RGB; `palette(classes)[class_map.long()]` paints a map."""
     return torch.tensor([entry.colour for entry in classes], dtype=torch.uint8)
+
+
+def nearest_classes(pixels: Tensor, classes: tuple[SemanticClass, ...]) -> Tensor:
+    """The class whose colour is nearest to each pixel; of equally near ones the first.
+
+    Args:
+        pixels: [T, 3, H, W], RGB in [0, 1].
+    Returns:
+        uint8 [T, H, W].
+    """
+    colours = palette(classes).to(pixels) / 255  # [K, 3]
+    half_square = (colours**2).sum(dim=1) / 2
+    # |p - c|^2 = |p|^2 - 2 (p . c - |c|^2 / 2): one product a pixel; frame by frame, to stay small
+    frames = [torch.addmm(-half_square[:, None], colours, frame.flatten(1)) for frame in pixels]  # [K, H*W] each
+    return torch.stack([frame.max(dim=0).indices for frame in frames]).to(torch.uint8).view(-1, *pixels.shape[-2:])

@@ -18,7 +18,8 @@ class Clip:
 
     video: float32 [T, 3, H, W], RGB in [-1, 1].
     fps: frames per second of the clip itself, not of the camera; the network is told this number.
-    mount: how the camera sits on its vehicle, for models that warp by planes; None for the mount of their training.
+    mount: how the camera sits on its vehicle, for models that warp by the planes of a road; None for the mount of their
+        training. Where the source camera of an orbit stands, the path says.
     """
 
     video: Tensor
@@ -48,7 +49,7 @@ class View:
     latents: float32 [S, T, C, h, w], what was decoded, in the scaled space the network works in.
     trajectory: the camera path that was asked for.
     motion_bucket: the motion number the network was told.
-    classes: uint8 [S, T, H, W], class ids of `Traits.classes`, on the CPU; None for models without class head.
+    classes: uint8 [S, T, H, W], class ids of `Traits.classes`, on the CPU; None for models that make none.
     """
 
     samples: Tensor

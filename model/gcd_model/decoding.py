@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gcd_model.class_head import class_map
+from gcd_model.class_head import class_map, nearest_classes
+from gcd_model.config import SemanticClass
 from gcd_model.networks import Networks
 from gcd_model.vae import to_pixels
 
@@ -38,8 +39,16 @@ class Pictures:
     classes: Tensor | None
 
 
-def decode(networks: Networks, denoised: Denoised, stacks: Sequence[LayerStack | None]) -> list[Pictures]:
-    """Decode view by view, one clip at a time. stacks: one per view; None for models without plane mix."""
+def decode(
+    networks: Networks,
+    denoised: Denoised,
+    stacks: Sequence[LayerStack | None],
+    painted: tuple[SemanticClass, ...] = (),
+) -> list[Pictures]:
+    """Decode view by view, one clip at a time.
+
+    stacks: one per view; None for models without plane mix. painted: the classes in whose colours the model paints.
+    """
     views: list[Pictures] = []
     for v, stack in enumerate(stacks):
         logits = denoised.class_logits
@@ -47,6 +56,8 @@ def decode(networks: Networks, denoised: Denoised, stacks: Sequence[LayerStack |
             _decoded_clip(networks, latents, None if logits is None else logits[v, s], stack)
             for s, latents in enumerate(denoised.latents[v])
         ]
+        if painted:
+            clips = [(pixels, nearest_classes(pixels, painted)) for pixels, _ in clips]
         classes = [clip_classes for _, clip_classes in clips if clip_classes is not None]
         views.append(
             Pictures(

@@ -8,6 +8,7 @@ import msgspec
 import torch
 from torch import Tensor
 
+from gcd_model.adapter import ADAPTER_KEY
 from gcd_model.architecture import Hints, Naming, Shapes, diffusers_levels, gcd_levels, infer_config
 from gcd_model.config import ModelConfig
 from gcd_model.errors import CheckpointError, OptionError
@@ -57,6 +58,11 @@ def layout_of(tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None)
 
     Raises: CheckpointError for names of no layout known here.
     """
+    if metadata is not None and ADAPTER_KEY in metadata:
+        raise CheckpointError(
+            "is an adapter, which is nothing without its base: give the base, and this as the adapter; or join them "
+            "with `gcd-train lora merge`"
+        )
     if metadata is not None and CONFIG_KEY in metadata:
         return "gcd-node"
     if any(name.startswith(f"{GCD_UNET}.") for name in tensors):
@@ -121,7 +127,7 @@ def examine(file: WeightsFile, options: Options) -> Examined:
     Raises:
         CheckpointError: it does not fit, name by name. OptionError: an option contradicts it.
     """
-    card = Card.from_metadata(file.metadata) if file.layout == "gcd-node" else None
+    card = Card.from_metadata(file.metadata) if CONFIG_KEY in file.metadata else None
     told = combined(
         Provenance(family=None if options.family is None else family_named(options.family).name, told_by="option"),
         _told_by_card(card),

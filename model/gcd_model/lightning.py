@@ -1,24 +1,29 @@
 """What a Lightning checkpoint holds, once it is read: weights, optimizer state, the rest. Opens nothing."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import cast
 
 from torch import Tensor
 
 from gcd_model.errors import CheckpointError
+from gcd_model.gcd_layout import NOTES
 from gcd_model.restricted_pickle import Placeholder
 
-_WEIGHTS, _OPTIMIZER = "state_dict", "optimizer_states"
+_WEIGHTS, _OPTIMIZER, _FACTS = "state_dict", "optimizer_states", "hyper_parameters"
 
 
 @dataclass(frozen=True, slots=True)
 class Contents:
-    """tensors: by published name. optimizer_size: bytes. other_entries: names of further top-level entries."""
+    """tensors: by published name. optimizer_size: bytes. other_entries: names of further top-level entries.
+
+    notes: what `gcd_layout` left among the hyper-parameters, empty in files of others.
+    """
 
     tensors: dict[str, Tensor]
     optimizer_size: int = 0
     other_entries: tuple[str, ...] = ()
+    notes: dict[str, str] = field(default_factory=dict[str, str])
 
 
 def contents(root: object) -> Contents:
@@ -36,7 +41,17 @@ def contents(root: object) -> Contents:
             raise CheckpointError(f"has no entry {_WEIGHTS!r} (found: {names}); it holds no weights")
         return Contents(_weights(entries))
     others = (str(key) for key in entries if key not in (_WEIGHTS, _OPTIMIZER))
-    return Contents(_weights(entries[_WEIGHTS]), _stored_bytes(entries.get(_OPTIMIZER)), tuple(others))
+    size = _stored_bytes(entries.get(_OPTIMIZER))
+    return Contents(_weights(entries[_WEIGHTS]), size, tuple(others), _notes(entries.get(_FACTS)))
+
+
+def _notes(facts: object) -> dict[str, str]:
+    """Our notes, if they are what we write: text to text."""
+    noted = cast("dict[object, object]", facts).get(NOTES) if isinstance(facts, dict) else None
+    if not isinstance(noted, dict):
+        return {}
+    texts = cast("dict[object, object]", noted).items()
+    return {key: value for key, value in texts if isinstance(key, str) and isinstance(value, str)}
 
 
 def _weights(state: object) -> dict[str, Tensor]:

@@ -1,20 +1,20 @@
 """From the name of a checkpoint to a synthesizer on a device."""
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
 import torch
 
-from gcd_model.checkpoints import LoadedWeights, load_weights
+from gcd_model.checkpoints import LoadedWeights, load_adapted, load_weights, read_adapter
 from gcd_model.config import SMALL
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.examination import Options
-from gcd_model.families import Traits, family_named
-from gcd_model.networks import Networks, random_networks
+from gcd_model.families import family_named
+from gcd_model.networks import Networks, random_networks, weights_digest
 from gcd_model.own_format import FULL_PRECISION, precision
 from gcd_model.synthesizer import Synthesizer
+from gcd_model.traits import Traits
 
 PACKAGED = Path(__file__).parent / "weights"
 """Where the weights that ship with the package lie."""
@@ -29,6 +29,7 @@ def load_synthesizer(
     head_width: int | None = None,
     image_heads: int | None = None,
     frames: int | None = None,
+    adapter: str | Path | None = None,
 ) -> Synthesizer:
     """A checkpoint, ready to run.
 
@@ -39,8 +40,10 @@ def load_synthesizer(
         dtype: "float32", "bfloat16" or "float16"; else float32 on the CPU, bfloat16 on CUDA. The VAE decoder
             stays float32 (on CUDA torch may use TF32 in its convolutions, see torch.backends.cudnn).
         head_width, image_heads, frames: see `load_weights`.
+        adapter: file of a low-rank adapter that was trained on these weights; family and path are then the adapter's.
     Raises:
-        CheckpointError: see `load_weights`. OptionError: an option is unknown or contradicts the checkpoint.
+        CheckpointError: see `load_weights`; or the adapter was trained on other weights.
+        OptionError: an option is unknown or contradicts the checkpoint.
     """
     place = _place(device, dtype)
     kind, _, name = str(source).partition(":")
@@ -49,7 +52,16 @@ def load_synthesizer(
         loaded = random_weights(name, frames=frames)
     else:
         path = packaged_weights(name) if isinstance(source, str) and kind == "package" else Path(source)
-        loaded = load_weights(path, family=family, head_width=head_width, image_heads=image_heads, frames=frames)
+        loaded = load_weights(
+            path,
+            family=family,
+            head_width=head_width,
+            image_heads=image_heads,
+            frames=frames,
+            ask_family=adapter is None,
+        )
+    if adapter is not None:
+        loaded = load_adapted(loaded, read_adapter(adapter))
     return Synthesizer(_moved(loaded.networks, place), _traits(loaded, place))
 
 
@@ -78,16 +90,8 @@ def random_weights(family: str, *, frames: int | None = None) -> LoadedWeights:
         family=chosen,
         move_time=config.frames - 1,
         trained=False,
-        sha256_12=_state_digest(networks)[:12],
+        sha256_12=weights_digest(networks.state_dict()),
     )
-
-
-def _state_digest(networks: Networks) -> str:
-    total = hashlib.sha256()
-    for name, tensor in sorted(networks.state_dict().items()):
-        total.update(name.encode())
-        total.update(tensor.detach().contiguous().flatten().view(torch.uint8).numpy().data)
-    return total.hexdigest()
 
 
 def _require_no_overrides(source: str, *given: object) -> None:

@@ -1,7 +1,10 @@
 """All networks of one checkpoint, built from its config."""
 
+import hashlib
+from collections.abc import Mapping
+
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from gcd_model.class_head import ClassHead
 from gcd_model.conditioning import CameraEmbedder
@@ -61,3 +64,12 @@ def random_networks(config: ModelConfig, seed: int) -> Networks:
             if not parameter.any():
                 nn.init.normal_(parameter, std=0.02)
     return networks
+
+
+def weights_digest(weights: Mapping[str, Tensor]) -> str:
+    """Twelve digits that name weights: of SHA-256 over names and bytes, in the order of the names."""
+    total = hashlib.sha256()
+    for name, tensor in sorted(weights.items()):
+        total.update(name.encode())
+        total.update(tensor.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data)
+    return total.hexdigest()[:12]

@@ -19,14 +19,14 @@ from gcd_model.conditioning import (
 from gcd_model.decoding import Denoised, LayerStack, Pictures, decode
 from gcd_model.denoiser import Denoiser, start_noise
 from gcd_model.errors import DeviceMemoryError, NonFiniteError, OptionError, ShapeError
-from gcd_model.families import Traits
-from gcd_model.geometry import Trajectory
+from gcd_model.geometry import CameraMount, Trajectory
 from gcd_model.image_encoder import clip_pixels
 from gcd_model.layers import prepare
 from gcd_model.networks import Networks
 from gcd_model.noise import edm_sigmas, guidance_scale, unit_noise
 from gcd_model.plane_warp import PathWarpCache, PathWarps
 from gcd_model.sampler import euler
+from gcd_model.traits import Traits
 
 Given = ParamSpec("Given")
 Made = TypeVar("Made")
@@ -117,7 +117,7 @@ class Synthesizer:
         extra: [T, C', h, w], for checkpoints with further condition channels.
         """
         augmentation = Augmentation() if augmentation is None else augmentation
-        told, warps = augmentation.strength, self._warps is not None
+        told = augmentation.strength
         strength = self._traits.config.sampling.augmentation if told is None else told
         self._traits.check_size(*clip.video.shape[-2:])
         self._check_extra(extra)
@@ -133,8 +133,8 @@ class Synthesizer:
             extra=None if extra is None else extra.to(self._like),
             fps=clip.fps,
             augmentation=strength,
-            video=clip.video if warps else None,
-            mount=(clip.mount or self._traits.mount) if warps else None,
+            video=None if self._warps is None else clip.video,
+            mount=self._mount(clip),
         )
 
     @_out_of_memory_is_our_error
@@ -193,10 +193,15 @@ class Synthesizer:
     def _condition_mean(self, frames: Tensor) -> Tensor:
         return self._networks.condition_encoder(frames.to(self._like)).mean
 
+    def _mount(self, clip: Clip) -> CameraMount | None:
+        """Of a camera on a vehicle; where an orbit's source camera stands, the path says."""
+        trained = self._traits.mount
+        return None if trained is None else clip.mount or trained
+
     def _path_warps(self, features: SourceFeatures, trajectory: Trajectory) -> PathWarps | None:
         if self._warps is None:
             return None
-        if features.video is None or features.mount is None:
+        if features.video is None:
             raise ShapeError(f"{self._traits.name} warps the source video, which these features lack; encode it here")
         height, width = features.video.shape[-2:]
         return self._warps.warps(features.mount, trajectory, height, width, self._like.device)
@@ -242,7 +247,8 @@ class Synthesizer:
 
     def _decode(self, job: "_Job", denoised: Denoised) -> list[Pictures]:
         mixes = self._networks.plane_mix is not None
-        pictures = decode(self._networks, denoised, [job.layers(warps) if mixes else None for warps in job.warps])
+        stacks = [job.layers(warps) if mixes else None for warps in job.warps]
+        pictures = decode(self._networks, denoised, stacks, self._traits.painted_classes)
         if not all(view.pixels.isfinite().all() for view in pictures):
             raise NonFiniteError(f"{self._traits.name} decoded to NaN or Inf; the weights are damaged")
         return pictures

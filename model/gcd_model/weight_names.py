@@ -26,7 +26,8 @@ stacked: several tensors, joined along the first axis.
 """
 
 GCD_UNET = "model.diffusion_model"
-GCD_IMAGE = "conditioner.embedders.0.open_clip.model.visual"
+GCD_CLIP = "conditioner.embedders.0.open_clip.model"
+GCD_IMAGE = f"{GCD_CLIP}.visual"
 GCD_CONDITION_VAE = "conditioner.embedders.3.encoder"
 GCD_CAMERA = "conditioner.embedders.5"
 GCD_VAE = "first_stage_model"
@@ -90,13 +91,13 @@ def _join(above: str, below: str) -> str:
 def gcd_source(name: str, levels: Levels) -> Source | None:
     """Where Stability's names keep our parameter; None if they have no such parameter."""
     row, leaf = _find(name, levels)
-    return Source((_join(row.gcd, leaf),)) if row.gcd else None
+    return Source((_join(row.gcd, leaf),)) if row is not None and row.gcd else None
 
 
 def diffusers_source(name: str, levels: Levels) -> Source | None:
     """Where a diffusers folder keeps our parameter; None if it has no such parameter."""
     row, leaf = _find(name, levels)
-    if not row.diffusers:
+    if row is None or not row.diffusers:
         return None
     if row.form == "stacked":
         return Source(tuple(row.diffusers.format(part) for part in "qkv"), "stacked")
@@ -121,13 +122,13 @@ def assembled(tensors: Sequence[Tensor], form: Form) -> Tensor:
     return tensors[0]
 
 
-def _find(name: str, levels: Levels) -> tuple[Row, str]:
-    """The row of a parameter, and what its name adds to the row's."""
+def _find(name: str, levels: Levels) -> tuple[Row | None, str]:
+    """The row of a parameter, and what its name adds to the row's; no row for what is ours alone."""
     table = _table(levels)
     if name in table:
         return table[name], ""
     module, _, leaf = name.rpartition(".")
-    return table[module], leaf
+    return table.get(module), leaf
 
 
 @lru_cache(maxsize=8)

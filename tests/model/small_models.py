@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import torch
+from msgspec import structs
 from torch import Tensor, nn
 
 from gcd_model.clip import Clip
@@ -18,9 +19,10 @@ from gcd_model.config import (
     VAEConfig,
     warp_channels,
 )
-from gcd_model.families import DRIVING, KUBRIC90, Traits
+from gcd_model.families import DRIVING, KUBRIC90
 from gcd_model.networks import Networks
 from gcd_model.synthesizer import Synthesizer
+from gcd_model.traits import Traits
 
 UNET = UNetConfig(
     width=64,
@@ -95,6 +97,21 @@ TINY_DRIVING = ModelConfig(
     class_head=ClassHeadConfig(classes=TINY_CLASSES, width=16, upscale=2),
 )
 """The same with every switch that is ours."""
+
+
+STAGE = PlaneWarpConfig(frame="stage", hfov_deg=53.13, offsets_m=(-2.0, 0.0, 2.0))
+
+TINY_OBJECTS = structs.replace(
+    TINY_DRIVING,
+    camera="spherical",
+    unet=structs.replace(TINY_DRIVING.unet, condition_channels=4 + warp_channels(STAGE, 4), camera_width=8),
+    plane_warp=STAGE,
+    class_head=None,
+)
+"""The same for orbits: planes on a stage, a steered camera, no class map."""
+
+TINY_SEMANTIC = structs.replace(TINY_DRIVING, plane_mix=None, class_head=None, semantic_classes=TINY_CLASSES)
+"""A model that paints its classes."""
 
 
 def draw(*shape: int, seed: int = 0) -> Tensor:

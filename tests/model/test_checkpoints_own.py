@@ -73,7 +73,7 @@ def test_a_published_name_against_the_camera_of_the_weights_is_refused(tmp_path:
 
 
 def test_an_unknown_family_name_lists_the_known_ones(tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="kubric90, kubric180, driving, driving-semantic, svd"):
+    with pytest.raises(OptionError, match="kubric90, kubric180, driving, driving-semantic, manipulation, svd"):
         load_weights(tmp_path / "a.ckpt", family="kubric")
 
 

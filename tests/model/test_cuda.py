@@ -5,10 +5,11 @@ import torch
 from small_models import TINY, random_clip, relative_error
 
 from gcd_model.clip import RenderOptions
-from gcd_model.families import KUBRIC90, Traits
+from gcd_model.families import KUBRIC90
 from gcd_model.geometry import SphericalDelta
 from gcd_model.networks import random_networks
 from gcd_model.synthesizer import Synthesizer
+from gcd_model.traits import Traits
 
 pytestmark = [
     pytest.mark.gpu,

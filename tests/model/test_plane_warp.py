@@ -180,6 +180,19 @@ def test_rays_are_of_unit_length_and_tell_the_distance_to_the_ground() -> None:
     assert (rays[0, 3, : HEIGHT // 2] == 1.0).all()
 
 
+def test_the_road_is_the_one_that_shipped_weights_were_trained_on() -> None:
+    """Recorded when driving-small was trained: what is warped otherwise is another model."""
+    made = warps()
+    seen = [int(made.valid[:, layer].sum()) for layer in range(CONFIG.layers)]
+    assert seen == [31524, 53892, 41248, 45250, 47938, 49840, 36562, 44756, 49842, 51764, 53180]
+    below = [made.grid[:, layer, ..., 1][made.valid[:, layer]].double().mean().item() for layer in range(CONFIG.layers)]
+    recorded = [0.289251, 0.037116, -0.031451, -0.029689, -0.0212, -0.008839]
+    assert below[:FIRST_FRONT] == pytest.approx(recorded, abs=2e-6)
+    assert below[FIRST_FRONT:] == pytest.approx([-0.080715, -0.110688, -0.087312, -0.042192, -0.008162], abs=2e-6)
+    rays = made.rays.double().mean(dim=(0, 2, 3)).tolist()
+    assert rays == pytest.approx([0.812637, 0.0, -0.231275, 0.405205], abs=2e-6)
+
+
 # --- along a path ----------------------------------------------------------------------------------------------------
 
 

@@ -10,8 +10,10 @@ import torch
 from msgspec.structs import replace as struct_replace
 
 from gcd_model import (
+    DRIVING_SEMANTIC_SMALL,
     DRIVING_SMALL,
     FAMILIES,
+    OBJECTS_SMALL,
     SMALL,
     Augmentation,
     Clip,
@@ -55,6 +57,18 @@ def warping_traits() -> Traits:
     """Of a model that warps by planes, uses its camera's mount and draws class maps."""
     config = struct_replace(DRIVING_SMALL, height=HEIGHT, width=WIDTH)
     return replace(traits("driving"), config=config)
+
+
+def orbiting_traits() -> Traits:
+    """Of a model that is steered by angles and warps by planes about the centre of its orbit."""
+    return replace(traits(), config=struct_replace(OBJECTS_SMALL, height=HEIGHT, width=WIDTH))
+
+
+def painting_traits() -> Traits:
+    """Of a model whose pictures are painted in class colours."""
+    return replace(
+        traits("driving-semantic"), config=struct_replace(DRIVING_SEMANTIC_SMALL, height=HEIGHT, width=WIDTH)
+    )
 
 
 def fake_classes(made: Traits, samples: int) -> torch.Tensor | None:

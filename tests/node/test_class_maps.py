@@ -6,7 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, fake_classes, made_node, traits, warping_traits
+from fakes import (
+    HEIGHT,
+    WIDTH,
+    Box,
+    FakeSource,
+    FakeSynthesizer,
+    fake_classes,
+    made_node,
+    painting_traits,
+    traits,
+    warping_traits,
+)
 
 from gcd_model import DRIVING_CLASSES, Traits
 from gcd_node.config import NodeConfig, parse_config
@@ -39,13 +50,15 @@ def published(made: Traits, frames: int = 28, **options: int) -> Box:
     return box
 
 
-def test_every_window_of_a_model_with_a_class_head_comes_with_its_class_map() -> None:
-    box = published(warping_traits())
+@pytest.mark.parametrize("made", [warping_traits(), painting_traits()], ids=["class head", "painted"])
+def test_every_window_of_a_model_that_makes_class_maps_comes_with_its_own(made: Traits) -> None:
+    box = published(made)
     maps, windows = box.of("cls"), box.of("win")
     assert [each.header.window_id for each in maps] == [0, 1]
     assert images(maps[0]).shape == (14, HEIGHT, WIDTH, 1)
-    drawn = fake_classes(warping_traits(), 1)
+    drawn = fake_classes(made, 1)
     assert drawn is not None
+    assert maps[0].header.classes == ontology(made)
     assert np.array_equal(images(maps[0])[..., 0], drawn[0].numpy())
     for drawing, window in zip(maps, windows, strict=True):
         same = ("t_capture_ns", "source_from_view", "view_rev", "intrinsics", "frame_role", "quality", "model")

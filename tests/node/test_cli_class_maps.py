@@ -11,7 +11,7 @@ import torch
 from fakes import FakeSynthesizer, warping_traits
 from msgspec.structs import replace
 
-from gcd_model import DRIVING_CLASSES, DRIVING_SMALL, CameraMount
+from gcd_model import DRIVING_CLASSES, DRIVING_SEMANTIC_SMALL, DRIVING_SMALL, OBJECTS_SMALL, CameraMount
 from gcd_model.checkpoints import save_weights
 from gcd_model.networks import random_networks
 from gcd_model.own_format import Card
@@ -60,6 +60,41 @@ def test_synthesize_writes_the_class_map_as_numbers_with_their_meaning_and_shows
     third = strip[2 * (HEIGHT + 4) : 2 * (HEIGHT + 4) + HEIGHT, :WIDTH]
     assert np.array_equal(third, arrays["colours"][arrays["classes"][0, 0]])
     assert len(strip) > 3 * HEIGHT + 8  # the legend below
+
+
+@pytest.fixture
+def short_clip(tmp_path: Path) -> Path:
+    np.save(tmp_path / "short.npy", np.random.default_rng(0).random((4, HEIGHT, WIDTH, 3), np.float32))
+    return tmp_path / "short.npy"
+
+
+def test_a_model_that_paints_its_classes_writes_the_map_of_its_own_picture(short_clip: Path, tmp_path: Path) -> None:
+    painted = replace(DRIVING_SEMANTIC_SMALL, frames=4, height=HEIGHT, width=WIDTH, unet=UNET, vae=VAE)
+    card = Card(name="painted", config=painted, family="driving-semantic", move_time=3, trained=False)
+    save_weights(random_networks(painted, seed=0), tmp_path / "painted.safetensors", card)
+    assert (
+        synthesize(short_clip, tmp_path / "painted.safetensors", tmp_path / "out", "--save", str(tmp_path / "a.npz"))
+        == 0
+    )
+    arrays, frames = np.load(tmp_path / "out" / "classes.npz"), np.load(tmp_path / "a.npz")["frames"]
+    assert arrays["names"].tolist() == [each.name for each in DRIVING_CLASSES]
+    away = ((frames[..., None, :] - arrays["colours"] / 255) ** 2).sum(axis=-1)  # [T, H, W, K]
+    assert np.array_equal(arrays["classes"][0], away.argmin(axis=-1))
+
+
+def test_an_orbit_is_warped_from_where_the_source_camera_is_said_to_stand(short_clip: Path, tmp_path: Path) -> None:
+    condition_channels = OBJECTS_SMALL.unet.condition_channels
+    unet = replace(UNET, condition_channels=condition_channels, camera_width=OBJECTS_SMALL.unet.camera_width)
+    objects = replace(OBJECTS_SMALL, frames=4, height=HEIGHT, width=WIDTH, unet=unet, vae=VAE)
+    card = Card(name="objects", config=objects, family="kubric90", move_time=3, trained=False)
+    save_weights(random_networks(objects, seed=0), tmp_path / "objects.safetensors", card)
+    sources = {"assumed": [], "other": ["30", "13"]}
+    for name, numbers in sources.items():
+        stated = [] if not numbers else ["--source-elevation-deg", numbers[0], "--source-radius", numbers[1]]
+        options = ["--azimuth-deg", "40", *stated, "--save", str(tmp_path / f"{name}.npz")]
+        assert synthesize(short_clip, tmp_path / "objects.safetensors", tmp_path / name, *options) == 0
+    frames = {name: np.load(tmp_path / f"{name}.npz")["frames"] for name in sources}
+    assert not np.array_equal(frames["assumed"], frames["other"])
 
 
 @pytest.mark.parametrize(

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fakes import WIDTH, Box, FakeSource, FakeSynthesizer, made_node, traits, warping_traits
+from fakes import WIDTH, Box, FakeSource, FakeSynthesizer, made_node, orbiting_traits, traits, warping_traits
 
 from gcd_model import CameraMount, OptionError, Traits
 from gcd_node.config import NodeConfig, SourcePose, load_config, parse_config
 from gcd_node.config_digest import config_digest
 from gcd_node.errors import ConfigError
-from gcd_node.optics.source_pose import is_foreign, require_usable, stated_mount, stated_sphere
+from gcd_node.optics.source_pose import in_words, is_foreign, require_usable, stated_mount, stated_sphere
 
 
 def config(pose: str | None = None, *, source: str = "", more: str = "") -> NodeConfig:
@@ -186,6 +186,55 @@ def test_a_sphere_is_filled_with_what_is_assumed() -> None:
     assert half is not None
     assert (half.elevation_deg, half.radius_m) == (5.0, 14.0)
     assert stated_sphere(SourcePose(height_m=2.0)) is None
+
+
+# --- orbits of a model that warps ------------------------------------------------------------------------------------
+
+
+def test_an_orbit_is_planned_from_where_the_camera_is_said_to_stand() -> None:
+    model, box = run(config("elevation_deg = 25.0\nradius = 13.0"), orbiting_traits(), FakeSource(14, fps=12.0))
+    source = model.asked[0][0][0].source
+    assert source is not None
+    assert (source.elevation_deg, source.radius_m) == (25.0, 13.0)
+    assert model.clips[0].mount is None
+    told = {"el_deg": 25.0, "r": 13.0, "assumed": False}
+    meta = next(fields for topic, fields in box.notes if topic == "meta")
+    assert (meta["mount"], meta["src_pose"]) == (None, told)
+
+
+def test_meta_tells_an_assumed_source_and_none_where_the_view_is_fixed() -> None:
+    for made, told in ((orbiting_traits(), {"el_deg": 5.0, "r": 15.0, "assumed": True}), (warping_traits(), None)):
+        _, box = run(config(), made, FakeSource(14, fps=made.fps))
+        assert next(fields for topic, fields in box.notes if topic == "meta")["src_pose"] == told
+
+
+def test_a_camera_below_the_ground_is_refused_where_the_ground_is_warped() -> None:
+    below = config("elevation_deg = -20.0")
+    with pytest.raises(ConfigError, match=r"\[source\.pose\]: a camera must stand above the ground"):
+        run(below, orbiting_traits())
+    require_usable(below.source.pose, traits())
+
+
+def test_the_view_of_a_model_that_warps_is_as_wide_as_in_training() -> None:
+    _, box = run(config(source="hfov_deg = 40.0"), orbiting_traits(), FakeSource(14))
+    header = box.of("win")[0].header
+    assert "hfov" in header.quality.ood
+    assert header.intrinsics is not None
+    assert header.intrinsics[0] == pytest.approx(WIDTH / 2 / np.tan(np.radians(53.13 / 2)))
+
+
+@pytest.mark.parametrize(
+    ("made", "pose", "words"),
+    [
+        (orbiting_traits(), SourcePose(radius=13.0), "an elevation of 5 degrees and a radius of 13 (stated)"),
+        (orbiting_traits(), None, "a radius of 15 (assumed: state it in [source.pose])"),
+        (warping_traits(), SourcePose(height_m=2.0), "2 m above the ground, 1.6 m ahead, tilted 0 degrees (stated)"),
+        (warping_traits(), None, "1.55 m above the ground, 1.6 m ahead, tilted 0 degrees (assumed"),
+    ],
+)
+def test_where_the_camera_is_taken_to_stand_is_said_in_words(made: Traits, pose: SourcePose | None, words: str) -> None:
+    assert words in in_words(stated_mount(pose, None, made), pose, made)
+    assert in_words(None, pose, traits()) == ""
 
 
 def test_the_mount_is_part_of_what_the_digest_names() -> None:

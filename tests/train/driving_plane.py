@@ -1,8 +1,13 @@
-"""A world that is one painted ground plane under a sky, drawn by following each pixel's ray: no renderer."""
+"""A world that is one painted ground plane under a sky, drawn by following each pixel's ray: no renderer.
+
+Seen from a vehicle, or by a camera that goes over the sphere about a stage.
+"""
 
 import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 import cv2
 import msgspec
@@ -10,13 +15,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gcd_model.config import DRIVING_CLASSES, SemanticClass
-from gcd_model.geometry import CameraMount
+from gcd_model.config import DRIVING_CLASSES, CameraControl, SemanticClass
+from gcd_model.geometry import (
+    CameraMount,
+    Spherical,
+    SphericalDelta,
+    Trajectory,
+    driving_trajectory,
+    spherical_trajectory,
+)
 from gcd_train.baselines.cameras import CameraPair, pixel_rays
 from gcd_train.datasets.paired import PairedClip
-from gcd_train.scenes.writer import DEPTH_UNIT_M, World
+from gcd_train.scenes.pair_world import DEPTH_UNIT_M, Orbit, World
 
 SKY, ROAD, TERRAIN = 0, 1, 4
+STAGE_SOURCE = Spherical(azimuth_deg=0.0, elevation_deg=20.0, radius_m=14.0)
 
 
 def picture(vehicle_from_camera: Tensor, rays: Tensor, phase: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -33,8 +46,8 @@ def picture(vehicle_from_camera: Tensor, rays: Tensor, phase: float) -> tuple[Te
 
 
 def plane_clip(cameras: CameraPair, phase: float = 0.0) -> PairedClip:
-    """The plane as both cameras of a driving clip see it."""
-    still = cameras.mount.vehicle_from_camera
+    """The plane as both cameras of a clip see it."""
+    still = cameras.ground_from_source
     moving = still @ cameras.source_from_target
     source = [picture(still, pixel_rays(cameras.source), phase) for _ in moving]
     target = [picture(pose, pixel_rays(cameras.target), phase) for pose in moving]
@@ -59,40 +72,79 @@ def _bytes(values: Tensor) -> np.ndarray:
 
 @dataclass(frozen=True)
 class PlaneClips:
-    """Clips of that world with different paint."""
+    """Clips of that world with different paint. paths: of the clips of an orbit; empty in driving."""
 
     clips: tuple[PairedClip, ...]
     classes: tuple[SemanticClass, ...] = DRIVING_CLASSES
     fps: float = 10.0
+    paths: tuple[Trajectory, ...] = ()
+    clips_per_scene: int = 1
+    hfov_deg: float = 85.0
 
     @classmethod
-    def make(cls, count: int, *, frames: int = 4, height: int = 32, width: int = 48) -> "PlaneClips":
+    def make(cls, count: int, *, frames: int = 4, height: int = 32, width: int = 48) -> Self:
         cameras = CameraPair.driving(CameraMount(), frames=frames, height=height, width=width)
         return cls(tuple(plane_clip(cameras, phase=float(i)) for i in range(count)))
+
+    @classmethod
+    def orbits(cls, changes: Sequence[SphericalDelta], *, frames: int = 4, height: int = 32, width: int = 48) -> Self:
+        """One clip for each change of azimuth, elevation and radius, without classes."""
+        paths = tuple(
+            spherical_trajectory(STAGE_SOURCE, change, frames=frames, move_time=frames - 1) for change in changes
+        )
+        lens = 53.13
+        cameras = [CameraPair.orbit(path, hfov_deg=lens, height=height, width=width) for path in paths]
+        clips = tuple(plane_clip(pair, phase=float(i)) for i, pair in enumerate(cameras))
+        return cls(clips, classes=(), fps=12.0, paths=paths, hfov_deg=lens)
 
     def write(self, folder: Path, first_seed: int = 0) -> Path:
         """A data folder with these clips in one shard, under seeds from `first_seed` on."""
         folder.mkdir(parents=True, exist_ok=True)
         world = World(
-            name="driving",
+            name="drop" if self.paths else "driving",
             width=self.width,
             height=self.height,
             frames=self.frames,
             fps=self.fps,
-            hfov_deg=85.0,
+            hfov_deg=self.hfov_deg,
             oversample=1,
             clips_per_shard=len(self),
             classes=self.classes,
+            camera="orbit" if self.paths else "fixed",
+            clips_per_scene=self.clips_per_scene,
         )
         (folder / "world.json").write_bytes(msgspec.json.encode(world))
         with zipfile.ZipFile(folder / f"shard-{first_seed:08d}-{len(self)}.zip", "w") as archive:
             for number, clip in enumerate(self.clips, start=first_seed):
+                if self.paths:
+                    archive.writestr(f"{number:08d}/scene.json", _told(self.paths[number - first_seed]))
                 for kind, strip in _strips(clip).items():
                     archive.writestr(f"{number:08d}/{kind}.png", cv2.imencode(".png", strip)[1].tobytes())
         return folder
 
     def __len__(self) -> int:
         return len(self.clips)
+
+    @property
+    def camera(self) -> CameraControl:
+        return "spherical" if self.paths else "none"
+
+    @property
+    def mount(self) -> CameraMount | None:
+        return None if self.paths else CameraMount()
+
+    @property
+    def origin(self) -> str:
+        return "plane"
+
+    def seed(self, number: int) -> int:
+        return number
+
+    def scene(self, number: int) -> tuple[str, int]:
+        return "plane", number // self.clips_per_scene
+
+    def trajectory(self, number: int) -> Trajectory:
+        return self.paths[number] if self.paths else driving_trajectory(frames=self.frames, move_time=self.frames - 1)
 
     def __getitem__(self, number: int) -> PairedClip:
         return self.clips[number]
@@ -114,6 +166,18 @@ class PlaneClips:
     @property
     def width(self) -> int:
         return self.clips[0].source.shape[2]
+
+
+def _told(path: Trajectory) -> bytes:
+    start, goal = path.source, path.goal_delta
+    assert start is not None
+    assert goal is not None
+    orbit = Orbit(
+        start=(start.azimuth_deg, start.elevation_deg, start.radius_m),
+        change=(goal.azimuth_deg, goal.elevation_deg, goal.radius_m),
+        frame_numbers=tuple(range(path.frames)),
+    )
+    return msgspec.json.encode({"orbit": orbit})
 
 
 def _strips(clip: PairedClip) -> dict[str, np.ndarray]:

@@ -1,11 +1,13 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
-from driving_plane import PlaneClips, plane_clip
+from driving_plane import STAGE_SOURCE, PlaneClips, plane_clip
 from torch.testing import assert_close
 
 from gcd_model.config import PlaneWarpConfig
-from gcd_model.geometry import CameraMount
+from gcd_model.geometry import CameraMount, SphericalDelta, spherical_trajectory, to_pose
 from gcd_model.plane_warp import plane_warp
 from gcd_train.baselines import (
     CameraPair,
@@ -15,15 +17,17 @@ from gcd_train.baselines import (
     MajorityMap,
     MeanTarget,
     TargetStatistics,
-    driving_baselines,
+    all_baselines,
     fit_statistics,
     to_pictures,
 )
 from gcd_train.baselines.cameras import pixel_rays, to_pixels
 from gcd_train.baselines.depth_reprojection import splat
 from gcd_train.baselines.ground_homography import ground_grid, plane_homography
+from gcd_train.baselines.predictor import SourceClip
 from gcd_train.datasets.paired import PairedClip
 from gcd_train.errors import DataError
+from gcd_train.evaluation import source_side
 from gcd_train.metrics import psnr
 
 FRAMES, HEIGHT, WIDTH = 5, 64, 96
@@ -32,6 +36,17 @@ MARK, MARK_CLASS = -1.0, 12
 
 def cameras(mount: CameraMount | None = None) -> CameraPair:
     return CameraPair.driving(mount or CameraMount(), frames=FRAMES, height=HEIGHT, width=WIDTH)
+
+
+def seen_by(pair: CameraPair, clip: PairedClip) -> SourceClip:
+    """What a predictor gets of a clip."""
+    return SourceClip(
+        source=clip.source,
+        source_depth=clip.source_depth,
+        source_classes=clip.source_classes,
+        cameras=pair,
+        fps=10.0,
+    )
 
 
 def marked_fill() -> TargetStatistics:
@@ -54,7 +69,7 @@ def agreement(video: torch.Tensor, target: torch.Tensor, seen: torch.Tensor) -> 
 @pytest.mark.parametrize("mount", [CameraMount(), CameraMount(height_m=1.9, tilt_deg=4.0)])
 def test_reprojecting_a_plane_gives_the_picture_drawn_by_rays(mount: CameraMount) -> None:
     clip = plane_clip(cameras(mount))
-    made = DepthReprojection(cameras=cameras(mount), fill=marked_fill(), classes=13).predict(clip)
+    made = DepthReprojection(fill=marked_fill(), classes=13).predict(seen_by(cameras(mount), clip))
     assert made.video is not None
     assert made.classes is not None
     seen = made.video[:, 0] > MARK / 2
@@ -69,7 +84,7 @@ def test_reprojecting_a_plane_gives_the_picture_drawn_by_rays(mount: CameraMount
 
 def test_reprojecting_into_the_same_camera_changes_nothing() -> None:
     clip = plane_clip(cameras())
-    made = DepthReprojection(cameras=cameras(), fill=marked_fill(), classes=13).predict(clip)
+    made = DepthReprojection(fill=marked_fill(), classes=13).predict(seen_by(cameras(), clip))
     assert made.video is not None
     assert made.classes is not None
     assert_close(made.video[0], to_pictures(clip.source)[0], rtol=0, atol=1e-5)
@@ -79,7 +94,7 @@ def test_reprojecting_into_the_same_camera_changes_nothing() -> None:
 @pytest.mark.parametrize("mount", [CameraMount(), CameraMount(height_m=1.2, tilt_deg=-3.0)])
 def test_the_ground_homography_gives_the_picture_of_a_plane_drawn_by_rays(mount: CameraMount) -> None:
     clip = plane_clip(cameras(mount))
-    made = GroundHomography(cameras=cameras(mount), fill=marked_fill()).predict(clip)
+    made = GroundHomography(fill=marked_fill()).predict(seen_by(cameras(mount), clip))
     assert made.video is not None
     assert made.classes is not None
     seen = (made.video[:, 0] > MARK / 2) & near_ground(clip)
@@ -91,7 +106,7 @@ def test_the_ground_homography_gives_the_picture_of_a_plane_drawn_by_rays(mount:
 
 def test_a_homography_takes_target_pixels_to_the_source_pixels_of_the_same_ground_points() -> None:
     pair = cameras(CameraMount(height_m=1.3, tilt_deg=2.0))
-    vehicle_from_source = pair.mount.vehicle_from_camera
+    vehicle_from_source = pair.ground_from_source
     vehicle_from_target = vehicle_from_source @ pair.source_from_target
     point = torch.tensor([14.0, -2.5, 0.0, 1.0], dtype=torch.float64)
     homography = plane_homography(pair.source_from_target, -vehicle_from_target[:, 2, :3], vehicle_from_target[:, 2, 3])
@@ -105,7 +120,7 @@ def test_a_homography_takes_target_pixels_to_the_source_pixels_of_the_same_groun
 def test_the_homography_agrees_with_the_models_own_ground_warp() -> None:
     pair = cameras()
     grid, seen = ground_grid(pair)
-    warps = plane_warp(PlaneWarpConfig(), pair.mount, pair.source_from_target, HEIGHT, WIDTH)
+    warps = plane_warp(PlaneWarpConfig(), CameraMount(), pair.source_from_target, HEIGHT, WIDTH)
     assert (seen == warps.valid[:, 0]).float().mean() > 0.999
     both = seen & warps.valid[:, 0]
     assert_close(grid[both], warps.grid[:, 0][both], rtol=0, atol=1e-4)
@@ -130,7 +145,7 @@ def test_points_behind_the_camera_or_beside_the_picture_are_not_drawn() -> None:
 
 def test_the_sky_is_reprojected_as_far_away() -> None:
     clip = plane_clip(cameras())
-    made = DepthReprojection(cameras=cameras(), fill=marked_fill(), classes=13).predict(clip)
+    made = DepthReprojection(fill=marked_fill(), classes=13).predict(seen_by(cameras(), clip))
     assert made.classes is not None
     sky = torch.from_numpy(clip.target_classes) == 0
     found = made.classes[sky]
@@ -143,7 +158,7 @@ def test_a_wrongly_declared_mount_costs_the_homography() -> None:
     for height_m in (1.55, 1.8):
         pair = cameras(CameraMount(height_m=height_m))
         statistics = TargetStatistics(mean=to_pictures(clip.target), majority=torch.from_numpy(clip.target_classes))
-        video = GroundHomography(cameras=pair, fill=statistics).predict(clip).video
+        video = GroundHomography(fill=statistics).predict(seen_by(pair, clip)).video
         assert video is not None
         scores.append(float(psnr(video, to_pictures(clip.target))[1:].mean()))
     assert scores[0] > scores[1] + 0.5
@@ -151,7 +166,7 @@ def test_a_wrongly_declared_mount_costs_the_homography() -> None:
 
 def test_copying_shows_the_source_and_its_classes() -> None:
     clip = PlaneClips.make(1)[0]
-    made = CopySource().predict(clip)
+    made = CopySource().predict(seen_by(cameras(), clip))
     assert made.video is not None
     assert made.classes is not None
     assert np.array_equal((made.video * 255).round().permute(0, 2, 3, 1).numpy(), clip.source)
@@ -160,7 +175,7 @@ def test_copying_shows_the_source_and_its_classes() -> None:
 
 def test_the_mean_target_is_by_pixel_and_frame_number() -> None:
     clips = PlaneClips.make(3)
-    mean = MeanTarget(statistics=fit_statistics(clips)).predict(clips[0]).video
+    mean = MeanTarget(statistics=fit_statistics(clips)).predict(seen_by(cameras(), clips[0])).video
     expected = np.stack([clip.target for clip in clips.clips]).mean(axis=0) / 255
     assert mean is not None
     assert np.abs(mean.permute(0, 2, 3, 1).numpy() - expected).max() < 1e-6
@@ -171,8 +186,9 @@ def test_the_majority_map_takes_the_commonest_class_of_each_pixel() -> None:
     clips[0].target_classes[1, 5, 7] = clips[2].target_classes[1, 5, 7] = 9
     clips[1].target_classes[2, 3, 4] = 9
     usual = clips[0].target_classes[2, 3, 4]
-    majority = MajorityMap(statistics=fit_statistics(clips)).predict(clips[1]).classes
+    majority = fit_statistics(clips).majority
     assert majority is not None
+    assert MajorityMap(majority=majority).predict(seen_by(cameras(), clips[1])).classes is majority
     assert (majority[1, 5, 7], majority[2, 3, 4]) == (9, usual)
 
 
@@ -180,6 +196,8 @@ def test_constant_statistics_have_each_frames_mean_colour_and_commonest_class() 
     clips = PlaneClips.make(2)
     statistics = fit_statistics(clips)
     constant = statistics.constant
+    assert statistics.majority is not None
+    assert constant.majority is not None
     assert_close(constant.mean[2, :, 0, 0], statistics.mean[2].mean(dim=(1, 2)))
     assert constant.mean[1].flatten(1).std(dim=1).max() < 1e-6
     assert constant.majority[3].unique().tolist() == [int(statistics.majority[3].flatten().mode().values)]
@@ -192,13 +210,62 @@ def test_statistics_of_no_clips_are_refused() -> None:
 
 def test_every_baseline_follows_one_protocol() -> None:
     clips = PlaneClips.make(2)
-    baselines = driving_baselines(fit_statistics(clips), CameraMount(), len(clips.classes))
+    baselines = all_baselines(fit_statistics(clips), len(clips.classes))
     names = [each.name for each in baselines]
     assert len(set(names)) == len(names) == 6
     assert [each.name for each in baselines if each.privileged] == names[-2:]
     shape = (clips.frames, 3, clips.height, clips.width)
+    seen = source_side(clips, 0, clips[0], None)
     for each in baselines:
-        made = each.predict(clips[0])
+        made = each.predict(seen)
         assert made.video is not None or made.classes is not None
         assert made.video is None or (made.video.shape == shape and made.video.dtype == torch.float32)
         assert made.classes is None or made.classes.dtype == torch.uint8
+
+
+def turned(azimuth_deg: float, elevation_deg: float = 0.0, radius_m: float = 0.0) -> SphericalDelta:
+    return SphericalDelta(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, radius_m=radius_m)
+
+
+@pytest.mark.parametrize("change", [turned(50.0), turned(-70.0, 20.0, -1.5), turned(0.0, -12.0, 2.0)])
+def test_on_a_plane_that_a_camera_orbits_both_reprojections_give_what_rays_draw(change: SphericalDelta) -> None:
+    path = spherical_trajectory(STAGE_SOURCE, change, frames=FRAMES, move_time=FRAMES - 1)
+    pair = CameraPair.orbit(path, hfov_deg=53.13, height=HEIGHT, width=WIDTH)
+    clip = plane_clip(pair)
+    fill = TargetStatistics(mean=marked_fill().mean)
+    for each in (GroundHomography(fill=fill), DepthReprojection(fill=fill, classes=0)):
+        made = each.predict(replace(seen_by(pair, clip), source_classes=None))
+        assert made.classes is None
+        assert made.video is not None
+        seen = made.video[:, 0] > MARK / 2
+        share, error = agreement(made.video, to_pictures(clip.target), seen & near_ground(clip))
+        assert share > 0.3
+        assert error < 0.03
+
+
+def test_an_orbits_homography_takes_target_pixels_to_the_source_pixels_of_the_same_ground_points() -> None:
+    path = spherical_trajectory(STAGE_SOURCE, turned(40.0, 15.0, 1.0), frames=FRAMES, move_time=FRAMES - 1)
+    pair = CameraPair.orbit(path, hfov_deg=53.13, height=HEIGHT, width=WIDTH)
+    stage_from_target = to_pose(STAGE_SOURCE) @ path.source_from_target
+    homography = plane_homography(path.source_from_target, -stage_from_target[:, 2, :3], stage_from_target[:, 2, 3])
+    point = torch.tensor([1.0, -2.0, 0.0, 1.0], dtype=torch.float64)
+    in_target = (torch.linalg.inv(stage_from_target) @ point)[:, :3]
+    in_source = (torch.linalg.inv(to_pose(STAGE_SOURCE)) @ point)[:3]
+    moved = torch.einsum("tij,tj->ti", homography, in_target / in_target[:, 2:])
+    assert_close(to_pixels(moved, pair.source), to_pixels(in_source, pair.source).expand(FRAMES, 2), rtol=0, atol=1e-8)
+
+
+def test_an_orbit_whose_beginning_nobody_knows_is_refused() -> None:
+    path = spherical_trajectory(STAGE_SOURCE, turned(40.0), frames=FRAMES, move_time=FRAMES - 1)
+    with pytest.raises(DataError, match="where the source is"):
+        CameraPair.orbit(replace(path, source=None), hfov_deg=53.13, height=HEIGHT, width=WIDTH)
+
+
+def test_without_an_ontology_there_is_no_majority_map_and_no_class_map() -> None:
+    clips = PlaneClips.orbits([turned(30.0), turned(-60.0)])
+    baselines = all_baselines(fit_statistics(clips), 0)
+    assert [each.name for each in baselines if "majority" in each.name] == []
+    assert len(baselines) == 5
+    seen = source_side(clips, 1, clips[1], None)
+    assert all(each.predict(seen).classes is None for each in baselines)
+    assert all(each.predict(seen).video is not None for each in baselines)

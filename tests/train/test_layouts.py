@@ -16,7 +16,17 @@ from gcd_model.geometry import Intrinsics, sphere_poses
 from gcd_train.errors import DataError
 from gcd_train.layouts import encodings, kubric4d_names, parallel_domain4d_names
 from gcd_train.layouts.camera_facts import blender_pose, project, quaternions, ray_lengths
-from gcd_train.layouts.depth_code import FAR_M, NEAR_M, SKY_M, decode_depth, encode_depth, with_sky
+from gcd_train.layouts.depth_code import (
+    FAR_M,
+    NEAR_M,
+    SKY_M,
+    decode_depth,
+    decode_street_depth,
+    encode_depth,
+    encode_street_depth,
+    stored_depth,
+    with_sky,
+)
 from gcd_train.layouts.instance_tracks import InstanceTracks
 from gcd_train.layouts.kubric4d import Kubric4DWriter, distance_of, segment_ids
 from gcd_train.layouts.kubric4d_metadata import camera_metadata, view_metadata
@@ -104,6 +114,44 @@ class TestDepthCode:
 
     def test_the_sky_is_far(self) -> None:
         assert with_sky(np.array([0.0, 2.5], np.float32)).tolist() == [30000.0, 2.5]
+
+
+class TestStreetDepthCode:
+    def test_the_error_grows_with_the_depth(self) -> None:
+        metres = np.geomspace(NEAR_M, 5000.0, 8001).astype(np.float32)
+        again = decode_street_depth(encode_street_depth(metres))
+        np.testing.assert_array_less(np.abs(1 / again - 1 / metres), 0.00127 * (1 / metres + 1 / 20))
+        street = metres <= 100
+        np.testing.assert_array_less((np.abs(again / metres - 1) / (1 + metres / 20))[street], 0.00127)
+
+    def test_codes_by_hand(self) -> None:
+        metres = np.array([0.0, -1.0, np.nan, 0.01, 0.05, 20.0, SKY_M, 1e9, np.inf], np.float32)
+        codes = encode_street_depth(metres)
+        assert codes.tolist() == [0, 0, 0, 1, 1, 2121, 2398, 2398, 2398]  # 1 + ln(20.05 / 0.1) / 0.0025
+        far = decode_street_depth(np.array([0, 1, 2398, 65535], np.uint16)).tolist()
+        assert far == pytest.approx([0.0, 0.05, SKY_M, SKY_M])
+
+    def test_further_is_never_nearer(self) -> None:
+        metres = decode_street_depth(np.arange(2**16).astype(np.uint16))
+        assert (np.diff(metres) >= 0).all()
+        assert (np.diff(metres[:2398]) > 0).all()
+
+    def test_the_sky_stays_the_sky_and_nothing_in_sight_becomes_it(self) -> None:
+        metres = np.array([900.0, SKY_M], np.float32)
+        assert (decode_street_depth(encode_street_depth(metres)) == SKY_M).tolist() == [False, True]
+
+    def test_a_file_tells_which_code_it_has(self) -> None:
+        metres = np.random.default_rng(0).uniform(0.5, 90.0, (6, 9)).astype(np.float32)
+        for write, decoded in (
+            (encodings.depth_png, decode_depth(encode_depth(metres))),
+            (encodings.street_depth_png, decode_street_depth(encode_street_depth(metres))),
+        ):
+            picture = cv2.imdecode(np.frombuffer(write(metres), np.uint8), cv2.IMREAD_UNCHANGED)
+            np.testing.assert_array_equal(stored_depth(np.asarray(picture)), decoded)
+
+    @pytest.mark.parametrize(("shape", "kind"), [((6, 9, 3), np.uint8), ((7, 9), np.uint8), ((6, 9), np.float32)])
+    def test_other_pictures_hold_no_depth(self, shape: tuple[int, ...], kind: type[np.generic]) -> None:
+        assert stored_depth(np.zeros(shape, kind)) is None
 
 
 class TestCameraFacts:
@@ -298,7 +346,9 @@ class TestParallelDomain4D:
         np.testing.assert_array_equal(instances[..., 2], view.instances)
         depth_path = names.frame_path(folder, "yaw-0", "depth", 3, compact=compact)
         if compact:
-            np.testing.assert_allclose(decode_depth(picture(depth_path)), with_sky(view.depth), rtol=6e-4)
+            metres = stored_depth(picture(depth_path))
+            assert metres is not None
+            np.testing.assert_allclose(metres, with_sky(view.depth), rtol=2e-3)  # all is 10 m away
             return
         with np.load(depth_path) as kept:
             np.testing.assert_array_equal(kept["data"], with_sky(view.depth))

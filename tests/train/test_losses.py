@@ -7,7 +7,10 @@ from torch.testing import assert_close
 
 from gcd_train.losses import (
     PARALLEL_DOMAIN_WEIGHTS,
+    PLAIN_BLEND,
+    RELEASED_BLEND,
     ClassWeight,
+    FocalBlend,
     class_emphasis,
     class_frequency_weights,
     edm_weight,
@@ -100,3 +103,19 @@ def test_frequency_weights_are_one_on_average_and_fall_with_frequency() -> None:
 
 def test_a_class_that_never_occurs_gets_a_finite_weight() -> None:
     assert all(map(math.isfinite, class_frequency_weights(torch.tensor([5, 0]), 0.35).tolist()))
+
+
+def test_the_plain_blend_is_the_mean_of_the_hardest_of_the_weighted_error() -> None:
+    denoised, target, emphasis = numbers(2, 3, 4, 5), numbers(2, 3, 4, 5, seed=1), numbers(2, 1, 4, 5, seed=2).abs()
+    weighted = ((denoised - target) ** 2 * (1 + emphasis)).flatten(1)
+    wanted = weighted.sort(descending=True).values[:, :18].mean(1)  # 0.3 of 60
+    loss = frame_losses(denoised, target, fraction=0.3, emphasis=emphasis, blend=PLAIN_BLEND)
+    assert_close(loss, wanted)
+    assert not torch.allclose(loss, frame_losses(denoised, target, fraction=0.3, emphasis=emphasis))
+
+
+@pytest.mark.parametrize("blend", [RELEASED_BLEND, PLAIN_BLEND])
+def test_both_blends_are_the_weighted_mean_while_everything_is_kept(blend: FocalBlend) -> None:
+    denoised, target, emphasis = numbers(2, 3, 4, 5), numbers(2, 3, 4, 5, seed=1), numbers(2, 1, 4, 5, seed=2).abs()
+    loss = frame_losses(denoised, target, fraction=1.0, emphasis=emphasis, blend=blend)
+    assert_close(loss, ((denoised - target) ** 2 * (1 + emphasis)).mean((1, 2, 3)))

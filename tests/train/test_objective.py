@@ -1,5 +1,7 @@
 """The objective against formulas written out here, and the laws of its random draws."""
 
+from dataclasses import replace
+
 import msgspec
 import pytest
 import torch
@@ -13,7 +15,7 @@ from gcd_train.batches import PixelBatches
 from gcd_train.datasets.clip_source import to_network
 from gcd_train.draws import Draws
 from gcd_train.model_setup import model_config
-from gcd_train.objective import Batch, Denoiser, Weights, diffusion_loss, draw_noise, draw_sigma, drop
+from gcd_train.objective import Batch, Denoiser, Weights, diffusion_loss, draw_noise, draw_sigma, drop, drop_streams
 from gcd_train.precision import Precision
 from gcd_train.recipe import LossRecipe, NoiseRecipe, UNetRecipe
 
@@ -130,9 +132,9 @@ def pixel_batch(augmentation: float, dropout: float = 0.0) -> tuple[Batch, Netwo
     changed: UNetRecipe = msgspec.structs.replace(
         recipe, image_share=0.0, loss=LossRecipe(), augmentation=augmentation, dropout=dropout
     )
-    source, target = (to_network(side) for side in TinyClips(1).rgb(0))
+    source = to_network(TinyClips(1).rgb(0)[0])
     batches = PixelBatches(TinyClips(1), networks, changed, PRECISION)
-    return batches.batch(source, target, FRAMES, draws()), networks, source
+    return batches.batch([0], draws()), networks, source
 
 
 def test_augmentation_noise_is_added_to_the_pixels_the_encoder_sees() -> None:
@@ -158,3 +160,79 @@ def test_draws_follow_from_seed_stage_and_update_alone() -> None:
     assert torch.equal(draws(5).normal(3), draws(5).normal(3))
     assert not torch.equal(draws(5).normal(3), draws(6).normal(3))
     assert not torch.equal(draws(5).normal(3), Draws(2, "test", 5, CPU).normal(3))
+
+
+def dropped(frames: int = 4, **options: object) -> tuple[Tensor, Tensor]:
+    """Which of 400 clips' frames keep latents and token, bool [400, T] each."""
+    recipe = msgspec.structs.replace(tiny_recipe().unet, dropout=0.3, **options)
+    rows = 400 * frames
+    condition, tokens = drop_streams(torch.ones(rows, 2, 3, 3), torch.ones(rows, 5), frames, draws(), recipe)
+    assert tokens is not None
+    kept = condition.flatten(1).bool(), tokens.bool()
+    assert all(bool((rows == rows[:, :1]).all()) for rows in kept)  # a frame goes as a whole
+    latents, images = (rows[:, 0].unflatten(0, (400, frames)) for rows in kept)
+    for stream in (latents, images):
+        assert 0.62 < float(stream.float().mean()) < 0.78
+    return latents, images
+
+
+def test_as_released_each_frame_and_each_stream_is_dropped_by_itself() -> None:
+    latents, images = dropped()
+    assert not bool((latents == latents[:, :1]).all())
+    both, alone = float((~latents & ~images).float().mean()), float((~latents & images).float().mean())
+    assert 0.06 < both < 0.12  # 0.3 * 0.3
+    assert 0.17 < alone < 0.25  # 0.3 * 0.7
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_per_clip_all_frames_of_a_stream_go_together(joint: bool) -> None:
+    latents, images = dropped(dropout_per="clip", dropout_joint=joint)
+    for stream in (latents, images):
+        assert bool((stream == stream[:, :1]).all())
+    assert bool((latents == images).all()) == joint
+
+
+def test_jointly_both_streams_of_a_frame_go_together() -> None:
+    latents, images = dropped(dropout_joint=True)
+    assert bool((latents == images).all())
+    assert not bool((latents == latents[:, :1]).all())
+
+
+def test_without_dropout_nothing_is_drawn() -> None:
+    recipe = msgspec.structs.replace(tiny_recipe().unet, dropout=0.0)
+    rows, later = torch.ones(8, 2, 3, 3), draws()
+    condition, tokens = drop_streams(rows, None, 4, later, recipe)
+    assert condition is rows
+    assert tokens is None
+    assert torch.equal(later.normal(3), draws().normal(3))
+
+
+def test_the_recipe_chooses_the_blend() -> None:
+    networks = tiny_networks("v")
+    batch, noise = batch_of(networks, 1), NoiseRecipe()
+    denoiser = Denoiser(networks.unet, None, "v")
+    released, plain = (
+        diffusion_loss(
+            denoiser,
+            batch,
+            draws(),
+            PRECISION,
+            noise=noise,
+            loss=LossRecipe(focal_blend=blend),
+            weights=Weights(),
+            step=5000,
+        ).total.detach()
+        for blend in ("released", "plain")
+    )
+    assert float(plain) > float(released)  # the hardest alone, without a tenth of the mean of all
+
+
+def test_how_long_the_data_took_is_told_beside_the_loss() -> None:
+    networks = tiny_networks("v")
+    batch = replace(batch_of(networks, 1), wait_s=0.25, ids=("a",))
+    denoiser = Denoiser(networks.unet, None, "v")
+    loss = diffusion_loss(
+        denoiser, batch, draws(), PRECISION, noise=NoiseRecipe(), loss=PAPER, weights=Weights(), step=0
+    )
+    assert float(loss.parts["wait_s"]) == 0.25
+    assert loss.ids == ("a",)

@@ -7,8 +7,7 @@ from headless import needs_egl
 from typer.testing import CliRunner
 
 from gcd_model import load_synthesizer
-from gcd_model.geometry import CameraMount
-from gcd_train.baselines import driving_baselines, fit_statistics
+from gcd_train.baselines import all_baselines, fit_statistics
 from gcd_train.cli.main import app
 from gcd_train.datasets.paired import PairedClips
 from gcd_train.evaluation import Evaluation, SynthesizedViews, evaluate
@@ -28,7 +27,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Evaluation]:
     folder = tmp_path_factory.mktemp("scenes")
     clips, training = made(folder / "held-out", 1_000_000, 4), made(folder / "train", 0, 4)
     model = SynthesizedViews.of(load_synthesizer("package:driving-small", device="cpu"), clips)
-    baselines = driving_baselines(fit_statistics(training), CameraMount(), len(clips.classes))
+    baselines = all_baselines(fit_statistics(training), len(clips.classes))
     return {each.name: each for each in evaluate([model, *baselines], clips)}
 
 

@@ -1,28 +1,77 @@
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from tiny_world import RECIPE
 
+from gcd_train.data_kinds import sampling_of
+from gcd_train.datasets.trajectories import DRIVING, MAX90, MAX180
 from gcd_train.errors import RecipeError
 from gcd_train.model_setup import family_of, model_config
-from gcd_train.recipe import PACKAGED, load_recipe, parse_recipe
+from gcd_train.recipe import load_recipe, packaged_recipes, parse_recipe
 
 
-@pytest.mark.parametrize("name", sorted(file.stem for file in PACKAGED.glob("*.toml")))
+@pytest.mark.parametrize("name", packaged_recipes())
 def test_every_packaged_recipe_describes_a_model_that_can_be_built(name: str) -> None:
     recipe = load_recipe(f"package:{name}")
     assert model_config(recipe.model).frames == 14
-    assert family_of(recipe.model).name.startswith("driving")
+    assert (family_of(recipe.model).camera == "none") == (model_config(recipe.model).camera == "none")
 
 
-def test_the_papers_recipe_holds_the_published_numbers() -> None:
-    unet = load_recipe("package:paper-driving").unet
+def test_the_sixteen_published_trainings_ship() -> None:
+    wanted = {f"kubric-{path}-max{most}" for path in ("gradual", "direct") for most in (90, 180)}
+    wanted |= {f"pardom-{path}-{kind}" for path in ("gradual", "direct") for kind in ("rgb", "semantic")}
+    wanted |= {f"{name}-scratch" for name in wanted}
+    assert len(wanted) == 16
+    assert {name for name in packaged_recipes() if name.startswith(("kubric-", "pardom-"))} == wanted
+    assert {"tabletop", "lerobot"} <= set(packaged_recipes())
+
+
+@pytest.mark.parametrize("name", [name for name in packaged_recipes() if name.startswith("kubric-")])
+def test_a_kubric_recipe_holds_the_published_numbers(name: str) -> None:
+    recipe = load_recipe(f"package:{name}")
+    data, unet, wide = recipe.data, recipe.unet, "max180" in name
+    assert (unet.batch, unet.parts * unet.clip_batch, unet.budget.updates) == (56, 56, 10000)
+    sampling = sampling_of(recipe, 14)
+    assert sampling == replace(MAX180 if wide else MAX90, move_time=13 if "gradual" in name else 0)
+    assert data.goal_frame(14) == (13 if "gradual" in name else 0)
+    assert (recipe.model.family, model_config(recipe.model).camera) == (
+        "kubric180" if wide else "kubric90",
+        "spherical",
+    )
+    assert recipe.model.scratch == name.endswith("-scratch")
+    assert unet.loss.class_weights == "none"
+
+
+@pytest.mark.parametrize("name", [name for name in packaged_recipes() if name.startswith("pardom-")])
+def test_a_driving_recipe_holds_the_published_numbers(name: str) -> None:
+    recipe = load_recipe(f"package:{name}")
+    unet, semantic = recipe.unet, "semantic" in name
+    assert (unet.batch, unet.budget.updates, unet.motion_bucket) == (24, 13000, 127)
+    assert sampling_of(recipe, 14) == replace(DRIVING, move_time=13 if "gradual" in name else 0)
+    assert (unet.loss.class_weights, recipe.data.modality) == (
+        ("parallel-domain", "semantic") if semantic else ("none", "rgb")
+    )
+    assert (recipe.model.family, model_config(recipe.model).camera) == (
+        "driving-semantic" if semantic else "driving",
+        "none",
+    )
+    assert recipe.model.scratch == name.endswith("-scratch")
+
+
+@pytest.mark.parametrize("name", [name for name in packaged_recipes() if name.startswith(("kubric-", "pardom-"))])
+def test_a_published_recipe_holds_what_all_of_them_share(name: str) -> None:
+    recipe = load_recipe(f"package:{name}")
+    unet = recipe.unet
     assert (unet.optimiser.kind, unet.optimiser.rate, unet.optimiser.weight_decay) == ("adam", 2e-5, 0.0)
     assert (unet.optimiser.clip, unet.optimiser.warm_up, unet.optimiser.final, unet.ema) == (None, 0, 1.0, None)
     assert (unet.noise.log_mean, unet.noise.log_std, unet.noise.fixed_share, unet.noise.shared) == (1.0, 1.6, 0, 0)
     assert (unet.loss.focal, unet.loss.focal_steps, unet.loss.focal_fraction) == (True, 5000, 0.1)
-    assert (unet.dropout, unet.augmentation, unet.loss.weight_limit) == (0.1, 0.02, None)
-    assert (unet.budget.updates, unet.clip_batch * unet.accumulate, unet.source) == (13000, 24, "pixels")
+    assert (unet.loss.focal_blend, unet.loss.weight_limit) == ("released", None)
+    assert (unet.dropout, unet.dropout_per, unet.dropout_joint, unet.augmentation) == (0.1, "frame", False, 0.02)
+    config = model_config(recipe.model)
+    assert (config.frames, config.height, config.width, recipe.compute.precision) == (14, 256, 384, "float32")
+    assert (recipe.seed, recipe.model.base, recipe.model.train) == (1234, "svd-14", "all")
 
 
 def test_the_small_recipes_fit_the_size_of_the_package() -> None:
@@ -64,7 +113,15 @@ def test_a_missing_recipe_names_the_packaged_ones(tmp_path: Path) -> None:
         load_recipe(tmp_path / "none.toml")
 
 
-def test_a_steered_family_is_refused() -> None:
-    recipe = parse_recipe(RECIPE.replace(b"[model]\n", b'[model]\nfamily = "kubric90"\n'), "x.toml")
-    with pytest.raises(RecipeError, match="fixed view"):
-        family_of(recipe.model)
+def test_a_batch_is_told_in_clips() -> None:
+    text = RECIPE.replace(b"clip_batch = 1\n", b"clip_batch = 2\nbatch = 6\n")
+    assert parse_recipe(text, "x.toml").unet.parts == 3
+    with pytest.raises(RecipeError, match="no multiple of clip_batch, 4"):
+        parse_recipe(text.replace(b"clip_batch = 2", b"clip_batch = 4"), "x.toml")
+    with pytest.raises(RecipeError, match="give one of them"):
+        parse_recipe(text.replace(b"clip_batch = 2", b"clip_batch = 2\naccumulate = 2"), "x.toml")
+
+
+def test_a_latent_cache_is_named_twice_or_not_at_all() -> None:
+    with pytest.raises(RecipeError, match=r"both data\.kind"):
+        parse_recipe(RECIPE + b'[data]\nkind = "cache"\n', "x.toml")

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,19 +11,18 @@ from typer.testing import CliRunner
 
 from gcd_model.checkpoints import save_weights
 from gcd_model.config import DRIVING_SMALL
-from gcd_model.geometry import CameraMount
+from gcd_model.geometry import SphericalDelta
 from gcd_model.networks import random_networks
 from gcd_model.own_format import Card
-from gcd_train.baselines import CopySource, MajorityMap, driving_baselines, fit_statistics
+from gcd_train.baselines import CopySource, MajorityMap, all_baselines, fit_statistics
 from gcd_train.cli.main import app
 from gcd_train.errors import RunError
-from gcd_train.evaluation import evaluate
-from gcd_train.report import (
+from gcd_train.evaluation import (
     Conditions,
     MountNumbers,
     Report,
-    against_bar,
-    psnr_lead,
+    Shot,
+    evaluate,
     to_markdown,
     write_contact_sheet,
     write_report,
@@ -30,20 +30,19 @@ from gcd_train.report import (
 
 
 def conditions(weights: str | None = None) -> Conditions:
-    mount = MountNumbers(height_m=1.55, tilt_deg=0.0)
     return Conditions(
-        data="held-out",
+        data=("held-out",),
         weights=weights,
         sha256_12=None,
-        clips=2,
-        first_seed=7,
-        last_seed=8,
+        steps=None if weights is None else 4,
+        shots=(Shot(world="driving", scene=7, clip="00000007"), Shot(world="driving", scene=8, clip="00000025")),
         frames=4,
         size=(32, 48),
         grid=(16, 24),
-        true_mount=mount,
+        camera="none",
+        true_mount=MountNumbers(height_m=1.55, tilt_deg=0.0),
         declared_mount=MountNumbers(height_m=1.8, tilt_deg=2.0),
-        train="training",
+        train=("training",),
         train_clips=2,
     )
 
@@ -51,18 +50,26 @@ def conditions(weights: str | None = None) -> Conditions:
 @pytest.fixture(scope="module")
 def report() -> Report:
     clips = PlaneClips.make(2)
-    baselines = driving_baselines(fit_statistics(clips), CameraMount(), len(clips.classes))
-    found = evaluate(baselines, clips)
-    return Report(conditions=conditions(), classes=tuple(c.name for c in clips.classes), evaluations=found)
+    found = evaluate(all_baselines(fit_statistics(clips), len(clips.classes)), clips)
+    return Report(conditions=conditions(), classes=tuple(c.name for c in clips.classes), model=(), baselines=found)
+
+
+def told_of(report: Report) -> Report:
+    """The ground homography as if it were a model that ships with 4 steps, and again with 1."""
+    homography = report.baselines[3]
+    worse = replace(homography.total, psnr_db=homography.total.psnr_db - 0.25)
+    rows = replace(homography, name="w"), replace(homography, name="w (1 step)", total=worse)
+    return replace(report, conditions=conditions("w"), model=rows)
 
 
 def test_the_table_has_a_row_for_each_predictor_and_class(report: Report) -> None:
     text = to_markdown(report)
     for name in ("copy_source", "mean_target", "majority_map", "ground_homography", "depth_reprojection *"):
         assert f"| {name} |" in text
+    assert "2 clips of 2 scenes in `held-out`" in text
     assert "declared: 1.8 m, 2 deg down" in text
     road = next(line for line in text.splitlines() if line.startswith("| road |"))
-    assert road.count("|") == 2 + len(report.evaluations)
+    assert road.count("|") == 2 + len(report.evaluations) - 1  # the mean target has no classes
     assert "nan" not in text
 
 
@@ -71,53 +78,80 @@ def test_what_a_predictor_lacks_is_a_dash(report: Report) -> None:
     assert line.split("|")[2].strip() == "-"
 
 
+def test_a_models_clips_are_named_and_its_steps_compared(report: Report) -> None:
+    text = to_markdown(told_of(report))
+    assert "`w` as it ships: 4 steps of its sampler" in text
+    assert "- over w (1 step): PSNR dB +0.25" in text
+    first, second = (line for line in text.splitlines() if line.startswith("| driving "))
+    assert first.startswith("| driving 7 |")
+    assert second.startswith("| driving 8 (00000025) |")
+    assert f"| {report.baselines[3].clips[0].psnr_db:.2f} |" in first
+
+
+def test_what_nobody_has_is_left_out() -> None:
+    clips = PlaneClips.orbits([SphericalDelta(azimuth_deg=40.0, radius_m=-1.0)])
+    found = evaluate(all_baselines(fit_statistics(clips), 0), clips)
+    shot = Shot(world="drop", scene=4, clip="00000013", change=(40.0, 0.0, -1.0))
+    orbit = msgspec.structs.replace(
+        conditions("copy"), camera="spherical", shots=(shot,), true_mount=None, declared_mount=None
+    )
+    made = Report(conditions=orbit, classes=(), model=found[:1], baselines=found)
+    text = to_markdown(made)
+    assert "| drop 4 (00000013) az +40 el +0 r -1.0 |" in text
+    assert [word for word in ("mIoU", "accuracy", "IoU of", "declared", "Class figures", "nan") if word in text] == []
+    assert [bar.name for bar in made.bars] == [
+        "PSNR over copy_source, dB",
+        "PSNR over ground_homography, dB",
+        "gradient energy",
+    ]
+
+
 def test_json_holds_every_figure_and_null_for_none(report: Report, tmp_path: Path) -> None:
-    write_report(report, tmp_path)
+    write_report(report, "text", tmp_path)
     read = json.loads((tmp_path / "evaluation.json").read_text())
-    majority = next(each for each in read["evaluations"] if each["name"] == "majority_map")
+    majority = next(each for each in read["baselines"] if each["name"] == "majority_map")
     assert majority["total"]["psnr_db"] is None
-    assert majority["total"]["miou"] == pytest.approx(report.evaluations[2].total.miou)
-    assert len(majority["clips"]) == 2
+    assert majority["total"]["miou"] == pytest.approx(report.baselines[2].total.miou)
+    assert len(majority["clips"]) == len(majority["without"]) == 2
     assert read["conditions"]["declared_mount"] == {"height_m": 1.8, "tilt_deg": 2.0}
+    assert [shot["scene"] for shot in read["conditions"]["shots"]] == [7, 8]
+    assert (read["model"], read["bars"]) == ([], [])
+    assert (tmp_path / "evaluation.md").read_text() == "text"
 
 
-def test_a_lead_is_paired_over_clips(report: Report) -> None:
-    first, other = report.evaluations[3], report.evaluations[0]
-    lead, error = psnr_lead(first, other)
-    assert lead == pytest.approx(first.total.psnr_db - other.total.psnr_db)
-    assert error >= 0
-    assert psnr_lead(first, first) == (0.0, 0.0)
+def test_json_says_what_was_wanted_and_reached(report: Report, tmp_path: Path) -> None:
+    write_report(told_of(report), "", tmp_path)
+    first = json.loads((tmp_path / "evaluation.json").read_text())["bars"][0]
+    assert (first["name"], first["least"], first["most"]) == ("PSNR over depth_reprojection, dB", 3.0, None)
+    assert first["reached"] is False
+    assert first["margin"] == pytest.approx(first["value"] - 3.0)
 
 
-def test_the_bar_is_told_for_weights_only(report: Report) -> None:
-    assert against_bar(report) == []
-    lines = against_bar(Report(conditions=conditions("w"), classes=report.classes, evaluations=report.evaluations))
-    assert len(lines) == 4
-    assert "missed" in lines[0]
-    assert "reached" in lines[1]
-
-
-def test_a_contact_sheet_stacks_five_rows_for_each_clip(tmp_path: Path) -> None:
+def test_a_contact_sheet_stacks_source_view_best_baselines_and_target(tmp_path: Path) -> None:
     clips = PlaneClips.make(2)
-    write_contact_sheet(tmp_path / "sheet.png", CopySource(), clips, [0, 1])
+    majority = fit_statistics(clips).majority
+    assert majority is not None
+    predictors = [CopySource(), MajorityMap(majority=majority)]  # two rows, and one
+    write_contact_sheet(tmp_path / "sheet.png", predictors, clips, [0, 1], labels=["driving 0", "driving 1"])
     sheet = cv2.imread(str(tmp_path / "sheet.png"))
     assert sheet is not None
-    assert sheet.shape == (2 * 5 * 32 + 4, 84 + 2 * (48 + 4), 3)  # frames 1 and 4
-    assert np.array_equal(sheet[4 * 32 : 5 * 32, 136 : 136 + 48, ::-1], clips[0].target[3])
+    assert sheet.shape == (2 * 6 * 32 + 4, 132 + 2 * (48 + 4), 3)  # frames 1 and 4
+    assert np.array_equal(sheet[:32, 132 : 132 + 48, ::-1], clips[0].source[0])
+    assert np.array_equal(sheet[5 * 32 : 6 * 32, 184 : 184 + 48, ::-1], clips[0].target[3])
 
 
-def test_rows_a_predictor_does_not_have_are_left_out(tmp_path: Path) -> None:
-    clips = PlaneClips.make(1)
-    write_contact_sheet(tmp_path / "sheet.png", MajorityMap(statistics=fit_statistics(clips)), clips, [0])
+def test_a_sheet_of_clips_without_classes_has_pictures_alone(tmp_path: Path) -> None:
+    clips = PlaneClips.orbits([SphericalDelta(azimuth_deg=40.0)])
+    write_contact_sheet(tmp_path / "sheet.png", [CopySource()], clips, [0], labels=["drop 0"])
     sheet = cv2.imread(str(tmp_path / "sheet.png"))
     assert sheet is not None
-    assert sheet.shape[0] == 4 * 32
+    assert sheet.shape[0] == 3 * 32
 
 
 def test_a_place_that_cannot_be_written_is_our_error(report: Report, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(RunError, match="--out"):
-        write_report(report, tmp_path / "file")
+        write_report(report, "", tmp_path / "file")
 
 
 def run(*arguments: object) -> tuple[int, str]:
@@ -131,7 +165,7 @@ def test_baselines_are_evaluated_from_the_command_line(tmp_path: Path) -> None:
     assert code == 0, output
     assert "depth_reprojection" in output
     read = json.loads((tmp_path / "out" / "evaluation.json").read_text())
-    assert (read["conditions"]["clips"], read["conditions"]["train_clips"]) == (1, 3)
+    assert (len(read["conditions"]["shots"]), read["conditions"]["train_clips"]) == (1, 3)
     assert (tmp_path / "out" / "contact_sheet.png").is_file()
 
 
@@ -141,9 +175,10 @@ def test_clips_from_a_folder_measure_as_they_do_in_memory(tmp_path: Path) -> Non
     code, output = run("--data", held_out, "--train", training, "--out", tmp_path / "out")
     assert code == 0, output
     read = json.loads((tmp_path / "out" / "evaluation.json").read_text())
-    baselines = driving_baselines(fit_statistics(clips), CameraMount(), len(clips.classes))
-    expected = [each.total.psnr_db for each in evaluate(baselines, clips)]
-    found = [each["total"]["psnr_db"] or np.nan for each in read["evaluations"]]
+    expected = [
+        each.total.psnr_db for each in evaluate(all_baselines(fit_statistics(clips), len(clips.classes)), clips)
+    ]
+    found = [each["total"]["psnr_db"] or np.nan for each in read["baselines"]]
     assert found == pytest.approx(expected, abs=0.02, nan_ok=True)  # depth is stored in 1/256 m
 
 
@@ -153,15 +188,18 @@ def test_weights_are_evaluated_from_the_command_line_with_a_declared_mount(tmp_p
     save_weights(random_networks(config, seed=0), tmp_path / "untrained.safetensors", card)
     held_out = PlaneClips.make(1, width=64).write(tmp_path / "a")
     given = ("--weights", tmp_path / "untrained.safetensors", "--declared-height", 1.8, "--no-baselines")
+    given = (*given, "--steps", 1, "--steps", 2)  # the first is what ships
     code, output = run("--data", held_out, "--out", tmp_path / "out", *given)
     assert code == 0, output
     read = json.loads((tmp_path / "out" / "evaluation.json").read_text())
-    (found,) = read["evaluations"]
-    assert found["name"] == "untrained"
+    found, more = read["model"]
+    assert (found["name"], more["name"]) == ("untrained", "untrained (2 steps)")
     assert 0 < found["total"]["psnr_db"] < 30
     assert 0 <= found["total"]["miou"] < 0.5
     assert read["conditions"]["declared_mount"]["height_m"] == 1.8
     assert read["conditions"]["true_mount"]["height_m"] == 1.55
+    assert "Wanted:" in output
+    assert "mIoU" in output
 
 
 @pytest.mark.parametrize(
@@ -173,3 +211,21 @@ def test_what_is_missing_is_said(tmp_path: Path, arguments: tuple[str, ...], cod
     found, output = run("--data", held_out, "--out", tmp_path / "out", *arguments)
     assert found == code
     assert hint in output
+
+
+def test_an_orbit_is_evaluated_from_the_command_line(tmp_path: Path) -> None:
+    changes = [SphericalDelta(azimuth_deg=azimuth) for azimuth in (40.0, -30.0, 10.0)]
+    held_out = PlaneClips.orbits(changes).write(tmp_path / "a", 3000)
+    training = PlaneClips.orbits(changes).write(tmp_path / "b")
+    out = tmp_path / "out"
+    code, output = run("--data", held_out, "--train", training, "--out", out, "--declared-tilt", 1)
+    assert code == 78
+    assert "no vehicle" in output
+    code, output = run("--data", held_out, "--train", training, "--out", out)
+    assert code == 0, output
+    read = json.loads((out / "evaluation.json").read_text())
+    found = {each["name"]: each["total"]["psnr_db"] for each in read["baselines"]}
+    assert "majority_map" not in found
+    assert found["ground_homography"] > found["copy_source"]
+    assert [shot["change"][0] for shot in read["conditions"]["shots"]] == pytest.approx([40.0, -30.0, 10.0])
+    assert (out / "contact_sheet.png").is_file()

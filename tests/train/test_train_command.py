@@ -29,3 +29,28 @@ def test_an_unknown_stage_is_refused_with_the_known_ones(tmp_path: Path) -> None
     result = CliRunner().invoke(app, ["train", "package:driving-small", *where, "--stage", "gan"])
     assert result.exit_code != 0
     assert "decoder" in result.output
+
+
+def test_the_recipes_that_ship_are_listed_and_one_is_shown_whole() -> None:
+    listed = CliRunner().invoke(app, ["recipes"], env={"COLUMNS": "160"})
+    assert listed.exit_code == 0, listed.output
+    for text in ("package:kubric-direct-max180-scratch", "parallel_domain4d, classes", "package:lerobot", "10000"):
+        assert text in listed.output
+    shown = CliRunner().invoke(app, ["recipes", "package:tabletop", "--small", "--set=unet.batch=6"])
+    assert shown.exit_code == 0, shown.output
+    for text in (
+        'name = "tabletop-small"',
+        'camera = "relative_pose"',
+        "batch = 6",
+        "[unet.loss]",
+        "dropout_joint = false",
+    ):
+        assert text in shown.output
+
+
+def test_train_takes_the_small_scale_and_changes(tmp_path: Path) -> None:
+    where = [f"--{name}={tmp_path / 'none'}" for name in ("data", "out")]
+    wrong = CliRunner().invoke(app, ["train", "package:tabletop", *where, "--small", "--set=unet.clip_bath=2"])
+    assert wrong.exit_code == 78
+    gone = CliRunner().invoke(app, ["train", "package:tabletop", *where, "--small"])
+    assert gone.exit_code == 66

@@ -7,14 +7,14 @@ from pathlib import Path
 import msgspec
 import pytest
 import torch
-from tiny_world import FRAMES, HEIGHT, WIDTH, Never, tiny_recipe
+from tiny_world import HEIGHT, WIDTH, Never, tiny_recipe
 from torch import Tensor, nn
 from torch.testing import assert_close
 
 from gcd_model.networks import Networks, random_networks
 from gcd_train.errors import TrainError
 from gcd_train.loop import Loop, LoopOptions, Progress, StepLoss
-from gcd_train.model_setup import model_config, path_warps
+from gcd_train.model_setup import model_config
 from gcd_train.recipe import Budget, LogRecipe, OptimiserRecipe
 from gcd_train.run_folder import RunFolder
 from gcd_train.schedule import ParameterGroup
@@ -40,16 +40,6 @@ def test_normalising_gives_unit_latents_and_changes_no_picture_inside() -> None:
     assert_close(after.mean.transpose(0, 1).flatten(1).std(1), torch.ones_like(std), atol=1e-4, rtol=0)
     assert_close(after.log_variance, before.log_variance - 2 * std.log()[:, None, None], atol=1e-4, rtol=1e-4)
     assert_close(same[..., 1:-1, 1:-1], picture[..., 1:-1, 1:-1], atol=1e-4, rtol=1e-4)
-
-
-def test_warps_of_the_source_at_half_size_are_those_of_the_source() -> None:
-    warps = path_warps(model_config(tiny_recipe().model), torch.device("cpu"))
-    assert warps is not None
-    source = torch.rand(FRAMES, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(1)) * 2 - 1
-    half = nn.functional.avg_pool2d(source, 2)
-    doubled = nn.functional.interpolate(half, scale_factor=2.0, mode="nearest")
-    numbers = torch.arange(FRAMES)
-    assert_close(warps.channels(doubled, numbers), warps.channels(source, numbers))
 
 
 class Parabola:

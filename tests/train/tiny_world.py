@@ -4,8 +4,15 @@ import msgspec
 import numpy as np
 
 from gcd_model.class_head import SemanticClass
-from gcd_model.config import DRIVING_CLASSES
-from gcd_model.geometry import CameraMount
+from gcd_model.config import DRIVING_CLASSES, CameraControl
+from gcd_model.geometry import (
+    CameraMount,
+    Spherical,
+    SphericalDelta,
+    Trajectory,
+    driving_trajectory,
+    spherical_trajectory,
+)
 from gcd_train.recipe import Recipe, parse_recipe
 
 FRAMES, HEIGHT, WIDTH = 4, 32, 64
@@ -70,17 +77,39 @@ class TinyClips:
         return DRIVING_CLASSES
 
     fps = 10.0
+    camera: CameraControl = "none"
     mount = CameraMount()
     origin = "tiny"
 
     def seed(self, number: int, /) -> int:
         return 100 + number
 
+    def trajectory(self, number: int, /) -> Trajectory:
+        return driving_trajectory(frames=FRAMES, move_time=FRAMES - 1, mount=self.mount)
+
     def rgb(self, number: int, /) -> tuple[np.ndarray, np.ndarray]:
         return self._clips[number], self._clips[number][:, ::-1]
 
     def target_classes(self, number: int, /) -> np.ndarray:
         return self._ids[number]
+
+
+class TinyOrbits(TinyClips):
+    """The same pictures, each clip from a path of its own over the sphere; no classes."""
+
+    fps = 12.0
+    camera: CameraControl = "spherical"
+    mount = None  # pyright: ignore[reportAssignmentType]  # no vehicle on a stage
+    origin = "tiny orbits"
+
+    @property
+    def classes(self) -> tuple[SemanticClass, ...]:
+        return ()
+
+    def trajectory(self, number: int, /) -> Trajectory:
+        source = Spherical(azimuth_deg=0.0, elevation_deg=5.0 + number, radius_m=14.0)
+        change = SphericalDelta(azimuth_deg=40.0 - 70.0 * number, elevation_deg=10.0, radius_m=-1.0)
+        return spherical_trajectory(source, change, frames=FRAMES, move_time=FRAMES - 1)
 
 
 class Never:

@@ -10,12 +10,13 @@ class Draws:
     """The randomness of one update.
 
     Whole numbers are drawn on the CPU, noise on the device that uses it; on the CPU both come from one generator.
+    number: of the update, or of the batch where an update takes several; what comes in a fixed order goes by it.
     """
 
     def __init__(self, seed: int, stage: str, update: int, device: torch.device) -> None:
         digest = hashlib.sha256(f"{seed}/{stage}/{update}".encode()).digest()
         mixed = int.from_bytes(digest[:8], "little") >> 1
-        self._device = device
+        self.number, self._device = update, device
         self._host = torch.Generator().manual_seed(mixed)
         on_host = device.type == "cpu"
         self._there = self._host if on_host else torch.Generator(device).manual_seed(mixed)

@@ -24,19 +24,19 @@ def ema_decay(update: int, recipe: EmaRecipe) -> float:
 
 
 class Ema:
-    """The average of all floating-point weights and buffers of a module."""
+    """The average of all floating-point weights and buffers of a module, in float32 at least."""
 
     def __init__(self, module: nn.Module, recipe: EmaRecipe) -> None:
         self._module, self._recipe = module, recipe
         self._live = {name: value for name, value in module.state_dict().items() if value.is_floating_point()}
-        self._average = {name: value.clone() for name, value in self._live.items()}
+        self._average = {name: _precise(value).clone() for name, value in self._live.items()}
 
     @torch.no_grad()
     def update(self, number: int) -> None:
         """Take the module's weights in, after update `number` (1 for the first)."""
         share = 1 - ema_decay(number, self._recipe)
         for name, value in self._live.items():
-            self._average[name].lerp_(value, share)
+            self._average[name].lerp_(_precise(value), share)
 
     @torch.no_grad()
     def restart(self) -> None:
@@ -47,11 +47,17 @@ class Ema:
     @contextmanager
     def applied(self) -> Generator[None]:
         """The module has the averaged weights inside the block."""
-        self._swap()
+        kept = {name: value.clone() for name, value in self._live.items()}
+        self._fill(self._average)
         try:
             yield
         finally:
-            self._swap()
+            self._fill(kept)
+
+    @torch.no_grad()
+    def _fill(self, weights: dict[str, Tensor]) -> None:
+        for name, value in self._live.items():
+            value.copy_(weights[name])
 
     def state_dict(self) -> dict[str, Tensor]:
         """The averaged weights by name."""
@@ -63,9 +69,6 @@ class Ema:
         for name, value in self._average.items():
             value.copy_(state[name])
 
-    @torch.no_grad()
-    def _swap(self) -> None:
-        for name, value in self._live.items():
-            kept = value.clone()
-            value.copy_(self._average[name])
-            self._average[name].copy_(kept)
+
+def _precise(value: Tensor) -> Tensor:
+    return value.float() if value.dtype in (torch.bfloat16, torch.float16) else value

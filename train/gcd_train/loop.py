@@ -1,25 +1,32 @@
 """The training loop of every stage: updates, moving average, log, state, measurements; resumable to the update."""
 
 import logging
-import math
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
+from tempfile import TemporaryDirectory
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
 
-from gcd_train.checkpoint import StageState, load_state, require_identity, save_state
 from gcd_train.ema import Ema
-from gcd_train.errors import Interrupted, RunError, TrainError
+from gcd_train.engine.engine import Engine
+from gcd_train.engine.optimisers import build_optimiser, set_rate
+from gcd_train.engine.parallel import whole
+from gcd_train.engine.trained import Mark, Trained
+from gcd_train.errors import Interrupted
+from gcd_train.monitor.finite import FiniteGuard
+from gcd_train.monitor.memory import peak_memory_gb
 from gcd_train.recipe import Budget, EmaRecipe, LogRecipe, OptimiserRecipe, StageName
 from gcd_train.run_folder import RunFolder
-from gcd_train.schedule import ParameterGroup, build_optimiser, set_rate
+from gcd_train.schedule import ParameterGroup
 from gcd_train.stop import StopSignal
 
 _log = logging.getLogger(__name__)
+_TOLD_APART = ("frames_per_s", "peak_memory_gb")
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,10 +73,19 @@ class Task(Protocol):
         ...
 
 
+@runtime_checkable
+class SharedTask(Task, Protocol):
+    """A task that several processes can train."""
+
+    def compute_through(self, network: nn.Module) -> None:
+        """Compute losses through this from now on: the task's module, as the engine wraps it."""
+        ...
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class LoopOptions:
     """How a stage runs. identity: see StageState. frames_per_clip: for the log. parts: batches
-    whose gradients make one update. clock: seconds, for tests."""
+    whose gradients make one update, shared by the engine's processes. clock: seconds, for tests."""
 
     stage: StageName
     identity: str
@@ -80,6 +96,7 @@ class LoopOptions:
     stop: StopSignal
     frames_per_clip: int
     parts: int = 1
+    engine: Engine = field(default_factory=Engine)
     clock: Callable[[], float] = time.perf_counter
 
 
@@ -88,16 +105,18 @@ class _Window:
     """What was seen since the last line of the log."""
 
     losses: list[StepLoss] = field(default_factory=list[StepLoss])
+    norms: list[Tensor] = field(default_factory=list[Tensor])
     seconds: float = 0.0
 
     def values(self) -> dict[str, float]:
-        """Mean of the loss and of its parts, and frames per second."""
+        """Mean of the loss, of its parts and of the gradient's norm, and frames per second."""
         names = self.losses[-1].parts
         parts = {name: [loss.parts[name] for loss in self.losses if name in loss.parts] for name in names}
         means = {name: float(torch.stack(values).float().mean()) for name, values in parts.items()}
         total = float(torch.stack([loss.total for loss in self.losses]).float().mean())
         frames = sum(loss.frames for loss in self.losses)
-        return {"loss": total, **means, "frames_per_s": frames / max(self.seconds, 1e-9)}
+        norm = float(torch.stack(self.norms).float().mean())
+        return {"loss": total, **means, "gradient_norm": norm, "frames_per_s": frames / max(self.seconds, 1e-9)}
 
 
 class Loop:
@@ -106,10 +125,20 @@ class Loop:
     def __init__(self, task: Task, folder: RunFolder, options: LoopOptions) -> None:
         self._task, self._folder, self._options = task, folder, options
         self._updates, self._seconds = 0, 0.0
-        self._optimiser = build_optimiser(task.parameter_groups(), options.optimiser)
+        engine, stage = options.engine, options.stage
+        self._processes, self._mine = engine.processes, engine.processes.batches(options.parts)
+        self._network = engine.prepare(task.module)
+        if isinstance(task, SharedTask):
+            task.compute_through(self._network)
+        self._optimiser = build_optimiser(task.parameter_groups(), options.optimiser, engine.compute.weights)
         self._ema = None if options.ema is None else Ema(task.module, options.ema)
+        trained = Trained(task.module, self._optimiser, self._ema)
+        self._states = engine.keeper(folder.stage(stage), trained, stage, options.identity, options.log)
         self._window = _Window()
-        self._restore()
+        self._guard = FiniteGuard(options.stage, folder.stage(options.stage) / "not_finite.json")
+        mark = self._states.restore()
+        if mark is not None:
+            self._updates, self._seconds = mark.updates, mark.seconds
 
     @property
     def progress(self) -> Progress:
@@ -123,41 +152,58 @@ class Loop:
             Interrupted: the stop signal was set; the state is saved. TrainError: the loss is no number any more.
         """
         options = self._options
-        saved = measured = logged = options.clock()
+        saved = measured = logged = self._agreed()[0]
         if self.progress.share >= 1:
-            if not self._folder.sample(options.stage, self._updates).exists():
+            if not self._processes.told(self._folder.sample(options.stage, self._updates).exists()):
                 self._measure()  # killed at the very end
             return
         while self.progress.share < 1:
-            self._update()
-            now = options.clock()
+            with self._processes.others_gone():
+                self._update()
+            now, stop = self._agreed()
             if now - logged >= options.log.log_s:
                 self._speak()
                 logged = now
-            if options.stop.is_set():
+            if stop:
                 self._save()
+                self._states.finish()
                 raise Interrupted(f"stopped at update {self._updates} of {options.stage}; run again to go on")
             if now - measured >= options.log.measure_s:
                 self._measure()
-                measured = saved = options.clock()
-            elif now - saved >= options.log.save_s:
+                measured = saved = self._agreed()[0]
+            elif now - saved >= options.log.save_s or self._kept_for_ever():
                 self._save()
-                saved = options.clock()
+                saved = self._agreed()[0]
         self._measure()
+        self._states.finish()
+
+    def _agreed(self) -> tuple[float, bool]:
+        """The time, and whether to stop: the same in every process, and so is the time spent on training."""
+        options = self._options
+        now, self._seconds, stop = self._processes.agreed(options.clock(), self._seconds, options.stop.is_set())
+        return now, stop
+
+    def _kept_for_ever(self) -> bool:
+        every = self._options.log.keep_every
+        return every is not None and self._updates % every == 0
 
     def _update(self) -> None:
         started, recipe = self._options.clock(), self._options.optimiser
         progress = self.progress
         set_rate(self._optimiser, progress.updates, progress.share, recipe)
         self._optimiser.zero_grad(set_to_none=True)
-        for part in range(self._options.parts):
-            loss = self._task.step_loss(replace(progress, part=part))
-            (loss.total / self._options.parts).backward()
+        engine, parts = self._options.engine, self._options.parts
+        for part in self._mine:
+            with engine.backward_of(self._network, part, parts):
+                loss = self._task.step_loss(replace(progress, part=part))
+                (loss.total * engine.share_of_loss(parts)).backward()
             kept = {name: value.detach() for name, value in loss.parts.items()}
+            self._guard.saw(progress.updates, "loss", loss.total, loss.ids)
             self._window.losses.append(StepLoss(loss.total.detach(), kept, loss.frames, loss.ids))
-        if recipe.clip is not None:
-            trained = [p for group in self._optimiser.param_groups for p in group["params"]]
-            nn.utils.clip_grad_norm_(trained, recipe.clip)
+        norm = self._clipped()
+        self._window.norms.append(norm)
+        self._guard.saw(progress.updates, "gradient", norm)
+        engine.seed_rounding(progress.updates)
         self._optimiser.step()
         self._updates += 1
         if self._ema is not None:
@@ -168,26 +214,39 @@ class Loop:
         if self._task.after_update(self.progress) and self._ema is not None:
             self._ema.restart()
 
+    def _clipped(self) -> Tensor:
+        """The norm of the whole gradient, which is then no longer than the recipe allows."""
+        trained = [p for group in self._optimiser.param_groups for p in group["params"]]
+        limit = self._options.optimiser.clip
+        if limit is not None:
+            return whole(nn.utils.clip_grad_norm_(trained, limit))
+        return whole(nn.utils.get_total_norm([p.grad for p in trained if p.grad is not None]))
+
     def _speak(self) -> None:
-        """One line of the log and of the metrics file. Raises TrainError if the loss is no number."""
+        """One line of the log and of the metrics file. Raises TrainError if a loss or gradient was no number."""
+        self._guard.check()
         if not self._window.losses:
             return
-        values, progress = self._window.values(), self.progress
+        values = self._window.values()
+        values["peak_memory_gb"] = peak_memory_gb(self._window.losses[-1].total.device)
         self._window = _Window()
-        if not math.isfinite(values["loss"]):
-            raise TrainError(
-                f"the loss of {self._options.stage} is {values['loss']} at update {progress.updates}; the state saved "
-                "before is untouched: lower the learning rate in the recipe and run again"
-            )
+        values = self._processes.averaged(values)
+        values["frames_per_s"] *= self._processes.count
+        if self._processes.first:
+            self._tell(values)
+
+    def _tell(self, values: dict[str, float]) -> None:
+        progress = self.progress
         left_s = self._seconds * (1 - progress.share) / max(progress.share, 1e-9)
         _log.info(
-            "%s %3.0f %%  update %d  %s  %.1f frames/s (%.2f clips/s)  %s left",
+            "%s %3.0f %%  update %d  %s  %.1f frames/s (%.2f clips/s)  %.2f GB  %s left",
             self._options.stage,
             100 * progress.share,
             progress.updates,
-            "  ".join(f"{name} {value:.4g}" for name, value in values.items() if name != "frames_per_s"),
+            "  ".join(f"{name} {value:.4g}" for name, value in values.items() if name not in _TOLD_APART),
             values["frames_per_s"],
             values["frames_per_s"] / self._options.frames_per_clip,
+            values["peak_memory_gb"],
             _duration(left_s),
         )
         self._folder.record(self._options.stage, "loss", {**self._when(), **values})
@@ -195,16 +254,17 @@ class Loop:
     def _measure(self) -> None:
         self._save()
         picture = self._folder.sample(self._options.stage, self._updates)
-        picture.parent.mkdir(parents=True, exist_ok=True)
-        with torch.no_grad():
-            if self._ema is None:
+        with torch.no_grad(), TemporaryDirectory() as scratch:
+            if not self._processes.first:  # takes part where weights are shared out, but writes nothing
+                picture = Path(scratch) / picture.name
+            picture.parent.mkdir(parents=True, exist_ok=True)
+            with nullcontext() if self._ema is None else self._ema.applied():
                 values = self._task.measure(picture)
-            else:
-                with self._ema.applied():
-                    values = self._task.measure(picture)
+        if not self._processes.first:
+            return
         shown = "  ".join(f"{name} {value:.4g}" for name, value in values.items())
         _log.info("%s update %d measured: %s", self._options.stage, self._updates, shown)
-        self._folder.record(self._options.stage, "measured", {**self._when(), **values})
+        self._folder.record(self._options.stage, "measured", {**self._when(), **values}, picture)
 
     def _when(self) -> dict[str, float | int | str]:
         share = self.progress.share
@@ -212,31 +272,7 @@ class Loop:
 
     def _save(self) -> None:
         self._speak()  # a loss that is no number must not be saved
-        options = self._options
-        state = StageState(
-            stage=options.stage,
-            identity=options.identity,
-            updates=self._updates,
-            seconds=self._seconds,
-            module=self._task.module.state_dict(),
-            optimiser=self._optimiser.state_dict(),
-            average=None if self._ema is None else self._ema.state_dict(),
-        )
-        save_state(self._folder.state(options.stage), state)
-
-    def _restore(self) -> None:
-        path = self._folder.state(self._options.stage)
-        if not path.exists():
-            return
-        state = load_state(path, self._options.stage)
-        require_identity(path, state, self._options.identity)
-        if (state.average is None) != (self._ema is None):
-            raise RunError(f"{path} and the recipe disagree about a moving average; delete the state to start anew")
-        self._task.module.load_state_dict(state.module)
-        self._optimiser.load_state_dict(state.optimiser)
-        if self._ema is not None and state.average is not None:
-            self._ema.load_state_dict(state.average)
-        self._updates, self._seconds = state.updates, state.seconds
+        self._states.save(Mark(self._updates, self._seconds))
 
 
 def _duration(seconds: float) -> str:

@@ -10,10 +10,28 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-FOCAL_SHARE = 0.9
-"""How much the hardest elements count; the plain mean counts the rest."""
+from gcd_model.config import DRIVING_CLASSES
+from gcd_train.recipe import ClassWeightsName
+
 _COLOUR_TOLERANCE = 0.02  # mean absolute difference over the channels of a picture in [-1, 1]
-_BIAS_BEFORE, _BIAS_AFTER = 0.5, 0.5  # shares of the class weights that act before and after the selection
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class FocalBlend:
+    """How the focal selection is mixed with what it leaves out.
+
+    hardest: how much the mean of the hardest elements counts; the mean of all counts the rest.
+    bias_before: share of the class weights that acts before the selection; the rest acts on all elements after it.
+    """
+
+    hardest: float
+    bias_before: float
+
+
+RELEASED_BLEND = FocalBlend(hardest=0.9, bias_before=0.5)
+"""As the released model was trained: 0.9 of the hardest and 0.1 of all, class weights half before and half after."""
+PLAIN_BLEND = FocalBlend(hardest=1.0, bias_before=1.0)
+"""As the paper describes it: the mean of the hardest elements of the class-weighted error, and nothing else."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -35,6 +53,20 @@ PARALLEL_DOMAIN_WEIGHTS: tuple[ClassWeight, ...] = (
 )
 """ParallelDomain-4D, semantic pictures: living beings and riders first, then vehicles; trains are left out."""
 
+_PERSONS, _VEHICLES = ("person", "cyclist"), ("car", "truck", "own_car")
+DRIVING_WEIGHTS: tuple[ClassWeight, ...] = (
+    *_weights(7.0, *(kind.colour for kind in DRIVING_CLASSES if kind.name in _PERSONS)),
+    *_weights(3.0, *(kind.colour for kind in DRIVING_CLASSES if kind.name in _VEHICLES)),
+)
+"""The same weights by name for the classes of our driving world."""
+
+COLOUR_WEIGHTS: dict[ClassWeightsName, tuple[ClassWeight, ...]] = {
+    "none": (),
+    "parallel-domain": PARALLEL_DOMAIN_WEIGHTS,
+    "driving": DRIVING_WEIGHTS,
+}
+"""By what a recipe calls them."""
+
 
 def edm_weight(sigma: Tensor, limit: float | None = None) -> Tensor:
     """Weight of a noise level, (s^2 + 1) / s^2, at most `limit`: any shape to the same.
@@ -54,8 +86,8 @@ def focal_fraction(step: int, *, final: float = 0.1, steps: int = 5000) -> float
     return (1 - done) + final * done
 
 
-def focal_mean(values: Tensor, fraction: float) -> Tensor:
-    """Per frame, 0.9 times the mean of the largest elements plus 0.1 times the mean of all: [N, ...] -> [N].
+def focal_mean(values: Tensor, fraction: float, hardest: float = RELEASED_BLEND.hardest) -> Tensor:
+    """Per frame, `hardest` times the mean of the largest elements, the mean of all for the rest: [N, ...] -> [N].
 
     The elements are those of one frame, channels included; floor(n * fraction) of n are kept. A fraction of 1 or
     more gives the plain mean.
@@ -65,7 +97,7 @@ def focal_mean(values: Tensor, fraction: float) -> Tensor:
         return rows.mean(1)
     kept = max(int(rows.shape[1] * fraction), 1)
     largest = rows.topk(kept, dim=1, sorted=False).values
-    return FOCAL_SHARE * largest.mean(1) + (1 - FOCAL_SHARE) * rows.mean(1)
+    return hardest * largest.mean(1) + (1 - hardest) * rows.mean(1)
 
 
 def class_emphasis(pictures: Tensor, weights: Sequence[ClassWeight], size: tuple[int, int]) -> Tensor:
@@ -90,13 +122,14 @@ def frame_losses(
     fraction: float,
     emphasis: Tensor | None = None,
     channel_weights: Tensor | None = None,
+    blend: FocalBlend = RELEASED_BLEND,
 ) -> Tensor:
     """Squared error of each frame before the weight of its noise level: [N].
 
-        all = raw + 0.5 bias;  loss = focal(all) + 0.5 mean(bias);  bias = raw * emphasis
+        all = raw + b bias;  loss = focal(all) + (1 - b) mean(bias);  bias = raw * emphasis;  b = blend.bias_before
 
     Args:
-        denoised, target: [N, C, h, w]. fraction: see `focal_mean`.
+        denoised, target: [N, C, h, w]. fraction, blend: see `focal_mean`.
         emphasis: [N, 1, h, w] of `class_emphasis`.
         channel_weights: [C], multiplies the squared error (ours, for latents whose channels matter unequally).
     """
@@ -104,9 +137,10 @@ def frame_losses(
     if channel_weights is not None:
         raw = raw * channel_weights[:, None, None]
     if emphasis is None:
-        return focal_mean(raw, fraction)
+        return focal_mean(raw, fraction, blend.hardest)
     bias = raw * emphasis
-    return focal_mean(raw + _BIAS_BEFORE * bias, fraction) + _BIAS_AFTER * bias.flatten(1).mean(1)
+    chosen = focal_mean(raw + blend.bias_before * bias, fraction, blend.hardest)
+    return chosen + (1 - blend.bias_before) * bias.flatten(1).mean(1)
 
 
 def class_frequency_weights(frequencies: Tensor, power: float) -> Tensor:

@@ -17,9 +17,11 @@ from gcd_model.noise import preconditioning
 from gcd_model.unet import VideoUNet
 from gcd_train.draws import Draws
 from gcd_train.loop import StepLoss
-from gcd_train.losses import edm_weight, focal_fraction, frame_losses
+from gcd_train.losses import PLAIN_BLEND, RELEASED_BLEND, FocalBlend, edm_weight, focal_fraction, frame_losses
 from gcd_train.precision import Precision
-from gcd_train.recipe import LossRecipe, NoiseRecipe
+from gcd_train.recipe import FocalBlendName, LossRecipe, NoiseRecipe, UNetRecipe
+
+_BLENDS: dict[FocalBlendName, FocalBlend] = {"released": RELEASED_BLEND, "plain": PLAIN_BLEND}
 
 
 class Denoiser(nn.Module):
@@ -61,7 +63,8 @@ class Batch:
     target: [N, C, h, w], scaled latents. condition: [N, C', h, w]. vector: [N, V]. tokens: [N, D] or None.
     classes: int64 [N, H', W'] or None. emphasis: [N, 1, h, w] of `class_emphasis`, or None.
     camera: [N, F], the features a model with camera control is steered by, see `CameraEmbedder`; None without.
-    ids: what the rows were made from, one name a clip, for messages.
+    ids: what the rows were made from, one name a clip, for messages. wait_s: seconds that were waited for the data,
+    None where it was not measured.
     """
 
     target: Tensor
@@ -73,6 +76,7 @@ class Batch:
     frames: int
     camera: Tensor | None = None
     ids: tuple[str, ...] = ()
+    wait_s: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -103,12 +107,40 @@ def drop(rows: Tensor, draws: Draws, probability: float) -> Tensor:
     """Rows set to zero, each with the given probability by itself."""
     if probability == 0:
         return rows
-    kept = ~draws.chance(probability, rows.shape[0])
+    return _kept(rows, ~draws.chance(probability, rows.shape[0]))
+
+
+def drop_streams(
+    condition: Tensor, tokens: Tensor | None, frames: int, draws: Draws, recipe: UNetRecipe
+) -> tuple[Tensor, Tensor | None]:
+    """Condition channels [N, C', h, w] and image tokens [N, D], set to zero where the network is to do without.
+
+    Per frame and each stream by itself, as released, or per clip, or both streams together: `dropout_per`,
+    `dropout_joint`. What is told of camera, rate and motion always stays.
+    """
+    if recipe.dropout == 0:
+        return condition, tokens
+    each = frames if recipe.dropout_per == "clip" else 1
+    kept = _drawn_kept(draws, recipe.dropout, condition.shape[0], each)
+    condition = _kept(condition, kept)
+    if tokens is None:
+        return condition, None
+    if not recipe.dropout_joint:
+        kept = _drawn_kept(draws, recipe.dropout, tokens.shape[0], each)
+    return condition, _kept(tokens, kept)
+
+
+def _drawn_kept(draws: Draws, probability: float, rows: int, each: int) -> Tensor:
+    """One flag for every `each` rows, [N]."""
+    return ~draws.chance(probability, rows // each).repeat_interleave(each)
+
+
+def _kept(rows: Tensor, kept: Tensor) -> Tensor:
     return rows * kept.view(-1, *[1] * (rows.ndim - 1)).to(rows.dtype)
 
 
 def diffusion_loss(
-    denoiser: Denoiser,
+    denoiser: nn.Module,
     batch: Batch,
     draws: Draws,
     precision: Precision,
@@ -120,7 +152,7 @@ def diffusion_loss(
 ) -> StepLoss:
     """The loss of one batch: mean over frames of w(sigma) * frame loss, plus the class map's cross-entropy.
 
-    step: updates of the optimiser so far, for the focal schedule.
+    denoiser: a Denoiser, or what wraps one. step: updates of the optimiser so far, for the focal schedule.
     """
     sigma = draw_sigma(draws, batch.target.shape[0] // batch.frames, noise).repeat_interleave(batch.frames)
     unit = draw_noise(draws, batch.target.shape, batch.frames, noise.shared)
@@ -128,10 +160,17 @@ def diffusion_loss(
         denoised, logits = denoiser(batch.target + _column(sigma) * unit, sigma, batch)
     fraction = focal_fraction(step, final=loss.focal_fraction, steps=loss.focal_steps) if loss.focal else 1.0
     rows = frame_losses(
-        denoised, batch.target, fraction=fraction, emphasis=batch.emphasis, channel_weights=weights.channels
+        denoised,
+        batch.target,
+        fraction=fraction,
+        emphasis=batch.emphasis,
+        channel_weights=weights.channels,
+        blend=_BLENDS[loss.focal_blend],
     )
     total = (rows * edm_weight(sigma, loss.weight_limit)).mean()
     parts = {"latent": total.detach()}
+    if batch.wait_s is not None:
+        parts["wait_s"] = total.new_tensor(batch.wait_s)
     if logits is not None and batch.classes is not None and loss.class_map:
         parts["class_map"] = class_map_loss(logits, batch.classes, sigma >= loss.class_from_sigma, weights.classes)
         total = total + loss.class_map * parts["class_map"]

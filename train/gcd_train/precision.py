@@ -25,7 +25,9 @@ class Precision:
     def of(cls, recipe: ComputeRecipe) -> "Precision":
         """As a recipe asks. Raises RecipeError for a device that is not there."""
         device = compute_device(recipe)
-        half = recipe.precision == "bfloat16" and device.type == "cuda"  # CPU kernels are slow or wrong in it
+        # CPU kernels are slow in it, so only weights kept in it make a CPU compute in it
+        kept = "bfloat16" in (recipe.weights, recipe.frozen)
+        half = kept or (recipe.precision == "bfloat16" and device.type == "cuda")
         return cls(device, half, recipe.channels_last)
 
     def arithmetic(self) -> AbstractContextManager[object]:

@@ -6,14 +6,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gcd_train.errors import RunError
+from gcd_train.monitor.board import Board
 from gcd_train.recipe import StageName
 
 
 @dataclass(frozen=True, slots=True)
 class RunFolder:
-    """The folder of one run: `STAGE/state.pt`, `STAGE/samples/`, `metrics.jsonl`, and the weights at the end."""
+    """The folder of one run: `STAGE/state.pt`, `STAGE/samples/`, `metrics.jsonl`, and the weights at the end.
+
+    board: gets every figure, too.
+    """
 
     path: Path
+    board: Board | None = None
 
     def stage(self, name: StageName) -> Path:
         """The folder of a stage."""
@@ -27,8 +32,13 @@ class RunFolder:
         """A sample picture after so many updates."""
         return self.stage(name) / "samples" / f"{updates:07d}.png"
 
-    def record(self, stage: StageName, kind: str, values: dict[str, float | int | str]) -> None:
-        """Append one line to metrics.jsonl: stage, kind, time of day, then the values. Raises RunError."""
+    def record(
+        self, stage: StageName, kind: str, values: dict[str, float | int | str], picture: Path | None = None
+    ) -> None:
+        """Append one line to metrics.jsonl: stage, kind, time of day, then the values. Raises RunError.
+
+        picture: a PNG that belongs to them, for the board.
+        """
         line = json.dumps({"stage": stage, "kind": kind, "time": round(time.time(), 3), **values})
         try:
             self.path.mkdir(parents=True, exist_ok=True)
@@ -36,3 +46,5 @@ class RunFolder:
                 file.write(line + "\n")
         except OSError as error:
             raise RunError(f"cannot write in {self.path}: {error.strerror}; choose another --out") from error
+        if self.board is not None:
+            self.board.add(stage, kind, values, picture)

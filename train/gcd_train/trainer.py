@@ -7,16 +7,22 @@ from typing import TypeVar
 import torch
 
 from gcd_model import ModelConfig
-from gcd_model.networks import Networks
-from gcd_model.plane_warp import trained_mount
-from gcd_train.batches import BatchSource, EncodedBatches, PixelBatches
+from gcd_model.adapter import Adapter, base_digest
+from gcd_model.networks import Networks, weights_digest
+from gcd_model.own_format import Card
+from gcd_train.batches import BatchMaker, BatchSource, EncodedBatches, PixelBatches
+from gcd_train.clip_fit import require_fit
+from gcd_train.conditioner import Conditioner
 from gcd_train.datasets.clip_source import ClipSource, KeptClips, numbers_of
 from gcd_train.datasets.latents import LatentClips
 from gcd_train.datasets.predictions import Predictions, PredictionsMeta, write_predictions
 from gcd_train.draws import Draws
-from gcd_train.errors import DataError, RecipeError, RunError
+from gcd_train.engine.engine import Engine
+from gcd_train.engine.processes import ALONE, Processes
+from gcd_train.errors import RecipeError, RunError
 from gcd_train.loop import Loop, LoopOptions, Task
-from gcd_train.losses import class_frequency_weights
+from gcd_train.lora import adapter_of, merge_lora
+from gcd_train.losses import COLOUR_WEIGHTS, class_frequency_weights
 from gcd_train.model_setup import (
     copy_of,
     digest_of,
@@ -24,19 +30,19 @@ from gcd_train.model_setup import (
     fill,
     model_config,
     sampled_as_trained,
-    start_networks,
-    weights_digest,
 )
 from gcd_train.objective import Weights
 from gcd_train.precision import Precision
 from gcd_train.recipe import DecoderRecipe, Recipe, StageName, UNetRecipe, VAERecipe
 from gcd_train.run_folder import RunFolder
 from gcd_train.stages.decoder import DecoderData, DecoderTask, Predictor
-from gcd_train.stages.export import export
+from gcd_train.stages.export import ExportJob, export
 from gcd_train.stages.latents import LatentsJob, encode_clips
 from gcd_train.stages.unet import UNetTask
 from gcd_train.stages.vae import VAETask
+from gcd_train.start import carried_leftovers, start_networks
 from gcd_train.stop import StopSignal
+from gcd_train.trained_part import halve_frozen, let_train, thaw
 from gcd_train.validation import Validation
 
 _log = logging.getLogger(__name__)
@@ -45,13 +51,19 @@ Table = TypeVar("Table")
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class RunInputs:
-    """What a run works with. clips: to learn from. valid: held out, to measure on. stop: asked between updates."""
+    """What a run works with. clips: to learn from. valid: held out, to measure on. stop: asked between updates.
+
+    batches: makes the U-Net's batches where they come neither from encoded clips nor from `clips`.
+    processes: this one among those of the run.
+    """
 
     recipe: Recipe
     clips: ClipSource
     valid: ClipSource
     folder: RunFolder
     stop: StopSignal
+    batches: BatchMaker | None = None
+    processes: Processes = ALONE
 
 
 class Trainer:
@@ -63,11 +75,12 @@ class Trainer:
         self._config: ModelConfig = sampled_as_trained(model_config(inputs.recipe.model), inputs.recipe.unet)
         self._family = family_of(inputs.recipe.model)
         self._precision = Precision.of(inputs.recipe.compute)
+        self._engine = Engine(processes=inputs.processes, compute=inputs.recipe.compute)
         for clips in (inputs.clips, inputs.valid):
             require_fit(clips, self._config, inputs.recipe.unet.fps)
 
     def run(self, only: StageName | None = None) -> None:
-        """Every stage that is not finished, or just one.
+        """Every stage that is not finished, or just one; several processes train the U-Net, one of them the rest.
 
         Raises:
             Interrupted: the stop signal was set; what was done is saved.
@@ -84,15 +97,35 @@ class Trainer:
         }
         for stage in (only,) if only else self._recipe.stages:
             _log.info("stage %s", stage)
-            steps[stage]()
+            if stage == "unet":
+                steps[stage]()
+            else:
+                self._inputs.processes.by_the_first(steps[stage], self._inputs.stop)
 
     def _networks(self, *stages: StageName) -> Networks:
         """Networks with the weights of those stages that the recipe has."""
         networks = start_networks(self._recipe.model, self._config, self._recipe.seed)
         for stage in stages:
-            if stage in self._recipe.stages:
+            if stage == "unet":
+                self._fill_unet(networks)
+                merge_lora(networks)
+                thaw(networks)
+            elif stage in self._recipe.stages:
                 fill(networks, self._folder, stage, self._identity(stage, networks))
         return networks
+
+    def _fill_unet(self, networks: Networks) -> int:
+        """Put in what the U-Net stage trained, adapters beside their layers; returns its updates so far."""
+        identity = self._identity("unet", networks)
+        let_train(networks, self._recipe.model, self._recipe.seed)
+        return fill(networks, self._folder, "unet", identity)
+
+    def _adapter(self, card: Card) -> Adapter:
+        """What the U-Net stage trained, apart from its base."""
+        networks = self._networks("vae")
+        base = base_digest(networks.state_dict())
+        self._fill_unet(networks)
+        return adapter_of(networks, self._recipe.model.lora, card, base)
 
     def _identity(self, stage: StageName, networks: Networks) -> str:
         """What a stage's state belongs to; `networks` hold what was trained before it."""
@@ -101,7 +134,9 @@ class Trainer:
             return digest_of(config.vae, seed)
         if stage == "unet":
             shape = digest_of(config.unet, config.prediction, config.plane_warp, seed)
-            return f"{_autoencoder_digest(networks)}-{shape}"
+            model = self._recipe.model
+            part = "" if model.train == "all" else f"-{base_digest(networks.state_dict())}-{digest_of(model.lora)}"
+            return f"{_autoencoder_digest(networks)}-{shape}{part}"
         mix = digest_of(config.plane_warp, config.plane_mix, config.sampling)
         return f"{weights_digest(networks.unet.state_dict())}-{digest_of(seed)}-{mix}"
 
@@ -117,7 +152,8 @@ class Trainer:
             log=self._recipe.log,
             stop=self._inputs.stop,
             frames_per_clip=self._config.frames,
-            parts=recipe.accumulate if isinstance(recipe, UNetRecipe) else 1,
+            parts=recipe.parts if isinstance(recipe, UNetRecipe) else 1,
+            engine=self._engine if stage == "unet" else Engine(),
         )
         Loop(task, self._folder, options).run()
 
@@ -137,6 +173,8 @@ class Trainer:
             recipe=recipe,
             precision=self._precision,
             seed=self._recipe.seed,
+            conditioner=Conditioner(self._config, self._recipe.unet, self._precision, self._family),
+            class_weights=COLOUR_WEIGHTS[self._recipe.unet.loss.class_weights],
             identity=self._latents_identity(networks),
             stop=self._inputs.stop,
         )
@@ -145,6 +183,9 @@ class Trainer:
     def _train_unet(self) -> None:
         recipe, networks = self._recipe.unet, self._networks("vae")
         identity = self._identity("unet", networks)
+        let_train(networks, self._recipe.model, self._recipe.seed)
+        if self._recipe.compute.frozen == "bfloat16":
+            halve_frozen(networks)
         self._precision.placed(networks)
         clips = self._latent_clips(networks) if recipe.source == "latents" else None
         task = UNetTask(
@@ -184,16 +225,33 @@ class Trainer:
 
     def _export(self) -> None:
         mixes = "decoder" in self._recipe.stages
-        networks = self._networks("vae", "unet", "decoder")
+        recipe, networks = self._recipe, self._networks("vae")
+        updates = self._fill_unet(networks)
+        merge_lora(networks)
+        thaw(networks)
+        if mixes:
+            fill(networks, self._folder, "decoder", self._identity("decoder", networks))
         networks = networks if mixes else copy_of(networks, plane_mix=False)
-        export(networks, self._folder, self._recipe.name, self._family, self._validation(plane_mix=mixes))
+        job = ExportJob(
+            name=recipe.name,
+            family=self._family,
+            move_time=recipe.data.goal_frame(self._config.frames),
+            updates=updates,
+            recipe=recipe.export,
+            leftovers=lambda: carried_leftovers(recipe.model),
+            adapter=self._adapter if recipe.model.train == "lora" else None,
+        )
+        export(networks, self._folder, job, self._validation(plane_mix=mixes))
 
     def _validation(self, *, plane_mix: bool) -> Validation:
         count = self._recipe.log.valid_clips
         return Validation(self._inputs.valid, self._family, count=count, plane_mix=plane_mix)
 
     def _latents_identity(self, networks: Networks) -> str:
-        told = digest_of(_present(self._recipe.latents), self._recipe.seed, self._inputs.clips.origin)
+        recipe, config = self._recipe, self._config
+        steered = (config.plane_warp, config.camera, self._family.name, recipe.unet.motion_bucket)
+        weighed = recipe.unet.loss.class_weights
+        told = digest_of(_present(recipe.latents), recipe.seed, self._inputs.clips.origin, steered, weighed)
         return f"{_autoencoder_digest(networks)}-{told}"
 
     def _latent_clips(self, networks: Networks) -> LatentClips:
@@ -206,9 +264,11 @@ class Trainer:
         return clips.resident(self._precision.device) if self._recipe.compute.resident else clips
 
     def _batches(self, networks: Networks, clips: LatentClips | None) -> BatchSource:
-        recipe = self._recipe.unet
+        recipe, made = self._recipe.unet, self._inputs.batches
+        if clips is None and made is not None:
+            return made(networks, self._precision)
         if clips is None:
-            return PixelBatches(self._inputs.clips, networks, recipe, self._precision)
+            return PixelBatches(self._inputs.clips, networks, recipe, self._precision, self._family)
         return EncodedBatches(clips, self._config, recipe, self._precision)
 
     def _weights(self, clips: LatentClips | None) -> Weights:
@@ -217,20 +277,6 @@ class Trainer:
             return Weights()
         channels = torch.tensor(clips.meta.sensitivity, device=device) if loss.sensitivity else None
         return Weights(channels=channels, classes=class_weights(clips, loss.class_power, device))
-
-
-def require_fit(clips: ClipSource, config: ModelConfig, fps: float) -> None:
-    """Raises DataError if the clips are not what the model and its recipe take them for."""
-    if clips.fps != fps:
-        raise DataError(f"the recipe's unet.fps is {fps:g}, the clips have {clips.fps:g}; change one of them")
-    if config.plane_warp is not None and clips.mount != trained_mount(config.plane_warp):
-        raise DataError(
-            f"the model warps for {trained_mount(config.plane_warp)}, the clips were taken with {clips.mount}; "
-            "generate clips with the model's mount"
-        )
-    head = config.class_head
-    if head is not None and [kind.name for kind in head.classes] != [kind.name for kind in clips.classes]:
-        raise DataError("the clips' classes are not the model's; generate them with this version")
 
 
 def class_weights(clips: LatentClips, power: float, device: torch.device) -> torch.Tensor | None:

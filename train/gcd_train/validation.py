@@ -34,9 +34,8 @@ class Validation:
         shown: list[list[Tensor]] = []
         for number in range(self._count):
             source, target = (to_network(side) for side in self._clips.rgb(number))
-            view = synthesizer.render(
-                synthesizer.encode(Clip(video=source, fps=self._family.fps)), [synthesizer.traits.plan_view()]
-            )[0]
+            clip = Clip(video=source, fps=self._clips.fps)
+            view = synthesizer.render(synthesizer.encode(clip), [self._clips.trajectory(number)])[0]
             scores.append(psnr(view.video, (target + 1) / 2)[1:])
             rows = [source, view.video * 2 - 1, target]
             if view.classes is not None:

@@ -1,6 +1,5 @@
 """What a model has to beat: predictors that learn nothing, or only means."""
 
-from gcd_model.geometry import CameraMount
 from gcd_train.baselines.cameras import CameraPair
 from gcd_train.baselines.copy_source import CopySource
 from gcd_train.baselines.depth_reprojection import DepthReprojection
@@ -11,6 +10,7 @@ from gcd_train.baselines.predictor import Prediction, Predictor, SourceClip, to_
 from gcd_train.baselines.target_statistics import TargetStatistics, fit_statistics
 
 __all__ = [
+    "DEPTH_ON_MEAN",
     "CameraPair",
     "CopySource",
     "DepthReprojection",
@@ -21,28 +21,30 @@ __all__ = [
     "Predictor",
     "SourceClip",
     "TargetStatistics",
-    "driving_baselines",
+    "all_baselines",
     "fit_statistics",
     "to_pictures",
 ]
 
+DEPTH_ON_MEAN = "depth_reprojection_on_mean"
+"""Depth reprojection with holes as in the mean target and the majority map."""
 
-def driving_baselines(statistics: TargetStatistics, mount: CameraMount, classes: int) -> tuple[Predictor, ...]:
-    """All of them, for driving clips.
+
+def all_baselines(statistics: TargetStatistics, classes: int) -> tuple[Predictor, ...]:
+    """All of them; each finds the cameras in the clip.
 
     Args:
-        statistics: of the training targets. mount: declared for the source camera. classes: how many there are.
+        statistics: of the training targets. classes: how many there are, 0 without an ontology.
     Returns:
-        Copy, mean target, majority map, ground homography with holes as in the mean target, depth reprojection with
-        holes in one colour, and the same with holes as in the mean target.
+        Copy, mean target, majority map (with an ontology), ground homography with holes as in the mean target, depth
+        reprojection with holes in one colour, and the same with holes as in the mean target.
     """
-    frames, _, height, width = statistics.mean.shape
-    cameras = CameraPair.driving(mount, frames=frames, height=height, width=width)
+    of_classes = () if statistics.majority is None else (MajorityMap(majority=statistics.majority),)
     return (
         CopySource(),
         MeanTarget(statistics=statistics),
-        MajorityMap(statistics=statistics),
-        GroundHomography(cameras=cameras, fill=statistics),
-        DepthReprojection(cameras=cameras, fill=statistics.constant, classes=classes),
-        DepthReprojection(cameras=cameras, fill=statistics, classes=classes, name="depth_reprojection_on_mean"),
+        *of_classes,
+        GroundHomography(fill=statistics),
+        DepthReprojection(fill=statistics.constant, classes=classes),
+        DepthReprojection(fill=statistics, classes=classes, name=DEPTH_ON_MEAN),
     )

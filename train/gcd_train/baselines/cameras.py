@@ -1,4 +1,4 @@
-"""The source and the target camera of a driving clip, as the baselines that know them see them."""
+"""The source and the target camera of a clip, as the baselines that know them see them."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -6,31 +6,54 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from gcd_model.geometry import CameraMount, Intrinsics, driving_trajectory
+from gcd_model.geometry import CameraMount, Intrinsics, Trajectory, driving_trajectory, to_pose
+from gcd_train.errors import DataError
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class CameraPair:
-    """mount: of the source camera, as it is declared. source, target: their pinholes, in pixels of the pictures.
+    """Both cameras of one clip.
 
-    source_from_target: float64 [T, 4, 4], metres.
+    ground_from_source: pose of the source camera where z is up and the ground is z = 0, float64 [4, 4], metres: in the
+        vehicle's frame, or on the stage that the camera orbits.
+    source, target: their pinholes, in pixels of the pictures.
+    trajectory: where the target camera is, frame by frame.
+    mount: how the source camera is declared to sit on its vehicle; None where there is no vehicle.
     """
 
-    mount: CameraMount
+    ground_from_source: Tensor
     source: Intrinsics
     target: Intrinsics
-    source_from_target: Tensor
+    trajectory: Trajectory
+    mount: CameraMount | None = None
 
     @classmethod
     def driving(cls, mount: CameraMount, *, frames: int, height: int, width: int) -> Self:
         """The fixed path from ParallelDomain-4D's forward camera to the view from above, over all of `frames`."""
-        path = driving_trajectory(frames=frames, move_time=frames - 1, mount=mount)
         return cls(
-            mount=mount,
+            ground_from_source=mount.vehicle_from_camera,
             source=Intrinsics.from_hfov(mount.hfov_deg, width, height),
             target=Intrinsics.from_hfov(CameraMount().hfov_deg, width, height),
-            source_from_target=path.source_from_target,
+            trajectory=driving_trajectory(frames=frames, move_time=frames - 1, mount=mount),
+            mount=mount,
         )
+
+    @classmethod
+    def orbit(cls, trajectory: Trajectory, *, hfov_deg: float, height: int, width: int) -> Self:
+        """A path over the sphere, both cameras with the same lens.
+
+        Raises: DataError if nobody says where the source camera stands.
+        """
+        if trajectory.source is None:
+            raise DataError("a path over the sphere begins at a camera: its trajectory must say where the source is")
+        lens = Intrinsics.from_hfov(hfov_deg, width, height)
+        start = to_pose(trajectory.source)
+        return cls(ground_from_source=start, source=lens, target=lens, trajectory=trajectory)
+
+    @property
+    def source_from_target(self) -> Tensor:
+        """float64 [T, 4, 4], metres."""
+        return self.trajectory.source_from_target
 
 
 def pixel_rays(camera: Intrinsics) -> Tensor:

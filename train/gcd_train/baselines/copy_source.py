@@ -2,9 +2,7 @@
 
 from dataclasses import dataclass
 
-import torch
-
-from gcd_train.baselines.predictor import Prediction, SourceClip, to_pictures
+from gcd_train.baselines.predictor import Prediction, SourceClip, to_labels, to_pictures
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -16,4 +14,4 @@ class CopySource:
 
     def predict(self, clip: SourceClip) -> Prediction:
         """See Predictor. The class map is the source's exact one."""
-        return Prediction(video=to_pictures(clip.source), classes=torch.from_numpy(clip.source_classes.copy()))
+        return Prediction(video=to_pictures(clip.source), classes=to_labels(clip.source_classes))

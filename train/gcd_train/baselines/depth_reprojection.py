@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gcd_model.geometry import Intrinsics, invert_rigid
 from gcd_train.baselines.cameras import CameraPair, pixel_rays, to_pixels
-from gcd_train.baselines.predictor import Prediction, SourceClip, to_pictures
+from gcd_train.baselines.predictor import Prediction, SourceClip, to_labels, to_pictures
 from gcd_train.baselines.target_statistics import TargetStatistics
 
 # Depth and classes are picked a quarter pixel off the middle of a pixel drawn at twice the size, colours are its mean.
@@ -24,10 +24,9 @@ _LEAST_WEIGHT = 0.2  # bilinear weight from which a point counts as covering a p
 class DepthReprojection:
     """Every source pixel as a point in space, splatted into the target camera; points behind others are hidden.
 
-    fill: what is shown where no point falls.
+    fill: what is shown where no point falls. classes: how many there are, 0 without an ontology.
     """
 
-    cameras: CameraPair
     fill: TargetStatistics
     classes: int
     name: str = "depth_reprojection"
@@ -35,21 +34,28 @@ class DepthReprojection:
 
     def predict(self, clip: SourceClip) -> Prediction:
         """See Predictor. The sky (depth 0) is taken to be far away."""
-        video, depth = to_pictures(clip.source), torch.from_numpy(clip.source_depth.copy()).double()
-        labels = torch.from_numpy(clip.source_classes.copy())
-        frames = [self._frame(t, video[t], depth[t], labels[t]) for t in range(len(video))]
-        return Prediction(video=torch.stack([f for f, _ in frames]), classes=torch.stack([c for _, c in frames]))
+        depth = torch.from_numpy(clip.source_depth.copy()).double()
+        values = self._values(clip)
+        moved = [self._splat(clip.cameras, t, values[t], depth[t]) for t in range(len(values))]
+        shown, covered = (torch.stack(each) for each in zip(*moved, strict=True))
+        video = torch.where(covered[:, None], shown[:, :3], self.fill.mean)
+        if clip.source_classes is None or self.fill.majority is None:
+            return Prediction(video=video)
+        labels = shown[:, 3:].max(dim=1).indices.to(torch.uint8)  # several times faster than argmax
+        return Prediction(video=video, classes=torch.where(covered, labels, self.fill.majority))
 
-    def _frame(self, t: int, picture: Tensor, depth: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-        rays = pixel_rays(self.cameras.source)
-        points = rays * torch.where(depth > 0, depth, _SKY_M)[..., None]
-        target_from_source = invert_rigid(self.cameras.source_from_target[t])
+    def _values(self, clip: SourceClip) -> Tensor:
+        """What the points show: colours and one vote for their class, float32 [T, 3 + K, H, W]."""
+        video, labels = to_pictures(clip.source), to_labels(clip.source_classes)
+        if labels is None:
+            return video
+        return torch.cat([video, F.one_hot(labels.long(), self.classes).permute(0, 3, 1, 2).float()], dim=1)
+
+    def _splat(self, cameras: CameraPair, t: int, values: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
+        points = pixel_rays(cameras.source) * torch.where(depth > 0, depth, _SKY_M)[..., None]
+        target_from_source = invert_rigid(cameras.source_from_target[t])
         points = points @ target_from_source[:3, :3].T + target_from_source[:3, 3]
-        votes = F.one_hot(labels.long(), self.classes).permute(2, 0, 1).float()
-        values = torch.cat([picture, votes]).flatten(1)  # [3 + K, H*W]
-        splatted, covered = splat(values, points.flatten(0, 1), self.cameras.target)
-        shown = torch.where(covered, splatted[:3], self.fill.mean[t])
-        return shown, torch.where(covered, splatted[3:].argmax(dim=0).to(torch.uint8), self.fill.majority[t])
+        return splat(values.flatten(1), points.flatten(0, 1), cameras.target)
 
 
 def splat(values: Tensor, points: Tensor, camera: Intrinsics) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.baselines.cameras import CameraPair, pixel_rays, to_pixels
-from gcd_train.baselines.predictor import Prediction, SourceClip, to_pictures
+from gcd_train.baselines.predictor import Prediction, SourceClip, to_labels, to_pictures
 from gcd_train.baselines.target_statistics import TargetStatistics
 
 _NEAREST_M = 0.1  # in front of the source camera
@@ -21,21 +21,24 @@ class GroundHomography:
     fill: what is shown where the target camera looks above the horizon or the source camera does not see the ground.
     """
 
-    cameras: CameraPair
     fill: TargetStatistics
     name: str = "ground_homography"
     privileged: bool = False
 
     def predict(self, clip: SourceClip) -> Prediction:
         """See Predictor. The class map is warped from the source's exact one."""
-        grid, seen = ground_grid(self.cameras)
+        grid, seen = ground_grid(clip.cameras)
         video = F.grid_sample(to_pictures(clip.source), grid, padding_mode="border", align_corners=False)
-        labels = torch.from_numpy(clip.source_classes.copy())[:, None].float()
-        labels = F.grid_sample(labels, grid, mode="nearest", padding_mode="border", align_corners=False)[:, 0]
         return Prediction(
             video=torch.where(seen[:, None], video, self.fill.mean),
-            classes=torch.where(seen, labels.to(torch.uint8), self.fill.majority),
+            classes=self._classes(to_labels(clip.source_classes), grid, seen),
         )
+
+    def _classes(self, labels: Tensor | None, grid: Tensor, seen: Tensor) -> Tensor | None:
+        if labels is None or self.fill.majority is None:
+            return None
+        moved = F.grid_sample(labels[:, None].float(), grid, mode="nearest", padding_mode="border", align_corners=False)
+        return torch.where(seen, moved[:, 0].to(torch.uint8), self.fill.majority)
 
 
 def plane_homography(source_from_target: Tensor, normal: Tensor, distance_m: Tensor) -> Tensor:
@@ -55,9 +58,9 @@ def plane_homography(source_from_target: Tensor, normal: Tensor, distance_m: Ten
 
 def ground_grid(cameras: CameraPair) -> tuple[Tensor, Tensor]:
     """Sampling grid float32 [T, H, W, 2] and where it is meant, bool [T, H, W]."""
-    vehicle_from_target = cameras.mount.vehicle_from_camera @ cameras.source_from_target
-    normal = -vehicle_from_target[:, 2, :3]  # downwards, in the target camera's axes
-    height_m = vehicle_from_target[:, 2, 3]  # above the ground
+    ground_from_target = cameras.ground_from_source @ cameras.source_from_target
+    normal = -ground_from_target[:, 2, :3]  # downwards, in the target camera's axes
+    height_m = ground_from_target[:, 2, 3]  # above the ground
     homography = plane_homography(cameras.source_from_target, normal, height_m)
     rays = pixel_rays(cameras.target)
     points = torch.einsum("tij,hwj->thwi", homography, rays)

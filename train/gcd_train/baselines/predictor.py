@@ -8,22 +8,24 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gcd_train.baselines.cameras import CameraPair
 from gcd_train.datasets.clip_source import Bytes
 
 
-class SourceClip(Protocol):
-    """What a predictor may look at: the source side of a `PairedClip`.
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SourceClip:
+    """What a predictor may look at: the source side of a clip, and where it is to be seen from.
 
-    source: uint8 [T, H, W, 3] RGB. source_depth: float32 [T, H, W], metres along the optical axis, 0 for the sky.
-    source_classes: uint8 [T, H, W].
+    source: uint8 [T, H, W, 3] RGB. source_depth: float32 [T, H, W], metres along the optical axis, 0 for the sky; for
+    privileged predictors only. source_classes: uint8 [T, H, W]; None where the world has no ontology.
+    cameras: of the clip, the source's as it is declared. fps: frames per second.
     """
 
-    @property
-    def source(self) -> Bytes: ...
-    @property
-    def source_depth(self) -> NDArray[np.float32]: ...
-    @property
-    def source_classes(self) -> Bytes: ...
+    source: Bytes
+    source_depth: NDArray[np.float32]
+    source_classes: Bytes | None
+    cameras: CameraPair
+    fps: float
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -50,3 +52,8 @@ class Predictor(Protocol):
 def to_pictures(frames: Bytes) -> Tensor:
     """uint8 [T, H, W, 3] -> float32 [T, 3, H, W] in [0, 1]."""
     return torch.from_numpy(np.ascontiguousarray(frames)).permute(0, 3, 1, 2).float() / 255.0
+
+
+def to_labels(classes: Bytes | None) -> Tensor | None:
+    """A class map as a tensor, uint8 [T, H, W]; None for none."""
+    return None if classes is None else torch.from_numpy(np.ascontiguousarray(classes))

@@ -10,7 +10,6 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from gcd_model.geometry import CameraMount
 from gcd_train.cli.errors import errors_shown
 from gcd_train.cli.progress_bar import progress_bar
 from gcd_train.errors import RecipeError
@@ -18,10 +17,10 @@ from gcd_train.layouts.scene_run import SceneRun, generate_scenes
 from gcd_train.layouts.scene_sheet import write_scene_sheet
 from gcd_train.layouts.scene_writer import SceneFormat
 from gcd_train.scenes.contact_sheet import write_contact_sheet
-from gcd_train.scenes.driving import FPS, HFOV_DEG
 from gcd_train.scenes.film import write_film
+from gcd_train.scenes.pair_world import PairForm, World, driving_world, orbit_world
 from gcd_train.scenes.worlds import SCENE_WORLDS, SceneWorld, WorldOptions, tabletop_world
-from gcd_train.scenes.writer import World, generate
+from gcd_train.scenes.writer import generate
 
 app = typer.Typer(no_args_is_help=True, help="Make training data with a procedural world (extra `scenes`).")
 
@@ -36,6 +35,10 @@ Frames = Annotated[int | None, typer.Option(min=2, help="Time steps; by default 
 Width = Annotated[int | None, typer.Option(min=16, help="Pixels; by default as published.")]
 Height = Annotated[int | None, typer.Option(min=16, help="Pixels; by default as published.")]
 Arm = Annotated[str, typer.Option(help="primitive, or panda (needs the package gymnasium-robotics).")]
+Pairs = Annotated[bool, typer.Option("--pairs", help="Pairs of clips in shards, not whole scenes.")]
+Clips = Annotated[int | None, typer.Option(min=1, help="How many pairs: implies --pairs; by default 100.")]
+ClipsPerScene = Annotated[int, typer.Option(min=1, help="Pairs: how many are cut from one simulation.")]
+ClipsPerShard = Annotated[int, typer.Option(min=1, help="Pairs a file.")]
 Sheet = Annotated[Path | None, typer.Option(help="Also draw the first scenes into this PNG.")]
 
 
@@ -47,7 +50,9 @@ def about() -> None:
 @app.command()
 def drop(
     out: Folder,
-    scenes: Scenes = 1,
+    scenes: Scenes = None,
+    pairs: Pairs = False,
+    clips: Clips = None,
     first_seed: FirstSeed = 0,
     workers: Workers = None,
     ray: Ray = None,
@@ -56,11 +61,21 @@ def drop(
     frames: Frames = None,
     width: Width = None,
     height: Height = None,
+    clips_per_scene: ClipsPerScene = 3,
+    clips_per_shard: ClipsPerShard = 24,
     contact_sheet: Sheet = None,
 ) -> None:
-    """Things that fall and collide, seen by 16 cameras, in Kubric-4D's layout (60 frames at 24 Hz)."""
+    """Things that fall and collide, seen by 16 cameras, in Kubric-4D's layout (60 frames at 24 Hz).
+
+    With --pairs or --clips: a camera that stands, and one that goes round, 192x128 and 14 frames at 12 Hz by default.
+    """
     with errors_shown():
         world = SCENE_WORLDS["drop"]
+        if _wants_pairs(pairs, clips, scenes, compact):
+            form = PairForm.of(width, height, frames, oversample, clips_per_shard)
+            made = orbit_world(world, form, clips_per_scene=clips_per_scene)
+            _make_pairs(out, made, made.seeds_of(first_seed, clips or 100), workers, ray, contact_sheet)
+            return
         form = _form(world, compact, oversample, frames, width, height)
         _make_scenes(world, out, form, _seeds(first_seed, scenes), workers, ray, contact_sheet)
 
@@ -69,7 +84,9 @@ def drop(
 def tabletop(
     out: Folder,
     arm: Arm = "primitive",
-    scenes: Scenes = 1,
+    scenes: Scenes = None,
+    pairs: Pairs = False,
+    clips: Clips = None,
     first_seed: FirstSeed = 0,
     workers: Workers = None,
     ray: Ray = None,
@@ -78,11 +95,21 @@ def tabletop(
     frames: Frames = None,
     width: Width = None,
     height: Height = None,
+    clips_per_scene: ClipsPerScene = 3,
+    clips_per_shard: ClipsPerShard = 24,
     contact_sheet: Sheet = None,
 ) -> None:
-    """A robot arm at work on a table, seen by 16 cameras, in Kubric-4D's layout (60 frames at 24 Hz)."""
+    """A robot arm at work on a table, seen by 16 cameras, in Kubric-4D's layout (60 frames at 24 Hz).
+
+    With --pairs or --clips: a camera that stands, and one that goes round, 192x128 and 14 frames at 12 Hz by default.
+    """
     with errors_shown():
         world = tabletop_world(arm)
+        if _wants_pairs(pairs, clips, scenes, compact):
+            form = PairForm.of(width, height, frames, oversample, clips_per_shard)
+            made = orbit_world(world, form, clips_per_scene=clips_per_scene)
+            _make_pairs(out, made, made.seeds_of(first_seed, clips or 100), workers, ray, contact_sheet)
+            return
         form = _form(world, compact, oversample, frames, width, height)
         _make_scenes(world, out, form, _seeds(first_seed, scenes), workers, ray, contact_sheet)
 
@@ -92,8 +119,8 @@ def driving(
     folder: Annotated[Path | None, typer.Argument(help="As --out.", metavar="[OUT]")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the data; an unfinished one is continued.")] = None,
     scenes: Scenes = None,
-    pairs: Annotated[bool, typer.Option(help="Pairs of clips in shards, not whole scenes.")] = False,
-    clips: Annotated[int | None, typer.Option(min=1, help="How many pairs, one scene each: implies --pairs.")] = None,
+    pairs: Pairs = False,
+    clips: Clips = None,
     first_seed: FirstSeed = 0,
     workers: Workers = None,
     ray: Ray = None,
@@ -102,7 +129,8 @@ def driving(
     frames: Frames = None,
     width: Width = None,
     height: Height = None,
-    clips_per_shard: Annotated[int, typer.Option(min=1, help="Pairs a file.")] = 8,
+    clips_per_shard: ClipsPerShard = 8,
+    edition: Annotated[int, typer.Option(min=1, max=2, help="Pairs: 1, or 2 for the streets of whole scenes.")] = 1,
     mount_height: Annotated[float, typer.Option(help="Pairs: true height of the source camera, metres.")] = 1.55,
     mount_tilt: Annotated[float, typer.Option(help="Pairs: true tilt of the source camera, degrees down.")] = 0.0,
     contact_sheet: Sheet = None,
@@ -114,15 +142,15 @@ def driving(
     with errors_shown():
         place = _one_folder(folder, out)
         mount = WorldOptions(height_m=mount_height, tilt_deg=mount_tilt)
-        if not (pairs or clips is not None or mount != WorldOptions()):
-            drive = SCENE_WORLDS["driving"]
-            form = _form(drive, compact, oversample, frames, width, height)
-            _make_scenes(drive, place, form, _seeds(first_seed, scenes), workers, ray, contact_sheet)
+        told = pairs or mount != WorldOptions() or edition != 1
+        if _wants_pairs(told, clips, scenes, compact):
+            form = PairForm.of(width, height, frames, oversample, clips_per_shard)
+            world = driving_world(form, mount, edition)
+            _make_pairs(place, world, world.seeds_of(first_seed, clips or 100), workers, ray, contact_sheet)
             return
-        if scenes is not None or compact:
-            raise RecipeError("--scenes and --compact make whole scenes, --clips, --pairs and a mount pairs; give one")
-        world = _pair_world(mount, width or 192, height or 128, frames or 14, oversample, clips_per_shard)
-        _make_pairs(place, world, _seeds(first_seed, clips or 100), workers, ray, contact_sheet)
+        drive = SCENE_WORLDS["driving"]
+        form = _form(drive, compact, oversample, frames, width, height)
+        _make_scenes(drive, place, form, _seeds(first_seed, scenes), workers, ray, contact_sheet)
 
 
 @app.command()
@@ -136,6 +164,15 @@ def film(
     """One longer drive as a video, seen from the forward camera; the packaged drive was made so."""
     with errors_shown():
         write_film(out, seed, frames=frames, width=width, height=height)
+
+
+def _wants_pairs(pairs: bool, clips: int | None, scenes: int | None, compact: bool) -> bool:
+    wanted = pairs or clips is not None
+    if wanted and (scenes is not None or compact):
+        raise RecipeError(
+            "--scenes and --compact make whole scenes; --clips, --pairs, a mount and an edition pairs; give one"
+        )
+    return wanted
 
 
 def _one_folder(argument: Path | None, option: Path | None) -> Path:
@@ -187,23 +224,6 @@ def _make_scenes(
         write_scene_sheet([out / world.scene_name(seed) for seed in seeds], sheet)
     if run.failures:
         raise typer.Exit(run.exit_code)
-
-
-def _pair_world(
-    mount: WorldOptions, width: int, height: int, frames: int, oversample: int, clips_per_shard: int
-) -> World:
-    CameraMount(height_m=mount.height_m, tilt_deg=mount.tilt_deg)  # refuses what is no mount before anything is made
-    return World(
-        name="driving",
-        width=width,
-        height=height,
-        frames=frames,
-        fps=FPS,
-        hfov_deg=HFOV_DEG,
-        oversample=oversample,
-        clips_per_shard=clips_per_shard,
-        options=mount,
-    )
 
 
 def _make_pairs(

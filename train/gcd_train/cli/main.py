@@ -8,11 +8,11 @@ from rich.console import Console
 from rich.table import Table
 
 from gcd_model import DRIVING_SMALL, FAMILIES, SMALL, SVD_14, Family, ModelConfig
-from gcd_train.cli import bench, generate, lerobot
+from gcd_train.cli import bench, generate, lerobot, lora
 from gcd_train.cli.cache import cache
 from gcd_train.cli.evaluate import evaluate_command
 from gcd_train.cli.show import show
-from gcd_train.cli.train import train
+from gcd_train.cli.train import recipes, train
 from gcd_train.cli.verify import verify_command
 
 app = typer.Typer(
@@ -25,10 +25,12 @@ app = typer.Typer(
 app.add_typer(generate.app, name="generate")
 app.add_typer(bench.app, name="bench")
 app.add_typer(lerobot.app, name="export")
+app.add_typer(lora.app, name="lora")
 app.command()(cache)
 app.command("evaluate")(evaluate_command)
 app.command("lerobot")(lerobot.lerobot_command)
 app.command()(show)
+app.command()(recipes)
 app.command()(train)
 app.command("verify")(verify_command)
 

@@ -1,4 +1,4 @@
-"""`gcd-train train`: from clips to a weight file, stage by stage."""
+"""`gcd-train train`: from clips to a weight file, stage by stage; `gcd-train recipes`: what there is to train."""
 
 import logging
 import signal
@@ -6,38 +6,102 @@ import threading
 import warnings
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, TypeAlias, get_args
+from typing import TYPE_CHECKING, Annotated, TypeAlias, get_args
 
 import torch
 import typer
+from rich.box import SIMPLE
+from rich.console import Console
+from rich.table import Table
 from typer import Argument, Option
 
 from gcd_train.cli.errors import errors_shown
-from gcd_train.recipe import StageName, load_recipe
+from gcd_train.recipe import Recipe, StageName, load_recipe, packaged_recipes, to_toml
+
+if TYPE_CHECKING:
+    from gcd_train.engine.processes import Processes
 
 RecipeFile: TypeAlias = Annotated[
     str, Argument(metavar="RECIPE", help="A TOML file, or package:driving-small for one that ships.")
 ]
-Data: TypeAlias = Annotated[Path, Option(help="Folder of clips to learn from.")]
-Valid: TypeAlias = Annotated[Path, Option(help="Folder of held-out clips to measure on.")]
+Shown: TypeAlias = Annotated[
+    str | None, Argument(metavar="[RECIPE]", help="Show this one whole, with its bases and every default.")
+]
+Data: TypeAlias = Annotated[Path, Option(help="What to learn from: the recipe's data.kind says what lies there.")]
+Valid: TypeAlias = Annotated[
+    Path | None, Option(help="Held-out data of the same kind to measure on; left out, a part of --data (data.split).")
+]
 Out: TypeAlias = Annotated[Path, Option(help="Folder of the run; run again to go on.")]
 Stage: TypeAlias = Annotated[str | None, Option(help=f"Only this one: {', '.join(get_args(StageName))}.")]
 Threads: TypeAlias = Annotated[int | None, Option(min=1, help="CPU threads; else torch's own choice.")]
+Small: TypeAlias = Annotated[
+    bool, Option("--small", help="Model, size, batch and budget of the recipe's table [small], for a CPU.")
+]
+Changes: TypeAlias = Annotated[
+    list[str] | None, Option("--set", metavar="KEY=VALUE", help="Change the recipe, for one unet.batch=8; repeat.")
+]
 
 
-def train(recipe: RecipeFile, data: Data, valid: Valid, out: Out, stage: Stage = None, threads: Threads = None) -> None:
+def train(
+    recipe: RecipeFile,
+    data: Data,
+    out: Out,
+    valid: Valid = None,
+    stage: Stage = None,
+    threads: Threads = None,
+    small: Small = False,
+    changes: Changes = None,
+) -> None:
     """Train a model on clips, or go on where a run stopped. Ctrl-C stops after the update and saves."""
     # a remark on speed that torch makes once, about the decoder's last layer
     warnings.filterwarnings("ignore", message="grad and param do not obey the gradient layout contract")
+    # projected embeddings are views of what their layer made; nobody writes into them
+    warnings.filterwarnings("ignore", message="FSDP2-wrapped module")
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     if threads is not None:
         torch.set_num_threads(threads)
     with errors_shown():
-        _run(recipe, data, valid, out, _stage_named(stage))
+        loaded = load_recipe(recipe, small=small, changes=changes or ())
+        _in_processes(loaded, data, valid, out, _stage_named(stage))
 
 
-def _run(recipe: str, data: Path, valid: Path, out: Path, stage: StageName | None) -> None:
-    from gcd_train.datasets.paired import PairedClips, require_apart
+def recipes(recipe: Shown = None, small: Small = False, changes: Changes = None) -> None:
+    """List the recipes that ship, or show one whole: on its bases, with every default."""
+    console = Console(highlight=False, soft_wrap=True)
+    with errors_shown():
+        if recipe is not None:
+            console.print(to_toml(load_recipe(recipe, small=small, changes=changes or ())), markup=False, end="")
+            return
+        table = Table(box=SIMPLE, pad_edge=False, padding=(0, 0))
+        for column in ("recipe", "data", "model", "updates", "clips an update", "starts from"):
+            table.add_column(column, no_wrap=True)
+        for name in packaged_recipes():
+            table.add_row(f"package:{name}", *_row(load_recipe(f"package:{name}")))
+        console.print(table)
+
+
+def _row(recipe: Recipe) -> tuple[str, ...]:
+    data, unet, model = recipe.data, recipe.unet, recipe.model
+    budget = f"{unet.budget.updates}" if unet.budget.updates is not None else f"{unet.budget.minutes:g} min"
+    kind = data.kind if data.modality == "rgb" else f"{data.kind}, classes"
+    return kind, f"{model.base} ({model.family})", budget, f"{unet.clip_batch * unet.parts}", model.weights or "nothing"
+
+
+def _in_processes(recipe: Recipe, data: Path, valid: Path | None, out: Path, stage: StageName | None) -> None:
+    from gcd_train.engine.processes import processes_of
+
+    with processes_of(recipe.compute) as processes:
+        if not processes.first:
+            logging.getLogger().setLevel(logging.WARNING)
+        _run(recipe, data, valid, out, stage, processes)
+
+
+def _run(
+    recipe: Recipe, data: Path, valid: Path | None, out: Path, stage: StageName | None, processes: "Processes"
+) -> None:
+    from gcd_train.data_kinds import DataPlaces, open_data
+    from gcd_train.model_setup import family_of, model_config
+    from gcd_train.monitor.board import TensorBoard
     from gcd_train.run_folder import RunFolder
     from gcd_train.trainer import RunInputs, Trainer
 
@@ -48,15 +112,17 @@ def _run(recipe: str, data: Path, valid: Path, out: Path, stage: StageName | Non
 
     signal.signal(signal.SIGINT, ask)
     signal.signal(signal.SIGTERM, ask)
-    loaded = load_recipe(recipe)
-    clips, held_out = PairedClips.open(data), PairedClips.open(valid)
-    require_apart(clips, held_out)
+    board = TensorBoard(out / "tensorboard") if recipe.log.tensorboard and processes.first else None
+    places = DataPlaces(data=data, valid=valid)
+    opened = open_data(recipe, model_config(recipe.model), family_of(recipe.model), places)
     inputs = RunInputs(
-        recipe=loaded,
-        clips=clips,
-        valid=held_out,
-        folder=RunFolder(out),
+        recipe=recipe,
+        clips=opened.clips,
+        valid=opened.valid,
+        batches=opened.batches,
+        folder=RunFolder(out, board),
         stop=stop,
+        processes=processes,
     )
     Trainer(inputs).run(stage)
 

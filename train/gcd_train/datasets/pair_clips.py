@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_model.class_head import SemanticClass
-from gcd_model.geometry import CameraMount
+from gcd_model.config import CameraControl
+from gcd_model.geometry import CameraMount, Trajectory, driving_trajectory
 from gcd_train.datasets.clip_frames import FrameSampling
 from gcd_train.datasets.dataset4d import PairSample
 from gcd_train.datasets.ontology import Ontology
@@ -61,6 +62,7 @@ class DrivingClips:
             class_ids=True,
             exact=exact,
         )
+        self._frames = frames.clip
         self._kept: tuple[int, PairSample] | None = None
 
     def __len__(self) -> int:
@@ -75,6 +77,11 @@ class DrivingClips:
     def fps(self) -> float:
         """Frames per second of the clips."""
         return self._dataset.fps / self._stride
+
+    @property
+    def camera(self) -> CameraControl:
+        """All clips share one path."""
+        return "none"
 
     @property
     def mount(self) -> CameraMount:
@@ -100,6 +107,10 @@ class DrivingClips:
         """A thousand times the scene's number, and which of its clips."""
         repeat, place = divmod(number, len(self._dataset.scenes))
         return _MOST_REPEATS * (scene_number(self._dataset.scenes[place]) or 0) + repeat
+
+    def trajectory(self, number: int, /) -> Trajectory:
+        """The one path, up and back, seen from the source camera."""
+        return driving_trajectory(frames=self._frames, move_time=self._frames - 1, mount=self.mount)
 
     def rgb(self, number: int, /) -> tuple[Bytes, Bytes]:
         """Source and target, u8 [T, H, W, 3] each."""

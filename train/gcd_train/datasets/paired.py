@@ -1,8 +1,10 @@
-"""Clips of a data folder: what the source camera saw, and what the target camera saw at the same times."""
+"""Clips of data folders: what the source camera saw, and what the target camera saw at the same times."""
 
 import hashlib
+import json
 import re
 import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -12,12 +14,21 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_model.config import SemanticClass
-from gcd_model.geometry import CameraMount
+from gcd_model.config import CameraControl, SemanticClass
+from gcd_model.geometry import (
+    CameraMount,
+    Spherical,
+    SphericalDelta,
+    Trajectory,
+    driving_trajectory,
+    spherical_trajectory,
+)
 from gcd_train.errors import DataError
-from gcd_train.scenes.writer import DEPTH_UNIT_M, World, read_world
+from gcd_train.scenes.pair_world import DEPTH_UNIT_M, Orbit, World, read_world
 
 Bytes = NDArray[np.uint8]
+_FOLDER_SEEDS = 10**12
+"""Clips of the second folder count from here, of the third from twice this: no clip's own number is as large."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -37,26 +48,46 @@ class PairedClip:
 
 @dataclass(frozen=True, slots=True)
 class PairedClips:
-    """All clips of a folder, ordered by seed; read when asked for, safe to share between processes."""
+    """All clips of some folders, read when asked for, safe to share between processes.
 
-    world: World
+    One folder's clips are ordered by their number. Those of several alternate, so that the first ones are a fair mix.
+    worlds: what each folder says about itself. places: shard and name of each clip. folders: in which folder it lies,
+    empty where there is but one.
+    """
+
+    worlds: tuple[World, ...]
     places: tuple[tuple[Path, str], ...]
+    folders: tuple[int, ...] = ()
 
     @classmethod
-    def open(cls, folder: Path | str, limit: int | None = None) -> Self:
-        """Find the clips of a folder, at most `limit`; shards still being written are left out.
+    def open(cls, folder: Path | str | Sequence[Path | str], limit: int | None = None) -> Self:
+        """Find the clips of a folder, of several, or of all data folders in one, at most `limit` in all.
 
-        Raises: DataError if it is no data folder, a shard is damaged, or there is no clip.
+        Shards still being written are left out.
+
+        Raises: DataError if one is no data folder, a shard is damaged, there is no clip, or the folders differ in size,
+            frames, rate, lens, classes or camera control.
         """
-        folder = Path(folder)
-        world = read_world(folder)
-        places: list[tuple[Path, str]] = []
-        for path in sorted(folder.glob("shard-*.zip")):
-            places += [(path, name) for name in _clip_names(path)]
-        places = sorted({name: (path, name) for path, name in reversed(places)}.values(), key=lambda place: place[1])
-        if not places:
-            raise DataError(f"{folder} holds no finished shard; run `gcd-train generate {world.name}` to its end")
-        return cls(world, tuple(places[:limit]))
+        found = _data_folders(folder)
+        worlds = tuple(read_world(each) for each in found)
+        _require_alike(found, worlds)
+        places = [_places(each, world) for each, world in zip(found, worlds, strict=True)]
+        order = _alternating([len(each) for each in places])[:limit]
+        return cls(worlds, tuple(places[i][k] for i, k in order), tuple(i for i, _ in order) if len(found) > 1 else ())
+
+    @property
+    def world(self) -> World:
+        """What the first folder says about itself; the others are alike in all but name, seeds and options."""
+        return self.worlds[0]
+
+    def world_of(self, index: int) -> World:
+        """The world a clip was taken in."""
+        return self.worlds[self._folder(index)]
+
+    def scene(self, index: int) -> tuple[str, int]:
+        """World and seed of the scene that a clip was cut from."""
+        world = self.world_of(index)
+        return world.name, world.scene_of(int(self.places[index][1]))
 
     def __len__(self) -> int:
         return len(self.places)
@@ -67,7 +98,7 @@ class PairedClips:
             target=self._colour(index, "target"),
             source_depth=self._strip(index, "source.depth").astype(np.float32) * np.float32(DEPTH_UNIT_M),
             target_depth=self._strip(index, "target.depth").astype(np.float32) * np.float32(DEPTH_UNIT_M),
-            source_classes=self._strip(index, "source.classes"),
+            source_classes=self._classes(index, "source"),
             target_classes=self.target_classes(index),
             source_instances=self._strip(index, "source.instances"),
             target_instances=self._strip(index, "target.instances"),
@@ -79,12 +110,43 @@ class PairedClips:
         return self._colour(index, "source"), self._colour(index, "target")
 
     def target_classes(self, index: int) -> Bytes:
-        """Class ids of the target view alone, [T, H, W]."""
-        return self._strip(index, "target.classes")
+        """Class ids of the target view alone, [T, H, W]; zeros where the world has no classes."""
+        return self._classes(index, "target")
 
     def seed(self, index: int) -> int:
-        """The seed a clip was made from."""
-        return int(self.places[index][1])
+        """The number a clip was made from; in other folders than the first it is made different from all others."""
+        return int(self.places[index][1]) + _FOLDER_SEEDS * self._folder(index)
+
+    def trajectory(self, index: int) -> Trajectory:
+        """The path from source to target. For an orbit its source stands at azimuth 0: only the change in it counts.
+
+        Raises: DataError if the shard is damaged.
+        """
+        if self.world.camera == "fixed":
+            return driving_trajectory(frames=self.frames, move_time=self.frames - 1, mount=self.mount)
+        orbit = self.orbit(index)
+        azimuth_deg, elevation_deg, radius_m = orbit.change
+        return spherical_trajectory(
+            Spherical(azimuth_deg=0.0, elevation_deg=orbit.start[1], radius_m=orbit.start[2]),
+            SphericalDelta(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, radius_m=radius_m),
+            frames=self.frames,
+            move_time=self.frames - 1,
+        )
+
+    def orbit(self, index: int) -> Orbit:
+        """How a clip of an orbit world was cut from its scene. Raises DataError for others, or a damaged shard."""
+        path, name = self.places[index]
+        try:
+            return msgspec.convert(json.loads(self._read(index, "scene.json"))["orbit"], Orbit)
+        except (KeyError, ValueError, msgspec.MsgspecError) as error:
+            raise DataError(
+                f"{path}: {name}/scene.json tells of no orbit ({error}); generate the shard again"
+            ) from error
+
+    @property
+    def camera(self) -> CameraControl:
+        """How a network is told where the target camera goes."""
+        return "none" if self.world.camera == "fixed" else "spherical"
 
     @property
     def classes(self) -> tuple[SemanticClass, ...]:
@@ -97,16 +159,18 @@ class PairedClips:
         return self.world.fps
 
     @property
-    def mount(self) -> CameraMount:
-        """How the source camera really sits on the vehicle."""
+    def mount(self) -> CameraMount | None:
+        """How the source camera really sits on the vehicle; None in a world without one."""
+        if self.world.camera != "fixed":
+            return None
         options = self.world.options
         return CameraMount(height_m=options.height_m, tilt_deg=options.tilt_deg, hfov_deg=self.world.hfov_deg)
 
     @property
     def origin(self) -> str:
-        """Names the world and its options, whatever number of clips there is."""
-        told = msgspec.json.encode(msgspec.structs.replace(self.world, clips_per_shard=0), order="deterministic")
-        return hashlib.sha256(told).hexdigest()[:8]
+        """Names the worlds and their options, whatever number of clips there is."""
+        told = [_told(world) for world in self.worlds]
+        return hashlib.sha256(told[0] if len(told) == 1 else b"\n".join(told)).hexdigest()[:8]
 
     @property
     def frames(self) -> int:
@@ -123,32 +187,94 @@ class PairedClips:
         """W."""
         return self.world.width
 
+    @property
+    def hfov_deg(self) -> float:
+        """Angle across the source pictures, and across the targets of an orbit."""
+        return self.world.hfov_deg
+
+    def _folder(self, index: int) -> int:
+        return self.folders[index] if self.folders else 0
+
     def _colour(self, index: int, camera: str) -> Bytes:
         return np.ascontiguousarray(self._strip(index, f"{camera}.rgb")[..., ::-1])
 
-    def _strip(self, index: int, kind: str) -> NDArray[np.uint8]:
+    def _classes(self, index: int, camera: str) -> Bytes:
+        if not self.classes:
+            return np.zeros((self.frames, self.height, self.width), np.uint8)
+        return self._strip(index, f"{camera}.classes")
+
+    def _read(self, index: int, file: str) -> bytes:
         path, name = self.places[index]
         try:
             with zipfile.ZipFile(path) as archive:
-                data = archive.read(f"{name}/{kind}.png")
+                return archive.read(f"{name}/{file}")
         except (OSError, KeyError, zipfile.BadZipFile) as error:
             raise DataError(
                 f"{path}: clip {name} cannot be read ({error}); delete the shard and generate again"
             ) from error
+
+    def _strip(self, index: int, kind: str) -> NDArray[np.uint8]:
+        data = self._read(index, f"{kind}.png")
         strip = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         if strip is None or strip.shape[:2] != (self.frames * self.height, self.width):
+            path, name = self.places[index]
             raise DataError(f"{path}: {name}/{kind}.png is damaged; delete the shard and generate again")
         return strip.reshape(self.frames, self.height, *strip.shape[1:])  # pyright: ignore[reportReturnType]
 
 
 def require_apart(training: PairedClips, held_out: PairedClips) -> None:
     """Raises DataError if two sets share scenes: what was learned from them says nothing about others."""
-    shared = {training.seed(i) for i in range(len(training))} & {held_out.seed(i) for i in range(len(held_out))}
-    if shared and training.world.name == held_out.world.name:
+    shared = {training.scene(i) for i in range(len(training))} & {held_out.scene(i) for i in range(len(held_out))}
+    if shared:
         raise DataError(
-            f"training and held-out clips share {len(shared)} scenes, first: seed {min(shared)}; generate the held-out "
-            "ones with --first-seed 1000000"
+            f"training and held-out clips share {len(shared)} scenes, first: seed {min(seed for _, seed in shared)}; "
+            "generate the held-out ones with --first-seed 1000000"
         )
+
+
+def _data_folders(folder: Path | str | Sequence[Path | str]) -> list[Path]:
+    """The folders meant: one, several, or those in a folder that is none itself."""
+    if not isinstance(folder, Path | str):
+        found = [each for one in folder for each in _data_folders(one)]
+        if not found:
+            raise DataError("no data folder is given; name at least one")
+        if len(set(found)) < len(found):
+            raise DataError("the same data folder is given twice; name each once")
+        return found
+    one = Path(folder)
+    inside = [] if (one / "world.json").exists() else sorted(path.parent for path in one.glob("*/world.json"))
+    return inside or [one]
+
+
+def _require_alike(folders: Sequence[Path], worlds: Sequence[World]) -> None:
+    def common(world: World) -> tuple[object, ...]:
+        size = world.width, world.height, world.frames, world.fps, world.hfov_deg
+        return *size, world.camera, world.classes, None if world.camera == "orbit" else world.options
+
+    for folder, world in zip(folders, worlds, strict=True):
+        if common(world) != common(worlds[0]):
+            raise DataError(
+                f"{folder} and {folders[0]} do not go together: clips of one training are alike in size, frames, rate, "
+                "lens, classes and camera; generate both with the same options"
+            )
+
+
+def _places(folder: Path, world: World) -> list[tuple[Path, str]]:
+    """Shard and name of a folder's clips by number, each once."""
+    places = [(path, name) for path in sorted(folder.glob("shard-*.zip")) for name in _clip_names(path)]
+    if not places:
+        raise DataError(f"{folder} holds no finished shard; run `gcd-train generate {world.name}` to its end")
+    return sorted({name: (path, name) for path, name in reversed(places)}.values(), key=lambda place: int(place[1]))
+
+
+def _alternating(counts: Sequence[int]) -> list[tuple[int, int]]:
+    """Folder and place in it of all clips, each folder spread evenly over the whole."""
+    every = [((k + 0.5) / count, i, k) for i, count in enumerate(counts) for k in range(count)]
+    return [(i, k) for _, i, k in sorted(every)]
+
+
+def _told(world: World) -> bytes:
+    return msgspec.json.encode({**world.told(), "clips_per_shard": 0})  # in the order of the fields
 
 
 def _clip_names(path: Path) -> list[str]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_train.datasets.skips import FileFault
-from gcd_train.layouts.depth_code import FAR_M, decode_depth
+from gcd_train.layouts.depth_code import FAR_M, stored_depth
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
@@ -70,7 +70,7 @@ def read_colour(path: Path) -> Bytes:
 
 
 def read_depth(path: Path, key: str = "data") -> Floats:
-    """Metres, f32 [H, W], of a float TIFF, an npz with array `key`, or a 16-bit PNG of ours (`depth_code`).
+    """Metres, f32 [H, W], of a float TIFF, an npz with array `key`, or a PNG of ours (`depth_code`).
 
     0 is kept as "nothing known"; beyond 30 000 m is cut there, as published.
     Raises: FileFault if it is damaged, or holds NaN, negative numbers, or nothing that is known or within those.
@@ -79,7 +79,7 @@ def read_depth(path: Path, key: str = "data") -> Floats:
         case ".npz":
             metres = _npz(path, key)
         case ".png":
-            metres = decode_depth(_sixteen_bit(path))
+            metres = _depth_png(path)
         case _:
             metres = _float_tiff(path)
     if not float(metres.min()) >= 0:  # NaN is the least of all
@@ -163,13 +163,15 @@ def _npz(path: Path, key: str) -> Floats:
     return array.reshape(array.shape[:2]).astype(np.float32, copy=False)
 
 
-def _sixteen_bit(path: Path) -> NDArray[np.uint16]:
+def _depth_png(path: Path) -> Floats:
     content = read(path)
     _require_whole_png(path, content)
     picture = _decoded(path, content, cv2.IMREAD_UNCHANGED)
-    if picture.dtype != np.uint16 or picture.ndim != 2:
-        raise FileFault(path, f"should hold 16-bit depth, got {picture.dtype} {list(picture.shape)}")
-    return picture.astype(np.uint16, copy=False)
+    metres = stored_depth(picture)
+    if metres is None:
+        got = f"{picture.dtype} {list(picture.shape)}"
+        raise FileFault(path, f"should hold 16-bit depth codes, or their low bytes above their high ones, got {got}")
+    return metres
 
 
 def _require_whole_png(path: Path, content: bytes) -> None:

@@ -1,7 +1,7 @@
 """Training pairs of a 4D data set: what a source camera saw, and what a camera on another path would have seen."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -168,6 +168,10 @@ class PairBatch:
     visible: Tensor | None
     skipped: tuple[Skipped, ...]
     bytes_read: int
+
+    def pin_memory(self) -> "PairBatch":
+        """The pictures in page-locked memory, as a loader wants to hand them over to CUDA."""
+        return replace(self, source=self.source.pin_memory(), target=self.target.pin_memory())
 
 
 def collate(samples: Sequence[PairSample]) -> PairBatch:

@@ -12,11 +12,10 @@ from gcd_model import ModelConfig
 from gcd_model.checkpoints import load_weights
 from gcd_model.image_encoder import ImageEncoder, clip_pixels
 from gcd_model.loading import packaged_weights, random_weights
-from gcd_model.networks import Networks
+from gcd_model.networks import Networks, weights_digest
 from gcd_model.own_format import precision
 from gcd_model.vae import Encoder, Posterior
 from gcd_train.errors import RecipeError
-from gcd_train.model_setup import weights_digest
 
 
 class EncoderChoice(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -74,12 +73,8 @@ def load_encoders(choice: EncoderChoice) -> Encoders:
     Raises: CheckpointError, OptionError as `load_weights`; RecipeError where the device is not there.
     """
     networks = _networks(choice)
-    parts: dict[str, nn.Module] = {"target": networks.target_encoder, "condition": networks.condition_encoder}
-    if networks.image_encoder is not None:
-        parts["image"] = networks.image_encoder
-    told = {f"{part}.{name}": value for part, module in parts.items() for name, value in module.state_dict().items()}
-    device, digest = _device(choice.device), weights_digest(told)
-    for module in parts.values():
+    device, digest = _device(choice.device), encoders_digest(networks)
+    for module in _parts(networks).values():
         module.to(device, precision(choice.dtype)).requires_grad_(False).eval()
     return Encoders(
         config=networks.config,
@@ -90,6 +85,17 @@ def load_encoders(choice: EncoderChoice) -> Encoders:
         choice=choice,
         device=device,
     )
+
+
+def encoders_digest(networks: Networks) -> str:
+    """Names the weights of the frozen encoders, whatever type they are kept in."""
+    states = {part: module.state_dict() for part, module in _parts(networks).items()}
+    return weights_digest({f"{part}.{name}": value.float() for part in states for name, value in states[part].items()})
+
+
+def _parts(networks: Networks) -> dict[str, nn.Module]:
+    parts: dict[str, nn.Module] = {"target": networks.target_encoder, "condition": networks.condition_encoder}
+    return parts if networks.image_encoder is None else {**parts, "image": networks.image_encoder}
 
 
 def _networks(choice: EncoderChoice) -> Networks:

@@ -11,7 +11,6 @@ from safetensors.torch import load
 from torch import Tensor
 
 from gcd_model.vae import Posterior
-from gcd_train.datasets.latents import LatentRows
 from gcd_train.draws import Draws
 from gcd_train.errors import DataError
 from gcd_train.latent_cache.index import CacheIndex, digest, read_index
@@ -20,15 +19,25 @@ from gcd_train.latent_cache.shard import log_variance_of
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class CachedRows:
+    """T frames of a clip: source [T, C, h, w], not scaled; target [T, C, h, w], scaled; half, the source at half size
+    as uint8, empty where it was not kept; frame_numbers 0..T-1."""
+
+    source: Tensor
+    target: Tensor
+    half: Tensor
+    frame_numbers: Tensor
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class CachedClip:
     """One clip of T frames, float32 on the CPU.
 
-    rows: as the trainer takes them: source [T, C, h, w], not scaled; target [T, C, h, w], scaled; half, empty for
-    models that do not warp; frame_numbers 0..T-1. tokens: [T, D] or None. emphasis: [T, 1, h, w] or None.
+    tokens: [T, D] or None. emphasis: [T, 1, h, w] or None.
     fps: of the clip, after the stride.
     """
 
-    rows: LatentRows
+    rows: CachedRows
     tokens: Tensor | None
     emphasis: Tensor | None
     fps: float
@@ -91,11 +100,10 @@ class CachedLatents:
         where = {(time, position): row for row, (time, position) in enumerate(tensors["pairs"].tolist())}
         r = torch.tensor([where[time, plan.position(path, i)] for i, time in enumerate(times.tolist())])
         copies = torch.zeros_like(n) if draws is None else draws.below(self.index.identity.copies, len(n))
-        rows = LatentRows(
+        rows = CachedRows(
             source=tensors["source"][n, copies].float(),
             target=self._target(tensors, r, draws),
             half=tensors["half"][n] if "half" in tensors else torch.zeros(len(n), 3, 0, 0, dtype=torch.uint8),
-            classes=None,
             frame_numbers=torch.arange(len(n)),
         )
         tokens = tensors["tokens"][n].float() if "tokens" in tensors else None

@@ -19,6 +19,7 @@ from gcd_train.scenes.renderer import Rendering
 
 _PALETTE = encodings.instance_palette()
 _IDS = 256
+_WEBP_QUALITY = 85
 
 
 class Kubric4DWriter:
@@ -45,7 +46,7 @@ class Kubric4DWriter:
         self._tracks[view].add(time, ids)
         self._write(view, "segmentation", time, encodings.indexed_png(ids, _PALETTE))
         if self._compact:
-            self._write(view, "rgba", time, encodings.webp(drawn.rgb))
+            self._write(view, "rgba", time, encodings.webp(drawn.rgb, quality=_WEBP_QUALITY))
             self._write(view, "depth", time, encodings.depth_png(with_sky(drawn.depth)))
         else:
             self._write(view, "rgba", time, encodings.rgba_png(drawn.rgb))

@@ -21,7 +21,7 @@ class SceneManifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """Written last, so that a scene that has one is whole.
 
     layout: which names and encodings. world, seed, edition: what was drawn; the edition rises whenever a world draws
-    another scene for the same seed. version: of this package. compact: WebP and 16-bit depth in place of the
+    another scene for the same seed. version: of this package. compact: WebP and depth codes in place of the
     published encodings. cameras: their names, in order. hfov_deg: of every camera. world_from_vehicle: [T][4][4],
     where the vehicle is in the frame of `geometry.npz`; None where poses are told in the world itself. facts: what the
     world tells of the whole scene. files: relative path -> SHA-256, without the manifest.

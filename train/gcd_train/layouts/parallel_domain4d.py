@@ -19,6 +19,7 @@ from gcd_train.scenes.driving import OntologyItem
 from gcd_train.scenes.renderer import Rendering
 
 _VOID_ID = 255
+_WEBP_QUALITY = 80
 
 
 class ParallelDomain4DWriter:
@@ -46,8 +47,12 @@ class ParallelDomain4DWriter:
         """Write colour, depth, classes and instances of one view."""
         depth = with_sky(drawn.depth)
         id_png = encodings.packed_id_png if self._compact else encodings.id_png
-        self._write(camera, "rgb", time, (encodings.webp if self._compact else encodings.rgb_png)(drawn.rgb))
-        self._write(camera, "depth", time, (encodings.depth_png if self._compact else encodings.float_npz)(depth))
+        if self._compact:
+            self._write(camera, "rgb", time, encodings.webp(drawn.rgb, quality=_WEBP_QUALITY))
+            self._write(camera, "depth", time, encodings.street_depth_png(depth))
+        else:
+            self._write(camera, "rgb", time, encodings.rgb_png(drawn.rgb))
+            self._write(camera, "depth", time, encodings.float_npz(depth))
         self._write(camera, "semantic_segmentation_2d", time, id_png(self._class_ids[drawn.classes]))
         self._write(camera, "instance_segmentation_2d", time, id_png(drawn.instances))
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gcd_train.errors import DataError
 from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
-from gcd_train.layouts.depth_code import decode_depth
+from gcd_train.layouts.depth_code import stored_depth
 from gcd_train.layouts.manifest import MANIFEST, SceneManifest, read_manifest
 
 Picture = NDArray[np.uint8]
@@ -92,7 +92,10 @@ def _metres(path: Path) -> NDArray[np.float32]:
         with np.load(path) as kept:
             return np.asarray(kept[parallel_domain4d_names.DEPTH_KEY], np.float32)
     stored = _read(path, cv2.IMREAD_UNCHANGED)
-    return decode_depth(np.asarray(stored, np.uint16)) if path.suffix == ".png" else np.asarray(stored, np.float32)
+    metres = stored_depth(stored) if path.suffix == ".png" else np.asarray(stored, np.float32)
+    if metres is None:
+        raise DataError(f"{path} holds no depth codes, but {stored.dtype} {list(stored.shape)}; remove the scene")
+    return metres
 
 
 def _classes(path: Path, scene: Path) -> Picture:

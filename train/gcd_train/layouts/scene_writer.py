@@ -26,7 +26,7 @@ _FREE_TO_DIFFER = {"version", "files", "world_from_vehicle", "hfov_deg", "camera
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SceneFormat:
-    """How scenes are drawn and stored. oversample: see `Renderer`. compact: WebP and 16-bit depth."""
+    """How scenes are drawn and stored. oversample: see `Renderer`. compact: WebP and depth codes."""
 
     width: int
     height: int

@@ -43,6 +43,7 @@ class LeRobotOptions:
     cameras: features to choose from, by default all that are calibrated; source and target are drawn from them.
     calibration: a file in place of the set's meta/cameras.json. repeats: the set counts as so many times its episodes.
     motion: the number that tells the network how far the camera goes.
+    episodes: which of the set's, from the first number up to the second, as in a slice: (-10, None) are the last ten.
     """
 
     frames: int = 14
@@ -53,6 +54,7 @@ class LeRobotOptions:
     calibration: Path | None = None
     repeats: int = 400
     motion: int = 127
+    episodes: tuple[int, int | None] = (0, None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +78,11 @@ class LeRobotPairs:
         load_av()
         self.options = options or LeRobotOptions()
         self.folder, self.seed, self.skips = LeRobotFolder.open(folder), seed, Skips()
+        self.episodes = tuple(self.folder.episodes)[slice(*self.options.episodes)]
+        if not self.episodes:
+            raise DataError(
+                f"{folder} has {len(self.folder.episodes)} episodes, none of them in {self.options.episodes}"
+            )
         self._calibrations = read_cameras(folder, self.options.calibration)
         self.cameras = self._chosen_cameras()
         info = self.folder.info
@@ -85,7 +92,7 @@ class LeRobotPairs:
         self._tolerance_s = self.options.tolerance_s or 0.5 / info.fps + _SLACK_S
 
     def __len__(self) -> int:
-        return self.options.repeats * len(self.folder.episodes)
+        return self.options.repeats * len(self.episodes)
 
     def __getitem__(self, index: int) -> PairSample:
         """As `sample`, for a loader. Raises IndexError beyond the end."""
@@ -100,7 +107,7 @@ class LeRobotPairs:
         """
         skipped: list[Skipped] = []
         for number in self._numbers(index):
-            episode = self.folder.episodes[number % len(self.folder.episodes)]
+            episode = self.episodes[number % len(self.episodes)]
             try:
                 return self._pair(episode, generator(self.seed, number), tuple(skipped))
             except FileFault as fault:

@@ -1,11 +1,13 @@
 """How weights are updated and averaged."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias
 
 import msgspec
 from msgspec import Meta
 
 from gcd_train.recipe.values import NotNegative, Positive, Share
+
+OptimiserKind: TypeAlias = Literal["adam", "adamw", "adam8bit", "adamw8bit"]
 
 
 class OptimiserRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -13,9 +15,11 @@ class OptimiserRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
     warm_up: updates from 0 to `rate`. flat: share of the budget at `rate`; then down to `final` times the rate.
     clip: largest norm of the whole gradient, left out for none.
+    kind: "adam8bit" and "adamw8bit" keep their moments in 8 bits (torchao). Adam adds the weight decay to the gradient,
+    AdamW takes it off the weights; published is Adam with none.
     """
 
-    kind: Literal["adam", "adamw"] = "adamw"
+    kind: OptimiserKind = "adamw"
     rate: Positive
     betas: tuple[Share, Share] = (0.9, 0.999)
     weight_decay: NotNegative = 0.0

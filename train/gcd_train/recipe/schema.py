@@ -6,6 +6,8 @@ import msgspec
 from msgspec import Meta
 
 from gcd_train.recipe.compute import ComputeRecipe, LogRecipe
+from gcd_train.recipe.data import DataRecipe
+from gcd_train.recipe.export import ExportRecipe
 from gcd_train.recipe.model import ModelRecipe
 from gcd_train.recipe.small_stages import DecoderRecipe, LatentsRecipe, VAERecipe
 from gcd_train.recipe.unet import UNetRecipe
@@ -20,6 +22,7 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     name: Annotated[str, Meta(pattern="^[a-z0-9][a-z0-9-]{0,40}$")]
     seed: int = 0
+    data: DataRecipe = DataRecipe()
     model: ModelRecipe = ModelRecipe()
     compute: ComputeRecipe = ComputeRecipe()
     log: LogRecipe = LogRecipe()
@@ -27,6 +30,7 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     latents: LatentsRecipe | None = None
     unet: UNetRecipe
     decoder: DecoderRecipe | None = None
+    export: ExportRecipe = ExportRecipe()
 
     def __post_init__(self) -> None:
         if self.unet.source == "latents" and self.latents is None:
@@ -39,6 +43,8 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             raise ValueError("[decoder] works on encoded clips and needs a [latents] table")
         if self.vae is None and self.model.weights is None:
             raise ValueError("a random autoencoder teaches nothing: give a [vae] table, or model.weights to start from")
+        if (self.data.kind == "cache") != (self.unet.source == "cache"):
+            raise ValueError('a latent cache is read with both data.kind "cache" and unet.source "cache"')
 
     @property
     def stages(self) -> tuple[StageName, ...]:

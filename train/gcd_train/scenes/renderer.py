@@ -4,7 +4,6 @@ The shadow map of a time step is drawn once and shared by its cameras. A scene i
 one call per way of painting (`shaders`), which is a handful. Works on software OpenGL (Mesa's llvmpipe) as on a GPU.
 """
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -17,9 +16,11 @@ from numpy.typing import NDArray
 
 from gcd_train.errors import RenderError
 from gcd_train.scenes.compile import VERTEX, Run, indexed, runs_of
+from gcd_train.scenes.culling import Groups, grouped
 from gcd_train.scenes.description import Extent, Floats, Light, Scene
 from gcd_train.scenes.frozen import FrozenScene, freeze
-from gcd_train.scenes.shaders import SHADOW_FRAGMENT, SHADOW_VERTEX, fragment
+from gcd_train.scenes.projections import clip_from_camera, sunlight_from_world
+from gcd_train.scenes.shaders import SHADELESS, SHADOW_FRAGMENT, SHADOW_VERTEX, fragment
 from gcd_train.scenes.shaders import VERTEX as VERTEX_SHADER
 
 _FIELDS = {"position": "3f4", "normal": "3f4", "colour": "4f1", "accent": "4f1", "tags": "4u1"}
@@ -62,11 +63,16 @@ class Rendering:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Uploaded:
-    """A scene in the context's memory: its triangles as each way of painting reads them, and as the shadow map does."""
+    """A scene in the context's memory: its triangles as each way of painting reads them, and as the shadow map does.
+
+    groups: which of them stand together. casting: bool [G], those that may cast a shadow.
+    """
 
     buffers: tuple[Any, Any]
+    groups: Groups
     runs: tuple[tuple[Run, Any], ...]
     shadow: Any
+    casting: NDArray[np.bool_]
 
     def release(self) -> None:
         for resource in (*(array for _, array in self.runs), self.shadow, *self.buffers):
@@ -120,24 +126,29 @@ class Renderer:
             self._set_scene(scene.light, scene.extent)
         try:
             for step in range(scene.frames):
+                places = drawn.groups.placed(scene.poses[step])
                 with self._context:
                     self._move(scene.poses[step])
-                    self._cast(scene, step, drawn.shadow)
+                    self._cast(scene, step, drawn, places)
                 for name, poses in cameras.items():
                     with self._context:
-                        view = self._view(poses[step], scene, drawn.runs)
+                        view = self._view(poses[step], scene, drawn, places)
                     yield step, name, view
         finally:
             with self._context:
                 drawn.release()
 
     def _uploaded(self, scene: FrozenScene) -> "_Uploaded":
-        corners, indices = indexed(scene.vertices)
+        runs = runs_of(scene.vertices)
+        vertices, groups = grouped(scene.vertices, runs)
+        corners, indices = indexed(vertices)
         buffer, index = self._context.buffer(corners.tobytes()), self._context.buffer(indices.tobytes())
         return _Uploaded(
             buffers=(buffer, index),
-            runs=tuple((run, self._array(buffer, index, run)) for run in runs_of(scene.vertices)),
+            groups=groups,
+            runs=tuple((run, self._array(buffer, index, run)) for run in runs),
             shadow=self._context.vertex_array(self._shadow_program, [_taking(buffer, "position", "tags")], index),
+            casting=~np.isin(vertices["tags"][groups.ends[:-1], 3], SHADELESS),
         )
 
     def _array(self, buffer: Any, index: Any, run: Run) -> Any:
@@ -171,31 +182,36 @@ class Renderer:
         self._bodies.write(rows.tobytes())
         self._bodies.use(0)
 
-    def _cast(self, scene: FrozenScene, step: int, array: Any) -> None:
+    def _cast(self, scene: FrozenScene, step: int, drawn: _Uploaded, places: NDArray[np.float64]) -> None:
         sun_to, focus = np.asarray(scene.light.sun_to), scene.focus[step].astype(np.float64)
-        light_from_world = _sun_matrix(sun_to, focus, scene.extent)
+        light_from_world = sunlight_from_world(sun_to, focus, scene.extent)
         self._shadow_target.use()
         self._context.enable_only(self._context.DEPTH_TEST)
         self._shadow_target.clear(depth=1.0)
         _set(self._shadow_program, clip_from_world=light_from_world, bodies=0)
-        array.render()
+        shown = drawn.groups.within(light_from_world, places) & drawn.casting
+        for first, count in drawn.groups.stretches(shown, 0, int(drawn.groups.ends[-1])):
+            drawn.shadow.render(vertices=count, first=first)
         self._frame["light_from_world"] = light_from_world.T.ravel()
 
     def _view(
-        self, world_from_camera: NDArray[np.float64], scene: FrozenScene, runs: tuple[tuple[Run, Any], ...]
+        self, world_from_camera: NDArray[np.float64], scene: FrozenScene, drawn: _Uploaded, places: NDArray[np.float64]
     ) -> Rendering:
         self._target.use()
         self._context.enable_only(self._context.DEPTH_TEST | self._context.CULL_FACE)
         self._target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
         self._shadow.use(1)
-        lens = _clip_from_camera(scene.hfov_deg, self._width / self._height, scene.extent)
-        self._frame["clip_from_world"] = (lens @ np.linalg.inv(world_from_camera)).T.ravel()
+        lens = clip_from_camera(scene.hfov_deg, self._width / self._height, scene.extent)
+        clip_from_world = lens @ np.linalg.inv(world_from_camera)
+        self._frame["clip_from_world"] = clip_from_world.T.ravel()
         self._frame["eye"][:3] = world_from_camera[:3, 3]
         self._frame["ahead"][:3] = world_from_camera[:3, 2]
         self._frame_block.write(self._frame.tobytes())
         self._frame_block.bind_to_uniform_block(0)
-        for run, array in runs:
-            array.render(vertices=run.count, first=run.first)
+        shown = drawn.groups.within(clip_from_world, places)
+        for run, array in drawn.runs:
+            for first, count in drawn.groups.stretches(shown, run.first, run.count):
+                array.render(vertices=count, first=first)
         return self._read()
 
     def _read(self) -> Rendering:
@@ -268,33 +284,3 @@ def _set(program: Any, **uniforms: Any) -> None:
             continue
         array = np.asarray(value)
         program[name].value = value if array.ndim == 0 else tuple(array.astype(float).T.flatten().tolist())
-
-
-def _clip_from_camera(hfov_deg: float, aspect: float, extent: Extent) -> NDArray[np.float64]:
-    """From camera axes (x right, y down, z ahead) to OpenGL's clip space."""
-    near, far = extent.near_m, extent.far_m
-    focal = 1 / math.tan(math.radians(hfov_deg) / 2)
-    matrix = np.zeros((4, 4))
-    matrix[0, 0], matrix[1, 1] = focal, -focal * aspect
-    matrix[2, 2] = (far + near) / (far - near)
-    matrix[2, 3] = -2 * far * near / (far - near)
-    matrix[3, 2] = 1
-    return matrix
-
-
-def _sun_matrix(sun_to: NDArray[np.float64], focus: NDArray[np.float64], extent: Extent) -> NDArray[np.float64]:
-    """Orthographic view along the sunlight around `focus`, snapped to whole shadow pixels against flicker."""
-    aside = [0.0, 0.0, 1.0] if abs(sun_to[2]) < 0.99 else [1.0, 0.0, 0.0]  # any axis that is not the sun's
-    right = np.cross(aside, sun_to)
-    right /= np.linalg.norm(right)
-    up = np.cross(sun_to, right)
-    turn = np.stack([right, up, sun_to])
-    radius = extent.shadow_radius_m
-    pixel = 2 * radius / extent.shadow_pixels
-    centre = np.round(turn @ focus / pixel) * pixel
-    matrix = np.eye(4)
-    matrix[:2, :3] = turn[:2] / radius
-    matrix[:2, 3] = -centre[:2] / radius
-    matrix[2, :3] = -turn[2] / extent.shadow_depth_m
-    matrix[2, 3] = centre[2] / extent.shadow_depth_m
-    return matrix

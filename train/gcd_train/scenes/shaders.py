@@ -19,7 +19,9 @@ vec3 placed(vec4 point, uint body) {
 }
 """
 
-_SHADELESS = " || ".join(f"tags.w == {int(pattern)}u" for pattern in (Pattern.SKY, *DOMES))
+SHADELESS = (Pattern.SKY, *DOMES)
+"""What casts no shadow."""
+_NO_SHADOW = " || ".join(f"tags.w == {int(pattern)}u" for pattern in SHADELESS)
 
 SHADOW_VERTEX = (
     _VERTEX_IN
@@ -30,7 +32,7 @@ void main() {
     gl_Position = clip_from_world * vec4(placed(vec4(position, 1.0), tags.z), 1.0);
     if (NO_SHADOW) gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // the sky casts no shadow
 }
-""".replace("NO_SHADOW", _SHADELESS)
+""".replace("NO_SHADOW", _NO_SHADOW)
 )
 SHADOW_FRAGMENT = """
 #version 330

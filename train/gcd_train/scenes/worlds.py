@@ -1,4 +1,4 @@
-"""The worlds there are, by name: for pairs of clips, and for whole scenes in the published layouts."""
+"""The worlds there are, by name, as whole scenes in the published layouts."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,8 +13,9 @@ from gcd_model.geometry import CameraMount
 from gcd_train.errors import RecipeError
 from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
 from gcd_train.scenes.description import Scene
-from gcd_train.scenes.driving import ONTOLOGY, OntologyItem, driving_drive, driving_scene, vehicle_from_camera
+from gcd_train.scenes.driving import ONTOLOGY, OntologyItem, driving_drive, vehicle_from_camera
 
+_TABLETOP = "tabletop-"
 Layout = Literal["kubric4d", "parallel_domain4d"]
 
 
@@ -23,15 +24,6 @@ class WorldOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
     height_m: float = CameraMount().height_m
     tilt_deg: float = CameraMount().tilt_deg
-
-
-def _driving(seed: int, frames: int, options: WorldOptions) -> Scene:
-    mount = CameraMount(height_m=options.height_m, tilt_deg=options.tilt_deg)
-    return driving_scene(seed, frames=frames, mount=mount)
-
-
-WORLDS: dict[str, Callable[[int, int, WorldOptions], Scene]] = {"driving": _driving}
-"""Worlds of pairs: a source and a target camera."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -104,7 +96,7 @@ def tabletop_world(arm: str = "primitive") -> SceneWorld:
         raise RecipeError(f"there is no arm {arm!r}; choose one of {', '.join(ARMS)}")
     if arm == "panda":
         panda_arm()
-    name = "tabletop" if arm == "primitive" else f"tabletop-{arm}"
+    name = "tabletop" if arm == "primitive" else f"{_TABLETOP}{arm}"
     return _on_a_stage(name, partial(_tabletop, arm), edition=1)
 
 
@@ -125,3 +117,17 @@ SCENE_WORLDS: dict[str, SceneWorld] = {
     ),
 }
 """Worlds of whole scenes."""
+
+
+def scene_world(name: str) -> SceneWorld:
+    """A world by its name, `tabletop-panda` too.
+
+    Raises:
+        RecipeError: no such world.
+        RenderError: see `tabletop_world`.
+    """
+    if name in SCENE_WORLDS:
+        return SCENE_WORLDS[name]
+    if name.startswith(_TABLETOP):
+        return tabletop_world(name.removeprefix(_TABLETOP))
+    raise RecipeError(f"there is no world {name!r}; choose one of {', '.join(SCENE_WORLDS)}")

@@ -2,7 +2,7 @@
 
 A data folder holds `world.json` (what it is) and `shard-<first seed>.zip` files. In a shard every clip has
 `<seed>/scene.json` and one PNG per camera and kind, all frames one below the other: colour as RGB, depth as 16 bit in
-1/256 metre (0: sky), classes and instances as 8 bit.
+1/256 metre (0: sky), instances and, where the world has an ontology, classes as 8 bit.
 """
 
 import json
@@ -20,35 +20,14 @@ import cv2
 import msgspec
 import numpy as np
 
-from gcd_model.config import DRIVING_CLASSES, SemanticClass
 from gcd_train.errors import DataError
 from gcd_train.map_items import map_items, one_thread_each
-from gcd_train.scenes.description import Scene
+from gcd_train.scenes.pair_scenes import DrawnClip, drawn_clips
+from gcd_train.scenes.pair_world import DEPTH_UNIT_M, World, agree
 from gcd_train.scenes.renderer import Renderer, Rendering
-from gcd_train.scenes.worlds import WORLDS, WorldOptions
 
-DEPTH_UNIT_M = 1 / 256
 _ABANDONED_S = 3600.0  # no shard takes so long
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
-
-
-class World(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a data folder says about itself; all its shards were made alike.
-
-    format: of this layout. oversample: see Renderer. options: what the generator was told.
-    """
-
-    name: str
-    width: int
-    height: int
-    frames: int
-    fps: float
-    hfov_deg: float
-    oversample: int
-    clips_per_shard: int
-    options: WorldOptions = WorldOptions()
-    classes: tuple[SemanticClass, ...] = DRIVING_CLASSES
-    format: int = 1
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -67,7 +46,7 @@ def generate(out: Path, world: World, seeds: range, workers: int, ray_address: s
         RenderError: nothing can be drawn on this machine. RunError: anything else that ends a shard.
     """
     out.mkdir(parents=True, exist_ok=True)
-    _agree(out, world)
+    agree(out, world)
     missing = _missing_shards(out, seeds, world.clips_per_shard)
     done = len(seeds) - sum(map(len, missing))
     yield Progress(done=done, total=len(seeds))
@@ -123,56 +102,36 @@ def write_shard(out: Path, world: World, seeds: range) -> None:
             Renderer(world.width, world.height, oversample=world.oversample) as renderer,
             zipfile.ZipFile(partial, "w", zipfile.ZIP_STORED) as archive,
         ):
-            for seed in seeds:
-                scene = WORLDS[world.name](seed, world.frames, world.options)
-                _store(archive, f"{seed:08d}", scene, renderer.render(scene))
+            for clip in drawn_clips(renderer, world, seeds):
+                _store(archive, clip)
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
 
 
-def _agree(out: Path, world: World) -> None:
-    """Write `world.json`, or make sure that the one that is there says the same."""
-    path = out / "world.json"
-    if not path.exists():
-        partial = path.with_suffix(".partial")
-        partial.write_bytes(msgspec.json.format(msgspec.json.encode(world)))
-        partial.replace(path)
-    elif read_world(out) != world:
-        raise DataError(f"{out} holds clips of another world or size (see its world.json); choose another folder")
-
-
-def read_world(folder: Path) -> World:
-    """What a data folder says about itself. Raises DataError."""
-    path = folder / "world.json"
-    if not path.is_file():
-        raise DataError(
-            f"{folder} is no data folder: it has no world.json; make one with `gcd-train generate driving --pairs`"
-        )
-    try:
-        return msgspec.json.decode(path.read_bytes(), type=World)
-    except msgspec.MsgspecError as error:
-        raise DataError(f"{path} cannot be read: {error}; make the folder anew with this version") from error
-
-
-def _store(archive: zipfile.ZipFile, name: str, scene: Scene, views: dict[str, list[Rendering]]) -> None:
-    facts = {**scene.facts, "hfov_deg": scene.hfov_deg}
-    poses = {camera: np.round(poses, 6).tolist() for camera, poses in scene.cameras.items()}
-    archive.writestr(f"{name}/scene.json", json.dumps({"facts": facts, "world_from_camera": poses}))
-    for camera, frames in views.items():
-        for kind, strip in _strips(frames).items():
+def _store(archive: zipfile.ZipFile, clip: DrawnClip) -> None:
+    name = f"{clip.seed:08d}"
+    poses = {camera: np.round(poses, 6).tolist() for camera, poses in clip.cameras.items()}
+    told: dict[str, Any] = {"facts": {**clip.facts, "hfov_deg": clip.hfov_deg}, "world_from_camera": poses}
+    if clip.orbit is not None:
+        told["orbit"] = msgspec.to_builtins(clip.orbit)
+    archive.writestr(f"{name}/scene.json", json.dumps(told))
+    for camera, frames in clip.views.items():
+        for kind, strip in _strips(frames, classes=clip.orbit is None).items():
             encoded, data = cv2.imencode(".png", strip, _PNG)
             if not encoded:
                 raise DataError(f"clip {name}: OpenCV could not write {camera}.{kind} as PNG")
             archive.writestr(f"{name}/{camera}.{kind}.png", data.tobytes())
 
 
-def _strips(frames: list[Rendering]) -> dict[str, Any]:
+def _strips(frames: list[Rendering], *, classes: bool) -> dict[str, Any]:
     """Every kind of picture, all frames one below the other, as OpenCV wants them."""
     depth = np.concatenate([frame.depth for frame in frames])
-    return {
+    strips: dict[str, Any] = {
         "rgb": np.concatenate([frame.rgb for frame in frames])[..., ::-1],
         "depth": np.rint(depth / DEPTH_UNIT_M).clip(0, 65535).astype(np.uint16),
-        "classes": np.concatenate([frame.classes for frame in frames]),
         "instances": np.concatenate([frame.instances for frame in frames]),
     }
+    if classes:
+        strips["classes"] = np.concatenate([frame.classes for frame in frames])
+    return strips

@@ -1,18 +1,19 @@
-"""A clip of pair shards (`gcd-train generate driving --pairs`), ready to look at."""
+"""A clip of pair shards (`gcd-train generate WORLD --pairs`), ready to look at."""
 
 import json
 import zipfile
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_model.geometry import DRIVING_GOAL_TARGET, Intrinsics
-from gcd_train.datasets.paired import PairedClips
+from gcd_model.geometry import DRIVING_GOAL_TARGET, LOOK_AT, Intrinsics
+from gcd_train.datasets.paired import PairedClip, PairedClips
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.pointcloud import depth_visibility, splat
 from gcd_train.scene_view import SceneView
-from gcd_train.show.colours import SKY_M
+from gcd_train.show.colours import SKY_M, instance_colour
 from gcd_train.show.footage import Footage, LabelName
 
 
@@ -31,15 +32,15 @@ def pair_clip(folder: Path, seed: int | None) -> Footage:
         for rgb, depth, pose in zip(clip.source, clip.source_depth, poses["source"], strict=True)
     ]
     targets = list(zip(views, clip.target_depth, poses["target"], strict=True))
-    vehicle_from_source = clips.mount.vehicle_from_camera.numpy()
+    setting = _setting(clips, index, poses)
     return Footage(
-        title=f"pair shard, {clips.world.name} world, seed {clip.seed}",
+        title=f"pair shard, {clips.world.name} world{_scale(clips)}, seed {clip.seed}",
         layout=str(clips.places[index][0]),
-        path="the driving path, up and back\nat a sine pace",
-        frame_numbers=tuple(range(clips.frames)),
+        path=setting.path,
+        frame_numbers=setting.frame_numbers,
         fps=clips.fps,
-        scene_frames=clips.frames,
-        scene_fps=clips.fps,
+        scene_frames=setting.scene_frames,
+        scene_fps=clips.fps * clips.world.stride,
         cameras=tuple(poses),
         source_camera="source",
         hfov_deg=lens.hfov_deg,
@@ -52,15 +53,66 @@ def pair_clip(folder: Path, seed: int | None) -> Footage:
         visible=np.stack([depth_visibility(view, depth, pose, lens) for view, depth, pose in targets]),
         visible_is="depths agree within 2 %",
         surface=(clip.target_depth > 0) & (clip.target_depth < SKY_M),
-        labels=clip.source_classes.astype(np.int32),
-        kind="class",
-        names=tuple(LabelName(id=i, name=kind.name, colour=kind.colour) for i, kind in enumerate(clips.classes)),
+        labels=(clip.source_classes if clips.classes else clip.source_instances).astype(np.int32),
+        kind="class" if clips.classes else "instance",
+        names=_names(clips, clip),
         depth=clip.source_depth,
-        world_from_source=np.repeat(vehicle_from_source[None], clips.frames, axis=0),
-        world_from_target=vehicle_from_source @ np.linalg.inv(poses["source"]) @ poses["target"],
-        look_at=DRIVING_GOAL_TARGET,
-        world="vehicle: x ahead, y left, z up, ground at z = 0",
+        world_from_source=setting.world_from_source,
+        world_from_target=setting.world_from_target,
+        look_at=setting.look_at,
+        world=setting.axes,
     )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Setting:
+    """What differs between a drive and an orbit; the fields are those of `Footage`."""
+
+    path: str
+    frame_numbers: tuple[int, ...]
+    scene_frames: int
+    world_from_source: NDArray[np.float64]
+    world_from_target: NDArray[np.float64]
+    look_at: tuple[float, float, float]
+    axes: str
+
+
+def _setting(clips: PairedClips, index: int, poses: dict[str, NDArray[np.float64]]) -> _Setting:
+    if clips.mount is not None:
+        vehicle_from_source = clips.mount.vehicle_from_camera.numpy()
+        return _Setting(
+            path="the driving path, up and back\nat a sine pace",
+            frame_numbers=tuple(range(clips.frames)),
+            scene_frames=clips.frames,
+            world_from_source=np.repeat(vehicle_from_source[None], clips.frames, axis=0),
+            world_from_target=vehicle_from_source @ np.linalg.inv(poses["source"]) @ poses["target"],
+            look_at=DRIVING_GOAL_TARGET,
+            axes="vehicle: x ahead, y left, z up, ground at z = 0",
+        )
+    orbit = clips.orbit(index)
+    azimuth_deg, elevation_deg, radius_m = orbit.change
+    return _Setting(
+        path=f"{azimuth_deg:+.1f}\N{DEGREE SIGN} azimuth, {elevation_deg:+.1f}\N{DEGREE SIGN} elevation,\n"
+        f"{radius_m:+.1f} m radius, gradual",
+        frame_numbers=orbit.frame_numbers,
+        scene_frames=orbit.frame_numbers[-1] + 1,
+        world_from_source=poses["source"],
+        world_from_target=poses["target"],
+        look_at=LOOK_AT,
+        axes="world: z up, ground at z = 0",
+    )
+
+
+def _scale(clips: PairedClips) -> str:
+    return " (1 m here is 1 dm)" if clips.world.name.startswith("tabletop") else ""
+
+
+def _names(clips: PairedClips, clip: PairedClip) -> tuple[LabelName, ...]:
+    if clips.classes:
+        return tuple(LabelName(id=i, name=kind.name, colour=kind.colour) for i, kind in enumerate(clips.classes))
+    numbers = np.unique(clip.source_instances).tolist()
+    told = {0: "background"}
+    return tuple(LabelName(id=i, name=told.get(i, f"instance {i}"), colour=instance_colour(i)) for i in numbers)
 
 
 def _told(shard: Path, name: str) -> tuple[dict[str, NDArray[np.float64]], float]:

@@ -12,17 +12,16 @@ from gcd_model.denoiser import Denoiser, start_noise
 from gcd_model.networks import Networks
 from gcd_model.noise import edm_sigmas, guidance_scale
 from gcd_model.plane_mix import PlaneMix
-from gcd_model.plane_warp import PathWarps
 from gcd_model.sampler import euler
 from gcd_model.vae import TemporalDecoder
 from gcd_train.batches import EncodedBatches
+from gcd_train.clip_warps import ClipWarps
 from gcd_train.datasets.clip_source import ClipSource, to_network
 from gcd_train.datasets.latents import LatentClips, LatentRows
 from gcd_train.datasets.predictions import Predicted, Predictions
 from gcd_train.draws import Draws
 from gcd_train.errors import RecipeError
 from gcd_train.loop import Progress, StepLoss
-from gcd_train.model_setup import path_warps
 from gcd_train.objective import class_map_loss
 from gcd_train.picture_losses import gradient_l1, ssim
 from gcd_train.precision import Precision
@@ -65,8 +64,14 @@ class Predictor:
         config, frames = networks.config, networks.config.frames
         clip, numbers = torch.full((frames,), number), torch.arange(frames)
         rows: LatentRows = self._latents.rows(clip, numbers, torch.zeros(frames, dtype=torch.bool), device)
-        vector = self._batches.vector(frames)
-        given = Conditioning(vector=vector, camera=None, tokens=None, latents=self._batches.condition(rows), branches=1)
+        steered = None if networks.camera is None or rows.control is None else networks.camera.proj(rows.control)
+        given = Conditioning(
+            vector=self._batches.vector(rows),
+            camera=steered,
+            tokens=None,
+            latents=self._batches.condition(rows),
+            branches=1,
+        )
         sigmas = edm_sigmas(config.sampling, config.sampling.steps)
         guidance = guidance_scale(1.0, 1.0, frames).to(device)
         denoiser = Denoiser(networks.unet, networks.class_head, given, sigmas, guidance, config.prediction)
@@ -91,14 +96,13 @@ class DecoderTask:
         seed: int,
     ) -> None:
         """Raises RecipeError for a model without plane mix."""
-        warps = path_warps(networks.config, precision.device)
-        if networks.plane_mix is None or warps is None:
+        if networks.plane_mix is None:
             raise RecipeError("the decoder stage trains the plane mix, which this model has not; leave [decoder] out")
         self._networks, self._data, self._validation = networks, data, validation
         self._recipe, self._precision, self._seed = recipe, precision, seed
-        self._warps: PathWarps = warps
+        self._warps = ClipWarps(data.clips, networks.config, precision.device)
         decoder = networks.decoder if recipe.finetune_vae else None
-        self._maker = precision.placed(PictureMaker(networks.plane_mix, decoder))
+        self._maker = precision.placed(PictureMaker(networks.plane_mix, decoder)).requires_grad_(True)
 
     @property
     def module(self) -> nn.Module:
@@ -119,7 +123,7 @@ class DecoderTask:
         clips, frames = self._drawn(draws)
         predicted = self._data.predictions.rows(clips, frames, self._precision.device)
         source, target = self._pictures(clips, frames)
-        warped, valid = self._warps.layers(source, frames.to(source.device))
+        warped, valid = self._layers(source, clips, frames)
         # in float32 throughout, as it is shipped: sums of pictures show the rounding of bfloat16
         picture, logits = self._maker.plane_mix(
             self._decoded(predicted), warped, valid, predicted.latents, predicted.logits
@@ -153,6 +157,17 @@ class DecoderTask:
             for side in (0, 1)
         )
         return source.to(self._precision.device), target.to(self._precision.device)
+
+    def _layers(self, source: Tensor, clips: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
+        """Full-size warps [batch, L, 3, H, W] of source frames along each clip's own path, and where they are valid."""
+        run, numbers = self._recipe.run, self._numbers(clips)
+        made = [
+            self._warps.of(numbers[first], frames[first : first + run].tolist()).layers(
+                source[first : first + run], frames[first : first + run].to(source.device)
+            )
+            for first in range(0, len(numbers), run)
+        ]
+        return torch.cat([warped for warped, _ in made]), torch.cat([valid for _, valid in made])
 
     def _classes(self, clips: Tensor, frames: Tensor) -> Tensor | None:
         plain = torch.zeros_like(frames, dtype=torch.bool)

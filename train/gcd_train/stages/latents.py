@@ -4,7 +4,7 @@ import json
 import logging
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,14 +12,18 @@ from typing import Any
 import msgspec
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
+from gcd_model.config import CAMERA_FEATURES
+from gcd_model.geometry import Trajectory
 from gcd_model.networks import Networks
+from gcd_train.clip_warps import ClipWarps
+from gcd_train.conditioner import Conditioner, mirrored_path
 from gcd_train.datasets.clip_source import ClipSource, numbers_of, to_network
-from gcd_train.datasets.latents import LatentsMeta
+from gcd_train.datasets.latents import LatentsMeta, picture_bytes
 from gcd_train.draws import Draws
 from gcd_train.errors import DataError, Interrupted, RunError
+from gcd_train.losses import ClassWeight, class_emphasis
 from gcd_train.metrics import majority_classes
 from gcd_train.precision import Precision
 from gcd_train.recipe import LatentsRecipe
@@ -33,12 +37,18 @@ _SENSITIVITY_CLIPS, _NUDGE = 8, 0.25
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class LatentsJob:
-    """What the stage works with. networks: of which the autoencoder counts. identity: names it and the options."""
+    """What the stage works with.
+
+    networks: of which the autoencoder counts. conditioner: tells the U-Net of camera paths. class_weights: of painted
+    targets, none for others. identity: names autoencoder and options.
+    """
 
     folder: Path
     networks: Networks
     clips: ClipSource
     recipe: LatentsRecipe
+    conditioner: Conditioner
+    class_weights: Sequence[ClassWeight]
     precision: Precision
     seed: int
     identity: str
@@ -57,9 +67,10 @@ def encode_clips(job: LatentsJob) -> None:
     job.precision.placed(job.networks.target_encoder)
     meta, arrays, done = _begin(job)
     places = numbers_of(job.clips, meta.seeds)
+    warps = ClipWarps(job.clips, job.networks.config, job.precision.device)
     logged = started = time.perf_counter()
     for number in range(done, meta.clips):
-        for name, rows in _encoded(job, meta, places[number]).items():
+        for name, rows in _encoded(job, meta, warps, places[number]).items():
             arrays[name][number] = rows
         now = time.perf_counter()
         if now - logged > _LOG_S:
@@ -144,12 +155,15 @@ def _description(job: LatentsJob) -> LatentsMeta:
         width=width // down,
         picture_height=height,
         picture_width=width,
+        distant=0 if config.plane_warp is None else config.plane_warp.distant,
+        control=CAMERA_FEATURES[config.camera],
         class_upscale=0 if config.class_head is None else config.class_head.upscale,
+        emphasis=bool(job.class_weights),
     )
 
 
 @torch.no_grad()
-def _encoded(job: LatentsJob, meta: LatentsMeta, number: int) -> dict[str, np.ndarray[Any, Any]]:
+def _encoded(job: LatentsJob, meta: LatentsMeta, warps: ClipWarps, number: int) -> dict[str, np.ndarray[Any, Any]]:
     """One clip's row of every array."""
     source, target = (job.precision.frames(to_network(side)) for side in job.clips.rgb(number))
     draws = Draws(job.seed, "latents", number, job.precision.device)
@@ -157,14 +171,25 @@ def _encoded(job: LatentsJob, meta: LatentsMeta, number: int) -> dict[str, np.nd
     rows = {
         "source": torch.stack([_condition(job, source, draws, mirrored) for mirrored in plain_and_mirrored]).half(),
         "target": torch.stack([_target(job, target, draws, mirrored) for mirrored in plain_and_mirrored]).half(),
-        "half": ((F.avg_pool2d(source, 2) + 1) * 127.5).round().to(torch.uint8),
+        **_told(job.conditioner, job.clips.trajectory(number), plain_and_mirrored),
     }
-    arrays = {name: value.cpu().numpy() for name, value in rows.items()}
+    pictures = warps.pictures(number, source)
+    if pictures is not None:
+        rows |= picture_bytes(pictures)
+    if meta.emphasis:
+        rows["emphasis"] = class_emphasis(target, job.class_weights, (meta.height, meta.width)).half()
     if meta.class_upscale:
         ids = torch.from_numpy(np.ascontiguousarray(job.clips.target_classes(number)))
-        grid, count = meta.class_grid, len(job.clips.classes)
-        arrays["classes"] = majority_classes(ids, *grid, count).numpy()
-    return arrays
+        rows["classes"] = majority_classes(ids, *meta.class_grid, len(job.clips.classes))
+    return {name: value.cpu().numpy() for name, value in rows.items()}
+
+
+def _told(conditioner: Conditioner, path: Trajectory, plain_and_mirrored: Sequence[bool]) -> dict[str, Tensor]:
+    """What the network is told of a clip's camera: motion number [] and, where it is steered, features [F, T, K]."""
+    features = [conditioner.camera(mirrored_path(path) if mirrored else path) for mirrored in plain_and_mirrored]
+    steered = [each for each in features if each is not None]
+    motion = {"motion": torch.tensor(conditioner.motion(path))}
+    return {**motion, "control": torch.stack(steered)} if steered else motion
 
 
 def _condition(job: LatentsJob, frames: Tensor, draws: Draws, mirrored: bool) -> Tensor:

@@ -13,6 +13,7 @@ from gcd_train.objective import Denoiser, Weights, diffusion_loss
 from gcd_train.precision import Precision
 from gcd_train.recipe import UNetRecipe
 from gcd_train.schedule import ParameterGroup
+from gcd_train.trained_part import keep_trained_alone
 from gcd_train.validation import Validation
 
 
@@ -33,6 +34,8 @@ class UNetTask:
         self._recipe, self._weights, self._precision, self._seed = recipe, weights, precision, seed
         precision.placed(networks)
         self._denoiser = Denoiser(networks.unet, networks.class_head, networks.config.prediction, networks.camera)
+        self._network: nn.Module = self._denoiser
+        keep_trained_alone(self._denoiser)
 
     @property
     def module(self) -> nn.Module:
@@ -44,20 +47,24 @@ class UNetTask:
         trained = [parameter for parameter in self._denoiser.parameters() if parameter.requires_grad]
         return [ParameterGroup(parameters=trained)]
 
+    def compute_through(self, network: nn.Module) -> None:
+        """See `SharedTask`."""
+        self._network = network
+
     def step_loss(self, progress: Progress) -> StepLoss:
         """The diffusion loss on single frames or on whole clips."""
         recipe = self._recipe
-        draws = Draws(self._seed, "unet", progress.updates * recipe.accumulate + progress.part, self._precision.device)
+        draws = Draws(self._seed, "unet", progress.updates * recipe.parts + progress.part, self._precision.device)
         if progress.share < recipe.image_share:
             batch = self._batches.single_frames(draws, recipe.image_batch)
         else:
             batch = self._batches.whole_clips(draws, recipe.clip_batch)
         return diffusion_loss(
-            self._denoiser,
+            self._network,
             batch,
             draws,
             self._precision,
-            noise=recipe.noise,
+            noise=recipe.noise_at(progress.share),
             loss=recipe.loss,
             weights=self._weights,
             step=progress.updates,

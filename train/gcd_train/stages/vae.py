@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gcd_model import ModelConfig
+from gcd_model.class_head import nearest_classes
 from gcd_model.layers import zeroed
 from gcd_model.networks import Networks
 from gcd_model.vae import Encoder, Posterior, TemporalDecoder
@@ -15,14 +16,14 @@ from gcd_train.datasets.clip_source import Bytes, ClipSource, KeptClips, to_netw
 from gcd_train.draws import Draws
 from gcd_train.errors import RecipeError
 from gcd_train.loop import Progress, StepLoss
-from gcd_train.metrics import psnr
+from gcd_train.metrics import confusion_matrix, mean_iou, psnr
 from gcd_train.picture_losses import gradient_l1, kl_to_normal, ssim
 from gcd_train.pictures import write_sheet
 from gcd_train.precision import Precision
 from gcd_train.recipe import VAERecipe
 from gcd_train.schedule import ParameterGroup
 
-_STATISTICS_CLIPS = 16
+_STATISTICS_CLIPS, _MEASURED_CLIPS = 16, 4
 _START_LOG_VARIANCE = -5.0
 
 
@@ -52,6 +53,7 @@ class VAETask:
         config = networks.config
         _require_shared(config)
         self._precision, self._seed, self._recipe, self._valid = precision, seed, recipe, valid
+        self._painted = config.semantic_classes
         order = Draws(seed, "vae-pool", 0, torch.device("cpu")).order(len(clips))
         self._clips = KeptClips(clips, order[: recipe.pool])
         if config.vae.linear:
@@ -89,24 +91,33 @@ class VAETask:
         return True
 
     def measure(self, picture: Path) -> dict[str, float]:
-        """PSNR of held-out targets, encoded and decoded; the latents' own spread."""
+        """PSNR of held-out targets, encoded and decoded, mean IoU of painted ones; the latents' own spread."""
         shown: list[list[Tensor]] = []
         scores: list[Tensor] = []
         means: list[Tensor] = []
-        for number in range(min(len(self._valid), 4)):
+        counts: list[Tensor] = []
+        for number in range(min(len(self._valid), _MEASURED_CLIPS)):
             frames = to_network(self._valid.rgb(number)[1]).to(self._precision.device)
             latents = self._pair.target_encoder(frames).mean
             decoded = self._pair.decoder(latents, frames.shape[0]).clamp(-1, 1)
             scores.append(psnr((decoded + 1) / 2, (frames + 1) / 2).mean())
             means.append(latents)
+            if self._painted:
+                truth = torch.from_numpy(self._valid.target_classes(number).copy())
+                counts.append(confusion_matrix(self._classes(decoded), truth, len(self._painted)))
             shown += [[decoded[0], decoded[-1]], [frames[0], frames[-1]]]
         write_sheet(picture, shown)
         spread = torch.cat(means).transpose(0, 1).flatten(1).std(1)
-        return {
+        values = {
             "psnr": float(torch.stack(scores).mean()),
             "latent_std_least": float(spread.min()),
             "latent_std_most": float(spread.max()),
         }
+        return {**values, "miou_full": mean_iou(torch.stack(counts).sum(0))} if counts else values
+
+    def _classes(self, decoded: Tensor) -> Tensor:
+        """Class ids [T, H, W] of painted frames [T, 3, H, W] in [-1, 1]."""
+        return nearest_classes(((decoded + 1) / 2).cpu(), self._painted)
 
     def _loss(self, crops: Tensor, decoded: Tensor, posterior: Posterior) -> StepLoss:
         recipe = self._recipe

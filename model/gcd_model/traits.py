@@ -1,0 +1,214 @@
+"""One loaded checkpoint as its users need to know it: its family, its own facts, and the views it can give."""
+
+import logging
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gcd_model.config import ModelConfig, SemanticClass
+from gcd_model.errors import OptionError, PoseError, ViewFixedError, ViewRangeError
+from gcd_model.families import Family
+from gcd_model.geometry import (
+    CameraMount,
+    DeltaFit,
+    Interpolation,
+    Spherical,
+    SphericalDelta,
+    Trajectory,
+    driving_trajectory,
+    fitted_trajectory,
+    motion_bucket,
+    pose_trajectory,
+    spherical_trajectory,
+)
+from gcd_model.plane_warp import orbit_mount, trained_mount
+
+_LOG = logging.getLogger(__name__)
+_TOLERATED_M, _TOLERATED_DEG = 1e-3, 0.05
+
+ASSUMED_SOURCE = Spherical(azimuth_deg=0.0, elevation_deg=5.0, radius_m=15.0)
+"""Where the source camera is taken to stand when nobody says: low, looking at the scene's centre."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Traits:
+    """One loaded checkpoint as its users need to know it.
+
+    family: None if nobody could tell; then no limits are checked.
+    move_time: frame in which the goal pose is reached; 0 for a direct checkpoint.
+    sha256_12: 12 hex digits that name the weights: of SHA-256 over the file, over samples of it above 512 MiB.
+    trained: False for random weights, whose pictures are noise.
+    """
+
+    name: str
+    config: ModelConfig
+    family: Family | None
+    move_time: int
+    sha256_12: str
+    precision: str
+    device: str
+    trained: bool = True
+
+    @property
+    def fps(self) -> float:
+        """The frame rate the network is told when nobody says another."""
+        return 12.0 if self.family is None else self.family.fps
+
+    @property
+    def rates(self) -> tuple[float, ...]:
+        """Trained frame rates; empty if any will do."""
+        return () if self.family is None else self.family.rates
+
+    @property
+    def knows_camera(self) -> bool:
+        """Whether anybody knows where the views' camera stands: not for checkpoints that nobody steers."""
+        return self.config.camera != "none" or (self.family is not None and self.family.name.startswith("driving"))
+
+    @property
+    def classes(self) -> tuple[SemanticClass, ...]:
+        """Ontology of the views' class maps, by id; empty for a model that makes none."""
+        return self.painted_classes if self.config.class_head is None else self.config.class_head.classes
+
+    @property
+    def painted_classes(self) -> tuple[SemanticClass, ...]:
+        """The classes whose colours the pictures are painted in; empty for a model of photographs."""
+        paints = self.family is not None and self.family.output == "semantic"
+        return self.config.semantic_classes if paints else ()
+
+    @property
+    def mount(self) -> CameraMount | None:
+        """The camera mount a model that warps by the planes of a road was trained with; None for others."""
+        plane_warp = self.config.plane_warp
+        return trained_mount(plane_warp) if plane_warp is not None and plane_warp.frame == "vehicle" else None
+
+    def check_size(self, height: int, width: int) -> None:
+        """Raises OptionError if the network cannot take frames of this size."""
+        factor = self.config.size_factor
+        if height % factor or width % factor or min(height, width) < factor:
+            raise OptionError(
+                f"height and width must be multiples of {factor} for {self.name}, got {height}x{width}; "
+                f"the trained size is {self.config.height}x{self.config.width}"
+            )
+
+    def check_source(self, source: Spherical) -> None:
+        """Raises OptionError if the source camera cannot stand there: below the ground that a model warps by."""
+        plane_warp = self.config.plane_warp
+        if plane_warp is not None and plane_warp.frame == "stage":
+            orbit_mount(plane_warp, source)
+
+    def motion_bucket(self, trajectory: Trajectory) -> float:
+        """The motion number for a camera path. Raises OptionError where only the user can know it.
+
+        Source: Van Hoorick et al. 2024 (GCD), appendix, with the angle ranges of the released configurations.
+        """
+        if self.family is not None and self.family.motion_bucket is not None:
+            return self.family.motion_bucket
+        if self.family is None or self.family.limits is None or trajectory.goal_delta is None:
+            raise OptionError(
+                f"the motion number cannot be worked out for {self.name}: its family or the path's angles are not "
+                "known; give --motion-bucket, or name the family with --family"
+            )
+        limits = self.family.limits
+        return motion_bucket(
+            trajectory.goal_delta, max_azimuth_deg=limits.azimuth_deg, max_elevation_deg=limits.elevation_deg
+        )
+
+    def plan_view(
+        self,
+        delta: SphericalDelta | None = None,
+        *,
+        source: Spherical | None = None,
+        move_time: int | None = None,
+        interpolation: Interpolation | None = None,
+        mount: CameraMount | None = None,
+    ) -> Trajectory:
+        """The camera path to a goal given as differences of angles and radius.
+
+        Args:
+            delta: destination minus source; None for the checkpoint's own fixed view.
+            source: where the source camera stands, if known; absolute limits are checked only then.
+            move_time: frame in which the goal is reached, instead of the checkpoint's.
+            mount: how the source camera sits on its vehicle, for the fixed driving view; None as trained. The clip
+                must name the same.
+        Raises:
+            ViewFixedError: the checkpoint takes no camera command.
+            ViewRangeError: the goal lies outside the family's limits.
+            OptionError: a mount was given to a checkpoint whose view hangs on no vehicle; or as `check_source`.
+        """
+        frames, move_time = self.config.frames, self.move_time if move_time is None else move_time
+        if mount is not None and not (self.config.camera == "none" and self.knows_camera):
+            raise OptionError(f"{self.name} has no vehicle's view to place a camera mount in; leave the mount out")
+        if self.config.camera == "none":
+            return self._fixed_view(delta, move_time, mount)
+        delta = SphericalDelta() if delta is None else delta
+        self._check_limits(delta, source)
+        if interpolation is None:
+            interpolation = "linear" if self.family is None else self.family.interpolation
+        start = source or ASSUMED_SOURCE
+        self.check_source(start)
+        return spherical_trajectory(start, delta, frames=frames, move_time=move_time, interpolation=interpolation)
+
+    def plan_poses(self, source_from_target: Tensor, *, source: Spherical | None = None) -> Trajectory:
+        """A camera path given as rigid transforms [T, 4, 4].
+
+        A checkpoint with spherical control gets the nearest angles and radius, frame by frame; one with relative
+        poses gets them as they are.
+        Raises: ViewFixedError, ViewRangeError, PoseError, OptionError as `plan_view`.
+        """
+        if self.config.camera == "none":
+            raise ViewFixedError(f"{self.name} has one fixed view and takes no poses; leave the poses out")
+        if source_from_target.shape[:1] != (self.config.frames,):
+            raise PoseError(f"poses must be [{self.config.frames}, 4, 4], got {list(source_from_target.shape)}")
+        if self.config.camera == "relative_pose" and (self.family is None or self.family.limits is None):
+            return pose_trajectory(source_from_target)
+        self.check_source(source or ASSUMED_SOURCE)
+        fitted, fits = fitted_trajectory(source_from_target, source or ASSUMED_SOURCE)
+        assert fitted.delta is not None
+        for azimuth, elevation, radius in fitted.delta.tolist():
+            self._check_limits(SphericalDelta(azimuth_deg=azimuth, elevation_deg=elevation, radius_m=radius), source)
+        if self.config.camera == "spherical":
+            _warn_of_residual(fits)
+            return fitted
+        asked = pose_trajectory(source_from_target)
+        return replace(fitted, source_from_target=asked.source_from_target, at_goal=asked.at_goal)
+
+    def _fixed_view(self, delta: SphericalDelta | None, move_time: int, mount: CameraMount | None) -> Trajectory:
+        if delta is not None and delta != SphericalDelta():
+            raise ViewFixedError(
+                f"{self.name} has one fixed view and takes no camera command; leave azimuth, elevation and radius out"
+            )
+        if self.knows_camera:
+            return driving_trajectory(frames=self.config.frames, move_time=move_time, mount=mount or self.mount)
+        return pose_trajectory(torch.eye(4, dtype=torch.float64).repeat(self.config.frames, 1, 1))
+
+    def _check_limits(self, delta: SphericalDelta, source: Spherical | None) -> None:
+        if self.family is None or self.family.limits is None:
+            return
+        allowed, slack = self.family.limits.allowed(source), 1e-6
+        for axis, (low, high) in allowed.items():
+            value = getattr(delta, axis)
+            if low > high + slack:
+                raise ViewRangeError(
+                    f"{axis} {getattr(source, axis):g} of the source camera is so far from where {self.family.name} "
+                    "was trained that no view can be reached; correct it (a radius is in units of the trained scenes)",
+                    allowed,
+                )
+            if not low - slack <= value <= high + slack:
+                raise ViewRangeError(
+                    f"{axis} {value:g} is outside [{low:g}, {high:g}], the limits of {self.family.name}; "
+                    "choose a view inside, or another checkpoint",
+                    allowed,
+                )
+
+
+def _warn_of_residual(fits: list[DeltaFit]) -> None:
+    position_m = max(fit.position_error_m for fit in fits)
+    rotation_deg = max(fit.rotation_error_deg for fit in fits)
+    if position_m > _TOLERATED_M or rotation_deg > _TOLERATED_DEG:
+        _LOG.warning(
+            "the network is steered by angles and radius: the nearest path misses the asked poses by up to %.3g m "
+            "and %.3g degrees",
+            position_m,
+            rotation_deg,
+        )

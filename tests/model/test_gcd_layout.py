@@ -1,0 +1,192 @@
+"""What is written for the released code: its names and shapes, its containers, and the same bits when read again."""
+
+from pathlib import Path
+
+import msgspec
+import pytest
+import torch
+from published import (
+    SMALL_GCD,
+    assert_same_weights,
+    filled,
+    fixed_view,
+    manifest,
+    write_diffusers,
+    write_gcd,
+    write_svd,
+)
+from small_models import TINY_DRIVING, draw
+from torch import Tensor
+
+from gcd_model.carry_over import CAMERA
+from gcd_model.checkpoints import convert_weights, inspect_weights, load_weights
+from gcd_model.config import SMALL, SVD_14, ModelConfig
+from gcd_model.errors import OptionError
+from gcd_model.gcd_layout import gcd_state
+from gcd_model.networks import Networks, empty_networks
+from gcd_model.own_format import Card
+from gcd_model.weights_export import write_published
+
+CONDITION_VAE = "conditioner.embedders.3.encoder"
+
+
+def card(config: ModelConfig, family: str = "kubric90") -> Card:
+    return Card(name="mine", config=config, family=family, move_time=7)
+
+
+def written(path: Path, networks: Networks, family: str = "kubric90", overwrite: bool = False) -> Path:
+    weights = networks.state_dict()
+    write_published(path, weights, card(networks.config, family), carried={}, updates=10, overwrite=overwrite)
+    return path
+
+
+def root_of(path: Path) -> dict[str, object]:
+    """As whoever does not know us reads it: tensors and plain containers alone."""
+    root = torch.load(path, map_location="cpu", weights_only=True)
+    assert isinstance(root, dict)
+    return root
+
+
+def published_shapes(state: dict[str, Tensor]) -> dict[str, tuple[int, ...]]:
+    return {name: tuple(tensor.shape) for name, tensor in state.items()}
+
+
+def without_lpips(shapes: dict[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
+    return {name: shape for name, shape in shapes.items() if not name.startswith("lpips.")}
+
+
+def test_names_and_shapes_at_full_size_are_those_of_the_released_file_and_of_the_base_model() -> None:
+    released, base = manifest("gcd_ckpt"), manifest("svd_safetensors")
+    weights = empty_networks(SVD_14).state_dict()
+    assert published_shapes(gcd_state(weights, SVD_14, {})) == without_lpips(released)
+    lpips = {n: torch.empty(shape, device="meta") for n, shape in released.items() if n.startswith("lpips.")}
+    assert len(lpips) == 33
+    assert published_shapes(gcd_state(weights, SVD_14, lpips)) == released
+    fixed = {name: value for name, value in weights.items() if not name.startswith(CAMERA)}
+    assert published_shapes(gcd_state(fixed, fixed_view(SVD_14), {})) == base
+
+
+@pytest.mark.parametrize("config", [SMALL_GCD, fixed_view(SMALL_GCD)], ids=["steered", "fixed view"])
+def test_what_is_written_and_read_again_is_the_same_bit_for_bit(tmp_path: Path, config: ModelConfig) -> None:
+    family = "driving" if config.camera == "none" else "kubric90"
+    loaded = load_weights(written(tmp_path / "mine.ckpt", filled(config), family))
+    assert_same_weights(loaded.networks, filled(config))
+    assert loaded.networks.config == config
+    assert loaded.family is not None
+    assert (loaded.name, loaded.family.name, loaded.move_time, loaded.layout) == ("mine", family, 7, "gcd-ckpt")
+
+
+def test_it_is_a_lightning_checkpoint_of_plain_containers(tmp_path: Path) -> None:
+    root = root_of(written(tmp_path / "mine.ckpt", filled()))
+    wanted = {"epoch", "global_step", "pytorch-lightning_version", "state_dict", "optimizer_states", "hyper_parameters"}
+    assert wanted <= set(root)
+    assert root["global_step"] == 10
+    assert root["optimizer_states"] == []
+    assert inspect_weights(tmp_path / "mine.ckpt").optimizer_size == 0
+
+
+def test_the_conditions_autoencoder_is_whole_as_the_released_code_builds_it(tmp_path: Path) -> None:
+    state = root_of(written(tmp_path / "mine.ckpt", filled()))["state_dict"]
+    assert isinstance(state, dict)
+    ours = filled().decoder.stem.weight
+    assert torch.equal(state[f"{CONDITION_VAE}.decoder.conv_in.weight"], ours)
+    assert torch.equal(state["first_stage_model.decoder.conv_in.weight"], ours)
+    assert torch.equal(state[f"{CONDITION_VAE}.post_quant_conv.weight"][:, :, 0, 0], torch.eye(4))
+    assert not any(".time_stack." in name for name in state if name.startswith(CONDITION_VAE))
+
+
+def test_leftovers_of_the_file_it_came_from_are_carried_over(tmp_path: Path) -> None:
+    source = write_gcd(tmp_path)
+    loaded = load_weights(source)
+    assert "lpips.lin0.model.1.weight" in loaded.carried
+    assert not any(name.startswith("model_ema.") for name in loaded.carried)
+    convert_weights(source, tmp_path / "again.ckpt", layout="gcd-ckpt")
+    state = root_of(tmp_path / "again.ckpt")["state_dict"]
+    assert isinstance(state, dict)
+    for name, tensor in loaded.carried.items():
+        assert torch.equal(state[name], tensor), name
+    assert_same_weights(load_weights(tmp_path / "again.ckpt").networks, filled())
+
+
+def test_the_base_model_converts_too_and_half_precision_spares_the_decoder(tmp_path: Path) -> None:
+    report = convert_weights(write_svd(tmp_path), tmp_path / "half.ckpt", layout="gcd-ckpt", dtype="float16")
+    assert (report.layout, report.family) == ("gcd-ckpt", "svd")
+    precisions = {network.name: network.dtypes for network in report.networks}
+    assert precisions["unet"] == ("float16",)
+    assert precisions["decoder"] == ("float32",)
+
+
+def test_one_encoder_for_all_frames_becomes_two_that_compute_the_same(tmp_path: Path) -> None:
+    folder = write_diffusers(tmp_path / "model")
+    convert_weights(folder, tmp_path / "two.ckpt", layout="gcd-ckpt")
+    one, two = load_weights(folder).networks, load_weights(tmp_path / "two.ckpt").networks
+    assert two.config == fixed_view(SMALL_GCD)
+    frames = draw(2, 3, 32, 32)
+    with torch.no_grad():
+        wanted = one.condition_encoder(frames)
+        for encoder in (two.target_encoder, two.condition_encoder):
+            torch.testing.assert_close(encoder(frames).mean, wanted.mean, rtol=1e-5, atol=1e-5)
+            torch.testing.assert_close(encoder(frames).log_variance, wanted.log_variance, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("config", "wanted"), [(TINY_DRIVING, "the paper's networks only"), (SMALL, "cannot say this architecture: ")]
+)
+def test_networks_the_released_code_could_not_build_are_refused(
+    tmp_path: Path, config: ModelConfig, wanted: str
+) -> None:
+    with pytest.raises(OptionError, match=wanted):
+        written(tmp_path / "mine.ckpt", Networks(config))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_heads_that_names_and_shapes_do_not_tell_are_refused() -> None:
+    narrow = msgspec.structs.replace(SMALL_GCD, unet=msgspec.structs.replace(SMALL_GCD.unet, head_width=32))
+    with pytest.raises(OptionError, match="its unet would be read as"):
+        gcd_state(empty_networks(narrow).state_dict(), narrow, {})
+
+
+def test_a_file_that_is_there_is_replaced_only_when_told(tmp_path: Path) -> None:
+    path = written(tmp_path / "mine.ckpt", filled())
+    before = path.read_bytes()
+    with pytest.raises(OptionError, match="exists; give another name"):
+        written(path, filled())
+    with pytest.raises(OptionError, match="this layout is a ckpt file"):
+        written(tmp_path / "mine.safetensors", filled())
+    assert path.read_bytes() == before
+    written(path, filled(), overwrite=True)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["mine.ckpt"]
+
+
+def test_what_cannot_be_written_whole_does_not_appear(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full_disk(_content: object, file: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", full_disk)
+    with pytest.raises(Exception, match="cannot be written: No space left"):
+        written(tmp_path / "mine.ckpt", filled())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_note_that_lies_about_the_networks_is_refused(tmp_path: Path) -> None:
+    path = written(tmp_path / "mine.ckpt", filled())
+    root = torch.load(path, weights_only=True)
+    root["hyper_parameters"]["gcd_node"] |= {
+        "gcd.config": msgspec.json.encode(TINY_DRIVING).decode(),
+        "gcd.family": "",
+    }
+    torch.save(root, path)
+    with pytest.raises(Exception, match="weights are missing"):
+        load_weights(path)
+
+
+def test_tensors_that_share_storage_are_written_alone(tmp_path: Path) -> None:
+    networks = Networks(SMALL_GCD)
+    joined = torch.zeros(1_000_000)
+    bias = networks.unet.conv_out.bias
+    assert isinstance(bias, Tensor)
+    weights = networks.state_dict() | {"unet.conv_out.bias": joined[: bias.numel()]}
+    write_published(tmp_path / "mine.ckpt", weights, card(SMALL_GCD), carried={})
+    state = root_of(tmp_path / "mine.ckpt")["state_dict"]
+    assert isinstance(state, dict)
+    assert state["model.diffusion_model.out.2.bias"].untyped_storage().nbytes() == bias.nbytes

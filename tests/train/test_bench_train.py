@@ -1,0 +1,151 @@
+"""`gcd-train bench train`: what training costs."""
+
+from dataclasses import replace
+
+import msgspec
+import pytest
+import torch
+from rich.console import Console
+
+from gcd_model import ModelConfig
+from gcd_model.config import SMALL, SVD_14
+from gcd_model.unet import VideoUNet
+from gcd_train.bench_train import BenchTrainOptions, MemoryRow, SpeedRow, TrainReport, bench_train, memory_rows
+from gcd_train.cli.bench import memory_table, speed_table
+from gcd_train.memory_account import PLANS, Kept, LiveBytes, account, kept_by_update, parameters_of
+
+TINY = msgspec.structs.replace(
+    SMALL,
+    frames=2,
+    height=64,
+    width=64,
+    unet=msgspec.structs.replace(SMALL.unet, multipliers=(1, 2), attention=(False, True)),
+)
+KEPT = Kept(everything=10**9, blocks=2 * 10**8, working=10**8, norms=5 * 10**7, flops=4 * 10**12)
+
+
+@pytest.fixture(scope="module")
+def rows() -> tuple[MemoryRow, ...]:
+    """Memory of the full model, with the activations counted for it by the slow test below."""
+    kept = Kept(everything=12_548_341_836, blocks=716_321_728, working=1_665_171_716, norms=330_301_440, flops=1)
+    return memory_rows(kept)
+
+
+def shown(*tables: object) -> str:
+    console = Console(record=True, width=240)
+    for table in tables:
+        console.print(table)
+    return console.export_text()
+
+
+def test_storages_are_counted_as_long_as_they_live_and_views_not_again() -> None:
+    with LiveBytes() as bytes_:
+        first = torch.zeros(1000)
+        view = first[10:].view(99, 10)
+        second = first + 1
+        assert bytes_.live == 8000
+        del first
+        assert bytes_.live == 8000  # the view keeps it
+        del view, second
+        assert bytes_.live == 0
+
+
+def really_kept(config: ModelConfig) -> int:
+    """What the graph of a real forward pass keeps alive."""
+    height, width = config.height // config.vae.down_factor, config.width // config.vae.down_factor
+    unet = VideoUNet(config.unet, config.frames).to(torch.bfloat16).train()
+    rows = torch.zeros(config.frames, 4, height, width, dtype=torch.bfloat16)
+    vector = torch.zeros(config.frames, config.unet.vector_width, dtype=torch.bfloat16)
+    camera = torch.zeros(config.frames, config.unet.camera_width, dtype=torch.bfloat16)
+    tokens = torch.zeros(config.frames, config.unet.context_width or 0, dtype=torch.bfloat16)
+    with LiveBytes() as live:
+        plan = unet.plan(torch.zeros(1, config.frames, dtype=torch.bfloat16), vector, camera, tokens)
+        made = unet(rows, rows, plan.step(0))
+        held = live.live
+    assert made.requires_grad
+    return held
+
+
+def test_what_is_counted_without_content_is_what_a_real_update_keeps() -> None:
+    kept = kept_by_update(TINY)
+    assert kept.everything == pytest.approx(really_kept(TINY), rel=0.02)
+    assert 0 < kept.blocks < kept.everything
+    assert kept.working > 0
+
+
+def test_an_account_adds_up_bytes_of_parameters() -> None:
+    trained, frozen = parameters_of(SMALL)
+    plan = replace(PLANS[0], weights=4, gradient=4, state=8)
+    counted = account(SMALL, plan, KEPT, cached=False)
+    assert counted.weights == pytest.approx(4 * trained / 1e9)
+    assert counted.gradients == pytest.approx(4 * trained / 1e9)
+    assert counted.state == pytest.approx(8 * trained / 1e9)
+    assert counted.activations == pytest.approx(0.35)
+    assert counted.encoders == pytest.approx(2 * frozen / 1e9)
+    assert counted.total == pytest.approx(0.35 + (16 * trained + 2 * frozen) / 1e9)
+    assert account(SMALL, plan, KEPT, cached=True).encoders == 0
+
+
+def test_full_fine_tunes_and_adapters_need_no_more_than_was_set(rows: tuple[MemoryRow, ...]) -> None:
+    bounded = [row for row in rows if row.wanted is not None]
+    assert {row.wanted for row in bounded} == {20.0, 14.0, 8.0}
+    assert all(row.total <= (row.wanted or 0) for row in bounded)
+
+
+def test_adapters_are_about_one_and_a_half_percent_of_the_full_model(rows: tuple[MemoryRow, ...]) -> None:
+    adapters, whole = (next(row for row in rows if name in row.name) for name in ("LoRA", "Adam, float32"))
+    assert 0.012 < adapters.gradients / whole.gradients < 0.022
+
+
+@pytest.mark.slow
+def test_activations_of_the_full_model_are_counted_as_recorded() -> None:
+    """Half a minute of counting."""
+    kept = kept_by_update(SVD_14)
+    assert kept.everything == pytest.approx(12.55e9, rel=0.01)
+    assert kept.blocks + kept.working + kept.norms == pytest.approx(2.71e9, rel=0.02)
+
+
+def test_a_report_is_shown_with_units_and_says_what_was_not_measured(rows: tuple[MemoryRow, ...]) -> None:
+    slow = SpeedRow(
+        name="encoded each time",
+        updates=3,
+        clips_per_s=0.5,
+        lowest=0.4,
+        highest=0.6,
+        utilisation=None,
+        peak_gb=None,
+        hours=None,
+    )
+    fast = msgspec.structs.replace(slow, name="latents cached", utilisation=0.41, peak_gb=17.25, hours=21.5)
+    report = TrainReport(
+        device="a GPU",
+        torch="2.13",
+        model="full (svd-14)",
+        clips=2,
+        tflop_per_clip=16.6,
+        memory=rows,
+        speed=(fast, slow),
+    )
+    told = shown(memory_table(report), speed_table(report))
+    for part in (
+        "<= 20",
+        "<= 14",
+        "<= 8",
+        "41%",
+        "17.2",
+        "21.5 (wanted <= 24)",
+        "full model on a GPU only",
+        "not known",
+    ):
+        assert part in told
+    assert msgspec.json.decode(msgspec.json.encode(report), type=TrainReport) == report
+
+
+@pytest.mark.slow
+def test_updates_of_the_small_model_are_measured_with_and_without_its_encoders() -> None:
+    """Half a minute, most of it for counting the full model."""
+    report = bench_train(BenchTrainOptions(full=False, updates=2, warm=1), lambda _: None)
+    assert [row.name for row in report.speed] == ["latents cached", "encoded each time"]
+    assert all(0 < row.lowest <= row.clips_per_s <= row.highest for row in report.speed)
+    if not torch.cuda.is_available():
+        assert all(row.hours is None and row.utilisation is None for row in report.speed)

@@ -1,0 +1,166 @@
+"""What a recipe's [data] makes of folders: parts, samplings, and what is refused."""
+
+import shutil
+from pathlib import Path
+
+import msgspec
+import pytest
+import torch
+from cached_sets import CHOICE, CLIP, HEIGHT, WIDTH, FakePictures, tiny_identity
+from tiny_scenes4d import DRIVING_POSES, write_driving, write_kubric
+from tiny_world import tiny_recipe
+
+from gcd_model import FAMILIES, ModelConfig
+from gcd_model.loading import random_weights
+from gcd_model.networks import random_networks
+from gcd_train.data_kinds import DataPlaces, RunData, open_data, sampling_of
+from gcd_train.datasets.trajectories import DrivingSampling, OrbitSampling
+from gcd_train.draws import Draws
+from gcd_train.errors import DataError, RecipeError
+from gcd_train.latent_cache import CacheJob, cache_scenes, only_writer
+from gcd_train.precision import Precision
+from gcd_train.recipe import DataRecipe, FramesRecipe, LossRecipe, OrbitRecipe, Recipe
+
+VIEWS = tuple(f"view{number}" for number in range(4))
+CONFIG = ModelConfig(frames=3, height=32, width=48)
+KUBRIC = DataRecipe(kind="kubric4d", cameras=VIEWS, repeats=5)
+DRIVING = DataRecipe(kind="parallel_domain4d", cameras=tuple(DRIVING_POSES), repeats=5)
+
+
+@pytest.fixture(scope="module")
+def kubric(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("kubric")
+    scene = write_kubric(root, 3, frames=8)
+    for number in (7, 2801):
+        copy = root / f"scn{number:05d}"
+        shutil.copytree(scene, copy)
+        for file in copy.glob("*.json"):
+            file.rename(copy / file.name.replace("scn00003", copy.name))
+    return root
+
+
+@pytest.fixture(scope="module")
+def driving(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("driving")
+    write_driving(root, 1, frames=5)
+    for number in (2, 5):
+        shutil.copytree(root / "scene_000001", root / f"scene_{number:06d}")
+    return root
+
+
+def recipe(data: DataRecipe, **unet: object) -> Recipe:
+    told = msgspec.structs.replace(tiny_recipe().unet, **({"fps": 12.0} | unet))
+    return tiny_recipe(data=data, unet=told)
+
+
+def opened(told: Recipe, data: Path, valid: Path | None = None, family: str = "kubric90") -> RunData:
+    return open_data(told, CONFIG, FAMILIES[family], DataPlaces(data=data, valid=valid))
+
+
+def lengths(run: RunData) -> tuple[int, int]:
+    """Clips to learn from and to measure on: five of each scene, and one."""
+    return len(run.clips) // 5, len(run.valid)
+
+
+def test_kubric_is_split_by_number(kubric: Path) -> None:
+    run = opened(recipe(KUBRIC), kubric)
+    assert lengths(run) == (2, 1)
+    assert run.batches is not None
+    assert (run.clips.fps, run.valid.fps, run.valid.camera) == (12.0, 12.0, "spherical")
+    source, target = run.valid.rgb(0)
+    assert source.shape == target.shape == (3, 32, 48, 3)
+    assert run.valid.trajectory(0).frames == 3
+
+
+def test_the_last_scenes_are_held_out_where_the_recipe_says_so(kubric: Path) -> None:
+    last = msgspec.structs.replace(KUBRIC, split="last", held_out=2)
+    assert lengths(opened(recipe(last), kubric)) == (1, 2)
+    with pytest.raises(DataError, match="0 to learn from and 3 to measure on; give --valid"):
+        opened(recipe(msgspec.structs.replace(last, held_out=3)), kubric)
+
+
+def test_a_folder_of_its_own_leaves_all_of_the_data_to_learn_from(kubric: Path, tmp_path: Path) -> None:
+    shutil.copytree(kubric / "scn02801", tmp_path / "scn02801")
+    assert lengths(opened(recipe(KUBRIC), kubric, tmp_path)) == (3, 1)
+    with pytest.raises(DataError, match="to learn from, too"):
+        opened(recipe(KUBRIC), kubric, kubric)
+
+
+def test_driving_is_split_by_its_file(driving: Path, tmp_path: Path) -> None:
+    parts = {"train": ["scene_000001", "scene_000005"], "val": ["scene_000002"], "test": []}
+    (tmp_path / "split.json").write_bytes(msgspec.json.encode(parts))
+    named = msgspec.structs.replace(DRIVING, split_file=str(tmp_path / "split.json"))
+    assert lengths(opened(recipe(named, fps=10.0), driving, family="driving")) == (2, 1)
+    with pytest.raises(RecipeError, match=r"data\.split_file"):
+        opened(recipe(DRIVING, fps=10.0), driving, family="driving")
+
+
+def test_pairs_and_caches_want_something_to_measure_on(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="give --valid FOLDER"):
+        opened(recipe(DataRecipe()), tmp_path)
+
+
+def test_a_cache_is_read_with_the_encoders_that_made_it(driving: Path, tmp_path: Path) -> None:
+    pictures = FakePictures()
+    job = CacheJob(folder=tmp_path, pictures=pictures, choice=CHOICE, identity=tiny_identity())
+    with only_writer(tmp_path):
+        assert len(list(cache_scenes(job, pictures.scenes))) == 3
+    data = msgspec.structs.replace(DRIVING, kind="cache")
+    own = recipe(data, fps=10.0, source="cache", image_share=0.0, augmentation=0.02, loss=LossRecipe())
+    model = msgspec.structs.replace(own.model, weights=CHOICE.weights)
+    told = msgspec.structs.replace(own, model=model, vae=None, latents=None, decoder=None)
+    networks = random_weights("driving", frames=CLIP).networks
+    config = msgspec.structs.replace(networks.config, height=HEIGHT, width=WIDTH)
+    run = open_data(told, config, FAMILIES["driving"], DataPlaces(data=tmp_path, valid=driving))
+    assert run.batches is not None
+    precision = Precision(torch.device("cpu"), half=False, channels_last=False)
+    batch = run.batches(networks, precision).whole_clips(Draws(1, "unet", 0, torch.device("cpu")), 2)
+    assert batch.target.shape[0] == 2 * CLIP
+    assert len(batch.ids) == 2
+    assert batch.wait_s is not None
+    with pytest.raises(RecipeError, match="made with other encoders"):
+        run.batches(random_networks(networks.config, seed=9), precision)
+    with pytest.raises(RecipeError, match="frozen autoencoder"):
+        open_data(own, config, FAMILIES["driving"], DataPlaces(data=tmp_path, valid=driving))
+
+
+def test_rates_and_orbits_that_do_not_fit_are_refused(kubric: Path) -> None:
+    with pytest.raises(RecipeError, match=r"unet\.fps is 10"):
+        opened(recipe(KUBRIC, fps=10.0), kubric)
+    wide = msgspec.structs.replace(KUBRIC, orbit=OrbitRecipe(max_azimuth_deg=120.0))
+    with pytest.raises(RecipeError, match="nobody could ask for the views beyond"):
+        opened(recipe(wide), kubric)
+    assert opened(recipe(wide), kubric, family="kubric180").batches is not None
+
+
+def test_what_is_left_out_of_the_sampling_is_as_released() -> None:
+    orbit, path = sampling_of(recipe(KUBRIC), 14), sampling_of(recipe(DRIVING), 14)
+    assert isinstance(orbit, OrbitSampling)
+    assert isinstance(path, DrivingSampling)
+    assert (orbit.frames.strides, orbit.frames.latest_start, orbit.frames.reverse) == ((1, 2, 3, 4), 6, 0.2)
+    assert (path.frames.strides, path.frames.latest_start, path.frames.reverse) == ((1, 2), None, 0.0)
+    assert not orbit.frames.reach_last
+    assert orbit.elevation_deg == (0.0, 50.0)
+
+
+def test_every_difference_of_the_release_can_be_chosen() -> None:
+    other = msgspec.structs.replace(
+        KUBRIC,
+        path="direct",
+        frames=FramesRecipe(strides=(2,), latest_start=0, reverse=0.0, reach_last=True),
+        orbit=OrbitRecipe(elevation_deg=(0.0, 90.0)),
+    )
+    orbit = sampling_of(recipe(other), 14)
+    assert isinstance(orbit, OrbitSampling)
+    assert (orbit.move_time, orbit.elevation_deg) == (0, (0.0, 90.0))
+    assert (orbit.frames.strides, orbit.frames.latest_start, orbit.frames.reverse) == ((2,), 0, 0.0)
+    assert orbit.frames.reach_last
+    slip = sampling_of(recipe(msgspec.structs.replace(other, move_time=13)), 14)
+    assert isinstance(slip, OrbitSampling)
+    assert slip.move_time == 13  # as the released file of the direct 180-degree model has it
+
+
+def test_clips_that_are_measured_on_have_one_rate_and_run_forwards() -> None:
+    orbit = sampling_of(recipe(KUBRIC), 14, stride=2)
+    assert isinstance(orbit, OrbitSampling)
+    assert (orbit.frames.strides, orbit.frames.reverse) == ((2,), 0.0)

@@ -1,0 +1,209 @@
+"""Blocks that compute twice, optimisers by name, and how an update is shared out; without starting processes."""
+
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import msgspec
+import pytest
+import torch
+from tiny_world import tiny_recipe
+from torch import nn
+from torch.testing import assert_close
+from two_processes import FRAMES, LOG, UPDATES, AfterUpdates, Never, Noise, Task, options, recipe_of
+
+from gcd_model.networks import random_networks
+from gcd_model.unet import VideoUNet
+from gcd_train.draws import Draws
+from gcd_train.ema import Ema
+from gcd_train.engine import optimisers
+from gcd_train.engine.blocks import recompute_blocks, stages_of
+from gcd_train.engine.engine import Engine
+from gcd_train.engine.optimisers import build_optimiser, set_rate
+from gcd_train.engine.processes import ALONE, Processes, processes_of
+from gcd_train.engine.states import newest_weights
+from gcd_train.errors import Interrupted, RecipeError
+from gcd_train.loop import Loop, Progress, StepLoss
+from gcd_train.model_setup import model_config
+from gcd_train.precision import Precision
+from gcd_train.recipe import Budget, ComputeRecipe, EmaRecipe, OptimiserRecipe
+from gcd_train.run_folder import RunFolder
+from gcd_train.schedule import ParameterGroup
+
+RATE = OptimiserRecipe(rate=0.1, kind="adam")
+
+
+def gradients(unet: VideoUNet) -> tuple[dict[str, torch.Tensor], int]:
+    """The gradient of each weight, and how often a block was computed."""
+    runs: list[int] = []
+    watched = [stage.res.register_forward_pre_hook(lambda *_: runs.append(1)) for stage in stages_of(unet)]
+    batch = Noise().whole_clips(Draws(0, "x", 0, torch.device("cpu")), 1)
+    plan = unet.plan(torch.ones(1, FRAMES), batch.vector, None, None)
+    unet(batch.target, batch.condition, plan.step(0)).square().mean().backward()
+    for hook in watched:
+        hook.remove()
+    found = {name: weight.grad for name, weight in unet.named_parameters() if weight.grad is not None}
+    unet.zero_grad(set_to_none=True)
+    return found, len(runs)
+
+
+@pytest.mark.parametrize("every", [2])
+def test_blocks_computed_anew_give_the_same_gradients_under_the_same_names(every: int) -> None:
+    unet = random_networks(model_config(tiny_recipe().model), seed=2).unet
+    plain, once = gradients(unet)
+    names, blocks = list(unet.state_dict()), len(stages_of(unet))
+    recompute_blocks(unet, every)
+    again, runs = gradients(unet)
+    assert list(unet.state_dict()) == names
+    assert (once, runs) == (blocks, blocks + blocks // every)
+    assert_close(again, plain, atol=1e-6, rtol=1e-6)
+
+
+def groups(count: int = 3) -> list[ParameterGroup]:
+    return [ParameterGroup(parameters=[nn.Parameter(torch.ones(count))])]
+
+
+def test_torchs_own_optimisers_are_fused() -> None:
+    for kind, wanted in (("adam", torch.optim.Adam), ("adamw", torch.optim.AdamW)):
+        made = build_optimiser(groups(), msgspec.structs.replace(RATE, kind=kind))
+        assert type(made) is wanted
+        assert made.param_groups[0]["fused"] is True
+
+
+@pytest.mark.parametrize(
+    ("kind", "weights", "name"),
+    [
+        ("adam8bit", "float32", "Adam8bit"),
+        ("adamw8bit", "float32", "AdamW8bit"),
+        ("adamw8bit", "bfloat16", "AdamW8bit"),
+        ("adam", "bfloat16", "_AdamW"),
+        ("adamw", "bfloat16", "_AdamW"),
+    ],
+)
+def test_8_bit_moments_and_bfloat16_weights_come_from_torchao(
+    monkeypatch: pytest.MonkeyPatch, kind: str, weights: Any, name: str
+) -> None:
+    asked: list[tuple[str, dict[str, Any]]] = []
+
+    def maker(called: str) -> Any:
+        return lambda _groups, **named: asked.append((called, named))
+
+    library = SimpleNamespace(**{each: maker(each) for each in ("Adam8bit", "AdamW8bit", "_AdamW")})
+    monkeypatch.setattr(optimisers, "import_module", lambda _name: library)
+    build_optimiser(groups(), msgspec.structs.replace(RATE, kind=kind), weights)
+    (called, named), *_ = asked
+    assert called == name
+    assert named["bf16_stochastic_round"] == (weights == "bfloat16")
+    assert named["weight_decay"] == 0.0
+
+
+def test_what_torchao_is_for_is_said_when_it_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> None:
+        raise ImportError(name)
+
+    monkeypatch.setattr(optimisers, "import_module", missing)
+    with pytest.raises(RecipeError, match=r"pip install 'gcd-node\[train\]'"):
+        build_optimiser(groups(), msgspec.structs.replace(RATE, kind="adam8bit"))
+
+
+def test_a_rate_that_is_a_tensor_is_filled() -> None:
+    made = build_optimiser(groups(), RATE)
+    rate = made.param_groups[0]["lr"] = torch.tensor(0.0)
+    set_rate(made, 0, 0.0, RATE)
+    assert made.param_groups[0]["lr"] is rate
+    assert rate.item() == pytest.approx(0.1)
+
+
+def test_the_average_of_bfloat16_weights_is_finer_than_they_are() -> None:
+    module = nn.Linear(1, 1, bias=False).bfloat16()
+    nn.init.ones_(module.weight)
+    ema = Ema(module, EmaRecipe(limit=0.999))
+    nn.init.constant_(module.weight, 1.5)
+    for update in range(1, 4):
+        ema.update(10**5 + update)
+    average = 1 + 0.5 * (1 - 0.999**3)  # less above 1 than bfloat16 can tell
+    with ema.applied():
+        assert module.weight.item() == 1.0
+    assert module.weight.item() == 1.5
+    assert ema.state_dict()["weight"].item() == pytest.approx(average, abs=1e-6)
+
+
+def test_an_updates_batches_are_shared_equally() -> None:
+    shares = [list(Processes(rank, 3).batches(6)) for rank in range(3)]
+    assert sorted(part for share in shares for part in share) == list(range(6))
+    assert {len(share) for share in shares} == {2}
+    with pytest.raises(RecipeError, match="cannot be shared by 4 processes"):
+        Processes(0, 4).batches(6)
+
+
+def test_without_torchrun_there_is_one_process_whatever_the_recipe_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RANK", raising=False)
+    with processes_of(ComputeRecipe(parallel="fsdp")) as processes:
+        assert processes is ALONE
+        assert (processes.first, processes.several) == (True, False)
+
+
+def test_several_processes_want_to_be_told_how_they_share(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RANK", "0")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(RecipeError, match=r'compute.parallel is "none"'), processes_of(ComputeRecipe()):
+        pass
+
+
+def test_a_recipe_of_bfloat16_weights_computes_gradients_in_them() -> None:
+    task = Task(recipe_of())
+    task._precision = Precision.of(ComputeRecipe(device="cpu", weights="bfloat16"))  # pyright: ignore
+    Engine(compute=ComputeRecipe(weights="bfloat16")).prepare(task.module)
+    task.step_loss(Progress(UPDATES, 1.0)).total.backward()
+    trained = [weight for group in task.parameter_groups() for weight in group.parameters]
+    assert {weight.dtype for weight in trained} == {torch.bfloat16}
+    assert all(torch.isfinite(weight.grad).all() for weight in trained if weight.grad is not None)
+
+
+class Square:
+    """64 x 64 numbers to learn, enough for 8-bit moments; one shape, as torchao compiles its step for each."""
+
+    def __init__(self) -> None:
+        self.module = nn.Linear(64, 64, bias=False)
+        nn.init.eye_(self.module.weight)
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        return [ParameterGroup(parameters=list(self.module.parameters()))]
+
+    def step_loss(self, progress: Progress) -> StepLoss:
+        inputs = torch.randn(8, 64, generator=torch.Generator().manual_seed(progress.updates))
+        with torch.autocast("cpu", torch.bfloat16):
+            loss = (self.module(inputs) + inputs).float().square().mean()
+        return StepLoss(loss, {"square": loss}, 8)
+
+    def after_update(self, progress: Progress) -> bool:
+        return False
+
+    def measure(self, picture: Path) -> dict[str, float]:
+        return {}
+
+
+def square_trained(path: Path, kind: Any, weights: Any, stop_at: int | None) -> torch.Tensor:
+    task, stop = Square(), Never() if stop_at is None else AfterUpdates(stop_at)
+    chosen = replace(options(ALONE, stop, LOG, weights=weights), budget=Budget(updates=6))
+    chosen = replace(chosen, optimiser=OptimiserRecipe(rate=1e-3, kind=kind))
+    with suppress(Interrupted):
+        Loop(task, RunFolder(path), chosen).run()
+    return task.module.weight.detach()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(
+    ("kind", "weights"), [("adam8bit", "float32"), ("adam", "bfloat16"), ("adamw8bit", "bfloat16")]
+)
+def test_a_run_with_torchaos_optimisers_resumes_to_the_same_bits(tmp_path: Path, kind: Any, weights: Any) -> None:
+    """Compiles torchao's step: a minute on a CPU."""
+    whole = square_trained(tmp_path / "whole", kind, weights, None)
+    square_trained(tmp_path / "resumed", kind, weights, 3)
+    resumed = square_trained(tmp_path / "resumed", kind, weights, None)
+    assert torch.equal(resumed, whole)
+    assert (whole - torch.eye(64)).abs().max() > 1e-3
+    assert newest_weights(tmp_path / "resumed" / "unet", "unet") is not None  # read by one that has no optimiser

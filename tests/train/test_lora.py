@@ -1,0 +1,144 @@
+"""Adapters on the U-Net: the same function at first, few weights, the same function merged, a file of their own."""
+
+from pathlib import Path
+
+import msgspec
+import pytest
+import torch
+from test_start import SEED, given, published, random_batch, updated
+from tiny_world import FRAMES, HEIGHT, WIDTH, Never, TinyClips
+from torch import Tensor
+from torch.testing import assert_close
+from typer.testing import CliRunner
+
+from gcd_model.adapter import adapted, base_digest
+from gcd_model.checkpoints import load_adapted, load_weights, read_adapter, save_weights
+from gcd_model.config import SVD_14
+from gcd_model.networks import Networks, empty_networks, random_networks
+from gcd_model.own_format import Card
+from gcd_train.checkpoint import load_state
+from gcd_train.cli.main import app
+from gcd_train.errors import RecipeError
+from gcd_train.lora import adapter_of, merge_lora, plain_weights
+from gcd_train.model_setup import copy_of, model_config
+from gcd_train.objective import Denoiser
+from gcd_train.recipe import LoraRecipe, ModelRecipe, Recipe, parse_recipe
+from gcd_train.run_folder import RunFolder
+from gcd_train.trained_part import is_temporal, let_train
+from gcd_train.trainer import RunInputs, Trainer
+
+LORA = LoraRecipe(rank=2, alpha=4.0)
+ADAPTED = ModelRecipe(base="small", family="kubric90", weights="given.safetensors", train="lora", lora=LORA)
+
+
+def output(networks: Networks) -> Tensor:
+    batch = random_batch(networks.config)
+    denoiser = Denoiser(networks.unet, None, "v", networks.camera)
+    with torch.no_grad():
+        return denoiser(batch.target, torch.full((batch.frames,), 2.0), batch)[0]
+
+
+def trained_networks() -> Networks:
+    """After updates that moved both factors of every adapter."""
+    networks = given()
+    let_train(networks, ADAPTED, SEED)
+    updated(networks)
+    return networks
+
+
+def test_adapters_change_nothing_at_first() -> None:
+    networks = given()
+    before = output(networks)
+    let_train(networks, ADAPTED, SEED)
+    assert_close(output(networks), before, rtol=0, atol=1e-6)
+
+
+def test_only_adapters_and_what_steers_are_trained() -> None:
+    networks = given()
+    let_train(networks, ADAPTED, SEED)
+    changed = updated(networks)
+    assert all(name.endswith((".down", ".up")) or "camera" in name for name in changed)
+    names = {name for name, p in networks.named_parameters() if p.requires_grad}
+    assert changed == names
+    assert not any(".dormant." in name for name in names)
+
+
+def test_merged_weights_compute_the_same_and_are_plain() -> None:
+    networks = trained_networks()
+    wanted, names = output(networks), set(given().state_dict())
+    assert not torch.allclose(wanted, output(given()), atol=1e-3)
+    assert set(plain_weights(networks)) == names
+    assert_close(output(copy_of(networks, plane_mix=True)), wanted, rtol=1e-5, atol=1e-5)
+    merge_lora(networks)
+    assert set(networks.state_dict()) == names
+    assert_close(output(networks), wanted, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("lora", [LORA, LoraRecipe(rank=2, alpha=4.0, stem=True, camera=False)])
+def test_an_adapter_kept_apart_gives_the_same_on_its_base(lora: LoraRecipe) -> None:
+    networks = given()
+    let_train(networks, msgspec.structs.replace(ADAPTED, lora=lora), SEED)
+    updated(networks)
+    card = Card(name="adapted", config=published(), family="kubric90", move_time=1)
+    apart = adapter_of(networks, lora, card, base_digest(given().state_dict()))
+    assert ("unet.stem.weight" in apart.tensors, "camera.proj.weight" in apart.tensors) == (lora.stem, lora.camera)
+    assert_close(output(adapted(given(), apart)), output(networks), rtol=1e-5, atol=1e-5)
+
+
+def test_at_full_size_rank_32_is_under_two_percent_and_the_temporal_part_as_large_as_published() -> None:
+    networks = empty_networks(SVD_14)
+    assert sum(value.numel() for name, value in networks.named_parameters() if is_temporal(name)) == 656_076_838
+    unet = sum(value.numel() for value in networks.unet.parameters())
+    let_train(networks, ModelRecipe(base="svd-14", family="kubric90", weights="svd", train="lora"), SEED)
+    factors = sum(value.numel() for name, value in networks.named_parameters() if name.endswith((".down", ".up")))
+    assert factors == 26_607_616
+    assert factors / unet < 0.02
+
+
+def test_adapters_want_weights_to_stand_on() -> None:
+    text = b'name = "x"\n[model]\ntrain = "lora"\n[vae]\nbudget = {updates = 1}\noptimiser = {rate = 1.0}\n'
+    with pytest.raises(RecipeError, match="adds to a trained U-Net: give model"):
+        parse_recipe(text + b"[unet]\nbudget = {updates = 1}\noptimiser = {rate = 1.0}\n[latents]\n", "x.toml")
+
+
+# --- a whole run -----------------------------------------------------------------------------------------------------
+
+
+def recipe(base: Path) -> Recipe:
+    text = f"""
+    name = "mine"
+    model = {{ base = "small", family = "driving", weights = "{base}", train = "lora", lora = {{ rank = 2 }},
+               frames = {FRAMES}, height = {HEIGHT}, width = {WIDTH} }}
+    log = {{ valid_clips = 1 }}
+    export = {{ dtype = "float32" }}
+    [unet]
+    budget = {{ updates = 2 }}
+    source = "pixels"
+    clip_batch = 1
+    optimiser = {{ kind = "adam", rate = 0.01 }}
+    """
+    return parse_recipe("\n".join(text.splitlines()).replace(",\n  ", ", ").encode(), "mine")
+
+
+@pytest.mark.slow
+def test_a_run_leaves_the_adapter_apart_and_merged_weights(tmp_path: Path) -> None:
+    """Two updates, from a file to three files: state, adapter and merged weights agree, and the command joins them."""
+    base, out = tmp_path / "base.safetensors", tmp_path / "run"
+    model = ModelRecipe(base="small", family="driving", frames=FRAMES, height=HEIGHT, width=WIDTH)
+    networks = random_networks(model_config(model), seed=1)
+    save_weights(networks, base, Card(name="base", config=networks.config, family=None, move_time=3))
+    valid = TinyClips(1, seed=9)
+    inputs = RunInputs(recipe=recipe(base), clips=TinyClips(1), valid=valid, folder=RunFolder(out), stop=Never())
+    Trainer(inputs).run()
+    state = load_state(out / "unet" / "state.pt", "unet").module
+    assert all(name.endswith((".down", ".up")) for name in state)
+    joined = load_adapted(load_weights(base, ask_family=False), read_adapter(out / "mine-adapter.safetensors"))
+    merged = load_weights(out / "mine.safetensors")
+    for name, value in merged.networks.state_dict().items():
+        assert torch.equal(value, joined.networks.state_dict()[name]), name
+    result = CliRunner().invoke(
+        app, ["lora", "merge", str(base), str(out / "mine-adapter.safetensors"), str(tmp_path / "joined.safetensors")]
+    )
+    assert result.exit_code == 0, result.output
+    again = load_weights(tmp_path / "joined.safetensors").networks.state_dict()
+    assert all(torch.equal(value, again[name]) for name, value in merged.networks.state_dict().items())

@@ -1,0 +1,72 @@
+"""What a run says of itself."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from gcd_train.errors import TrainError
+from gcd_train.monitor.board import TensorBoard
+from gcd_train.monitor.finite import FiniteGuard
+from gcd_train.monitor.memory import peak_memory_gb
+from gcd_train.pictures import write_sheet
+from gcd_train.run_folder import RunFolder
+
+
+def test_a_loss_that_is_no_number_names_update_and_clips(tmp_path: Path) -> None:
+    guard = FiniteGuard("unet", tmp_path / "unet" / "not_finite.json")
+    guard.saw(4, "loss", torch.tensor(0.5), ("seed 1",))
+    with pytest.raises(TrainError, match=r"the loss of unet is nan at update 5, on clips seed 2, seed 3 \(see"):
+        guard.saw(5, "loss", torch.tensor(torch.nan), ("seed 2", "seed 3"))
+    told = json.loads((tmp_path / "unet" / "not_finite.json").read_text())
+    assert (told["update"], told["clips"]) == (5, ["seed 2", "seed 3"])
+
+
+def test_looked_at_late_the_first_wrong_value_counts_with_the_clips_of_its_update(tmp_path: Path) -> None:
+    guard = FiniteGuard("unet", tmp_path / "note.json", at_once=False)
+    guard.saw(7, "loss", torch.tensor(1.0), ("a",))
+    guard.saw(7, "loss", torch.tensor(2.0), ("b",))
+    guard.saw(7, "gradient", torch.tensor(torch.inf))
+    guard.saw(8, "loss", torch.tensor(torch.nan), ("c",))
+    with pytest.raises(TrainError, match="the gradient of unet is inf at update 7, on clips a, b"):
+        guard.check()
+
+
+def test_what_was_looked_at_and_fine_is_forgotten(tmp_path: Path) -> None:
+    guard = FiniteGuard("vae", tmp_path / "note.json", at_once=False)
+    guard.saw(1, "loss", torch.tensor(1.0))
+    guard.check()
+    guard.check()
+    assert not (tmp_path / "note.json").exists()
+
+
+def test_many_clips_are_counted_in_the_message_and_all_in_the_note(tmp_path: Path) -> None:
+    guard = FiniteGuard("unet", tmp_path / "note.json")
+    ids = tuple(f"seed {i}" for i in range(20))
+    with pytest.raises(TrainError, match="seed 5 and 14 more"):
+        guard.saw(0, "loss", torch.tensor(torch.inf), ids)
+    assert json.loads((tmp_path / "note.json").read_text())["clips"] == list(ids)
+
+
+def test_memory_is_told_in_gigabytes_of_the_process() -> None:
+    assert 0.05 < peak_memory_gb(torch.device("cpu")) < 1000.0
+
+
+def test_figures_and_pictures_reach_tensorboard(tmp_path: Path) -> None:
+    accumulator = pytest.importorskip(
+        "tensorboard.backend.event_processing.event_accumulator", reason="needs tensorboard (extra `train`)"
+    )
+    board = TensorBoard(tmp_path / "tensorboard")
+    folder = RunFolder(tmp_path, board)
+    picture = folder.sample("unet", 3)
+    write_sheet(picture, [[torch.zeros(3, 8, 8)]])
+    folder.record("unet", "loss", {"updates": 3, "loss": 0.25})
+    folder.record("unet", "measured", {"updates": 3, "psnr": 20.0}, picture)
+    board.close()
+    events = accumulator.EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    (loss,) = events.Scalars("unet/loss/loss")
+    assert (loss.step, loss.value) == (3, 0.25)
+    assert events.Scalars("unet/measured/psnr")[0].value == 20.0
+    assert events.Images("unet/samples")[0].step == 3

@@ -1,0 +1,262 @@
+"""Batches from samples of a data set: which samples, what each clip is told, and that a resumed run has the same."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+from tiny_scenes4d import DRIVING_POSES, write_driving, write_kubric
+from torch.testing import assert_close
+
+from gcd_model import FAMILIES, SMALL, ModelConfig
+from gcd_model.conditioning import micro_conditioning, relative_pose_features, spherical_features
+from gcd_model.geometry import pose_trajectory
+from gcd_model.networks import Networks, random_networks
+from gcd_train.datasets.clip_frames import FrameSampling
+from gcd_train.datasets.dataset4d import PairSample
+from gcd_train.datasets.kubric4d import Kubric4D
+from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
+from gcd_train.datasets.sample_clips import SampleClips
+from gcd_train.datasets.skips import Skips
+from gcd_train.datasets.trajectories import DrivingSampling, OrbitSampling
+from gcd_train.datasets.view_pairs import ViewPairs, collate
+from gcd_train.draws import Draws
+from gcd_train.errors import DataError, RecipeError, RunError
+from gcd_train.pair_batches import PairBatches, told_motion
+from gcd_train.precision import Precision
+from gcd_train.recipe import LoaderRecipe, LossRecipe, UNetRecipe
+from gcd_train.recipe.optimiser import OptimiserRecipe
+from gcd_train.recipe.values import Budget
+from gcd_train.sample_loader import LoadedBatch, SampleLoader, SampleOrder
+
+CPU = torch.device("cpu")
+PRECISION = Precision(CPU, half=False, channels_last=False)
+FRAMES, HEIGHT, WIDTH = 3, 16, 32
+UNET = UNetRecipe(
+    budget=Budget(updates=2), optimiser=OptimiserRecipe(rate=1e-3), source="pixels", augmentation=0.02, dropout=0.0
+)
+HERE = LoaderRecipe()
+
+
+class CountedSamples:
+    """Samples that show their own number."""
+
+    def __init__(self, length: int = 7, broken: frozenset[int] = frozenset()) -> None:
+        self.length, self.broken, self.skips = length, broken, Skips()
+
+    def __len__(self) -> int:
+        return self.length
+
+    def sample(self, index: int) -> PairSample:
+        if index in self.broken:
+            raise DataError(f"sample {index} is gone")
+        picture = np.full((FRAMES, HEIGHT, WIDTH, 3), index % 256, np.uint8)
+        deltas = np.linspace(0, 1, FRAMES)[:, None] * np.array([10.0 * (index % 9), 5.0, -1.0])
+        poses = np.tile(np.eye(4), (FRAMES, 1, 1))
+        poses[:, 0, 3] = index
+        return PairSample(
+            source=picture,
+            target=255 - picture,
+            target_classes=None,
+            source_from_target=poses,
+            start=None,
+            deltas=deltas,
+            motion=0,
+            fps=24.0 / (1 + index % 4),
+            scene=f"scn{index % 3:05d}",
+            frame_numbers=tuple(range(FRAMES)),
+            reversed=False,
+            visible=None,
+        )
+
+
+def config(camera: str = "spherical") -> ModelConfig:
+    unet = msgspec.structs.replace(SMALL.unet, camera_width=0 if camera == "none" else 32)
+    unet = msgspec.structs.replace(unet, width=16, multipliers=(1, 2), attention=(False, True), head_width=16)
+    return msgspec.structs.replace(
+        SMALL, frames=FRAMES, height=HEIGHT, width=WIDTH, camera=camera, unet=unet, image_encoder=SMALL.image_encoder
+    )
+
+
+@cache
+def networks(camera: str = "spherical") -> Networks:
+    return random_networks(config(camera), seed=1)
+
+
+def batches(model: Networks, *, family: str = "kubric90", **changes: object) -> PairBatches:
+    recipe = msgspec.structs.replace(UNET, **changes)
+    return PairBatches(CountedSamples(), model, recipe, FAMILIES[family], PRECISION, HERE, 5)
+
+
+def draws(number: int) -> Draws:
+    return Draws(1, "unet", number, CPU)
+
+
+# which samples
+
+
+def test_a_round_takes_every_sample_once_and_the_next_round_others() -> None:
+    order = SampleOrder(7, seed=3)
+    first = [order.batch(number, 2) for number in range(7)]  # two rounds
+    taken = [index for batch in first for index in batch]
+    assert sorted(taken[:7]) == list(range(7))
+    assert sorted(taken[7:]) == list(range(7, 14))
+    assert [index - 7 for index in taken[7:]] != taken[:7]
+    assert SampleOrder(7, seed=4).batch(0, 7) != SampleOrder(7, seed=3).batch(0, 7)
+
+
+@pytest.mark.parametrize("number", [0, 3, 5, 40])
+def test_a_batch_follows_from_its_number_alone(number: int) -> None:
+    order = SampleOrder(7, seed=3)
+    for other in (9, 0, 2):
+        order.batch(other, 4)
+    assert order.batch(number, 4) == SampleOrder(7, seed=3).batch(number, 4)
+
+
+@pytest.mark.parametrize("numbers", [(0, 1, 2, 3), (4, 5), (2, 5, 8, 11), (3, 1, 2, 2)])
+def test_whatever_was_asked_for_before_a_loader_gives_the_same_batch(numbers: tuple[int, ...]) -> None:
+    loader, order = SampleLoader(CountedSamples(), 3, HERE), SampleOrder(7, seed=3)
+    for number in numbers:
+        loaded = loader.batch(number, 2)
+        assert list(loaded.numbers) == order.batch(number, 2)
+        assert loaded.samples.source[:, 0, 0, 0, 0].tolist() == list(loaded.numbers)
+        assert loaded.wait_s >= 0
+
+
+@pytest.mark.slow
+def test_processes_give_the_batches_that_are_made_here() -> None:
+    """Two spawned processes, batches in order and after a jump; what they cannot read ends as it does here."""
+    there = SampleLoader(CountedSamples(), 3, LoaderRecipe(workers=2, prefetch=2))
+    here = SampleLoader(CountedSamples(), 3, HERE)
+    for number in (0, 1, 2, 9, 11, 13):
+        one, other = there.batch(number, 2), here.batch(number, 2)
+        assert one.numbers == other.numbers
+        assert torch.equal(one.samples.source, other.samples.source)
+        assert one.samples.scenes == other.samples.scenes
+    broken = SampleLoader(CountedSamples(broken=frozenset(range(7))), 3, LoaderRecipe(workers=1))
+    with pytest.raises(DataError, match=r"^sample \d is gone$"):
+        broken.batch(0, 2)
+
+
+def test_a_killed_process_is_told_with_what_to_do() -> None:
+    loader = SampleLoader(CountedSamples(), 3, HERE)
+
+    def killed() -> Iterator[object]:
+        raise RuntimeError("DataLoader worker (pid 1) is killed by signal: Killed.")
+        yield
+
+    loader.batch(0, 2)
+    loader._batches = killed()  # pyright: ignore
+    with pytest.raises(RunError, match=r"data\.loader\.workers"):
+        loader.batch(1, 2)
+
+
+# what each clip is told
+
+
+@pytest.mark.parametrize("camera", ["spherical", "relative_pose", "none"])
+def test_each_clip_is_told_its_own_camera_rate_and_motion(camera: str) -> None:
+    model = networks(camera)
+    batch = batches(model).whole_clips(draws(4), 3)
+    numbers = SampleOrder(7, seed=5).batch(4, 3)
+    samples = [CountedSamples().sample(number) for number in numbers]
+    assert batch.target.shape == batch.condition.shape == (3 * FRAMES, 4, HEIGHT // 8, WIDTH // 8)
+    assert batch.tokens is not None
+    assert batch.tokens.shape[0] == 3 * FRAMES
+    for clip, sample in enumerate(samples):
+        rows = slice(clip * FRAMES, (clip + 1) * FRAMES)
+        assert sample.deltas is not None
+        motion = round(255 * np.hypot(*sample.deltas[-1, :2]) / np.hypot(90, 30))
+        told = micro_conditioning(sample.fps, motion, 0.02, SMALL.unet.vector_width)
+        assert_close(batch.vector[rows], told.expand(FRAMES, -1))
+        if camera == "none":
+            assert batch.camera is None
+            continue
+        assert batch.camera is not None
+        wanted = spherical_features(torch.from_numpy(sample.deltas))
+        if camera == "relative_pose":
+            wanted = relative_pose_features(torch.from_numpy(sample.source_from_target))
+        assert_close(batch.camera[rows], wanted)
+    assert batch.ids == tuple(f"scn{number % 3:05d} (sample {number})" for number in numbers)
+    assert batch.wait_s is not None
+
+
+def test_the_same_number_is_the_same_batch_to_the_bit() -> None:
+    model = networks()
+    source = batches(model, dropout=0.5)
+    for number in (3, 4, 5):
+        batch = source.whole_clips(draws(number), 2)
+    again = batches(model, dropout=0.5).whole_clips(draws(5), 2)
+    for name in ("target", "condition", "vector", "tokens", "camera"):
+        assert torch.equal(getattr(batch, name), getattr(again, name)), name
+
+
+def test_the_network_sees_what_the_encoders_make_of_source_and_target() -> None:
+    model = networks()
+    batch = batches(model, augmentation=0.0).whole_clips(draws(1), 1)
+    sample = CountedSamples().sample(SampleOrder(7, seed=5).batch(1, 1)[0])
+    pixels = torch.from_numpy(sample.source).permute(0, 3, 1, 2) / 127.5 - 1
+    with torch.no_grad():
+        assert_close(batch.condition, model.condition_encoder(pixels).mean, atol=1e-5, rtol=1e-4)
+        posterior = model.target_encoder(-pixels)  # 255 - source
+    spread = (0.5 * posterior.log_variance).exp()
+    away = (batch.target / model.config.vae.scale - posterior.mean) / spread
+    assert 0.8 < float(away.std()) < 1.2  # drawn from the posterior, not its mean
+
+
+def test_a_family_with_one_motion_number_is_told_the_recipes() -> None:
+    samples = collate([CountedSamples().sample(2)])
+    assert told_motion(samples, 0, FAMILIES["driving"], UNET) == UNET.motion_bucket == 127
+    assert told_motion(samples, 0, FAMILIES["kubric180"], UNET) < told_motion(samples, 0, FAMILIES["kubric90"], UNET)
+
+
+def test_what_samples_cannot_give_is_refused() -> None:
+    model = networks()
+    with pytest.raises(RecipeError, match="image_share"):
+        batches(model, image_share=0.5)
+    with pytest.raises(RecipeError, match="class_map"):
+        batches(model, loss=LossRecipe(class_map=0.1))
+    other = random_networks(msgspec.structs.replace(config(), frames=4), seed=1)
+    with pytest.raises(DataError, match=r"\[4, 16, 32\] for this model, got \[3, 16, 32\]"):
+        batches(other).whole_clips(draws(0), 1)
+    sample = CountedSamples().sample(1)
+    unsteered = collate([replace(sample, deltas=None)])
+    with pytest.raises(DataError, match="not on a sphere"):
+        batches(model).batch(LoadedBatch(unsteered, (1,), 0.0), draws(0))
+
+
+# samples as clips
+
+
+def test_samples_are_clips_with_the_path_they_were_drawn_with(tmp_path: Path) -> None:
+    write_kubric(tmp_path, 2, frames=FRAMES + 1)
+    data = Kubric4D.open(tmp_path, cameras=[f"view{n}" for n in range(4)])
+    frames = FrameSampling(clip=FRAMES)
+    pairs = ViewPairs(data, OrbitSampling(frames=frames), 0, (WIDTH, HEIGHT), repeats=3)
+    clips = SampleClips(pairs, 2, camera="spherical", fps=24.0, origin="x")
+    sample, path = pairs.sample(1), clips.trajectory(1)
+    assert (len(clips), clips.fps, clips.classes, clips.mount, clips.camera) == (2, 24.0, (), None, "spherical")
+    assert path.delta is not None
+    np.testing.assert_array_equal(path.delta.numpy(), sample.deltas)
+    assert path.source == sample.start
+    assert path.at_goal == (False, False, True)
+    source, target = clips.rgb(1)
+    np.testing.assert_array_equal(source, sample.source)
+    np.testing.assert_array_equal(target, sample.target)
+    assert not clips.target_classes(1).any()
+
+
+def test_a_driving_sample_has_a_free_path(tmp_path: Path) -> None:
+    write_driving(tmp_path, 2, frames=FRAMES + 1)
+    data = ParallelDomain4D.open(tmp_path, cameras=list(DRIVING_POSES), classes=False)
+    pairs = ViewPairs(data, DrivingSampling(frames=FrameSampling(clip=FRAMES)), 0, (48, 32))
+    path = SampleClips(pairs, 1, camera="none", fps=10.0, origin="x").trajectory(0)
+    assert path.delta is None
+    assert_close(
+        path.source_from_target,
+        pose_trajectory(torch.from_numpy(pairs.sample(0).source_from_target)).source_from_target,
+    )

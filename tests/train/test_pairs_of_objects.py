@@ -1,0 +1,337 @@
+"""Pairs of clips on a stage: cut from one simulation, seen along orbits, told so that a model can be steered."""
+
+import json
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from headless import needs_egl
+from stage_world import STAGE as FAST_STAGE
+from stage_world import stage as fast_stage
+from typer.testing import CliRunner
+
+from gcd_model.config import DRIVING_CLASSES
+from gcd_model.geometry import CameraMount, driving_trajectory
+from gcd_train.cli.main import app
+from gcd_train.datasets.clip_source import KeptClips, PaintedClips
+from gcd_train.datasets.paired import PairedClips, require_apart
+from gcd_train.errors import DataError, RecipeError, RenderError
+from gcd_train.scenes.description import Scene, SceneObject
+from gcd_train.scenes.drop import HFOV_DEG
+from gcd_train.scenes.pair_scenes import orbit_draw
+from gcd_train.scenes.pair_world import (
+    STAGE_HFOV_DEG,
+    PairForm,
+    World,
+    agree,
+    driving_world,
+    orbit_world,
+    read_world,
+)
+from gcd_train.scenes.renderer import Renderer
+from gcd_train.scenes.worlds import SCENE_WORLDS, WorldOptions, scene_world
+from gcd_train.scenes.writer import write_shard
+
+
+def stage(seed: int, frames: int) -> Scene:
+    """A floor with a box that creeps over it and stays in view."""
+    scene = fast_stage(seed, frames)
+    return replace(scene, poses=scene.poses * np.array([1, 1, 1, 0.05], np.float32))
+
+
+STAGE = replace(FAST_STAGE, make=stage)
+TINY = PairForm(width=48, height=32, frames=3, oversample=1)
+ORBITS = orbit_world(STAGE, TINY)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Scenes 0 and 1 of the stage, three clips each."""
+    return written(tmp_path_factory.mktemp("orbits"), ORBITS, range(6))
+
+
+@pytest.fixture(autouse=True)
+def stage_is_a_world(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SCENE_WORLDS, "stage", STAGE)
+    monkeypatch.setitem(SCENE_WORLDS, "other", replace(STAGE, name="other"))
+
+
+def written(folder: Path, world: World, seeds: range) -> Path:
+    """A data folder with these clips in one shard."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(SCENE_WORLDS, "stage", STAGE)
+        patch.setitem(SCENE_WORLDS, "other", replace(STAGE, name="other"))
+        folder.mkdir(parents=True, exist_ok=True)
+        agree(folder, world)
+        write_shard(folder, world, seeds)
+    return folder
+
+
+def told(clips: PairedClips, number: int) -> dict[str, np.ndarray]:
+    """Poses as the shard keeps them, rounded to a millionth."""
+    path, name = clips.places[number]
+    with zipfile.ZipFile(path) as archive:
+        poses = json.loads(archive.read(f"{name}/scene.json"))["world_from_camera"]
+    return {camera: np.array(rows) for camera, rows in poses.items()}
+
+
+# laws
+
+
+@needs_egl
+def test_a_clip_shows_its_time_steps_from_its_cameras(folder: Path) -> None:
+    clips = PairedClips.open(folder)
+    clip, numbers = clips[4], list(clips.orbit(4).frame_numbers)
+    scene = stage(1, STAGE.frames)
+    cut = replace(scene, poses=scene.poses[numbers], focus=scene.focus[numbers], cameras=told(clips, 4))
+    with Renderer(48, 32, oversample=1) as renderer:
+        drawn = renderer.render(cut)
+    for name, frames in drawn.items():
+        apart = getattr(clip, name).astype(int) - np.stack([frame.rgb for frame in frames])
+        assert np.abs(apart).mean() < 0.05  # poses on disk are rounded
+        assert getattr(clip, f"{name}_instances").max() == 7
+        assert not getattr(clip, f"{name}_classes").any()
+
+
+@needs_egl
+def test_the_trajectory_is_the_way_between_the_cameras_on_disk(folder: Path) -> None:
+    clips = PairedClips.open(folder)
+    for number in range(len(clips)):
+        path, poses, orbit = clips.trajectory(number), told(clips, number), clips.orbit(number)
+        assert np.ptp(poses["source"], axis=0).max() == 0
+        between = np.linalg.inv(poses["source"]) @ poses["target"]
+        np.testing.assert_allclose(path.source_from_target.numpy(), between, atol=1e-4)
+        assert path.source is not None
+        assert path.delta is not None
+        assert (path.source.azimuth_deg, path.source.elevation_deg, path.source.radius_m) == (0.0, *orbit.start[1:])
+        np.testing.assert_allclose(path.delta[-1].numpy(), orbit.change)
+        assert not path.delta[0].any()
+
+
+@needs_egl
+def test_a_clip_does_not_depend_on_those_beside_it(folder: Path, tmp_path: Path) -> None:
+    alone = PairedClips.open(written(tmp_path, ORBITS, range(4, 5)))
+    beside = PairedClips.open(folder)
+    assert (alone.seed(0), alone.orbit(0)) == (beside.seed(4), beside.orbit(4))
+    for kind in ("source", "target", "target_depth", "target_instances"):
+        np.testing.assert_array_equal(getattr(alone[0], kind), getattr(beside[4], kind))
+
+
+def test_paths_keep_within_the_bounds_and_differ_between_worlds() -> None:
+    scene = stage(0, STAGE.frames)
+    draws = [orbit_draw(scene, ORBITS, seed) for seed in range(30)]
+    for draw in draws:
+        assert draw.start is not None
+        assert draw.deltas is not None
+        goal = np.array([draw.start.elevation_deg, draw.start.radius_m]) + draw.deltas[-1, 1:]
+        assert 0 <= goal[0] <= 50
+        assert 12 <= goal[1] <= 18
+        assert (np.abs(draw.deltas[-1]) <= (90, 30, 3)).all()
+        assert (np.diff(draw.frame_numbers) == 2).all()
+        assert draw.fps == 12.0
+    assert len({draw.frame_numbers[0] for draw in draws}) > 10
+    elsewhere = orbit_draw(scene, msgspec.structs.replace(ORBITS, name="other"), 0)
+    assert elsewhere.start != draws[0].start
+
+
+def test_the_world_told_is_the_world_read(tmp_path: Path) -> None:
+    for number, world in enumerate((ORBITS, driving_world(TINY, WorldOptions(), 2))):
+        (tmp_path / str(number)).mkdir()
+        agree(tmp_path / str(number), world)
+        assert read_world(tmp_path / str(number)) == world
+
+
+# examples
+
+
+@needs_egl
+def test_no_scene_is_on_both_sides_of_a_split(folder: Path, tmp_path: Path) -> None:
+    training = PairedClips.open(folder)
+    fewer = orbit_world(STAGE, TINY, clips_per_scene=1)
+    for name, world, seeds, shared in (
+        ("same scene, another clip", ORBITS, range(5, 6), True),
+        ("cut otherwise", fewer, range(1, 2), True),
+        ("another scene", fewer, range(2, 3), False),
+        ("another world", msgspec.structs.replace(ORBITS, name="other"), range(1), False),
+    ):
+        held_out = PairedClips.open(written(tmp_path / name, world, seeds))
+        if shared:
+            with pytest.raises(DataError, match="share 1 scenes, first: seed 1"):
+                require_apart(PairedClips((training.world,), training.places[3:]), held_out)
+        else:
+            require_apart(training, held_out)
+
+
+@needs_egl
+def test_clips_of_several_folders_alternate(folder: Path, tmp_path: Path) -> None:
+    written(tmp_path / "b", msgspec.structs.replace(ORBITS, name="other"), range(2))
+    first, both = PairedClips.open(folder), PairedClips.open([folder, tmp_path / "b"])
+    assert len(both) == 8
+    names = [both.scene(number)[0] for number in range(8)]
+    assert [names[:4].count(name) for name in ("stage", "other")] == [3, 1]
+    assert len({both.seed(number) for number in range(8)}) == 8
+    assert {first.seed(number) for number in range(6)} < {both.seed(number) for number in range(8)}
+    assert both.origin != first.origin
+    other = names.index("other")
+    alone = PairedClips.open(tmp_path / "b")
+    np.testing.assert_array_equal(both.rgb(other)[1], alone.rgb(0)[1])
+    np.testing.assert_array_equal(both.trajectory(other).delta, alone.trajectory(0).delta)
+    assert [clips.scene(3) for clips in (both, PairedClips.open([folder, tmp_path / "b"], limit=4))] == [
+        both.scene(3)
+    ] * 2
+
+
+@needs_egl
+def test_a_folder_of_folders_is_all_of_them(folder: Path, tmp_path: Path) -> None:
+    for name in ("stage", "other"):
+        written(tmp_path / name, msgspec.structs.replace(ORBITS, name=name), range(2))
+    within = PairedClips.open(tmp_path)
+    assert within.origin == PairedClips.open([tmp_path / "other", tmp_path / "stage"]).origin
+    assert {world.name for world in within.worlds} == {"stage", "other"}
+    with pytest.raises(DataError, match="given twice"):
+        PairedClips.open([folder, folder])
+
+
+@needs_egl
+def test_folders_that_differ_do_not_go_together(folder: Path, tmp_path: Path) -> None:
+    wider = orbit_world(STAGE, replace(TINY, width=64))
+    written(tmp_path / "wider", wider, range(1))
+    with pytest.raises(DataError, match="do not go together"):
+        PairedClips.open([folder, tmp_path / "wider"])
+
+
+@needs_egl
+def test_what_wraps_clips_tells_of_the_same_path(folder: Path) -> None:
+    clips = PairedClips.open(folder)
+    kept = KeptClips(clips, (5, 2))
+    assert (kept.camera, kept.mount, kept.fps) == ("spherical", None, 12.0)
+    np.testing.assert_array_equal(kept.trajectory(0).delta, clips.trajectory(5).delta)
+    np.testing.assert_array_equal(kept.rgb(1)[0], clips.rgb(2)[0])
+    with pytest.raises(DataError, match="need"):
+        PaintedClips(clips)
+
+
+@needs_egl
+def test_painted_clips_show_classes_where_others_show_colours(tmp_path: Path) -> None:
+    clips = PairedClips.open(written(tmp_path, driving_world(TINY, WorldOptions(), 1), range(1)))
+    painted = PaintedClips(clips)
+    colours = np.array([kind.colour for kind in DRIVING_CLASSES], np.uint8)
+    np.testing.assert_array_equal(painted.rgb(0)[0], clips.rgb(0)[0])
+    np.testing.assert_array_equal(painted.rgb(0)[1], colours[clips.target_classes(0)])
+    assert painted.origin != clips.origin
+    expected = driving_trajectory(frames=3, move_time=2, mount=clips.mount).source_from_target
+    np.testing.assert_array_equal(painted.trajectory(0).source_from_target, expected)
+
+
+def test_things_keep_clear_of_the_cameras() -> None:
+    scene = stage(0, STAGE.frames)
+    beside = with_thing(scene, at=(15.0, 0.0, 1.0))
+    for seed in range(20):
+        draw = orbit_draw(beside, ORBITS, seed)
+        eyes = np.concatenate([draw.world_from_source[None, :3, 3], draw.world_from_target[:, :3, 3]])
+        assert np.linalg.norm(eyes - (15.0, 0.0, 1.0), axis=-1).min() >= 1.0 + 3**0.5
+    with pytest.raises(RenderError, match="no path"):
+        orbit_draw(with_thing(scene, at=(0.0, 0.0, 1.0), side=40.0), ORBITS, 0)
+
+
+def with_thing(scene: Scene, at: tuple[float, float, float], side: float = 2.0) -> Scene:
+    """The scene with a cube that stands there, as far as metadata tells."""
+    still = np.zeros((scene.frames, 3))
+    cube = SceneObject(
+        name="cube",
+        instance=1,
+        body=1,
+        label=1,
+        size=(side, side, side),
+        dynamic=False,
+        mass_kg=1.0,
+        friction=0.5,
+        restitution=0.1,
+        positions=still + at,
+        quaternions=np.tile([1.0, 0.0, 0.0, 0.0], (scene.frames, 1)),
+        velocities=still,
+        angular_velocities=still,
+    )
+    return replace(scene, objects=(cube,))
+
+
+def test_the_stage_has_one_lens() -> None:
+    assert STAGE_HFOV_DEG == HFOV_DEG
+
+
+@pytest.mark.parametrize(("world", "frames", "said"), [("driving", 14, "no stage"), ("stage", 40, "up to 30")])
+def test_worlds_that_give_no_such_clips_are_refused(world: str, frames: int, said: str) -> None:
+    with pytest.raises(RecipeError, match=said):
+        orbit_world(scene_world(world), PairForm(frames=frames))
+    assert orbit_world(STAGE, PairForm(frames=30)).frames == 30
+
+
+def test_a_world_that_is_none_is_refused() -> None:
+    with pytest.raises(RecipeError, match="no world 'sea'"):
+        scene_world("sea")
+
+
+@needs_egl
+def test_the_command_makes_pairs_and_a_contact_sheet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SCENE_WORLDS, "drop", replace(STAGE, name="drop"))
+    data, sheet = tmp_path / "data", tmp_path / "sheet.png"
+    size = ["--width", "48", "--height", "32", "--frames", "3", "--oversample", "1", "--workers", "1"]
+    line = ["generate", "drop", str(data), "--pairs", "--first-seed", "5", *size]
+    made = CliRunner().invoke(app, [*line, "--clips", "4", "--contact-sheet", str(sheet)])
+    assert made.exit_code == 0, made.output
+    clips = PairedClips.open(data)
+    assert [clips.seed(number) for number in range(4)] == [15, 16, 17, 18]
+    assert clips.scene(3) == ("drop", 6)
+    assert sheet.read_bytes().startswith(b"\x89PNG")
+    refused = CliRunner().invoke(app, [*line, "--scenes", "2"])
+    assert refused.exit_code == 78
+    assert "give one" in refused.output
+
+
+# recorded
+
+
+def test_driving_folders_made_before_keep_their_name(tmp_path: Path) -> None:
+    """The text and the digests are those of the version before orbits (2026-11-21)."""
+    classes = [{"name": kind.name, "colour": list(kind.colour)} for kind in DRIVING_CLASSES]
+    before = {
+        "name": "driving",
+        "width": 192,
+        "height": 128,
+        "frames": 14,
+        "fps": 10.0,
+        "hfov_deg": 85.0,
+        "oversample": 2,
+        "clips_per_shard": 8,
+        "options": {"height_m": 1.55, "tilt_deg": 0.0},
+        "classes": classes,
+        "format": 1,
+    }
+    (tmp_path / "world.json").write_text(json.dumps(before))
+    world = read_world(tmp_path)
+    assert world == driving_world(PairForm(), WorldOptions(), 1)
+    assert json.loads(msgspec.json.encode(world.told())) == before
+    clips = PairedClips((world,), ((tmp_path, "00000000"),))
+    assert clips.origin == "5ac02f4a"
+    assert (clips.camera, clips.mount, clips.scene(0)) == ("none", CameraMount(), ("driving", 0))
+    grown = PairedClips((driving_world(PairForm(), WorldOptions(), 2),), clips.places)
+    assert grown.origin != clips.origin
+
+
+@needs_egl
+@pytest.mark.slow
+@pytest.mark.parametrize("world", ["drop", "tabletop"])
+def test_real_scenes_show_their_things_to_both_cameras(world: str, tmp_path: Path) -> None:
+    """Simulates, which takes a second or two: things are in both views, and no camera stands in one or below ground."""
+    pairs = orbit_world(scene_world(world), replace(TINY, frames=14))
+    clips = PairedClips.open(written(tmp_path, pairs, range(3)))
+    for number in range(3):
+        clip, poses = clips[number], told(clips, number)
+        for side in ("source", "target"):
+            assert ((getattr(clip, f"{side}_instances") > 0).mean((1, 2)) > 0.01).all()
+            seen = getattr(clip, f"{side}_depth")
+            assert seen[seen > 0].min() > 1.0
+            assert poses[side][:, 2, 3].min() > 0.0

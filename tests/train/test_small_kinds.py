@@ -1,0 +1,318 @@
+"""Runs of the small models that are not `driving-small`, at a tiny size: steered orbits, and painted classes."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips, TinyOrbits, tiny_recipe
+from torch import Tensor
+
+from gcd_model import FAMILIES, Clip, load_synthesizer
+from gcd_model.conditioning import micro_conditioning, spherical_features
+from gcd_model.config import DRIVING_CLASSES
+from gcd_model.geometry import SphericalDelta, Trajectory
+from gcd_model.networks import random_networks
+from gcd_train.batches import EncodedBatches, PixelBatches
+from gcd_train.checkpoint import load_state
+from gcd_train.conditioner import Conditioner, mirrored_path
+from gcd_train.datasets.clip_source import ClipSource, PaintedClips, SomeClips, to_network
+from gcd_train.datasets.latents import LatentClips, LatentRows
+from gcd_train.draws import Draws
+from gcd_train.errors import DataError, Interrupted
+from gcd_train.losses import COLOUR_WEIGHTS, class_emphasis
+from gcd_train.model_setup import model_config, sampled_as_trained
+from gcd_train.precision import Precision
+from gcd_train.recipe import Budget, ClassWeightsName, NoiseRecipe, Recipe
+from gcd_train.run_folder import RunFolder
+from gcd_train.stages.latents import LatentsJob, encode_clips
+from gcd_train.start import start_networks
+from gcd_train.stop import StopSignal
+from gcd_train.trainer import RunInputs, Trainer
+
+CPU = torch.device("cpu")
+PRECISION = Precision(CPU, half=False, channels_last=False)
+
+
+def small_recipe(name: str, base: str, family: str, loss: dict[str, object], **changes: object) -> Recipe:
+    """The tiny recipe for another base, with still smaller networks and few updates."""
+    tiny = tiny_recipe()
+    assert tiny.vae is not None
+    unet = msgspec.structs.replace(tiny.model.unet, multipliers=(1, 1, 1), embedding_width=16)
+    vae = msgspec.structs.replace(tiny.model.vae, multipliers=(1, 1, 1))
+    told = msgspec.structs.replace(tiny.unet.loss, **loss)
+    return tiny_recipe(
+        name=name,
+        model=msgspec.structs.replace(tiny.model, base=base, family=family, unet=unet, vae=vae),
+        vae=msgspec.structs.replace(tiny.vae, budget=Budget(updates=2), normalise_at=0.5),
+        unet=msgspec.structs.replace(
+            tiny.unet,
+            budget=Budget(updates=5),  # layers that start at zero let the camera's gradient through by and by
+            optimiser=msgspec.structs.replace(tiny.unet.optimiser, warm_up=0),
+            loss=told,
+            fps=FAMILIES[family].fps,
+        ),
+        **changes,
+    )
+
+
+def orbit_recipe() -> Recipe:
+    decoder = tiny_recipe().decoder
+    assert decoder is not None
+    short = msgspec.structs.replace(decoder, budget=Budget(updates=1), class_map=0.0)
+    return small_recipe("tiny-orbits", "objects-small", "kubric90", {"class_map": 0.0}, decoder=short)
+
+
+def painted_recipe() -> Recipe:
+    loss: dict[str, object] = {"class_map": 0.0, "class_weights": "driving"}
+    return small_recipe("tiny-painted", "driving-semantic-small", "driving-semantic", loss, decoder=None)
+
+
+def trainer(
+    path: Path, recipe: Recipe, clips: ClipSource, valid: ClipSource, stop: StopSignal | None = None
+) -> Trainer:
+    return Trainer(RunInputs(recipe=recipe, clips=clips, valid=valid, folder=RunFolder(path), stop=stop or Never()))
+
+
+def orbits(path: Path, stop: StopSignal | None = None) -> Trainer:
+    return trainer(path, orbit_recipe(), TinyOrbits(), TinyOrbits(1, seed=9), stop)
+
+
+def painted(path: Path) -> Trainer:
+    return trainer(path, painted_recipe(), PaintedClips(TinyClips()), PaintedClips(TinyClips(1, seed=9)))
+
+
+@pytest.fixture(scope="module")
+def orbit_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run; tests only read it."""
+    path = tmp_path_factory.mktemp("orbits")
+    orbits(path).run()
+    return path
+
+
+@pytest.fixture(scope="module")
+def painted_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run; tests only read it."""
+    path = tmp_path_factory.mktemp("painted")
+    painted(path).run()
+    return path
+
+
+def measured(run: Path) -> dict[str, dict[str, float]]:
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    return {line["stage"]: line for line in lines if line["kind"] == "measured"}
+
+
+def test_a_run_on_orbits_ends_in_a_file_that_is_steered(orbit_run: Path) -> None:
+    synthesizer = load_synthesizer(orbit_run / "tiny-orbits.safetensors", device="cpu")
+    traits, clips = synthesizer.traits, TinyOrbits(1, seed=4)
+    features = synthesizer.encode(Clip(video=to_network(clips.rgb(0)[0]), fps=12.0))
+    near, far = (traits.plan_view(SphericalDelta(azimuth_deg=azimuth)) for azimuth in (5.0, 60.0))
+    first, second = synthesizer.render(features, [near, far])
+    assert first.video.shape == (FRAMES, 3, HEIGHT, WIDTH)
+    assert not torch.equal(first.video[-1], second.video[-1])
+    assert traits.family is FAMILIES["kubric90"]
+    assert set(measured(orbit_run)) == {"vae", "unet", "decoder", "export"}
+
+
+def test_what_steers_is_trained_too(orbit_run: Path) -> None:
+    trained = load_state(orbit_run / "unet" / "state.pt", "unet").module
+    assert trained["camera.proj.weight"].shape[1] == 13
+    recipe = orbit_recipe()
+    start = start_networks(recipe.model, model_config(recipe.model), recipe.seed).camera
+    assert start is not None
+    assert not torch.equal(trained["camera.proj.weight"], start.proj.weight)
+
+
+def test_a_run_on_painted_clips_ends_in_a_file_that_makes_class_maps(painted_run: Path) -> None:
+    synthesizer = load_synthesizer(painted_run / "tiny-painted.safetensors", device="cpu")
+    source, _ = TinyClips(1, seed=4).rgb(0)
+    features = synthesizer.encode(Clip(video=to_network(source), fps=10.0))
+    view = synthesizer.render(features, [synthesizer.traits.plan_view()])[0]
+    assert view.classes is not None
+    assert view.classes.shape == (1, FRAMES, HEIGHT, WIDTH)
+    assert synthesizer.traits.classes == DRIVING_CLASSES
+    assert all(0 <= measured(painted_run)[stage]["miou_full"] <= 1 for stage in ("vae", "unet", "export"))
+
+
+def test_the_target_of_a_painted_clip_is_what_the_latents_hold(painted_run: Path) -> None:
+    meta = LatentClips.open(painted_run / "latents").meta
+    assert meta.emphasis
+    assert (meta.class_upscale, meta.control) == (0, 0)
+
+
+@pytest.mark.slow
+def test_a_resumed_run_on_orbits_equals_an_uninterrupted_one(orbit_run: Path, tmp_path: Path) -> None:
+    """Bit for bit, what is steered and warped included; slow because other runs show the same of fixed paths."""
+    (tmp_path / "vae").symlink_to(orbit_run / "vae")
+    for stage in ("latents", "unet"):
+        with pytest.raises(Interrupted):
+            orbits(tmp_path, stop=After(1)).run(stage)
+        orbits(tmp_path).run(stage)
+    for name in LatentClips.open(orbit_run / "latents").meta.shapes:
+        first, second = (np.load(folder / "latents" / f"{name}.npy") for folder in (tmp_path, orbit_run))
+        assert np.array_equal(first, second), name
+    resumed, whole = (load_state(folder / "unet" / "state.pt", "unet").module for folder in (tmp_path, orbit_run))
+    assert all(torch.equal(resumed[name], value) for name, value in whole.items())
+
+
+class Mirrored(SomeClips):
+    """Clips as seen in a mirror."""
+
+    def __init__(self, clips: ClipSource) -> None:
+        super().__init__(clips, range(len(clips)))
+
+    def rgb(self, number: int, /) -> tuple[np.ndarray, np.ndarray]:
+        source, target = super().rgb(number)
+        return source[:, :, ::-1], target[:, :, ::-1]
+
+    def trajectory(self, number: int, /) -> Trajectory:
+        return mirrored_path(super().trajectory(number))
+
+    def target_classes(self, number: int, /) -> np.ndarray:
+        return super().target_classes(number)[:, :, ::-1]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A recipe, its clips, and the clips in a mirror."""
+
+    recipe: Recipe
+    clips: ClipSource
+    mirrored: ClipSource
+
+
+KINDS = {
+    "orbits": Kind(orbit_recipe(), TinyOrbits(), Mirrored(TinyOrbits())),
+    "painted": Kind(painted_recipe(), PaintedClips(TinyClips()), PaintedClips(Mirrored(TinyClips()))),
+}
+
+
+def encoded(path: Path, recipe: Recipe, clips: ClipSource) -> LatentClips:
+    """Latents of clips by a random autoencoder."""
+    config = model_config(recipe.model)
+    assert recipe.latents is not None
+    job = LatentsJob(
+        folder=path,
+        networks=random_networks(config, seed=5),
+        clips=clips,
+        recipe=recipe.latents,
+        conditioner=Conditioner(config, recipe.unet, PRECISION, FAMILIES[recipe.model.family]),
+        class_weights=COLOUR_WEIGHTS[recipe.unet.loss.class_weights],
+        precision=PRECISION,
+        seed=1,
+        identity="test",
+        stop=Never(),
+    )
+    encode_clips(job)
+    return LatentClips.open(path)
+
+
+def row(clips: LatentClips, *, mirrored: bool) -> LatentRows:
+    """Frame 2 of clip 1."""
+    return clips.rows(torch.tensor([1]), torch.tensor([2]), torch.tensor([mirrored]), CPU)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_mirrored_row_is_the_row_of_the_mirrored_scene(name: str, tmp_path: Path) -> None:
+    kind = KINDS[name]
+    one = row(encoded(tmp_path / "plain", kind.recipe, kind.clips), mirrored=True)
+    other = row(encoded(tmp_path / "mirrored", kind.recipe, kind.mirrored), mirrored=False)
+    assert torch.equal(one.source, other.source)
+    assert torch.equal(one.target, other.target)
+    assert torch.equal(one.motion, other.motion)
+    assert_alike(one.control, other.control)
+    assert_alike(one.emphasis, other.emphasis)
+    assert one.pictures is not None
+    assert other.pictures is not None
+    for pictures in ("half", "ground", "distant", "rays"):
+        difference = (getattr(one.pictures, pictures) - getattr(other.pictures, pictures)).abs()
+        assert difference.mean() < 2e-3, pictures  # a pixel of the rim may be seen on one side alone
+
+
+def assert_alike(one: Tensor | None, other: Tensor | None) -> None:
+    assert (one is None) == (other is None)
+    if one is not None and other is not None:
+        torch.testing.assert_close(one, other)
+
+
+def test_the_network_is_told_of_orbits_what_the_synthesizer_would_tell(orbit_run: Path) -> None:
+    recipe, clips = orbit_recipe(), LatentClips.open(orbit_run / "latents")
+    rows = clips.rows(torch.tensor([1]), torch.tensor([2]), torch.tensor([False]), CPU)
+    config, path = model_config(recipe.model), TinyOrbits().trajectory(1)
+    traits = load_synthesizer(orbit_run / "tiny-orbits.safetensors", device="cpu").traits
+    told = micro_conditioning(12.0, traits.motion_bucket(path), 0.0, config.unet.vector_width)
+    torch.testing.assert_close(EncodedBatches(clips, config, recipe.unet, PRECISION).vector(rows)[0], told)
+    assert path.delta is not None
+    assert rows.control is not None
+    assert torch.equal(rows.control[0], spherical_features(path.delta)[2])
+
+
+def test_batches_from_pixels_are_told_of_orbits_the_same(orbit_run: Path) -> None:
+    recipe = orbit_recipe()
+    unet = msgspec.structs.replace(recipe.unet, image_share=0.0)
+    networks = random_networks(model_config(recipe.model), seed=5)
+    batch = PixelBatches(TinyOrbits(), networks, unet, PRECISION, FAMILIES["kubric90"]).batch(
+        [0, 1], Draws(1, "test", 0, CPU)
+    )
+    encoded_rows = LatentClips.open(orbit_run / "latents").rows(
+        torch.tensor([0, 1]).repeat_interleave(FRAMES),
+        torch.arange(FRAMES).repeat(2),
+        torch.zeros(2 * FRAMES, dtype=torch.bool),
+        CPU,
+    )
+    assert batch.camera is not None
+    assert encoded_rows.control is not None
+    assert torch.equal(batch.camera, encoded_rows.control)
+    assert batch.condition.shape[1] == networks.config.unet.condition_channels
+
+
+@pytest.mark.parametrize(
+    ("name", "factor"), [("person", 7.0), ("cyclist", 7.0), ("truck", 3.0), ("own_car", 3.0), ("road", 1.0)]
+)
+def test_people_and_vehicles_of_our_world_count_as_published(name: str, factor: float) -> None:
+    (colour,) = (kind.colour for kind in DRIVING_CLASSES if kind.name == name)
+    painted_one = torch.tensor(colour).view(1, 3, 1, 1).expand(1, 3, 8, 8) / 127.5 - 1
+    weights: ClassWeightsName = "driving"
+    emphasis = class_emphasis(painted_one, COLOUR_WEIGHTS[weights], (1, 1))
+    assert emphasis.item() == pytest.approx(factor - 1)
+
+
+def test_late_noise_takes_over_where_the_recipe_says() -> None:
+    mixed = NoiseRecipe(fixed_share=0.5)
+    unet = msgspec.structs.replace(
+        tiny_recipe().unet, noise=NoiseRecipe(fixed_share=1.0, fixed_sigma=40.0), late_noise=mixed, late_from=0.8
+    )
+    assert unet.noise_at(0.79).fixed_share == 1.0
+    assert unet.noise_at(0.8) is mixed
+    config = model_config(tiny_recipe().model)
+    assert sampled_as_trained(config, unet).sampling.steps == 1  # sigma 80 is among the late ones
+    several = model_config(msgspec.structs.replace(tiny_recipe().model, steps=4))
+    assert sampled_as_trained(several, unet).sampling.steps == 4
+
+
+@pytest.mark.parametrize(
+    ("recipe", "clips", "words"),
+    [
+        (orbit_recipe(), TinyClips(), "no orbits"),
+        (painted_recipe(), TinyOrbits(), "its own"),
+    ],
+)
+def test_clips_of_the_other_kind_are_refused(recipe: Recipe, clips: ClipSource, words: str, tmp_path: Path) -> None:
+    recipe = msgspec.structs.replace(recipe, unet=msgspec.structs.replace(recipe.unet, fps=clips.fps))
+    with pytest.raises(DataError, match=words):
+        trainer(tmp_path, recipe, clips, clips)
+
+
+def test_a_mirrored_path_turns_the_other_way() -> None:
+    path = TinyOrbits().trajectory(1)
+    other = mirrored_path(path)
+    assert path.delta is not None
+    assert other.delta is not None
+    assert torch.equal(other.delta[:, 0], -path.delta[:, 0])
+    assert torch.equal(other.delta[:, 1:], path.delta[:, 1:])
+    torch.testing.assert_close(other.source_from_target[:, 0, 3], -path.source_from_target[:, 0, 3])
+    torch.testing.assert_close(mirrored_path(other).source_from_target, path.source_from_target)

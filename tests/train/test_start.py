@@ -1,0 +1,209 @@
+"""Where training starts, which part of the networks it changes, and what it leaves as it was, bit for bit."""
+
+from pathlib import Path
+
+import msgspec
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+
+from gcd_model.checkpoints import save_weights
+from gcd_model.config import ModelConfig
+from gcd_model.gcd_layout import gcd_state
+from gcd_model.networks import Networks, empty_networks, random_networks
+from gcd_model.own_format import Card
+from gcd_model.weights_export import write_published
+from gcd_train.draws import Draws
+from gcd_train.errors import RecipeError
+from gcd_train.model_setup import model_config
+from gcd_train.objective import Batch, Denoiser, Weights, diffusion_loss
+from gcd_train.precision import Precision
+from gcd_train.recipe import LossRecipe, ModelRecipe, NoiseRecipe
+from gcd_train.start import fresh_networks, start_networks
+from gcd_train.trained_part import is_temporal, keep_trained_alone, let_train
+
+CPU = torch.device("cpu")
+SEED = 3
+
+
+def published(camera: str = "spherical") -> ModelConfig:
+    """The smallest networks that published names and shapes can tell."""
+    small = model_config(ModelRecipe(base="small", family="driving" if camera == "none" else "kubric90"))
+    unet = msgspec.structs.replace(
+        small.unet, width=32, multipliers=(1, 2), attention=(False, True), head_width=64, norm_groups=32
+    )
+    vae = msgspec.structs.replace(small.vae, width=32, multipliers=(1, 1), norm_groups=32)
+    tower = msgspec.structs.replace(small.image_encoder, heads=16)  # pyright: ignore[reportArgumentType]  it has one
+    return msgspec.structs.replace(small, unet=unet, vae=vae, image_encoder=tower, frames=2, camera=camera)
+
+
+def starting(path: Path, scratch: bool = False) -> ModelRecipe:
+    return ModelRecipe(base="small", family="kubric90", weights=str(path), scratch=scratch)
+
+
+def given(camera: str = "spherical") -> Networks:
+    return random_networks(published(camera), seed=1)
+
+
+def write(path: Path, networks: Networks) -> Path:
+    """In the layout its suffix and name tell."""
+    config, weights = networks.config, networks.state_dict()
+    card = Card(name="given", config=config, family=None, move_time=1)
+    if path.suffix == ".ckpt":
+        write_published(path, weights, card, carried={})
+    elif path.stem == "svd":
+        save_file({name: value.clone() for name, value in gcd_state(weights, config, {}).items()}, path)
+    else:
+        save_weights(networks, path, card)
+    return path
+
+
+def assert_from(networks: Networks, source: Networks, anew: tuple[str, ...]) -> None:
+    """Weights come from the source, but those that start anew, which are as fresh networks have them."""
+    state, wanted = networks.state_dict(), source.state_dict()
+    fresh = fresh_networks(networks.config, SEED).state_dict()
+    for name, value in state.items():
+        expected = fresh[name] if name.startswith(anew) else wanted[name]
+        assert torch.equal(value, expected), name
+
+
+@pytest.mark.parametrize("name", ["gcd.ckpt", "own.safetensors"])
+def test_a_model_of_the_same_kind_gives_all_its_weights(tmp_path: Path, name: str) -> None:
+    source = given()
+    networks = start_networks(starting(write(tmp_path / name, source)), published(), SEED)
+    assert_from(networks, source, ("nothing",))
+
+
+def test_the_base_model_gives_all_but_the_camera(tmp_path: Path) -> None:
+    source = given("none")
+    networks = start_networks(starting(write(tmp_path / "svd.safetensors", source)), published(), SEED)
+    assert_from(networks, source, ("camera.", "unet.embed_camera."))
+
+
+def test_from_scratch_takes_autoencoders_and_image_tower_alone(tmp_path: Path) -> None:
+    source = given("none")
+    path = write(tmp_path / "svd.safetensors", source)
+    networks = start_networks(starting(path, scratch=True), published(), SEED)
+    assert_from(networks, source, ("unet.", "camera."))
+    assert not torch.equal(networks.unet.stem.weight, source.unet.stem.weight)
+
+
+def test_a_file_of_another_model_is_refused_by_its_first_weight(tmp_path: Path) -> None:
+    path = write(tmp_path / "own.safetensors", given())
+    wide = msgspec.structs.replace(published(), unet=msgspec.structs.replace(published().unet, embedding_width=64))
+    with pytest.raises(RecipeError, match=r"own.safetensors holds another model .* misshapen, first: unet\."):
+        start_networks(starting(path), wide, SEED)
+
+
+def test_starting_from_a_file_needs_no_family_of_it(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    start_networks(starting(write(tmp_path / "mine.ckpt", given())), published(), SEED)
+    assert caplog.text == ""
+
+
+# --- what is trained -------------------------------------------------------------------------------------------------
+
+
+def random_batch(config: ModelConfig) -> Batch:
+    draws, rows = Draws(1, "batch", 0, CPU), config.frames
+    assert config.image_encoder is not None
+    return Batch(
+        target=draws.normal(rows, 4, 4, 4),
+        condition=draws.normal(rows, 4, 4, 4),
+        vector=draws.normal(rows, config.unet.vector_width),
+        tokens=draws.normal(rows, config.image_encoder.output_width),
+        classes=None,
+        emphasis=None,
+        frames=rows,
+        camera=draws.normal(rows, 13),
+    )
+
+
+def updated(networks: Networks) -> set[str]:
+    """One update with a large rate; the names of all weights whose bits changed."""
+    before = {name: value.clone() for name, value in networks.state_dict().items()}
+    denoiser = Denoiser(networks.unet, None, "v", networks.camera)
+    trained = [parameter for parameter in denoiser.parameters() if parameter.requires_grad]
+    optimiser = torch.optim.Adam(trained, lr=0.01)
+    for update in range(2):  # what stands behind a layer that starts at zero moves with the second
+        loss = diffusion_loss(
+            denoiser,
+            random_batch(networks.config),
+            Draws(1, "test", update, CPU),
+            Precision(CPU, half=False, channels_last=False),
+            noise=NoiseRecipe(),
+            loss=LossRecipe(),
+            weights=Weights(),
+            step=0,
+        )
+        optimiser.zero_grad()
+        loss.total.backward()
+        optimiser.step()
+    return {name for name, value in networks.state_dict().items() if not torch.equal(value, before[name])}
+
+
+def test_as_published_all_of_the_unet_and_the_camera_change_and_nothing_else() -> None:
+    networks = given()
+    let_train(networks, ModelRecipe(base="small", family="kubric90"), SEED)
+    changed = updated(networks)
+    assert {name.partition(".")[0] for name in changed} == {"unet", "camera"}
+    unet = {name for name, _ in networks.named_parameters() if name.startswith(("unet.", "camera."))}
+    assert changed == {name for name in unet if ".dormant." not in name}
+    frozen = [(name, p) for name, p in networks.named_parameters() if name not in unet]
+    assert {name.partition(".")[0] for name, _ in frozen} == {
+        "image_encoder",
+        "target_encoder",
+        "own_condition_encoder",
+        "decoder",
+    }
+    assert all(p.grad is None and not p.requires_grad for _, p in frozen)
+
+
+def test_training_what_is_temporal_leaves_the_spatial_layers_alone() -> None:
+    networks = given()
+    let_train(networks, ModelRecipe(base="small", family="kubric90", train="temporal"), SEED)
+    changed = updated(networks)
+    steering = {"camera.proj.weight", "camera.proj.bias"}
+    steering |= {f"unet.embed_camera.{layer}.{leaf}" for layer in (0, 2) for leaf in ("weight", "bias")}
+    assert steering < changed
+    assert all(is_temporal(name) for name in changed - steering)
+    assert len(changed - steering) > 30
+
+
+def test_states_hold_only_what_is_trained_and_go_back_where_they_were() -> None:
+    networks = given()
+    let_train(networks, ModelRecipe(base="small", family="kubric90", train="temporal"), SEED)
+    denoiser = Denoiser(networks.unet, None, "v", networks.camera)
+    whole = set(denoiser.state_dict())
+    keep_trained_alone(denoiser)
+    state: dict[str, Tensor] = {name: torch.full_like(value, 0.5) for name, value in denoiser.state_dict().items()}
+    assert set(state) == {name for name, p in networks.named_parameters() if p.requires_grad}
+    assert len(state) < len(whole)
+    spatial = networks.unet.stem.weight.clone()
+    denoiser.load_state_dict(state)
+    assert all(p.eq(0.5).all() for p in networks.parameters() if p.requires_grad)
+    assert torch.equal(networks.unet.stem.weight, spatial)
+    with pytest.raises(RuntimeError, match="Missing key"):
+        denoiser.load_state_dict({name: value for name, value in state.items() if "camera" not in name})
+
+
+# --- camera control --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("family", "camera", "features", "width"),
+    [("kubric90", None, 13, 32), ("kubric90", "relative_pose", 12, 32), ("driving", None, 0, 0)],
+)
+def test_the_papers_networks_are_steered_as_the_recipe_says(
+    family: str, camera: str | None, features: int, width: int
+) -> None:
+    recipe = msgspec.convert({"base": "small", "family": family, "camera": camera}, ModelRecipe)
+    networks = empty_networks(model_config(recipe))
+    shape = () if networks.camera is None else tuple(networks.camera.proj.weight.shape)
+    assert shape == ((width, features) if width else ())
+    assert (networks.unet.embed_camera is None) == (width == 0)
+
+
+def test_a_family_with_another_kind_of_view_is_refused() -> None:
+    with pytest.raises(RecipeError, match=r"camera = 'none', its family kubric90 by 'spherical'"):
+        model_config(ModelRecipe(base="svd-14", family="kubric90", camera="none"))

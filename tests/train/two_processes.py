@@ -1,0 +1,300 @@
+"""Two processes that train a tiny U-Net together, and what one process makes of the same; writes JSON for the tests.
+
+One start of Python, then a fork: an import of torch is most of what this costs. `python two_processes.py FOLDER [more]`
+"""
+
+import json
+import os
+import socket
+import sys
+import time
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import torch
+from tiny_world import FRAMES, tiny_recipe
+from torch import Tensor
+
+from gcd_model.networks import random_networks
+from gcd_train.checkpoint import StageState
+from gcd_train.draws import Draws
+from gcd_train.engine.engine import Engine
+from gcd_train.engine.parallel import whole
+from gcd_train.engine.processes import ALONE, Processes, processes_of
+from gcd_train.engine.states import newest_weights
+from gcd_train.errors import Interrupted, TrainError
+from gcd_train.loop import Loop, LoopOptions, Progress, StepLoss
+from gcd_train.model_setup import model_config
+from gcd_train.objective import Batch, Weights, diffusion_loss
+from gcd_train.precision import Precision
+from gcd_train.recipe import Budget, ComputeRecipe, LogRecipe, Recipe
+from gcd_train.run_folder import RunFolder
+from gcd_train.stages.unet import UNetTask
+from gcd_train.stop import StopSignal
+
+CPU = torch.device("cpu")
+PRECISION = Precision(CPU, half=False, channels_last=False)  # one layout, so that all use the same kernels
+UPDATES = 3  # the first two on single frames, which leave out the layers across frames
+
+
+class Noise:
+    """Batches of nothing but noise. See BatchSource."""
+
+    def single_frames(self, draws: Draws, count: int) -> Batch:
+        return self._batch(draws, count, 1)
+
+    def whole_clips(self, draws: Draws, count: int) -> Batch:
+        return self._batch(draws, count * FRAMES, FRAMES)
+
+    def _batch(self, draws: Draws, rows: int, frames: int) -> Batch:
+        unet = model_config(tiny_recipe().model).unet
+        return Batch(
+            target=draws.normal(rows, unet.latent_channels, 4, 8),
+            condition=draws.normal(rows, unet.condition_channels, 4, 8),
+            vector=draws.normal(rows, unet.vector_width),
+            tokens=None,
+            classes=None,
+            emphasis=None,
+            frames=frames,
+        )
+
+
+class Never:
+    def is_set(self) -> bool:
+        return False
+
+
+class AfterUpdates:
+    """Set once it was asked so often."""
+
+    def __init__(self, count: int) -> None:
+        self._left = count
+
+    def is_set(self) -> bool:
+        self._left -= 1
+        return self._left < 0
+
+
+class Task(UNetTask):
+    """The U-Net's own task, on noise, with nothing to measure on. dies_at: the update in which the process ends."""
+
+    def __init__(self, recipe: Recipe, dies_at: int | None = None) -> None:
+        networks = random_networks(model_config(recipe.model), seed=1)
+        super().__init__(networks, Noise(), None, recipe.unet, Weights(), PRECISION, recipe.seed)  # pyright: ignore
+        self._dies_at = dies_at
+
+    def step_loss(self, progress: Progress) -> StepLoss:
+        if progress.updates == self._dies_at:
+            os._exit(9)
+        return super().step_loss(progress)
+
+    def measure(self, picture: Path) -> dict[str, float]:
+        return {"weight": float(whole(self.module.unet.conv_out.weight).sum())}  # pyright: ignore
+
+
+class BothDraws:
+    """The draws of two batches, one after the other: those of one batch twice as large."""
+
+    def __init__(self, two: Sequence[Draws]) -> None:
+        self._two = two
+
+    def normal(self, rows: int, *shape: int) -> Tensor:
+        return torch.cat([draws.normal(rows // 2, *shape) for draws in self._two])
+
+    def chance(self, probability: float, count: int) -> Tensor:
+        return torch.cat([draws.chance(probability, count // 2) for draws in self._two])
+
+
+class TwiceTheBatch(Task):
+    """One batch an update, of the rows that two batches would have."""
+
+    def step_loss(self, progress: Progress) -> StepLoss:
+        recipe = self._recipe
+        draws = BothDraws([Draws(self._seed, "unet", 2 * progress.updates + part, CPU) for part in (0, 1)])
+        single = progress.share < recipe.image_share
+        made = self._batches.single_frames if single else self._batches.whole_clips
+        batch = made(draws, 2 * (recipe.image_batch if single else recipe.clip_batch))  # pyright: ignore
+        return diffusion_loss(
+            self._network, batch, draws, PRECISION,  # pyright: ignore
+            noise=recipe.noise, loss=recipe.loss, weights=Weights(), step=progress.updates,
+        )  # fmt: skip
+
+
+def recipe_of() -> Recipe:
+    recipe = tiny_recipe()
+    loss = msgspec.structs.replace(recipe.unet.loss, sensitivity=False, class_map=0.0)
+    # half the published rate: where a gradient is next to nothing, Adam makes a whole step of its rounding
+    optimiser = msgspec.structs.replace(recipe.unet.optimiser, kind="adam", rate=1e-5)
+    budget = Budget(updates=UPDATES)
+    return tiny_recipe(
+        unet=msgspec.structs.replace(recipe.unet, batch=2, loss=loss, budget=budget, optimiser=optimiser)
+    )
+
+
+def options(processes: Processes, stop: StopSignal, log: LogRecipe, **compute: object) -> LoopOptions:
+    recipe = recipe_of()
+    return LoopOptions(
+        stage="unet",
+        identity="tiny",
+        budget=recipe.unet.budget,
+        optimiser=recipe.unet.optimiser,
+        ema=recipe.unet.ema,
+        log=log,
+        stop=stop,
+        frames_per_clip=FRAMES,
+        parts=2,
+        engine=Engine(processes=processes, compute=ComputeRecipe(device="cpu", **compute)),  # pyright: ignore
+    )
+
+
+LOG = LogRecipe(log_s=1000.0, save_s=1000.0, measure_s=1000.0)
+
+
+def trained(path: Path, task: Task, chosen: LoopOptions, stop_at: int | None = None) -> dict[str, Tensor]:
+    """The weights after a run; or after it was stopped."""
+    loop = Loop(task, RunFolder(path), chosen if stop_at is None else replace(chosen, stop=AfterUpdates(stop_at)))
+    try:
+        loop.run()
+    except Interrupted:
+        assert stop_at is not None
+    return {name: whole(value).clone() for name, value in task.module.state_dict().items()}
+
+
+def furthest(first: dict[str, Tensor], second: dict[str, Tensor]) -> float:
+    assert first.keys() == second.keys()
+    return max(float((first[name] - second[name]).abs().max()) for name in first)
+
+
+def distance(first: dict[str, Tensor], second: dict[str, Tensor]) -> float:
+    return sum(float((first[name] - second[name]).square().sum()) for name in first) ** 0.5
+
+
+def alone(folder: Path) -> dict[str, dict[str, Tensor]]:
+    """What one process makes of it, in an update of two batches, and in one of a batch twice as large."""
+    recipe = recipe_of()
+    once = replace(options(ALONE, Never(), LOG), parts=1)
+    return {
+        "two batches": trained(folder / "two", Task(recipe), options(ALONE, Never(), LOG)),
+        "twice the batch": trained(folder / "twice", TwiceTheBatch(recipe), once),
+        "start": Task(recipe).module.state_dict(),
+    }
+
+
+class Together:
+    """Runs of two processes, compared with those of one."""
+
+    def __init__(self, folder: Path, processes: Processes, single: dict[str, dict[str, Tensor]]) -> None:
+        self.folder, self.processes, self.single = folder, processes, single
+
+    def run(self, name: str, stop_at: int | None = None, log: LogRecipe = LOG, **compute: object) -> dict[str, Tensor]:
+        """The weights that such a run ends with, in a folder of that name."""
+        chosen = options(self.processes, Never(), log, **compute)
+        return trained(self.folder / name, Task(recipe_of()), chosen, stop_at)
+
+    def equal_one(self, *kinds: str) -> dict[str, object]:
+        """How far the weights of two are from those of one."""
+        found: dict[str, object] = {}
+        for parallel in kinds:
+            weights = self.run(parallel, parallel=parallel)
+            found[f"{parallel} against two batches"] = furthest(weights, self.single["two batches"])
+            found[f"{parallel} against twice the batch"] = furthest(weights, self.single["twice the batch"])
+            found[f"{parallel} moved"] = furthest(weights, self.single["start"])
+            off = distance(weights, self.single["twice the batch"])
+            found[f"{parallel} share of the way"] = off / distance(weights, self.single["start"])
+        return found
+
+    def stopped_and_resumed(self, parallel: str) -> dict[str, object]:
+        """Only the second process hears the signal; both stop, and go on to the bits of an undisturbed run."""
+        weights, name = self.run(f"{parallel}-whole", parallel=parallel), f"{parallel}-stopped"
+        self.run(name, 2 if self.processes.rank == 1 else 1000, parallel=parallel)
+        found: dict[str, object] = {f"{parallel} stopped at": self.newest(name).updates}
+        self.processes.told(None)
+        found[f"{parallel} resumed"] = furthest(self.run(name, parallel=parallel), weights)
+        found[f"{parallel} read by one"] = furthest(self.newest(name).module, weights)
+        self.processes.told(None)
+        return found
+
+    def damaged(self) -> dict[str, object]:
+        """States written beside training, every update; then the newest loses a bit of truth."""
+        every = msgspec.structs.replace(LOG, save="async", keep=2, keep_every=1)
+        weights = self.run("beside", log=every, parallel="fsdp")
+        states = self.folder / "beside" / "unet" / "states"
+        names = sorted(path.name for path in states.iterdir())
+        self.processes.told(None)
+        if self.processes.first:
+            part = next((states / f"{UPDATES:07d}").glob("*.distcp"))
+            data = bytearray(part.read_bytes())
+            data[len(data) // 2] ^= 1
+            part.write_bytes(data)
+        self.processes.told(None)
+        again = self.run("beside", log=every, parallel="fsdp")
+        put_aside = sorted(path.name for path in states.iterdir() if path.name.endswith(".damaged"))
+        return {"beside": names, "repaired": furthest(again, weights), "put aside": put_aside}
+
+    def handed_on(self) -> dict[str, object]:
+        """What one process began, two go on with for an update, and then one again."""
+        if self.processes.first:
+            trained(self.folder / "handed", Task(recipe_of()), options(ALONE, Never(), LOG), 1)
+        self.processes.told(None)
+        self.run("handed", 1, parallel="fsdp")
+        found: dict[str, object] = {
+            "handed on after": sorted(path.name for path in (self.folder / "handed/unet/states").iterdir())
+        }
+        self.processes.told(None)
+        if self.processes.first:
+            back = trained(self.folder / "handed", Task(recipe_of()), options(ALONE, Never(), LOG))
+            found["handed back"] = furthest(back, self.single["two batches"])
+        self.processes.told(None)
+        return found
+
+    def recomputed(self) -> dict[str, object]:
+        """With every second block computed twice."""
+        weights = self.run("recomputed", parallel="fsdp", checkpoint_activations=2)
+        return {"recomputed": furthest(weights, self.single["two batches"])}
+
+    def lost(self) -> dict[str, object]:
+        """What the first process says when the second one ends in the middle of its work. Must come last."""
+        task = Task(recipe_of(), dies_at=1 if self.processes.rank == 1 else None)
+        try:
+            trained(self.folder / "lost", task, options(self.processes, Never(), LOG, parallel="ddp"))
+        except TrainError as error:
+            return {"lost": str(error)}
+        return {"lost": "nothing happened"}
+
+    def newest(self, name: str) -> StageState:
+        state = newest_weights(self.folder / name / "unet", "unet")
+        assert state is not None
+        return state[1]
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def main(folder: Path, what: Sequence[str]) -> None:
+    torch.set_num_threads(1)
+    warnings.filterwarnings("ignore", message="FSDP2-wrapped module")
+    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()), "WORLD_SIZE": "2"}
+    os.environ["RANK"] = os.environ["LOCAL_RANK"] = "1" if os.fork() == 0 else "0"
+    with processes_of(ComputeRecipe(device="cpu", parallel="ddp", timeout_s=240.0)) as processes:
+        single = processes.told(alone(folder / "alone") if processes.first else None)
+        both = Together(folder, processes, single)
+        found = both.equal_one("ddp")
+        if "more" in what:
+            found |= both.equal_one("fsdp")
+            for parallel in ("ddp", "fsdp"):
+                found |= both.stopped_and_resumed(parallel)
+            found |= both.damaged() | both.handed_on() | both.recomputed()
+        found |= both.lost() | {"seconds": time.process_time()}
+        (folder / "found.json").write_text(json.dumps(found))
+        sys.stdout.flush()
+        os._exit(0)  # the other one is gone: nobody to say good-bye to
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2:])

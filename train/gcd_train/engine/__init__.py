@@ -1,0 +1,1 @@
+"""What a training run stands on: processes, sharing of weights, memory savers, optimisers, states on disk."""

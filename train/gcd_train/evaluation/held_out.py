@@ -1,0 +1,84 @@
+"""The clips that predictors are measured on."""
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from gcd_model.config import CameraControl, SemanticClass
+from gcd_model.geometry import CameraMount, Trajectory
+from gcd_train.baselines import CameraPair, SourceClip
+from gcd_train.datasets.clip_source import ClipSource
+from gcd_train.datasets.paired import PairedClip
+from gcd_train.errors import DataError
+
+
+class HeldOutClips(ClipSource, Protocol):
+    """Clips to be measured on; `PairedClips` is one.
+
+    camera: "none" for the one path of driving, "spherical" for a path of each clip's own.
+    frames, height, width: T, H and W of each clip. hfov_deg: across the pictures, of orbits both cameras' own.
+    scene: world and seed of the scene that a clip was cut from. trajectory: of a clip, from source to target.
+    """
+
+    def __getitem__(self, number: int, /) -> PairedClip: ...
+    def scene(self, number: int, /) -> tuple[str, int]: ...
+    def trajectory(self, number: int, /) -> Trajectory: ...
+    @property
+    def camera(self) -> CameraControl: ...
+    @property
+    def mount(self) -> CameraMount | None: ...
+    @property
+    def frames(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+    @property
+    def width(self) -> int: ...
+    @property
+    def hfov_deg(self) -> float: ...
+
+
+def cameras_of(clips: HeldOutClips, number: int, declared: CameraMount | None = None) -> CameraPair:
+    """Both cameras of a clip.
+
+    Args:
+        declared: mount that is declared for the source camera of driving clips; None for the true one.
+    """
+    if clips.camera == "none":
+        mount = declared or clips.mount or CameraMount()
+        return CameraPair.driving(mount, frames=clips.frames, height=clips.height, width=clips.width)
+    return CameraPair.orbit(clips.trajectory(number), hfov_deg=clips.hfov_deg, height=clips.height, width=clips.width)
+
+
+def source_side(clips: HeldOutClips, number: int, clip: PairedClip, declared: CameraMount | None) -> SourceClip:
+    """What predictors may see of a clip. declared: see `cameras_of`."""
+    return SourceClip(
+        source=clip.source,
+        source_depth=clip.source_depth,
+        source_classes=clip.source_classes if clips.classes else None,
+        cameras=cameras_of(clips, number, declared),
+        fps=clips.fps,
+    )
+
+
+def class_grid(clips: HeldOutClips) -> tuple[int, int]:
+    """Height and width at which class maps are compared: half the pictures', the grid of our small class head."""
+    return clips.height // 2, clips.width // 2
+
+
+def require_same_kind(training: HeldOutClips, clips: HeldOutClips) -> None:
+    """Raises DataError unless means over the training clips fit the held-out ones."""
+    sizes = [(each.frames, each.height, each.width) for each in (training, clips)]
+    if sizes[0] != sizes[1] or names_of(training.classes) != names_of(clips.classes):
+        raise DataError(
+            f"training and held-out clips must be of one kind, got T, H, W = {sizes[0]} and {sizes[1]}, "
+            f"classes {names_of(training.classes)} and {names_of(clips.classes)}; generate both alike"
+        )
+    if training.camera != clips.camera:
+        raise DataError(
+            f"training and held-out clips must be of one kind, got camera control {training.camera!r} and "
+            f"{clips.camera!r}; generate both alike"
+        )
+
+
+def names_of(classes: Sequence[SemanticClass]) -> str:
+    """An ontology in one line."""
+    return ", ".join(each.name for each in classes) or "none"

@@ -1,0 +1,101 @@
+"""Which data a run learns from, and how clips are drawn from it."""
+
+from typing import Annotated, Literal, TypeAlias
+
+import msgspec
+from msgspec import Meta
+
+from gcd_train.recipe.values import Count, NotNegative, Positive, Share
+
+DataKind: TypeAlias = Literal["pairs", "kubric4d", "parallel_domain4d", "lerobot", "cache"]
+Modality: TypeAlias = Literal["rgb", "semantic"]
+Bounds: TypeAlias = tuple[float, float]
+
+
+class FramesRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Which frames of a scene make a clip; what is left out is as released for the kind of data.
+
+    strides: one of them is drawn (Kubric-4D 1 to 4, ParallelDomain-4D 1 and 2). latest_start: largest first frame
+    (Kubric-4D 6). reverse: probability that a clip runs backwards (Kubric-4D 0.2). reach_last: let clips end with the
+    scene's last frame, which an off-by-one in the release keeps out of reach.
+    """
+
+    strides: tuple[Count, ...] | None = None
+    latest_start: Annotated[int, Meta(ge=0)] | None = None
+    reverse: Share | None = None
+    reach_last: bool = False
+
+
+class OrbitRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Cameras about the scene's centre; see `trajectories.OrbitSampling`.
+
+    max_azimuth_deg, max_elevation_deg, max_radius_m: largest change from source to goal.
+    azimuth_deg, elevation_deg, radius_m: where cameras may stand. The elevation is as released, also for the 180-degree
+    models; the paper prints [0, 90] for those.
+    """
+
+    max_azimuth_deg: NotNegative = 90.0
+    max_elevation_deg: NotNegative = 30.0
+    max_radius_m: NotNegative = 3.0
+    azimuth_deg: Bounds = (0.0, 360.0)
+    elevation_deg: Bounds = (0.0, 50.0)
+    radius_m: Bounds = (12.0, 18.0)
+
+
+class LoaderRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How samples are made beside training.
+
+    workers: processes, 0 for none; they are started anew (spawn), so that OpenGL works in them. prefetch: batches that
+    each makes ahead. pin: hand them over in page-locked memory where there is CUDA.
+    """
+
+    workers: Annotated[int, Meta(ge=0)] = 0
+    prefetch: Count = 2
+    pin: bool = True
+
+
+class LeRobotRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Pairs of calibrated cameras, at unet.fps; see `lerobot.pairs.LeRobotOptions`."""
+
+    cameras: tuple[str, ...] | None = None
+    calibration: str | None = None
+    tolerance_s: Positive | None = None
+
+
+class DataRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What --data holds, and how clips are drawn from it.
+
+    kind: "pairs" of `gcd-train generate`; a set in the layout of "kubric4d" or "parallel_domain4d", published or
+    ours; "lerobot" with calibrated cameras; a latent "cache" (unet.source "cache").
+    modality: targets in colour, or painted by class.
+    path: "gradual" moves all the way through the clip, "direct" stands at the goal from the first frame on.
+    move_time: the frame in which a gradual move is done, the last if left out.
+    exact: draw from the geometry that our own scenes keep, instead of from points. published: points with the
+    approximations of the release (distance to depth, see `pointcloud`); otherwise without.
+    cameras: views to draw points from, all published ones if left out.
+    split, split_file, held_out: what is measured on where no --valid is given. "published": Kubric-4D by number (0-2799
+    to learn from, 2800-2899 held out), ParallelDomain-4D by split_file. "last": the last held_out scenes or episodes.
+    repeats: samples a scene gives before it is drawn anew.
+    """
+
+    kind: DataKind = "pairs"
+    modality: Modality = "rgb"
+    path: Literal["gradual", "direct"] = "gradual"
+    move_time: Annotated[int, Meta(ge=0)] | None = None
+    exact: bool = False
+    published: bool = False
+    cameras: tuple[str, ...] | None = None
+    split: Literal["published", "last"] = "published"
+    split_file: str | None = None
+    held_out: Count = 50
+    repeats: Count = 400
+    frames: FramesRecipe = FramesRecipe()
+    orbit: OrbitRecipe = OrbitRecipe()
+    loader: LoaderRecipe = LoaderRecipe()
+    lerobot: LeRobotRecipe = LeRobotRecipe()
+
+    def goal_frame(self, frames: int) -> int:
+        """The frame of T in which the camera is at its goal: 0 for direct, T - 1 for gradual, or `move_time`."""
+        if self.move_time is not None:
+            return self.move_time
+        return 0 if self.path == "direct" else frames - 1

@@ -1,0 +1,135 @@
+"""Recipes on bases: a file states only what differs from the one it is based on."""
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias, cast
+
+import msgspec
+
+from gcd_train.errors import RecipeError
+
+PACKAGED = Path(__file__).parents[1] / "recipes"
+"""Where the recipes that ship with the package lie; those that only serve as a base, in `bases/`."""
+BASE, WITHOUT, SMALL = "base", "without", "small"
+_DEEPEST = 20
+
+Table: TypeAlias = dict[str, object]
+
+
+@dataclass(frozen=True, slots=True)
+class MergedTable:
+    """What a recipe states together with its bases. files: the recipe's, then its base, and so on."""
+
+    table: Table
+    files: tuple[str, ...]
+
+    @property
+    def place(self) -> str:
+        """The files, for a message."""
+        first, *rest = self.files
+        return first if not rest else f"{first} (based on {', '.join(rest)})"
+
+
+def recipe_path(source: str | Path, beside: Path | None = None) -> Path:
+    """Where a recipe lies: a path, taken from the folder `beside` if it is not absolute, or `package:NAME`."""
+    kind, _, name = str(source).partition(":")
+    if kind == "package":
+        return PACKAGED / f"{name}.toml"
+    return Path(source) if beside is None else beside / source
+
+
+def packaged_recipes() -> list[str]:
+    """Names of the recipes that ship."""
+    return sorted(file.stem for file in PACKAGED.glob("*.toml"))
+
+
+def read_merged(source: str | Path) -> MergedTable:
+    """A recipe file on its bases, as plain tables. `name` is the file's own: told in it, or the file's name.
+
+    Raises:
+        RecipeError: a file of the chain is missing or not TOML, or bases go in a circle; names the files.
+    """
+    return _read(recipe_path(source), ())
+
+
+def parsed(text: bytes, name: str) -> Table:
+    """A TOML file's content. Raises RecipeError naming it."""
+    try:
+        return msgspec.toml.decode(text, type=Table)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise RecipeError(f"{name} is not valid TOML: {error}") from error
+
+
+def merged(base: Mapping[str, object], over: Mapping[str, object]) -> Table:
+    """Tables merged key by key; anything else, lists too, is replaced."""
+    table = dict(base)
+    for key, value in over.items():
+        below = table.get(key)
+        both = isinstance(below, dict) and isinstance(value, dict)
+        table[key] = merged(cast(Table, below), cast(Table, value)) if both else value
+    return table
+
+
+def on_top(base: Mapping[str, object], over: Mapping[str, object], name: str) -> Table:
+    """What `over` makes of a base: first what it does without is taken out, then the rest is merged.
+
+    Raises: RecipeError if it does without something that the base does not have.
+    """
+    wanted = over.get(WITHOUT, [])
+    keys = cast(list[object], wanted) if isinstance(wanted, list) else [None]
+    if not all(isinstance(key, str) for key in keys):
+        raise RecipeError(f'{name}: `without` is a list of keys of the base, such as ["unet.ema"], got {wanted!r}')
+    table = dict(base)
+    for key in cast(Sequence[str], keys):
+        table = _removed(table, key.split("."), key, name)
+    return merged(table, {key: value for key, value in over.items() if key != WITHOUT})
+
+
+def require_known(table: Mapping[str, object], known: Sequence[str], name: str) -> None:
+    """Raises RecipeError for a key at the top of a file that no recipe has."""
+    for key in table:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+            hint = f"did you mean `{near[0]}`?" if near else f"known are {', '.join(known)}"
+            raise RecipeError(f"{name}: unknown key `{key}`; {hint}")
+
+
+def _read(path: Path, above: tuple[Path, ...]) -> MergedTable:
+    chain = (*above, path.resolve())
+    if path.resolve() in above or len(chain) > _DEEPEST:
+        raise RecipeError(f"recipes are based on each other in a circle: {_told(chain)}; take out one `base`")
+    try:
+        own = parsed(path.read_bytes(), _told(chain))
+    except OSError as error:
+        there = ", ".join(f"package:{name}" for name in packaged_recipes())
+        raise RecipeError(
+            f"cannot read the recipe {_told(chain)}: {error.strerror}; give a TOML file, or one of {there}"
+        ) from error
+    base = own.pop(BASE, None)
+    own.setdefault("name", path.stem)
+    if base is None:
+        return MergedTable(own, (str(path),))
+    if not isinstance(base, str):
+        raise RecipeError(f"{path}: `base` is a path from here, or package:NAME, got {base!r}")
+    below = _read(recipe_path(base, path.parent), chain)
+    return MergedTable(on_top(below.table, own, str(path)), (str(path), *below.files))
+
+
+def _told(chain: Sequence[Path]) -> str:
+    """The last file, and who led there."""
+    last, *before = reversed([str(path) for path in chain])
+    return last if not before else f"{last} (the base of {', the base of '.join(before)})"
+
+
+def _removed(table: Mapping[str, object], keys: Sequence[str], told: str, name: str) -> Table:
+    first, *rest = keys
+    if first not in table:
+        raise RecipeError(f"{name} is to do without `{told}`, which its base does not have; take it out of `without`")
+    if not rest:
+        return {key: value for key, value in table.items() if key != first}
+    below = table[first]
+    if not isinstance(below, dict):
+        raise RecipeError(f"{name} is to do without `{told}`, but `{first}` is no table")
+    return {**table, first: _removed(cast(Table, below), rest, told, name)}

@@ -1,0 +1,174 @@
+"""Samples by number, made ahead by other processes, in an order that a resumed run finds again."""
+
+import signal
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from multiprocessing import get_context
+from typing import Protocol
+
+import cv2
+import numpy as np
+import torch
+from torch.utils.data import DataLoader, Dataset
+
+from gcd_train.datasets.dataset4d import PairSample
+from gcd_train.datasets.skips import Skips
+from gcd_train.datasets.view_pairs import PairBatch, collate
+from gcd_train.errors import RunError, TrainError
+from gcd_train.map_items import one_thread_each
+from gcd_train.recipe import LoaderRecipe
+
+
+class Samples(Protocol):
+    """Samples of a data set by number; `ViewPairs` and `LeRobotPairs` are two.
+
+    Any number from 0 up may be asked for; the set repeats its scenes after its length, with other draws.
+    """
+
+    skips: Skips
+
+    def __len__(self) -> int:
+        """Samples that are drawn before a scene comes again more often than another."""
+        ...
+
+    def sample(self, index: int) -> PairSample:
+        """The sample of a number, the same in any process. Raises DataError if too many in a row cannot be read."""
+        ...
+
+
+@dataclass(slots=True)
+class SampleOrder:
+    """Which samples a batch takes: of all samples in an order shuffled by the seed, then of all again in another.
+
+    Batch n of `count` clips takes the places n * count and on, so a batch follows from its number alone.
+    """
+
+    length: int
+    seed: int
+    _round: int = -1
+    _places: Sequence[int] = ()
+
+    def batch(self, number: int, count: int) -> list[int]:
+        """Numbers of the samples."""
+        return [self._at(place) for place in range(number * count, (number + 1) * count)]
+
+    def _at(self, place: int) -> int:
+        round_, within = divmod(place, self.length)
+        if round_ != self._round:
+            self._round = round_
+            self._places = np.random.default_rng((self.seed, round_)).permutation(self.length).tolist()
+        return round_ * self.length + self._places[within]
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedBatch:
+    """Samples, their numbers, and how long they were waited for."""
+
+    samples: PairBatch
+    numbers: tuple[int, ...]
+    wait_s: float
+
+
+class SampleLoader:
+    """Batches by number. As long as numbers rise evenly, those that follow are made ahead.
+
+    Worker processes are spawned, not forked: a fork would share OpenGL's and torch's state.
+    """
+
+    def __init__(self, samples: Samples, seed: int, recipe: LoaderRecipe) -> None:
+        self._samples, self._recipe = samples, recipe
+        self._order = SampleOrder(len(samples), seed)
+        self._count, self._step, self._next = 0, 1, -1
+        self._batches: Iterator[PairBatch | TrainError] | None = None
+
+    def batch(self, number: int, count: int) -> LoadedBatch:
+        """Batch `number` of `count` samples. Raises: as `Samples.sample`; RunError if a process was killed."""
+        started = time.perf_counter()
+        if self._batches is None or (number, count) != (self._next, self._count):
+            self._start(number, count)
+        assert self._batches is not None, "just started"
+        samples = self._following(self._batches)
+        self._next = number + self._step
+        if self._recipe.workers:
+            self._samples.skips.extend(samples.skipped)  # each worker has its own account
+        numbers = tuple(self._order.batch(number, count))
+        return LoadedBatch(samples, numbers, time.perf_counter() - started)
+
+    def _following(self, batches: "Iterator[PairBatch | TrainError]") -> PairBatch:
+        try:
+            samples = next(batches)
+        except RuntimeError as error:  # what torch makes of a process that is gone
+            raise RunError(
+                f"a process that makes samples was killed, most likely for want of memory ({error}); give fewer "
+                "data.loader.workers, or more room in /dev/shm, and run again"
+            ) from error
+        if isinstance(samples, TrainError):
+            raise samples
+        return samples
+
+    def _start(self, number: int, count: int) -> None:
+        """From this number on, in steps as wide as the last one was: processes of a group take turns."""
+        last = self._next - self._step
+        self._step = number - last if self._batches is not None and number > last else 1
+        self._count = count
+        self._batches = iter(self._loader(number)) if self._recipe.workers else self._here(number)
+
+    def _here(self, number: int) -> Iterator[PairBatch | TrainError]:
+        for indices in _Batches(self._order, number, self._step, self._count):
+            yield collate([self._samples.sample(index) for index in indices])
+
+    def _loader(self, number: int) -> DataLoader[PairSample | TrainError]:
+        recipe = self._recipe
+        order = SampleOrder(self._order.length, self._order.seed)  # read ahead, so not the one that is looked up
+        return DataLoader(
+            _Numbered(self._samples),
+            batch_sampler=_Batches(order, number, self._step, self._count),
+            num_workers=recipe.workers,
+            prefetch_factor=recipe.prefetch,
+            collate_fn=_collated,
+            pin_memory=recipe.pin and torch.cuda.is_available(),
+            multiprocessing_context=get_context("spawn"),
+            worker_init_fn=_settle,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Batches:
+    """Numbers of the samples of batch `first`, `first + step` and so on without end: a batch sampler."""
+
+    order: SampleOrder
+    first: int
+    step: int
+    count: int
+
+    def __iter__(self) -> Iterator[list[int]]:
+        number = self.first
+        while True:
+            yield self.order.batch(number, self.count)
+            number += self.step
+
+
+class _Numbered(Dataset[PairSample | TrainError]):
+    """Samples as torch's loader takes them; an error is handed over as it is, torch would bury it in a trace."""
+
+    def __init__(self, samples: Samples) -> None:
+        self._samples = samples
+
+    def __getitem__(self, index: int) -> PairSample | TrainError:
+        try:
+            return self._samples.sample(index)
+        except TrainError as error:
+            return error
+
+
+def _collated(samples: list[PairSample | TrainError]) -> PairBatch | TrainError:
+    failed = [sample for sample in samples if isinstance(sample, TrainError)]
+    return failed[0] if failed else collate([sample for sample in samples if isinstance(sample, PairSample)])
+
+
+def _settle(_worker: int) -> None:
+    """In a new process: one thread; Ctrl-C is for the main process, which finishes its update and saves."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    one_thread_each()
+    cv2.setNumThreads(1)

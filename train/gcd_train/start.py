@@ -1,0 +1,56 @@
+"""Where training starts: at random, from a weight file of any layout, or from scratch as the paper's ablation does.
+
+A file is told by its content. `svd.safetensors` and a diffusers folder have no camera embedder, so that one starts at
+random; a GCD checkpoint gives its own where it is steered alike. A diffusers folder has one encoder for all frames,
+the paper's networks have two: both are made of it.
+"""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from gcd_model import ModelConfig
+from gcd_model.carry_over import DIFFUSION, carried_over
+from gcd_model.checkpoints import LoadedWeights, load_weights
+from gcd_model.errors import CheckpointError
+from gcd_model.networks import Networks
+from gcd_train.errors import RecipeError
+from gcd_train.recipe import ModelRecipe
+
+
+def fresh_networks(config: ModelConfig, seed: int) -> Networks:
+    """Networks as training starts with them: zero-initialised layers are zero."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return Networks(config)
+
+
+def start_networks(recipe: ModelRecipe, config: ModelConfig, seed: int) -> Networks:
+    """What training starts from: random, or the recipe's weight file in float32 with what it lacks at random.
+
+    Raises RecipeError if the file holds another model, and names the first weights that differ; CheckpointError as
+    `load_weights`.
+    """
+    networks = fresh_networks(config, seed)
+    if recipe.weights is None:
+        return networks
+    loaded = load_weights(recipe.weights, ask_family=False)
+    try:
+        over = carried_over(loaded.networks, config, anew=DIFFUSION if recipe.scratch else ())
+    except CheckpointError as error:
+        raise RecipeError(
+            f"{recipe.weights} {error}; change [model], or give a file of the model it describes"
+        ) from error
+    networks.load_state_dict({name: value.float() for name, value in over.weights.items()}, strict=False)
+    return networks
+
+
+def carried_leftovers(recipe: ModelRecipe) -> Mapping[str, Tensor]:
+    """Weights of the file training started from that nothing here uses; see gcd_model.gcd_layout."""
+    return {} if recipe.weights is None else load_weights(recipe.weights, ask_family=False).carried
+
+
+def loaded_base(path: str) -> LoadedWeights:
+    """A weight file of any layout, whatever its family. Raises CheckpointError."""
+    return load_weights(path, ask_family=False)
