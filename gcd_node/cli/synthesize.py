@@ -151,9 +151,10 @@ def synthesize(
     options = RenderOptions(steps=steps, guidance=guidance, samples=samples, seed=seed, motion_bucket=motion_bucket)
     options = replace(options, initial_noise=injected.initial)
     _require_possible(input_path, save, samples)
-    heads = {"head_width": head_width, "image_heads": image_heads}
     with Console(stderr=True, markup=False).status(f"loading {weights}"):
-        model = load_synthesizer(weights, family=family, device=device, dtype=dtype, **heads)
+        model = load_synthesizer(
+            weights, family=family, device=device, dtype=dtype, head_width=head_width, image_heads=image_heads
+        )
     augmentation = Augmentation(strength=cond_aug, seed=seed, noise=injected.augmentation)
     _run(_Order(model, input_path, clip, wanted, options, augmentation), out, save)
 
