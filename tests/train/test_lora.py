@@ -24,7 +24,7 @@ from gcd_train.model_setup import copy_of, model_config
 from gcd_train.objective import Denoiser
 from gcd_train.recipe import LoraRecipe, ModelRecipe, Recipe, parse_recipe
 from gcd_train.run_folder import RunFolder
-from gcd_train.trained_part import is_temporal, let_train
+from gcd_train.trained_part import halve_frozen, is_temporal, let_train
 from gcd_train.trainer import RunInputs, Trainer
 
 LORA = LoraRecipe(rank=2, alpha=4.0)
@@ -61,6 +61,19 @@ def test_only_adapters_and_what_steers_are_trained() -> None:
     names = {name for name, p in networks.named_parameters() if p.requires_grad}
     assert changed == names
     assert not any(".dormant." in name for name in names)
+
+
+def test_a_base_kept_in_bfloat16_computes_nearly_the_same_and_trains_the_same_adapters() -> None:
+    networks = given()
+    wanted = output(networks)
+    let_train(networks, ADAPTED, SEED)
+    halve_frozen(networks)
+    frozen = [each for name, each in networks.named_parameters() if not each.requires_grad and "dormant" not in name]
+    assert {each.dtype for each in frozen} == {torch.bfloat16}
+    with torch.autocast("cpu", torch.bfloat16):
+        assert (output(networks) - wanted).norm() < 0.02 * wanted.norm()
+    assert updated(networks, half=True) == {name for name, each in networks.named_parameters() if each.requires_grad}
+    assert {each.dtype for each in networks.parameters() if each.requires_grad} == {torch.float32}
 
 
 def test_merged_weights_compute_the_same_and_are_plain() -> None:

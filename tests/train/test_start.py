@@ -119,8 +119,8 @@ def random_batch(config: ModelConfig) -> Batch:
     )
 
 
-def updated(networks: Networks) -> set[str]:
-    """One update with a large rate; the names of all weights whose bits changed."""
+def updated(networks: Networks, *, half: bool = False) -> set[str]:
+    """One update with a large rate; the names of all weights whose bits changed. half: arithmetic in bfloat16."""
     before = {name: value.clone() for name, value in networks.state_dict().items()}
     denoiser = Denoiser(networks.unet, None, "v", networks.camera)
     trained = [parameter for parameter in denoiser.parameters() if parameter.requires_grad]
@@ -130,7 +130,7 @@ def updated(networks: Networks) -> set[str]:
             denoiser,
             random_batch(networks.config),
             Draws(1, "test", update, CPU),
-            Precision(CPU, half=False, channels_last=False),
+            Precision(CPU, half=half, channels_last=False),
             noise=NoiseRecipe(),
             loss=LossRecipe(),
             weights=Weights(),
