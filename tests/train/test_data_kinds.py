@@ -120,6 +120,15 @@ def test_a_cache_is_read_with_the_encoders_that_made_it(driving: Path, tmp_path:
     assert batch.wait_s is not None
     with pytest.raises(RecipeError, match="made with other encoders"):
         run.batches(random_networks(networks.config, seed=9), precision)
+    for change, name in (
+        ({"modality": "semantic"}, "data.modality"),
+        ({"move_time": 0}, "data.move_time"),
+        ({"frames": FramesRecipe(strides=(1, 3))}, "data.frames.strides"),
+        ({"frames": FramesRecipe(reverse=0.2, reach_last=True)}, "data.frames.reverse, data.frames.reach_last"),
+    ):
+        other = msgspec.structs.replace(told, data=msgspec.structs.replace(data, **change))
+        with pytest.raises(RecipeError, match=f"the recipe's {name} wants another thing"):
+            open_data(other, config, FAMILIES["driving"], DataPlaces(data=tmp_path, valid=driving))
     with pytest.raises(RecipeError, match="frozen autoencoder"):
         open_data(own, config, FAMILIES["driving"], DataPlaces(data=tmp_path, valid=driving))
 

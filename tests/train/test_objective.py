@@ -15,7 +15,7 @@ from gcd_train.batches import PixelBatches
 from gcd_train.datasets.clip_source import to_network
 from gcd_train.draws import Draws
 from gcd_train.model_setup import model_config
-from gcd_train.objective import Batch, Denoiser, Weights, diffusion_loss, draw_noise, draw_sigma, drop, drop_streams
+from gcd_train.objective import Batch, Denoiser, Weights, diffusion_loss, draw_noise, draw_sigma, drop_streams
 from gcd_train.precision import Precision
 from gcd_train.recipe import LossRecipe, NoiseRecipe, UNetRecipe
 
@@ -121,7 +121,9 @@ def test_frames_of_a_clip_share_as_much_noise_as_the_recipe_says(shared: float, 
 
 
 def test_conditioning_is_dropped_frame_by_frame_one_time_in_ten() -> None:
-    kept = drop(torch.ones(20000, 2, 1, 1), draws(), 0.1)
+    recipe = tiny_recipe().unet
+    assert recipe.dropout == 0.1
+    kept, _ = drop_streams(torch.ones(20000, 2, 1, 1), None, 4, draws(), recipe)
     assert torch.equal(kept[:, 0], kept[:, 1])  # the whole row or nothing
     assert 1 - kept.mean().item() == pytest.approx(0.1, abs=0.01)
 

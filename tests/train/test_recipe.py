@@ -7,7 +7,7 @@ from tiny_world import RECIPE
 from gcd_train.data_kinds import sampling_of
 from gcd_train.datasets.trajectories import DRIVING, MAX90, MAX180
 from gcd_train.errors import RecipeError
-from gcd_train.model_setup import family_of, model_config
+from gcd_train.model_setup import family_of, model_config, require_exportable
 from gcd_train.recipe import load_recipe, packaged_recipes, parse_recipe
 
 
@@ -108,9 +108,11 @@ def test_contradictions_are_refused(old: bytes, new: bytes, wanted: str) -> None
         model_config(parse_recipe(RECIPE.replace(old, new, 1), "x.toml").model)
 
 
-def test_a_missing_recipe_names_the_packaged_ones(tmp_path: Path) -> None:
-    with pytest.raises(RecipeError, match="package:driving-small"):
+def test_a_missing_recipe_says_where_names_are_listed_and_which_is_near(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match=r"No such file.*; give a TOML file, or a name"):
         load_recipe(tmp_path / "none.toml")
+    with pytest.raises(RecipeError, match="did you mean package:driving-small"):
+        load_recipe("package:driving-smal")
 
 
 def test_a_batch_is_told_in_clips() -> None:
@@ -125,3 +127,33 @@ def test_a_batch_is_told_in_clips() -> None:
 def test_a_latent_cache_is_named_twice_or_not_at_all() -> None:
     with pytest.raises(RecipeError, match=r"both data\.kind"):
         parse_recipe(RECIPE + b'[data]\nkind = "cache"\n', "x.toml")
+
+
+def test_a_size_that_the_networks_cannot_halve_is_refused_before_anything_is_trained() -> None:
+    recipe = load_recipe("package:kubric-gradual-max90", small=True, changes=["model.width=48"])
+    with pytest.raises(RecipeError, match=r"multiples of 32.* got 64 and 48"):
+        model_config(recipe.model)
+
+
+@pytest.mark.parametrize(
+    ("small", "more", "said"),
+    [(True, [], "the paper's networks only"), (True, ["model.vae.linear=false"], "multiple"), (False, [], None)],
+)
+def test_a_layout_that_cannot_hold_the_networks_is_refused_before_anything_is_trained(
+    small: bool, more: list[str], said: str | None
+) -> None:
+    changes = ['export.layouts=["gcd-node", "gcd-ckpt"]', *more]
+    recipe = load_recipe("package:kubric-gradual-max90", small=small, changes=changes)
+    config = model_config(recipe.model)
+    if said is None:
+        require_exportable(recipe, config)  # the paper's own
+        return
+    with pytest.raises(RecipeError, match=rf"export\.layouts asks.*{said}"):
+        require_exportable(recipe, config)
+
+
+def test_the_small_scale_drops_the_published_layout_that_a_recipe_asks_for(tmp_path: Path) -> None:
+    own = tmp_path / "own.toml"
+    own.write_text('base = "package:kubric-gradual-max90"\n[export]\nlayouts = ["gcd-node", "gcd-ckpt"]\n')
+    assert load_recipe(own).export.layouts == ("gcd-node", "gcd-ckpt")
+    assert load_recipe(own, small=True).export.layouts == ("gcd-node",)

@@ -1,4 +1,5 @@
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -70,6 +71,16 @@ def test_the_table_has_a_row_for_each_predictor_and_class(report: Report) -> Non
     assert "declared: 1.8 m, 2 deg down" in text
     road = next(line for line in text.splitlines() if line.startswith("| road |"))
     assert road.count("|") == 2 + len(report.evaluations) - 1  # the mean target has no classes
+    assert "nan" not in text
+
+
+def test_a_class_that_is_too_small_for_the_class_grid_has_a_dash_there(report: Report) -> None:
+    first, *others = report.evaluations
+    total = replace(
+        first.total, class_iou=(math.nan,) * len(report.classes), class_iou_full=(0.25,) * len(report.classes)
+    )
+    text = to_markdown(replace(report, model=(), baselines=(replace(first, total=total), *others)))
+    assert "- (0.25)" in text
     assert "nan" not in text
 
 

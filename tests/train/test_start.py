@@ -19,7 +19,7 @@ from gcd_train.errors import RecipeError
 from gcd_train.model_setup import model_config
 from gcd_train.objective import Batch, Denoiser, Weights, diffusion_loss
 from gcd_train.precision import Precision
-from gcd_train.recipe import LossRecipe, ModelRecipe, NoiseRecipe
+from gcd_train.recipe import LossRecipe, ModelRecipe, NoiseRecipe, load_recipe
 from gcd_train.start import fresh_networks, start_networks
 from gcd_train.trained_part import is_temporal, keep_trained_alone, let_train
 
@@ -207,3 +207,9 @@ def test_the_papers_networks_are_steered_as_the_recipe_says(
 def test_a_family_with_another_kind_of_view_is_refused() -> None:
     with pytest.raises(RecipeError, match=r"camera = 'none', its family kubric90 by 'spherical'"):
         model_config(ModelRecipe(base="svd-14", family="kubric90", camera="none"))
+
+
+def test_a_missing_weight_file_is_told_with_its_key_before_networks_are_made() -> None:
+    recipe = load_recipe("package:kubric-gradual-max90").model
+    with pytest.raises(RecipeError, match=r"svd\.safetensors, is not there; .*--set model\.weights=FILE"):
+        start_networks(recipe, model_config(recipe), seed=0)

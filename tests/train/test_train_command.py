@@ -3,6 +3,7 @@ from pathlib import Path
 from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
+from gcd_train.recipe import packaged_recipes
 
 
 def test_train_explains_itself() -> None:
@@ -54,3 +55,14 @@ def test_train_takes_the_small_scale_and_changes(tmp_path: Path) -> None:
     assert wrong.exit_code == 78
     gone = CliRunner().invoke(app, ["train", "package:tabletop", *where, "--small"])
     assert gone.exit_code == 66
+
+
+def test_no_name_of_a_recipe_is_cut_off_in_a_narrow_terminal() -> None:
+    listed = CliRunner().invoke(app, ["recipes"], env={"COLUMNS": "60"})
+    assert [name for name in packaged_recipes() if f"package:{name} " not in listed.output] == []
+
+
+def test_a_mistyped_recipe_is_answered_with_its_neighbour() -> None:
+    result = CliRunner().invoke(app, ["recipes", "package:kubric-gradul-max90"])
+    assert result.exit_code == 78
+    assert "did you mean package:kubric-gradual-max90" in " ".join(result.output.split())

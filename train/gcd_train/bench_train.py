@@ -22,17 +22,27 @@ from gcd_train.engine.blocks import recompute_blocks
 from gcd_train.engine.optimisers import build_optimiser
 from gcd_train.lora import add_lora, is_adapted
 from gcd_train.memory_account import PLANS, Account, Kept, Plan, account, kept_by_update
-from gcd_train.objective import Batch, Denoiser, Weights, diffusion_loss, drop
+from gcd_train.objective import Batch, Denoiser, Weights, diffusion_loss, drop_streams
 from gcd_train.pixel_encoding import encode_frames
 from gcd_train.precision import Precision
-from gcd_train.recipe import Budget, ComputeRecipe, LoraRecipe, LossRecipe, NoiseRecipe, OptimiserRecipe, UNetRecipe
+from gcd_train.recipe import (
+    Budget,
+    ComputeRecipe,
+    LoraRecipe,
+    LossRecipe,
+    ModelRecipe,
+    NoiseRecipe,
+    OptimiserRecipe,
+    UNetRecipe,
+)
 from gcd_train.schedule import ParameterGroup
+from gcd_train.trained_part import halve_frozen, let_train
 
 KUBRIC_CLIPS = 10_000 * 56
 """Clips of the published Kubric-4D recipe: iterations times batch."""
 _WANTED_LORA_GB, _LORA_RANK = 8.0, 32
-_PEAK_FLOPS = {"H100": 989e12, "H200": 989e12, "A100": 312e12, "L40": 181e12}
-"""Dense bfloat16 arithmetic of whole devices, as their makers state it."""
+_PEAK_FLOPS = {"H100": 989e12, "H200": 989e12, "A100": 312e12, "L40S": 362e12, "L40": 181e12}
+"""Dense bfloat16 arithmetic of whole devices, as their makers state it; the first name that fits counts."""
 
 
 class MemoryRow(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -97,7 +107,8 @@ def bench_train(options: BenchTrainOptions, on_part: Callable[[str], None]) -> T
     kept = kept_by_update(SVD_14)
     config = SVD_14 if options.full else SMALL
     flops = 3 * (kept if options.full else kept_by_update(config)).flops // 4
-    precision = Precision.of(ComputeRecipe(precision="bfloat16"))
+    frozen = "bfloat16" if torch.cuda.is_available() else "float32"  # CPU kernels are slow in it
+    precision = Precision.of(ComputeRecipe(precision="bfloat16", frozen=frozen))
     speed: list[SpeedRow] = []
     if options.measure:
         for cached in (True, False):
@@ -123,7 +134,6 @@ def memory_rows(kept: Kept) -> tuple[MemoryRow, ...]:
         gradient=4,
         state=8,
         adapter=lora_parameters(SVD_14, LoraRecipe(rank=_LORA_RANK)),
-        autocast=True,
         wanted_gb=_WANTED_LORA_GB,
     )
     return tuple(
@@ -188,11 +198,11 @@ class _Updates:
     def __init__(self, config: ModelConfig, options: BenchTrainOptions, precision: Precision, *, cached: bool) -> None:
         self._recipe = _recipe(options)
         self._precision, self._options = precision, options
-        self._networks: Networks = precision.placed(random_networks(config, seed=0))
-        for frozen in (self._networks.target_encoder, self._networks.condition_encoder, self._networks.image_encoder):
-            if frozen is not None:
-                frozen.requires_grad_(False)
-        networks = self._networks
+        networks = random_networks(config, seed=0)
+        let_train(networks, ModelRecipe(), seed=0)
+        if precision.half:
+            halve_frozen(networks)
+        self._networks: Networks = precision.placed(networks)
         self._denoiser = Denoiser(networks.unet, networks.class_head, config.prediction, networks.camera)
         if options.recompute:
             recompute_blocks(self._denoiser, 1)
@@ -224,13 +234,13 @@ class _Updates:
         draws = Draws(0, "bench", number, device)
         rows = self._options.clips * config.frames
         source, target = (self._pictures(draws, rows) for _ in range(2))
-        with self._precision.arithmetic():
-            made = encode_frames(self._networks, self._recipe, source, target, draws)
+        made = encode_frames(self._networks, self._recipe, source, target, draws)
+        condition, tokens = drop_streams(made.source, made.tokens, config.frames, draws, self._recipe)
         return Batch(
-            target=made.target.float(),
-            condition=drop(made.source.float(), draws, self._recipe.dropout),
+            target=made.target,
+            condition=condition,
             vector=self._conditioner.vector(torch.full((rows,), 100.0), rows),
-            tokens=None if made.tokens is None else drop(made.tokens.float(), draws, self._recipe.dropout),
+            tokens=tokens,
             classes=None,
             emphasis=made.emphasis,
             frames=config.frames,

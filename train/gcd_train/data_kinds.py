@@ -109,6 +109,7 @@ class _Opening:
         if self.recipe.vae is not None or self.recipe.latents is not None:
             raise RecipeError("a latent cache is of a frozen autoencoder: leave out [vae] and [latents]")
         cache, valid = CachedLatents.open(self.places.data), self._valid_folder("a latent cache holds no pictures")
+        self._require_drawn_as_cached(cache)
         held = self._driving(valid)
         clips = self._one_rate(held, held.fps)
 
@@ -225,6 +226,25 @@ class _Opening:
         if self.places.valid is None:
             raise DataError(f"{why}: give --valid FOLDER to measure on")
         return self.places.valid
+
+    def _require_drawn_as_cached(self, cache: CachedLatents) -> None:
+        """What a cache was made of cannot be drawn otherwise. Raises RecipeError naming the option."""
+        data, told, kept = self._data, self._data.frames, cache.index.identity
+        wrong = {
+            "data.modality": (data.modality == "semantic") != kept.emphasis,
+            "data.move_time": data.move_time not in (None, 0 if data.path == "direct" else self.config.frames - 1),
+            "data.frames.strides": told.strides is not None and set(told.strides) != set(kept.plan.strides),
+            "data.frames.latest_start": told.latest_start is not None,
+            "data.frames.reverse": bool(told.reverse),
+            "data.frames.reach_last": told.reach_last,
+        }
+        named = [name for name, is_wrong in wrong.items() if is_wrong]
+        if named:
+            kind = "class colours" if kept.emphasis else "colour"
+            raise RecipeError(
+                f"{cache.folder} holds {kind} at strides {kept.plan.strides}, forwards, up to the last frame but one; "
+                f"the recipe's {', '.join(named)} wants another thing: change the recipe, or make the cache anew"
+            )
 
     def _require_family_covers_orbit(self) -> None:
         orbit, limits = self._data.orbit, self.family.limits

@@ -5,7 +5,7 @@ alive afterwards and is counted. Weights, gradients and the optimiser's state fo
 """
 
 import weakref
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
-from torch.utils.flop_counter import FlopCounterMode
+from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
 from gcd_model import ModelConfig
 from gcd_model.networks import empty_networks
@@ -24,6 +24,7 @@ from gcd_model.unet import Stage, VideoUNet
 
 _FLOAT32_MORE = 2  # bytes more than in bfloat16
 _PASSING = 4  # gradients of a block's largest tensor that are alive at once while it is gone back through
+_CPU_ATTENTION = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu  # which torch's counter does not know
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -31,8 +32,8 @@ class Plan:
     """How weights are kept and updated.
 
     weights: bytes of each parameter of the U-Net. gradient, state: bytes of each trained one. adapter: parameters that
-    are trained instead of the U-Net's, in float32, beside it. autocast: norms compute and keep in float32.
-    wanted_gb: at most this, for one clip an update.
+    are trained instead of the U-Net's, in float32, beside it. copies: autocast computes with bfloat16 copies of a
+    block's float32 weights. wanted_gb: at most this, for one clip an update.
     """
 
     name: str
@@ -40,7 +41,7 @@ class Plan:
     gradient: float
     state: float
     adapter: int = 0
-    autocast: bool = False
+    copies: bool = False
     wanted_gb: float | None = None
 
 
@@ -49,7 +50,8 @@ class Kept:
     """Bytes of one clip's update, all in bfloat16.
 
     everything: what the graph keeps. blocks: of it, if of the U-Net's blocks only the inputs are kept. working: the
-    most that going back through one block takes beside. norms: what `working` grows by if norms are in float32.
+    most that going back through one block takes beside. norms: what `working` grows by as norms compute and keep in
+    float32, which autocast lets them do. weights: of the block that has most of them.
     flops: of forward, backward and, again, forward.
     """
 
@@ -57,6 +59,7 @@ class Kept:
     blocks: int
     working: int
     norms: int
+    weights: int
     flops: int
 
 
@@ -73,13 +76,13 @@ class Account:
 
     @property
     def total(self) -> float:
-        """All at once, which is never less than the peak."""
+        """All at once. Not in it: the driver's own, workspaces of libraries, fragments of the allocator."""
         return self.weights + self.gradients + self.state + self.activations + self.encoders
 
 
 PLANS = (
-    Plan(name="Adam, float32 weights", weights=4, gradient=4, state=8, autocast=True),
-    Plan(name="8-bit Adam, float32 weights", weights=4, gradient=4, state=2, autocast=True, wanted_gb=20.0),
+    Plan(name="Adam, float32 weights", weights=4, gradient=4, state=8, copies=True),
+    Plan(name="8-bit Adam, float32 weights", weights=4, gradient=4, state=2, copies=True, wanted_gb=20.0),
     Plan(name="8-bit Adam, bfloat16 weights", weights=2, gradient=2, state=2, wanted_gb=14.0),
 )
 """Full fine-tunes."""
@@ -92,6 +95,12 @@ class LiveBytes(TorchDispatchMode):
         super().__init__()
         self.live = self.largest = 0
         self._known: dict[int, weakref.ref[Any]] = {}
+
+    def leave_out(self, tensors: Iterable[Tensor]) -> None:
+        """Do not count these, such as weights, when views of them are made."""
+        for tensor in tensors:
+            storage = tensor.untyped_storage()
+            self._known[storage._cdata] = weakref.ref(storage)  # pyright: ignore[reportPrivateUsage]  as in _watch
 
     def __torch_dispatch__(
         self,
@@ -128,6 +137,7 @@ class _Block:
     kept: int = 0
     largest: int = 0
     norms: int = 0
+    weights: int = 0
 
 
 def kept_by_update(config: ModelConfig) -> Kept:
@@ -141,7 +151,9 @@ def kept_by_update(config: ModelConfig) -> Kept:
         vector = torch.zeros(frames, unet_config.vector_width)
         camera = torch.zeros(frames, unet_config.camera_width) if unet_config.camera_width else None
         tokens = None if unet_config.context_width is None else torch.zeros(frames, unet_config.context_width)
-        live, flops, blocks = LiveBytes(), FlopCounterMode(display=False), list[_Block]()
+        live, blocks = LiveBytes(), list[_Block]()
+        live.leave_out(unet.parameters())
+        flops = FlopCounterMode(display=False, custom_mapping={_CPU_ATTENTION: _attention_flops})
         with flops, live, _watched(unet, live, blocks):
             plan = unet.plan(torch.zeros(1, frames), vector, camera, tokens)
             made = unet(rows, condition, plan.step(0))
@@ -153,8 +165,16 @@ def kept_by_update(config: ModelConfig) -> Kept:
         blocks=held - inside + sum(block.input for block in blocks),
         working=max(block.kept + _PASSING * block.largest for block in blocks),
         norms=max(block.norms for block in blocks),
+        weights=max(block.weights for block in blocks),
         flops=4 * flops.get_total_flops(),
     )
+
+
+def _attention_flops(
+    query: tuple[int, ...], key: tuple[int, ...], value: tuple[int, ...], *_rest: object, **_named: object
+) -> int:
+    """Of shapes, as torch's counter calls it."""
+    return sdpa_flop_count(query, key, value)
 
 
 @contextmanager
@@ -172,9 +192,10 @@ def _watched(unet: VideoUNet, live: LiveBytes, blocks: list[_Block]) -> Generato
     """Fill in `blocks` while the network runs, one for each of its stages."""
     open_blocks: list[_Block] = []
 
-    def enter(_module: nn.Module, inputs: tuple[Any, ...]) -> None:
+    def enter(module: nn.Module, inputs: tuple[Any, ...]) -> None:
         x: Tensor = inputs[0]
-        open_blocks.append(_Block(before=live.live, input=x.numel() * x.element_size()))
+        weights = sum(weight.numel() * weight.element_size() for weight in module.parameters())
+        open_blocks.append(_Block(before=live.live, input=x.numel() * x.element_size(), weights=weights))
         live.largest = 0
 
     def leave(_module: nn.Module, _inputs: tuple[Any, ...], _made: Tensor) -> None:
@@ -182,9 +203,11 @@ def _watched(unet: VideoUNet, live: LiveBytes, blocks: list[_Block]) -> Generato
         block.kept, block.largest = live.live - block.before, live.largest
         blocks.append(block)
 
-    def normed(_module: nn.Module, _inputs: tuple[Any, ...], made: Tensor) -> None:
+    def normed(module: nn.Module, _inputs: tuple[Any, ...], made: Tensor) -> None:
+        copied = 2 * _FLOAT32_MORE * made.numel()  # what came in, in float32
+        kept = _FLOAT32_MORE * made.numel() if isinstance(module, nn.GroupNorm) else 0  # for the activation after it
         for block in open_blocks:
-            block.norms += 2 * _FLOAT32_MORE * made.numel()  # what the norm made, and the activation of it
+            block.norms += copied + kept
 
     stages = [part for part in unet.modules() if isinstance(part, Stage)]
     norms = [part for part in unet.modules() if isinstance(part, nn.GroupNorm | nn.LayerNorm)]
@@ -221,7 +244,7 @@ def account(config: ModelConfig, plan: Plan, kept: Kept, *, cached: bool) -> Acc
         weights=(plan.weights * parameters + 4 * plan.adapter) / 1e9,
         gradients=plan.gradient * trained / 1e9,
         state=plan.state * trained / 1e9,
-        activations=(kept.blocks + kept.working + plan.autocast * kept.norms) / 1e9,
+        activations=(kept.blocks + kept.working + kept.norms + plan.copies * kept.weights) / 1e9,
         encoders=0.0 if cached else 2 * frozen / 1e9,
     )
 

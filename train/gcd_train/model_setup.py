@@ -9,12 +9,13 @@ from torch import nn
 from gcd_model import FAMILIES, SMALL, SVD_14, Family, ModelConfig
 from gcd_model.config import DRIVING_SEMANTIC_SMALL, DRIVING_SMALL, OBJECTS_SMALL, CameraControl
 from gcd_model.errors import OptionError
-from gcd_model.networks import Networks
+from gcd_model.gcd_layout import gcd_state
+from gcd_model.networks import Networks, empty_networks
 from gcd_train.checkpoint import require_identity
 from gcd_train.engine.states import newest_weights
 from gcd_train.errors import RecipeError, RunError
 from gcd_train.lora import plain_weights
-from gcd_train.recipe import ComputeRecipe, ModelRecipe, StageName, UNetChanges, UNetRecipe, VAEChanges
+from gcd_train.recipe import ComputeRecipe, ModelRecipe, Recipe, StageName, UNetChanges, UNetRecipe, VAEChanges
 from gcd_train.run_folder import RunFolder
 
 _BASES: dict[str, ModelConfig] = {
@@ -46,9 +47,28 @@ def model_config(recipe: ModelRecipe) -> ModelConfig:
             width=recipe.width or base.width,
         )
         # msgspec does not check what `replace` makes; a round trip does
-        return msgspec.json.decode(msgspec.json.encode(changed), type=ModelConfig)
+        config = msgspec.json.decode(msgspec.json.encode(changed), type=ModelConfig)
     except (OptionError, msgspec.ValidationError) as error:
         raise RecipeError(f"the recipe's [model] cannot be built: {error}") from error
+    factor = config.size_factor
+    if config.height % factor or config.width % factor:
+        raise RecipeError(
+            f"model.height and model.width must be multiples of {factor}, which these networks halve down to whole "
+            f"numbers; got {config.height} and {config.width}"
+        )
+    return config
+
+
+def require_exportable(recipe: Recipe, config: ModelConfig) -> None:
+    """Raises RecipeError, before anything is trained, if [export] asks for a layout that cannot hold these networks."""
+    if "gcd-ckpt" not in recipe.export.layouts:
+        return
+    try:
+        gcd_state(empty_networks(config).state_dict(), config, {})
+    except OptionError as error:
+        raise RecipeError(
+            f'export.layouts asks for "gcd-ckpt", but {error}; leave it out: --set \'export.layouts=["gcd-node"]\''
+        ) from error
 
 
 def _steered(base: ModelConfig, camera: CameraControl) -> ModelConfig:

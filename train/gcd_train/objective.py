@@ -103,13 +103,6 @@ def draw_noise(draws: Draws, shape: torch.Size, frames: int, shared: float) -> T
     return shared**0.5 * common + (1 - shared) ** 0.5 * own
 
 
-def drop(rows: Tensor, draws: Draws, probability: float) -> Tensor:
-    """Rows set to zero, each with the given probability by itself."""
-    if probability == 0:
-        return rows
-    return _kept(rows, ~draws.chance(probability, rows.shape[0]))
-
-
 def drop_streams(
     condition: Tensor, tokens: Tensor | None, frames: int, draws: Draws, recipe: UNetRecipe
 ) -> tuple[Tensor, Tensor | None]:

@@ -6,6 +6,7 @@ the paper's networks have two: both are made of it.
 """
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -29,12 +30,14 @@ def fresh_networks(config: ModelConfig, seed: int) -> Networks:
 def start_networks(recipe: ModelRecipe, config: ModelConfig, seed: int) -> Networks:
     """What training starts from: random, or the recipe's weight file in float32 with what it lacks at random.
 
-    Raises RecipeError if the file holds another model, and names the first weights that differ; CheckpointError as
-    `load_weights`.
+    Raises RecipeError if the file is missing, or holds another model, whose first weights that differ are named;
+    CheckpointError as `load_weights`.
     """
-    networks = fresh_networks(config, seed)
     if recipe.weights is None:
-        return networks
+        return fresh_networks(config, seed)
+    if ":" not in recipe.weights and not Path(recipe.weights).exists():
+        raise RecipeError(f"model.weights, {recipe.weights}, is not there; give its place: --set model.weights=FILE")
+    networks = fresh_networks(config, seed)
     loaded = load_weights(recipe.weights, ask_family=False)
     try:
         over = carried_over(loaded.networks, config, anew=DIFFUSION if recipe.scratch else ())

@@ -29,6 +29,7 @@ from gcd_train.model_setup import (
     family_of,
     fill,
     model_config,
+    require_exportable,
     sampled_as_trained,
 )
 from gcd_train.objective import Weights
@@ -70,10 +71,11 @@ class Trainer:
     """The stages of one run."""
 
     def __init__(self, inputs: RunInputs) -> None:
-        """Raises RecipeError if the recipe's model cannot be built or its device is not there."""
+        """Raises RecipeError if the recipe's model cannot be built or exported, or its device is not there."""
         self._inputs, self._recipe, self._folder = inputs, inputs.recipe, inputs.folder
         self._config: ModelConfig = sampled_as_trained(model_config(inputs.recipe.model), inputs.recipe.unet)
         self._family = family_of(inputs.recipe.model)
+        require_exportable(inputs.recipe, self._config)
         self._precision = Precision.of(inputs.recipe.compute)
         self._engine = Engine(processes=inputs.processes, compute=inputs.recipe.compute)
         for clips in (inputs.clips, inputs.valid):
@@ -186,7 +188,7 @@ class Trainer:
         let_train(networks, self._recipe.model, self._recipe.seed)
         if self._recipe.compute.frozen == "bfloat16":
             halve_frozen(networks)
-        self._precision.placed(networks)
+        self._precision.placed(networks if recipe.source == "pixels" else networks.unet)  # encoders only to encode
         clips = self._latent_clips(networks) if recipe.source == "latents" else None
         task = UNetTask(
             networks,

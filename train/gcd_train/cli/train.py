@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from gcd_train.engine.processes import Processes
 
 RecipeFile: TypeAlias = Annotated[
-    str, Argument(metavar="RECIPE", help="A TOML file, or package:driving-small for one that ships.")
+    str, Argument(metavar="RECIPE", help="A TOML file, or package:NAME for one that ships (`gcd-train recipes`).")
 ]
 Shown: TypeAlias = Annotated[
     str | None, Argument(metavar="[RECIPE]", help="Show this one whole, with its bases and every default.")
@@ -35,10 +35,11 @@ Out: TypeAlias = Annotated[Path, Option(help="Folder of the run; run again to go
 Stage: TypeAlias = Annotated[str | None, Option(help=f"Only this one: {', '.join(get_args(StageName))}.")]
 Threads: TypeAlias = Annotated[int | None, Option(min=1, help="CPU threads; else torch's own choice.")]
 Small: TypeAlias = Annotated[
-    bool, Option("--small", help="Model, size, batch and budget of the recipe's table [small], for a CPU.")
+    bool, Option("--small", help="Model, size, batch and budget of the recipe's table `small`, for a CPU.")
 ]
 Changes: TypeAlias = Annotated[
-    list[str] | None, Option("--set", metavar="KEY=VALUE", help="Change the recipe, for one unet.batch=8; repeat.")
+    list[str] | None,
+    Option("--set", metavar="KEY=VALUE", help="Change the recipe: unet.batch=8, for one; may be repeated."),
 ]
 
 
@@ -77,6 +78,9 @@ def recipes(recipe: Shown = None, small: Small = False, changes: Changes = None)
             table.add_column(column, no_wrap=True)
         for name in packaged_recipes():
             table.add_row(f"package:{name}", *_row(load_recipe(f"package:{name}")))
+        # a name that is cut off cannot be given to `train`: a narrow terminal breaks lines instead
+        whole = console.measure(table, options=console.options.update(max_width=1000)).maximum
+        console.width = max(console.width, whole)
         console.print(table)
 
 

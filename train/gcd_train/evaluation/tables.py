@@ -110,7 +110,8 @@ def _classes(report: Report) -> list[str]:
 
     def cell(each: Evaluation, label: int) -> str:
         iou, full = each.total.class_iou[label], each.total.class_iou_full[label]
-        return "-" if math.isnan(iou) and math.isnan(full) else f"{iou:.2f} ({full:.2f})"
+        shown = tuple("-" if math.isnan(value) else f"{value:.2f}" for value in (iou, full))
+        return "-" if shown == ("-", "-") else f"{shown[0]} ({shown[1]})"
 
     rows = [[name, *(cell(each, i) for each in shown)] for i, name in enumerate(report.classes)]
     return ["IoU of each class:", "", *_table(["class", *(each.name for each in shown)], rows)]

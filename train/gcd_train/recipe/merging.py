@@ -103,10 +103,7 @@ def _read(path: Path, above: tuple[Path, ...]) -> MergedTable:
     try:
         own = parsed(path.read_bytes(), _told(chain))
     except OSError as error:
-        there = ", ".join(f"package:{name}" for name in packaged_recipes())
-        raise RecipeError(
-            f"cannot read the recipe {_told(chain)}: {error.strerror}; give a TOML file, or one of {there}"
-        ) from error
+        raise RecipeError(f"cannot read the recipe {_told(chain)}: {error.strerror}; {_instead(path)}") from error
     base = own.pop(BASE, None)
     own.setdefault("name", path.stem)
     if base is None:
@@ -115,6 +112,13 @@ def _read(path: Path, above: tuple[Path, ...]) -> MergedTable:
         raise RecipeError(f"{path}: `base` is a path from here, or package:NAME, got {base!r}")
     below = _read(recipe_path(base, path.parent), chain)
     return MergedTable(on_top(below.table, own, str(path)), (str(path), *below.files))
+
+
+def _instead(path: Path) -> str:
+    """What to give in place of a recipe file that is not there."""
+    near = difflib.get_close_matches(path.stem, packaged_recipes(), n=2, cutoff=0.6)
+    meant = f"did you mean {' or '.join(f'package:{name}' for name in near)}? " if near else ""
+    return f"{meant}give a TOML file, or a name that `gcd-train recipes` lists"
 
 
 def _told(chain: Sequence[Path]) -> str:

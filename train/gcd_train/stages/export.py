@@ -1,5 +1,6 @@
 """The weight files of a run: averaged weights of all stages, with a card."""
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,8 @@ from gcd_train.errors import RunError
 from gcd_train.recipe import ExportRecipe
 from gcd_train.run_folder import RunFolder
 from gcd_train.validation import Validation
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -47,7 +50,7 @@ def export(networks: Networks, folder: RunFolder, job: ExportJob, validation: Va
     networks, path = networks.cpu(), folder.path / f"{job.name}.safetensors"
     card = Card(name=job.name, config=networks.config, family=job.family.name, move_time=job.move_time, trained=True)
     try:
-        _write_others(networks, folder.path, card, job)
+        others = _write_others(networks, folder.path, card, job)
         save_weights(networks.to(precision(job.recipe.dtype)), path, card, overwrite=True)
         loaded = load_weights(path)
     except ModelError as error:
@@ -55,12 +58,17 @@ def export(networks: Networks, folder: RunFolder, job: ExportJob, validation: Va
     values = validation.measure(loaded.networks.float(), folder.stage("export") / "samples.png")
     size = {"bytes": path.stat().st_size, "sha256_12": loaded.sha256_12}
     folder.record("export", "measured", {**size, **values})
+    _log.info("wrote %s", ", ".join([str(path), *(str(other) for other in others)]))
 
 
-def _write_others(networks: Networks, folder: Path, card: Card, job: ExportJob) -> None:
-    """What is written in float32, while the networks are."""
+def _write_others(networks: Networks, folder: Path, card: Card, job: ExportJob) -> list[Path]:
+    """What is written in float32, while the networks are; returns the files."""
+    written = list[Path]()
     if "gcd-ckpt" in job.recipe.layouts:
         out, weights, carried = folder / f"{job.name}.ckpt", networks.state_dict(), job.leftovers()
         write_published(out, weights, card, carried=carried, updates=job.updates, overwrite=True)
+        written.append(out)
     if job.adapter is not None:
-        write_adapter(folder / f"{job.name}-adapter.safetensors", job.adapter(card), overwrite=True)
+        written.append(folder / f"{job.name}-adapter.safetensors")
+        write_adapter(written[-1], job.adapter(card), overwrite=True)
+    return written

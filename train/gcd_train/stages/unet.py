@@ -32,8 +32,9 @@ class UNetTask:
     ) -> None:
         self._networks, self._batches, self._validation = networks, batches, validation
         self._recipe, self._weights, self._precision, self._seed = recipe, weights, precision, seed
-        precision.placed(networks)
-        self._denoiser = Denoiser(networks.unet, networks.class_head, networks.config.prediction, networks.camera)
+        self._denoiser = precision.placed(
+            Denoiser(networks.unet, networks.class_head, networks.config.prediction, networks.camera)
+        )
         self._network: nn.Module = self._denoiser
         keep_trained_alone(self._denoiser)
 
