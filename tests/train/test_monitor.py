@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from gcd_train.errors import TrainError
+from gcd_train.errors import RunError, TrainError
 from gcd_train.monitor.board import TensorBoard
 from gcd_train.monitor.finite import FiniteGuard
 from gcd_train.monitor.memory import peak_memory_gb
@@ -47,6 +47,19 @@ def test_many_clips_are_counted_in_the_message_and_all_in_the_note(tmp_path: Pat
     with pytest.raises(TrainError, match="seed 5 and 14 more"):
         guard.saw(0, "loss", torch.tensor(torch.inf), ids)
     assert json.loads((tmp_path / "note.json").read_text())["clips"] == list(ids)
+
+
+def test_a_note_that_cannot_be_written_does_not_hide_what_is_wrong(tmp_path: Path) -> None:
+    (tmp_path / "unet").write_text("a file where a folder should be")
+    with pytest.raises(TrainError, match="the loss of unet is nan at update 5"):
+        FiniteGuard("unet", tmp_path / "unet" / "not_finite.json").saw(5, "loss", torch.tensor(torch.nan))
+
+
+def test_a_folder_that_tensorboard_cannot_write_is_named(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard", reason="needs tensorboard (extra `train`)")
+    (tmp_path / "tensorboard").write_text("a file where a folder should be")
+    with pytest.raises(RunError, match=r"cannot write in .*tensorboard"):
+        TensorBoard(tmp_path / "tensorboard")
 
 
 def test_memory_is_told_in_gigabytes_of_the_process() -> None:

@@ -101,6 +101,7 @@ def test_an_unknown_key_is_refused_with_the_nearest_known_one(line: bytes, wante
         (b"[latents]\n", b"", "needs a \\[latents\\] table"),
         (b"batch = 2\n", b"batch = 2\nfinetune_vae = true\n", "run above 1"),
         (b"multipliers = [1, 2, 3]", b"multipliers = [1, 2]", "attention names"),
+        (b"[model]\n", b'[model]\ntrain = "lora"\nweights = "x.safetensors"\n', r"leave \[vae\] out"),
     ],
 )
 def test_contradictions_are_refused(old: bytes, new: bytes, wanted: str) -> None:

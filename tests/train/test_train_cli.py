@@ -3,9 +3,13 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
+import typer
 from typer.testing import CliRunner
 
+from gcd_train.cli.errors import errors_shown
 from gcd_train.cli.main import app
+from gcd_train.errors import RunError
 
 
 def test_families_lists_every_family_with_its_limits() -> None:
@@ -40,6 +44,21 @@ def test_evaluation_says_what_is_wrong_in_one_line(tmp_path: Path, options: list
     assert result.exit_code == code
     assert words in result.output
     assert "Traceback" not in result.output
+
+
+@pytest.mark.parametrize("error", [torch.OutOfMemoryError("of the device"), RuntimeError("can't allocate memory")])
+def test_want_of_memory_is_one_line_that_says_what_helps(
+    error: RuntimeError, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(typer.Exit) as caught, errors_shown():
+        raise error
+    assert caught.value.exit_code == RunError.exit_code
+    assert "clip_batch" in capsys.readouterr().err
+
+
+def test_another_error_of_the_program_stays_a_traceback() -> None:
+    with pytest.raises(RuntimeError, match="shape"), errors_shown():
+        raise RuntimeError("shape mismatch")
 
 
 def test_architectures_lists_all_set_ups() -> None:

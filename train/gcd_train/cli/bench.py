@@ -112,8 +112,9 @@ def memory_table(report: "TrainReport") -> Table:
 
 def speed_table(report: "TrainReport") -> Table:
     """Measured updates, for people."""
+    clips = f"{report.clips} clip{'' if report.clips == 1 else 's'}"
     title = (
-        f"{report.clips} clips an update, {report.model} model, {report.tflop_per_clip:.3g} TFLOP a clip; "
+        f"{clips} an update, {report.model} model, {report.tflop_per_clip:.3g} TFLOP a clip; "
         f"{report.device}, torch {report.torch}"
     )
     table = Table(title=title, title_justify="left", box=SIMPLE)

@@ -27,9 +27,22 @@ def errors_shown() -> Generator[None]:
     except BrokenProcessPool as error:
         _say("a worker was killed, most likely for want of memory; give fewer --workers, the finished part stays")
         raise typer.Exit(RunError.exit_code) from error
+    except RuntimeError as error:
+        if not _out_of_memory(error):
+            raise
+        _say(
+            f"{error}; give fewer clips at once (clip_batch), compute.checkpoint_activations, 8-bit Adam or precision "
+            '"bfloat16": `gcd-train bench train` says what each takes'
+        )
+        raise typer.Exit(RunError.exit_code) from error
     except OSError as error:
         _say(f"{error}; see to the disk or the path, then run the same line to go on")
         raise typer.Exit(RunError.exit_code) from error
+
+
+def _out_of_memory(error: RuntimeError) -> bool:
+    """Whether a device, or the host, had no memory left. By name: torch is not imported for an error's sake."""
+    return type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in str(error)
 
 
 def _say(message: object) -> None:

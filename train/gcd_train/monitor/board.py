@@ -6,7 +6,7 @@ from typing import Protocol
 
 import cv2
 
-from gcd_train.errors import RecipeError
+from gcd_train.errors import RecipeError, RunError
 
 Values = Mapping[str, float | int | str]
 
@@ -22,7 +22,7 @@ class Board(Protocol):
 class TensorBoard:
     """Event files in a folder, tags STAGE/KIND/NAME, steps are updates; a resumed run goes on in a further file.
 
-    Raises RecipeError if TensorBoard is not installed.
+    Raises RecipeError if TensorBoard is not installed, RunError if the folder cannot be written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -33,7 +33,10 @@ class TensorBoard:
                 "log.tensorboard is on, but TensorBoard is not installed; `pip install 'gcd-node[train]'`, or turn "
                 "it off"
             ) from error
-        self._writer = SummaryWriter(str(folder), flush_secs=30)
+        try:
+            self._writer = SummaryWriter(str(folder), flush_secs=30)
+        except OSError as error:
+            raise RunError(f"cannot write in {folder}: {error.strerror}; choose another --out") from error
 
     def add(self, stage: str, kind: str, values: Values, picture: Path | None) -> None:
         """See Board."""

@@ -2,6 +2,7 @@
 
 import json
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,8 +48,9 @@ class FiniteGuard:
 
     def _stop(self, wrong: _Seen, value: float, ids: list[str]) -> None:
         told = {"stage": self._stage, "update": wrong.update, "what": wrong.what, "value": str(value), "clips": ids}
-        self._note.parent.mkdir(parents=True, exist_ok=True)
-        self._note.write_text(json.dumps(told, indent=1))
+        with suppress(OSError):  # a full disk must not hide what is wrong
+            self._note.parent.mkdir(parents=True, exist_ok=True)
+            self._note.write_text(json.dumps(told, indent=1))
         named = ", ".join(ids[:_NAMED]) + (f" and {len(ids) - _NAMED} more" if len(ids) > _NAMED else "")
         raise TrainError(
             f"the {wrong.what} of {self._stage} is {value} at update {wrong.update}"

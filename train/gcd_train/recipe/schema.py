@@ -43,6 +43,11 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             raise ValueError("[decoder] works on encoded clips and needs a [latents] table")
         if self.vae is None and self.model.weights is None:
             raise ValueError("a random autoencoder teaches nothing: give a [vae] table, or model.weights to start from")
+        if self.vae is not None and self.model.train != "all":
+            raise ValueError(
+                f'model.train "{self.model.train}" builds on given weights, whose autoencoder must stay: leave [vae] '
+                'out (without = ["vae"])'
+            )
         if (self.data.kind == "cache") != (self.unet.source == "cache"):
             raise ValueError('a latent cache is read with both data.kind "cache" and unet.source "cache"')
 
