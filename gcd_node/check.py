@@ -153,9 +153,23 @@ def _weights(section: ModelSection, known: _Known) -> str:
     report = inspect_weights(
         path, family=section.family, head_width=section.head_width, image_heads=section.image_heads
     )
-    known.traits = _traits(report, section)
+    known.traits = _traits(report, section) if section.adapter is None else _adapted(section)
     known.weight_bytes = report.parameters * _BYTES.get(known.traits.precision, 4)
-    return f"{report.name}, family {report.family or 'unknown'}, {report.parameters / 1e6:.1f} M parameters"
+    family = "unknown" if known.traits.family is None else known.traits.family.name
+    return f"{known.traits.name}, family {family}, {report.parameters / 1e6:.1f} M parameters"
+
+
+def _adapted(section: ModelSection) -> Traits:
+    """Of weights with an adapter: both are loaded, as nothing less says whether they belong together."""
+    return load_synthesizer(
+        section.weights,
+        family=section.family,
+        device="cpu",
+        dtype=section.dtype,
+        head_width=section.head_width,
+        image_heads=section.image_heads,
+        adapter=section.adapter,
+    ).traits
 
 
 def _packaged(name: str) -> Path:
@@ -177,6 +191,7 @@ def _traits(report: WeightsReport, section: ModelSection) -> Traits:
         precision=section.dtype or ("bfloat16" if device != "cpu" else "float32"),
         device=device,
         trained=report.trained,
+        uncertainty_scale=report.uncertainty_scale,
     )
 
 

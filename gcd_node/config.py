@@ -140,12 +140,14 @@ class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     """The model and how it is sampled. What is left out is as the checkpoint was made for.
 
     weights: a checkpoint, a diffusers folder, `package:NAME`, or `random:FAMILY` (noise, for trying the plumbing).
+    adapter: file of a low-rank adapter trained on these weights; family and move_time are then the adapter's.
     threads: CPU threads for the model, and for OpenCV beside it; leave the rest of the robot its cores.
     guidance: scale of the first and of the last frame.
     cond_aug: strength of the noise on the conditioning frames.
     """
 
     weights: str
+    adapter: str | None = None
     family: str | None = None
     device: str = "auto"
     dtype: str | None = None

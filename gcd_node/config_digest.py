@@ -23,7 +23,7 @@ def config_digest(config: NodeConfig, traits: Traits) -> str:
     """
     source = config.source
     taken = source.resize, source.allow_upscale, source.hfov_deg, _pose(source.pose, traits)
-    filled = taken, _model(config.model, traits), config.view, _window(config.window, traits)
+    filled = taken, _told(_model(config.model, traits)), config.view, _window(config.window, traits)
     plain = _without_negative_zero(msgspec.to_builtins(filled))
     return hashlib.sha256(msgspec.json.encode(plain, order="deterministic")).hexdigest()[:12]
 
@@ -44,6 +44,14 @@ def _model(section: ModelSection, traits: Traits) -> ModelSection:
         head_width=traits.config.unet.head_width,
         image_heads=None if tower is None else tower.heads,
     )
+
+
+def _told(section: ModelSection) -> dict[str, object]:
+    """Without an adapter where there is none: recordings made before adapters could be named keep their name."""
+    told: dict[str, object] = msgspec.structs.asdict(section)
+    if section.adapter is None:
+        del told["adapter"]
+    return told
 
 
 def _window(section: WindowConfig, traits: Traits) -> WindowConfig:

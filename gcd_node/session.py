@@ -67,6 +67,7 @@ def load_model(section: ModelSection) -> ViewSynthesizer:
             dtype=section.dtype,
             head_width=section.head_width,
             image_heads=section.image_heads,
+            adapter=section.adapter,
         )
     except OptionError as error:
         raise ConfigError(f"[model]: {error}") from error

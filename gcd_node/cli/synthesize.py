@@ -1,6 +1,7 @@
 """`gcd-node synthesize`: one clip, one view, offline."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, TypeAlias
 
@@ -98,6 +99,9 @@ Noise: TypeAlias = Annotated[
 Save: TypeAlias = Annotated[
     Path | None, Option(help=".npz to write `latents` and `frames` to.", rich_help_panel=_SAMPLING)
 ]
+AdapterFile: TypeAlias = Annotated[
+    Path | None, Option("--adapter", help="Low-rank adapter trained on these weights.", rich_help_panel=_MODEL)
+]
 Device: TypeAlias = Annotated[str, Option(help="auto, cpu, cuda, cuda:1, ...", rich_help_panel=_MODEL)]
 Dtype: TypeAlias = Annotated[str | None, Option(help="float32, bfloat16 or float16.", rich_help_panel=_MODEL)]
 
@@ -137,6 +141,7 @@ def synthesize(
     dtype: Dtype = None,
     head_width: HeadWidth = None,
     image_heads: ImageHeads = None,
+    adapter: AdapterFile = None,
 ) -> None:
     """See one clip from another camera, offline.
 
@@ -151,10 +156,9 @@ def synthesize(
     options = RenderOptions(steps=steps, guidance=guidance, samples=samples, seed=seed, motion_bucket=motion_bucket)
     options = replace(options, initial_noise=injected.initial)
     _require_possible(input_path, save, samples)
+    load = partial(load_synthesizer, weights, adapter=adapter, family=family, device=device, dtype=dtype)
     with Console(stderr=True, markup=False).status(f"loading {weights}"):
-        model = load_synthesizer(
-            weights, family=family, device=device, dtype=dtype, head_width=head_width, image_heads=image_heads
-        )
+        model = load(head_width=head_width, image_heads=image_heads)
     augmentation = Augmentation(strength=cond_aug, seed=seed, noise=injected.augmentation)
     _run(_Order(model, input_path, clip, wanted, options, augmentation), out, save)
 

@@ -45,7 +45,7 @@ def test_a_failed_write_leaves_the_older_state(tmp_path: Path, monkeypatch: pyte
 def test_a_damaged_state_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "state.pt"
     path.write_bytes(content)
-    with pytest.raises(RunError, match="delete it"):
+    with pytest.raises(RunError, match=r"the state .*state\.pt is damaged: "):
         load_state(path, "unet")
 
 

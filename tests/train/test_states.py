@@ -119,7 +119,7 @@ def test_a_run_whose_states_are_all_damaged_does_not_start_anew_by_itself(tmp_pa
 def test_damaged_weights_are_not_exchanged_for_less_trained_ones(tmp_path: Path) -> None:
     run(tmp_path, 3)
     flip(tmp_path / "unet" / "state.pt")
-    with pytest.raises(DamagedStateError, match="not those that were written"):
+    with pytest.raises(RunError, match="not those that were written; run the stage 'unet' again"):
         newest_weights(tmp_path / "unet", "unet")
 
 

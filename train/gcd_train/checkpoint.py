@@ -63,18 +63,18 @@ def load_state(path: Path, stage: str) -> StageState:
     """Read a state, checking its digest. Raises DamagedStateError; RunError for another stage or format."""
     wrong = damage(path)
     if wrong is not None:
-        raise DamagedStateError(f"the state {path} is damaged: {wrong}; delete it to start the stage anew")
+        raise DamagedStateError(f"the state {path} is damaged: {wrong}")
     try:
         _admit_torchao(path)
         content = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, UnpicklingError, EOFError, ValueError) as error:
-        raise DamagedStateError(f"cannot read the state {path} ({error}); delete it to start the stage anew") from error
+        raise DamagedStateError(f"cannot read the state {path}: {error}") from error
     if not isinstance(content, dict) or content.pop("format", None) != _FORMAT or content.get("stage") != stage:
         raise RunError(f"{path} is no state of the stage {stage!r} in format {_FORMAT}; delete it to start anew")
     try:
         return StageState(**content)
     except TypeError as error:
-        raise DamagedStateError(f"{path} is damaged ({error}); delete it to start the stage anew") from error
+        raise DamagedStateError(f"the state {path} is damaged: {error}") from error
 
 
 def _admit_torchao(path: Path) -> None:

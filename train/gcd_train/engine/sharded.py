@@ -121,7 +121,7 @@ def _under(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 
 def _damaged(folder: Path, what: str) -> DamagedStateError:
-    return DamagedStateError(f"the state {folder} is damaged: {what}; delete it to start the stage anew")
+    return DamagedStateError(f"the state {folder} is damaged: {what}")
 
 
 def _digest(path: Path) -> str:

@@ -89,9 +89,8 @@ def newest_good(states: list[Path], read: Callable[[Path], Read]) -> tuple[Path,
         try:
             return path, read(path)
         except DamagedStateError as error:
-            _log.warning("%s", error)
             before = "no state is left" if path == states[-1] else "going on from the state before it"
-            _log.warning("%s is not used; %s", path, before)
+            _log.warning("%s; %s", error, before)
     if states:
         raise RunError(
             f"all {len(states)} states of the stage are damaged, see above; delete {states[0]} and what else there is "
@@ -103,14 +102,16 @@ def newest_good(states: list[Path], read: Callable[[Path], Read]) -> tuple[Path,
 def newest_weights(stage_folder: Path, stage: str) -> tuple[Path, StageState] | None:
     """The newest state of a stage, for its weights; None if there is none.
 
-    Raises DamagedStateError if it is damaged: the one before it is less trained, so running the stage again has to
-    choose it.
+    Raises RunError if it is damaged: the one before it is less trained, so running the stage again has to choose it.
     """
     states = StateFolder(stage_folder, LogRecipe()).listed()
     if not states:
         return None
     read = read_weights if states[0].is_dir() else load_state
-    return states[0], read(states[0], stage)
+    try:
+        return states[0], read(states[0], stage)
+    except DamagedStateError as error:
+        raise RunError(f"{error}; run the stage {stage!r} again, it goes on from the state before") from error
 
 
 def _remove(path: Path) -> None:
