@@ -116,10 +116,16 @@ def _facts(report: WeightsReport) -> Table:
         ("size on disk", f"{_mb(report.size)} MB"),
         ("digest", report.digest),
         ("trained", "yes" if report.trained else "no: random weights"),
+        ("uncertainty scale", _scale(report)),
     )
     for row in rows:
         facts.add_row(*row)
     return facts
+
+
+def _scale(report: WeightsReport) -> str:
+    scale = report.uncertainty_scale
+    return "not measured" if scale is None else f"{scale:.3g}: the deviation over samples times this is calibrated"
 
 
 def _heads(report: WeightsReport) -> str:

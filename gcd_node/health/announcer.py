@@ -83,6 +83,7 @@ def metadata(run: Run, settings: Settings, fps: float) -> dict[str, object]:
             "family": "unknown" if traits.family is None else traits.family.name,
             "sha256_12": traits.sha256_12,
             "trained": traits.trained,
+            "uncertainty_scale": traits.uncertainty_scale,
         },
         "views": list(settings.revisions),
         "view_revs": dict(settings.revisions),

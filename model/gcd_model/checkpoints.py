@@ -54,7 +54,7 @@ class LoadedWeights:
     """Networks with their weights, still in the mapped file, in the stored precision, on the CPU.
 
     family: None if nobody could tell. move_time: frame in which the goal pose is reached.
-    sha256_12: first 12 digits of `digest`. layout: of the file.
+    sha256_12: first 12 digits of `digest`. uncertainty_scale: see `Traits`. layout: of the file.
     carried: leftovers of a published file that its next owner may want, by published name; see `gcd_layout.CARRIED`.
     """
 
@@ -64,6 +64,7 @@ class LoadedWeights:
     move_time: int
     trained: bool
     sha256_12: str
+    uncertainty_scale: float | None = None
     layout: Layout = "gcd-node"
     carried: Mapping[str, Tensor] = field(default_factory=dict[str, Tensor])
 
@@ -107,6 +108,7 @@ def load_weights(
             move_time=examined.move_time,
             trained=examined.trained,
             sha256_12=digest(examined.file.files)[:12],
+            uncertainty_scale=examined.uncertainty_scale,
             layout=examined.file.layout,
             carried=_carried(examined),
         )
@@ -123,6 +125,7 @@ def load_adapted(base: LoadedWeights, adapter: Adapter) -> LoadedWeights:
         family=family,
         move_time=card.move_time,
         trained=base.trained and card.trained,
+        uncertainty_scale=None,
         sha256_12=weights_digest({f"{base.sha256_12}.{name}": tensor for name, tensor in adapter.tensors.items()}),
     )
 
@@ -171,6 +174,7 @@ def inspect_weights(
             other_entries=file.other_entries,
             size=sum(part.stat().st_size for part in file.files),
             digest=digest(file.files, full=full_digest),
+            uncertainty_scale=examined.uncertainty_scale,
         )
 
 
@@ -184,6 +188,7 @@ def convert_weights(
     head_width: int | None = None,
     image_heads: int | None = None,
     frames: int | None = None,
+    uncertainty_scale: float | None = None,
     overwrite: bool = False,
     progress: Report | None = None,
 ) -> WeightsReport:
@@ -193,6 +198,7 @@ def convert_weights(
         layout: "gcd-node" leaves behind what inference does not use; "gcd-ckpt" is for the released code, see
             `gcd_state`, and holds all weights in memory where `dtype` changes them.
         dtype: store in this precision, else as it is. The decoder, which computes in float32, is never narrowed.
+        uncertainty_scale: what was measured, instead of what the file says; see `Traits`.
         progress: called with (bytes written, bytes).
     Returns:
         The report of the new file.
@@ -209,6 +215,7 @@ def convert_weights(
             move_time=examined.move_time,
             trained=examined.trained,
             origin=digest(examined.file.files)[:12],
+            uncertainty_scale=examined.uncertainty_scale if uncertainty_scale is None else uncertainty_scale,
         )
     dtypes = {name: written_dtype(name, examined.stored_dtype(name), wanted) for name in examined.match.sources}
     if layout == "gcd-ckpt":

@@ -50,6 +50,7 @@ class View:
     trajectory: the camera path that was asked for.
     motion_bucket: the motion number the network was told.
     classes: uint8 [S, T, H, W], class ids of `Traits.classes`, on the CPU; None for models that make none.
+    uncertainty_scale: see `Traits`.
     """
 
     samples: Tensor
@@ -57,6 +58,7 @@ class View:
     trajectory: Trajectory
     motion_bucket: float
     classes: Tensor | None = None
+    uncertainty_scale: float | None = None
 
     @property
     def video(self) -> Tensor:
@@ -70,6 +72,15 @@ class View:
             return None
         samples = self.samples if self.samples.is_floating_point() else self.samples / 255
         return samples.std(dim=0, correction=0).mean(dim=1)
+
+    @property
+    def uncertainty(self) -> Tensor | None:
+        """How far the truth lies from the mean of the samples, as a standard deviation: [T, H, W], in parts of 1.
+
+        `std` times the scale that was measured on held-out clips. None with one sample, or where nobody measured it.
+        """
+        std = self.std
+        return None if std is None or self.uncertainty_scale is None else std * self.uncertainty_scale
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -110,6 +110,7 @@ class Examined:
     told_by: str | None
     move_time: int
     trained: bool
+    uncertainty_scale: float | None
 
     def tensor(self, name: str) -> Tensor:
         """Our parameter of that name, made of mapped tensors."""
@@ -152,6 +153,7 @@ def examine(file: WeightsFile, options: Options) -> Examined:
         told_by=told.told_by,
         move_time=last if told.move_time is None else min(told.move_time, last),
         trained=card is None or card.trained,
+        uncertainty_scale=None if card is None else card.uncertainty_scale,
     )
 
 

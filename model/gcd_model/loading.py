@@ -142,4 +142,5 @@ def _traits(loaded: LoadedWeights, place: _Place) -> Traits:
         precision=place.precision,
         device=str(place.device),
         trained=loaded.trained,
+        uncertainty_scale=loaded.uncertainty_scale,
     )

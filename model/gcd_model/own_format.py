@@ -14,6 +14,7 @@ from gcd_model.errors import CheckpointError, OptionError
 
 FORMAT = "1"
 CONFIG_KEY = "gcd.config"
+_SCALE_KEY = "gcd.uncertainty_scale"
 
 PRECISIONS: dict[str, torch.dtype] = {
     "float32": torch.float32,
@@ -41,6 +42,7 @@ class Card:
 
     family: a name of FAMILIES or None. move_time: frame in which the goal pose is reached.
     trained: False for random weights. origin: digest of the file this one was converted from, or "".
+    uncertainty_scale: see `Traits`; a positive number, or None.
     """
 
     name: str
@@ -49,9 +51,16 @@ class Card:
     move_time: int
     trained: bool = True
     origin: str = ""
+    uncertainty_scale: float | None = None
+
+    def __post_init__(self) -> None:
+        scale = self.uncertainty_scale
+        if scale is not None and not 0 < scale < math.inf:
+            raise OptionError(f"the uncertainty scale must be a positive number, got {scale:g}; measure it again")
 
     def to_metadata(self) -> dict[str, str]:
         """As safetensors metadata: text to text."""
+        scale = self.uncertainty_scale
         return {
             "gcd.format": FORMAT,
             CONFIG_KEY: msgspec.json.encode(self.config).decode(),
@@ -60,6 +69,7 @@ class Card:
             "gcd.move_time": str(self.move_time),
             "gcd.trained": "true" if self.trained else "false",
             "gcd.origin": self.origin,
+            **({} if scale is None else {_SCALE_KEY: repr(scale)}),
         }
 
     @classmethod
@@ -77,6 +87,7 @@ class Card:
                 move_time=int(metadata["gcd.move_time"]),
                 trained=metadata.get("gcd.trained", "true") != "false",
                 origin=metadata.get("gcd.origin", ""),
+                uncertainty_scale=None if _SCALE_KEY not in metadata else float(metadata[_SCALE_KEY]),
             )
         except (msgspec.DecodeError, KeyError, ValueError, ArithmeticError) as error:
             raise CheckpointError(f"its metadata cannot be used ({error}); convert the weights again") from error

@@ -158,6 +158,7 @@ class Synthesizer:
                 trajectory=path,
                 motion_bucket=buckets[v],
                 classes=pictures[v].classes,
+                uncertainty_scale=self._traits.uncertainty_scale,
             )
             for v, path in enumerate(trajectories)
         ]

@@ -33,6 +33,7 @@ class Leftover:
 class WeightsReport:
     """What `gcd-node weights inspect` shows.
 
+    uncertainty_scale: see `Traits`.
     family: None if unknown; told_by: "option", "metadata", "file name" or "yaml".
     optimizer_size: bytes of optimizer state, which is never read; 0 without. other_entries: further top-level names.
     size: bytes on disk, all files together. digest: see `checkpoints.digest`.
@@ -52,6 +53,7 @@ class WeightsReport:
     other_entries: tuple[str, ...]
     size: int
     digest: str
+    uncertainty_scale: float | None = None
 
     @property
     def sha256_12(self) -> str:

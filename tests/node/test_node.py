@@ -318,6 +318,7 @@ def test_status_and_meta_describe_the_run() -> None:
     assert told.index("meta") < told.index("active")
     meta = next(fields for topic, fields in box.notes if topic == "meta")
     assert meta["weights"]["trained"] is False
+    assert meta["weights"]["uncertainty_scale"] is None  # nobody measured these
     status = [fields for topic, fields in box.notes if topic == "status"]
     states = [fields["state"] for fields in status]
     assert list(dict.fromkeys(states[: states.index("active")])) == (

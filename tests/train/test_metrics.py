@@ -1,20 +1,23 @@
 import math
+import statistics
 
 import pytest
 import torch
+from scipy.ndimage import binary_erosion
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch.testing import assert_close
 
 from gcd_model.errors import ShapeError
 from gcd_train.metrics import (
-    class_iou,
-    confusion_matrix,
+    diversity,
     frame_change,
     gradient_magnitude,
-    majority_classes,
-    mean_iou,
-    pixel_accuracy,
+    masked_psnr,
+    masked_ssim,
     psnr,
     ssim,
+    ssim_map,
+    window_mask,
 )
 
 
@@ -49,22 +52,123 @@ def test_ssim_of_two_flat_pictures_is_the_luminance_term() -> None:
     assert ssim(grey(a), grey(b)).item() == pytest.approx(expected, abs=1e-4)
 
 
-def test_ssim_weighs_by_a_gaussian_of_eleven_pixels() -> None:
-    first, second = noise(0)[:1, :1, :11, :11].double(), noise(1)[:1, :1, :11, :11].double()
-    ramp = torch.exp(-((torch.arange(11.0, dtype=torch.float64) - 5) ** 2) / (2 * 1.5**2))
-    weight = torch.outer(ramp, ramp) / ramp.sum() ** 2
-    mean_a, mean_b = (weight * first).sum(), (weight * second).sum()
-    var_a, var_b = (weight * first**2).sum() - mean_a**2, (weight * second**2).sum() - mean_b**2
-    covariance = (weight * first * second).sum() - mean_a * mean_b
-    c1, c2 = 0.01**2, 0.03**2
-    top = (2 * mean_a * mean_b + c1) * (2 * covariance + c2)
-    expected = top / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))
-    assert_close(ssim(first, second)[0], expected, rtol=1e-5, atol=1e-5)
+def test_ssim_of_one_window_by_hand() -> None:
+    first, second = noise(0)[:1, :, :7, :7].double(), noise(1)[:1, :, :7, :7].double()
+    by_colour: list[float] = []
+    for a, b in zip(first[0].flatten(1).tolist(), second[0].flatten(1).tolist(), strict=True):
+        mean_a, mean_b = sum(a) / 49, sum(b) / 49
+        var_a, var_b = statistics.variance(a), statistics.variance(b)  # over 48
+        top = (2 * mean_a * mean_b + 0.0001) * (2 * statistics.covariance(a, b) + 0.0009)
+        by_colour.append(top / ((mean_a**2 + mean_b**2 + 0.0001) * (var_a + var_b + 0.0009)))
+    assert ssim(first, second).item() == pytest.approx(sum(by_colour) / 3, rel=1e-12)
+
+
+def test_ssim_and_psnr_are_those_of_scikit_image() -> None:
+    first = noise(0)
+    second = (0.8 * first + 0.2 * noise(1)).clamp(0, 1)
+    pairs = [(first[t].double().numpy(), second[t].double().numpy()) for t in range(2)]
+    theirs = [structural_similarity(a, b, channel_axis=0, data_range=1.0) for a, b in pairs]
+    assert ssim(first.double(), second.double()).tolist() == pytest.approx(theirs, abs=1e-12)
+    assert ssim(first, second).tolist() == pytest.approx(theirs, abs=1e-6)
+    noises = [peak_signal_noise_ratio(a, b, data_range=1.0) for a, b in pairs]
+    assert psnr(first, second).tolist() == pytest.approx(noises, abs=1e-4)
+
+
+def test_the_ssim_map_is_scikit_images_without_its_border() -> None:
+    first, second = noise(0).double(), noise(1).double()
+    _, theirs = structural_similarity(
+        first[0].numpy(), second[0].numpy(), channel_axis=0, data_range=1.0, full=True
+    )  # [3, H, W]
+    assert_close(ssim_map(first, second)[0], torch.from_numpy(theirs).mean(dim=0)[3:-3, 3:-3], rtol=0, atol=1e-12)
+
+
+def test_ssim_of_bright_flat_pictures_does_not_drown_in_rounding() -> None:
+    flat = grey(1.0, size=32) - 1e-4 * torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+    assert ssim(flat, flat.clone()).item() == pytest.approx(1.0, abs=1e-9)
 
 
 def test_ssim_refuses_pictures_below_its_window() -> None:
-    with pytest.raises(ShapeError, match="11"):
-        ssim(grey(0.1, size=8), grey(0.1, size=8))
+    with pytest.raises(ShapeError, match="at least 7 pixels"):
+        ssim(grey(0.1, size=6), grey(0.1, size=6))
+
+
+def halves() -> torch.Tensor:
+    """The left 8 of 20 columns of the first frame, nothing of the second."""
+    mask = torch.zeros(2, 24, 20, dtype=torch.bool)
+    mask[0, :, :8] = True
+    return mask
+
+
+def test_masks_of_everything_change_nothing() -> None:
+    first, second, mask = noise(0), noise(1), torch.ones(2, 24, 20, dtype=torch.bool)
+    assert_close(masked_psnr(first, second, mask), psnr(first, second))
+    assert_close(masked_ssim(first, second, mask), ssim(first, second))
+    assert_close(diversity(torch.stack([first, second]), mask), diversity(torch.stack([first, second])))
+
+
+def test_what_lies_outside_a_mask_is_not_looked_at() -> None:
+    first, second, mask = noise(0), noise(1), halves()
+    changed = torch.where(mask[:, None], second, 1 - second)
+    changed[0, :, :, 19] = torch.nan
+    assert_close(masked_psnr(first, second, mask)[0], masked_psnr(first, changed, mask)[0])
+    assert_close(diversity(torch.stack([first, changed]), mask)[0], diversity(torch.stack([first, second]), mask)[0])
+    cut = psnr(first[:1, :, :, :8], second[:1, :, :, :8])
+    assert_close(masked_psnr(first, second, mask)[:1], cut)
+
+
+def test_squared_errors_of_two_masks_weigh_as_their_pixels() -> None:
+    first, second, mask = noise(0)[:1], noise(1)[:1], halves()[:1]
+    error = [10 ** (-float(masked_psnr(first, second, each)[0]) / 10) for each in (mask, ~mask)]
+    together = 10 ** (-float(psnr(first, second)[0]) / 10)
+    assert error[0] * 8 / 20 + error[1] * 12 / 20 == pytest.approx(together, rel=1e-5)
+
+
+def test_frames_without_a_pixel_in_the_mask_have_no_figure() -> None:
+    first, second, mask = noise(0), noise(1), halves()
+    found = [
+        masked_psnr(first, second, mask),
+        masked_ssim(first, second, mask),
+        diversity(torch.stack([first, second]), mask),
+    ]
+    assert [each.isnan().tolist() for each in found] == [[False, True]] * 3
+
+
+def test_a_mask_too_thin_for_a_window_has_psnr_but_no_ssim() -> None:
+    mask = torch.zeros(2, 24, 20, dtype=torch.bool)
+    mask[:, :, 6:12] = True  # six columns: eroded three times nothing is left
+    assert not masked_psnr(noise(0), noise(1), mask).isnan().any()
+    assert masked_ssim(noise(0), noise(1), mask).isnan().all()
+
+
+def test_ssim_masks_are_eroded_three_times_by_a_cross() -> None:
+    mask = torch.rand(2, 24, 20, generator=torch.Generator().manual_seed(0)) > 0.03
+    theirs = [binary_erosion(each.numpy(), iterations=3)[3:-3, 3:-3] for each in mask]
+    assert 20 < sum(int(each.sum()) for each in theirs) < 400
+    assert window_mask(mask).tolist() == [each.tolist() for each in theirs]
+
+
+def test_masked_ssim_is_the_mean_of_the_map_over_what_is_left_of_the_mask() -> None:
+    first, second, mask = noise(0), noise(1), halves()
+    # of columns 0..7 the erosion leaves 3 and 4 and, at the picture's edge, the crop takes the rest
+    assert masked_ssim(first, second, mask)[0].item() == pytest.approx(
+        float(ssim_map(first, second)[0, :, 0:2].mean()), abs=1e-6
+    )
+
+
+def test_a_mask_of_another_size_is_refused() -> None:
+    with pytest.raises(ShapeError, match=r"\[2, 24, 20\], got \[2, 24, 19\]"):
+        masked_psnr(noise(0), noise(1), torch.ones(2, 24, 19, dtype=torch.bool))
+
+
+def test_diversity_is_the_spread_over_all_draws() -> None:
+    draws = torch.stack([grey(0.1), grey(0.3), grey(0.3), grey(0.5)])
+    assert diversity(draws).item() == pytest.approx(math.sqrt((0.2**2 + 0.2**2) / 4), rel=1e-5)
+    assert_close(diversity(torch.stack([noise(0)] * 3)), torch.zeros(2), rtol=0, atol=1e-6)
+
+
+def test_one_draw_has_no_diversity() -> None:
+    with pytest.raises(ShapeError, match="two draws"):
+        diversity(noise(0)[None])
 
 
 def test_gradient_of_a_ramp_is_its_slope() -> None:
@@ -77,39 +181,3 @@ def test_gradient_of_a_ramp_is_its_slope() -> None:
 
 def test_frame_change_is_the_mean_absolute_step() -> None:
     assert_close(frame_change(grey(0.1, 0.4, 0.2)), torch.tensor([0.3, 0.2]))
-
-
-def test_confusion_counts_targets_in_rows() -> None:
-    target = torch.tensor([[0, 0, 1, 2]], dtype=torch.uint8)
-    predicted = torch.tensor([[0, 1, 1, 1]], dtype=torch.uint8)
-    assert confusion_matrix(predicted, target, 4).tolist() == [[1, 1, 0, 0], [0, 1, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0]]
-
-
-def test_iou_by_hand_with_an_absent_class() -> None:
-    confusion = torch.tensor([[1, 1, 0, 0], [0, 1, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0]])
-    iou = class_iou(confusion)
-    assert iou[:3].tolist() == pytest.approx([1 / 2, 1 / 3, 0.0])
-    assert math.isnan(float(iou[3]))
-    assert mean_iou(confusion) == pytest.approx((1 / 2 + 1 / 3 + 0) / 3)
-    assert pixel_accuracy(confusion) == pytest.approx(0.5)
-
-
-def test_a_perfect_map_has_iou_one_for_all_that_is_there() -> None:
-    labels = torch.tensor([[0, 3], [3, 1]], dtype=torch.uint8)
-    assert mean_iou(confusion_matrix(labels, labels, 5)) == 1.0
-
-
-def test_ids_beyond_the_ontology_are_refused() -> None:
-    labels = torch.tensor([4], dtype=torch.uint8)
-    with pytest.raises(ShapeError, match="below 4"):
-        confusion_matrix(labels, labels, 4)
-
-
-def test_the_majority_of_each_cell_wins_and_ties_go_to_the_lowest_id() -> None:
-    labels = torch.tensor([[2, 2, 0, 1], [2, 1, 1, 1], [0, 3, 2, 2], [3, 0, 3, 3]], dtype=torch.uint8)
-    assert majority_classes(labels[None], 2, 2, 4).tolist() == [[[2, 1], [0, 2]]]
-
-
-def test_a_grid_that_does_not_divide_the_map_is_refused() -> None:
-    with pytest.raises(ShapeError, match="divide"):
-        majority_classes(torch.zeros(4, 6, dtype=torch.uint8), 2, 4, 2)

@@ -10,7 +10,7 @@ from gcd_model import load_synthesizer
 from gcd_train.baselines import all_baselines, fit_statistics
 from gcd_train.cli.main import app
 from gcd_train.datasets.paired import PairedClips
-from gcd_train.evaluation import Evaluation, SynthesizedViews, evaluate
+from gcd_train.evaluation import Evaluation, PairedSet, SynthesizedViews, evaluate
 
 pytestmark = [needs_egl, pytest.mark.timeout(600)]
 
@@ -29,7 +29,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Evaluation]:
     model = SynthesizedViews.of(load_synthesizer("package:driving-small", device="cpu"), clips)
     baselines = all_baselines(fit_statistics(training), len(clips.classes))
     compared = [each for each in baselines if each.name in ("depth_reprojection", "majority_map")]
-    return {each.name: each for each in evaluate([model, *compared], clips)}
+    return {each.name: each for each in evaluate([model, *compared], PairedSet.of(clips))}
 
 
 def test_it_is_ahead_of_the_exact_depth(found: dict[str, Evaluation]) -> None:

@@ -21,6 +21,7 @@ from gcd_train.errors import RunError
 from gcd_train.evaluation import (
     Conditions,
     MountNumbers,
+    PairedSet,
     Report,
     Shot,
     evaluate,
@@ -28,6 +29,10 @@ from gcd_train.evaluation import (
     write_contact_sheet,
     write_report,
 )
+
+
+def as_set(clips: PlaneClips) -> PairedSet:
+    return PairedSet(clips=clips, identity="plane")
 
 
 def conditions(weights: str | None = None) -> Conditions:
@@ -51,7 +56,7 @@ def conditions(weights: str | None = None) -> Conditions:
 @pytest.fixture(scope="module")
 def report() -> Report:
     clips = PlaneClips.make(2)
-    found = evaluate(all_baselines(fit_statistics(clips), len(clips.classes)), clips)
+    found = evaluate(all_baselines(fit_statistics(clips), len(clips.classes)), as_set(clips))
     return Report(conditions=conditions(), classes=tuple(c.name for c in clips.classes), model=(), baselines=found)
 
 
@@ -67,7 +72,8 @@ def test_the_table_has_a_row_for_each_predictor_and_class(report: Report) -> Non
     text = to_markdown(report)
     for name in ("copy_source", "mean_target", "majority_map", "ground_homography", "depth_reprojection *"):
         assert f"| {name} |" in text
-    assert "2 clips of 2 scenes in `held-out`" in text
+    assert "2 clips of 2 scenes in `held-out`, frames 2-4" in text
+    assert "LPIPS: no weights given" in text
     assert "declared: 1.8 m, 2 deg down" in text
     road = next(line for line in text.splitlines() if line.startswith("| road |"))
     assert road.count("|") == 2 + len(report.evaluations) - 1  # the mean target has no classes
@@ -101,7 +107,7 @@ def test_a_models_clips_are_named_and_its_steps_compared(report: Report) -> None
 
 def test_what_nobody_has_is_left_out() -> None:
     clips = PlaneClips.orbits([SphericalDelta(azimuth_deg=40.0, radius_m=-1.0)])
-    found = evaluate(all_baselines(fit_statistics(clips), 0), clips)
+    found = evaluate(all_baselines(fit_statistics(clips), 0), as_set(clips))
     shot = Shot(world="drop", scene=4, clip="00000013", change=(40.0, 0.0, -1.0))
     orbit = msgspec.structs.replace(
         conditions("copy"), camera="spherical", shots=(shot,), true_mount=None, declared_mount=None
@@ -143,7 +149,8 @@ def test_a_contact_sheet_stacks_source_view_best_baselines_and_target(tmp_path: 
     majority = fit_statistics(clips).majority
     assert majority is not None
     predictors = [CopySource(), MajorityMap(majority=majority)]  # two rows, and one
-    write_contact_sheet(tmp_path / "sheet.png", predictors, clips, [0, 1], labels=["driving 0", "driving 1"])
+    some = [(key, as_set(clips).clip(key)) for key in as_set(clips).keys]
+    write_contact_sheet(tmp_path / "sheet.png", predictors, some, classes=clips.classes)
     sheet = cv2.imread(str(tmp_path / "sheet.png"))
     assert sheet is not None
     assert sheet.shape == (2 * 6 * 32 + 4, 132 + 2 * (48 + 4), 3)  # frames 1 and 4
@@ -153,7 +160,8 @@ def test_a_contact_sheet_stacks_source_view_best_baselines_and_target(tmp_path: 
 
 def test_a_sheet_of_clips_without_classes_has_pictures_alone(tmp_path: Path) -> None:
     clips = PlaneClips.orbits([SphericalDelta(azimuth_deg=40.0)])
-    write_contact_sheet(tmp_path / "sheet.png", [CopySource()], clips, [0], labels=["drop 0"])
+    some = as_set(clips)
+    write_contact_sheet(tmp_path / "sheet.png", [CopySource()], [("drop 0", some.clip(some.keys[0]))])
     sheet = cv2.imread(str(tmp_path / "sheet.png"))
     assert sheet is not None
     assert sheet.shape[0] == 3 * 32
@@ -187,10 +195,11 @@ def test_clips_from_a_folder_measure_as_they_do_in_memory(tmp_path: Path) -> Non
     assert code == 0, output
     read = json.loads((tmp_path / "out" / "evaluation.json").read_text())
     expected = [
-        each.total.psnr_db for each in evaluate(all_baselines(fit_statistics(clips), len(clips.classes)), clips)
+        each.total.psnr_db for each in evaluate(all_baselines(fit_statistics(clips), len(clips.classes)), as_set(clips))
     ]
-    found = [each["total"]["psnr_db"] or np.nan for each in read["baselines"]]
-    assert found == pytest.approx(expected, abs=0.02, nan_ok=True)  # depth is stored in 1/256 m
+    found = {each["name"]: each["total"]["psnr_db"] or np.nan for each in read["baselines"]}
+    names = [each.name for each in all_baselines(fit_statistics(clips), len(clips.classes))]
+    assert [found[name] for name in names] == pytest.approx(expected, abs=0.02, nan_ok=True)  # depth in 1/256 m
 
 
 def test_weights_are_evaluated_from_the_command_line_with_a_declared_mount(tmp_path: Path) -> None:
@@ -199,7 +208,7 @@ def test_weights_are_evaluated_from_the_command_line_with_a_declared_mount(tmp_p
     save_weights(random_networks(config, seed=0), tmp_path / "untrained.safetensors", card)
     held_out = PlaneClips.make(1, width=64).write(tmp_path / "a")
     given = ("--weights", tmp_path / "untrained.safetensors", "--declared-height", 1.8, "--no-baselines")
-    given = (*given, "--steps", 1, "--steps", 2)  # the first is what ships
+    given = (*given, "--steps", 1, "--steps", 2, "--sheet-clips", 0)  # one step is what ships
     code, output = run("--data", held_out, "--out", tmp_path / "out", *given)
     assert code == 0, output
     read = json.loads((tmp_path / "out" / "evaluation.json").read_text())

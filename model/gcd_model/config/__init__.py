@@ -10,6 +10,7 @@ from gcd_model.config.small_models import (
     DRIVING_SEMANTIC_SMALL,
     DRIVING_SMALL,
     OBJECTS_SMALL,
+    PLAIN_SMALL,
     SMALL,
     SVD_14,
 )
@@ -28,6 +29,7 @@ __all__ = [
     "DRIVING_SEMANTIC_SMALL",
     "DRIVING_SMALL",
     "OBJECTS_SMALL",
+    "PLAIN_SMALL",
     "SMALL",
     "SVD_14",
     "CameraControl",

@@ -101,6 +101,20 @@ DRIVING_SEMANTIC_SMALL = replace(
 """The same view painted in class colours, as the paper's semantic models paint it; in several steps, so that edges
 come out sharp. Without the plane mix: the source's own colours have no place in such a picture."""
 
+PLAIN_SMALL = replace(
+    DRIVING_SMALL,
+    unet=replace(DRIVING_SMALL.unet, condition_channels=DRIVING_SMALL.vae.latent_channels),
+    plane_warp=None,
+    plane_mix=None,
+    class_head=None,
+    sampling=SamplingConfig(
+        steps=4, sigma_max=80.0, sigma_min=0.3, guidance=(1.0, 1.0), shared_noise=True, augmentation=0.0
+    ),
+)
+"""The widths of DRIVING_SMALL in the paper's form: the source's latents are all the condition, and several Euler steps
+draw the view; no warps, no plane mix, no class map. For studies of the paper's findings. What is left of ours is
+x0-prediction, one noise for all frames and the autoencoder."""
+
 _STAGE = PlaneWarpConfig(frame="stage", hfov_deg=53.13)
 
 OBJECTS_SMALL = replace(

@@ -28,13 +28,17 @@ class CameraPair:
     mount: CameraMount | None = None
 
     @classmethod
-    def driving(cls, mount: CameraMount, *, frames: int, height: int, width: int) -> Self:
-        """The fixed path from ParallelDomain-4D's forward camera to the view from above, over all of `frames`."""
+    def driving(cls, mount: CameraMount, *, frames: int, height: int, width: int, move_time: int | None = None) -> Self:
+        """The fixed path from ParallelDomain-4D's forward camera to the view from above.
+
+        move_time: the frame in which the goal is reached, the last if left out.
+        """
+        last = frames - 1 if move_time is None else move_time
         return cls(
             ground_from_source=mount.vehicle_from_camera,
             source=Intrinsics.from_hfov(mount.hfov_deg, width, height),
             target=Intrinsics.from_hfov(CameraMount().hfov_deg, width, height),
-            trajectory=driving_trajectory(frames=frames, move_time=frames - 1, mount=mount),
+            trajectory=driving_trajectory(frames=frames, move_time=last, mount=mount),
             mount=mount,
         )
 

@@ -1,5 +1,6 @@
 """The one protocol of everything that is evaluated: a clip in, its target view out."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -10,6 +11,13 @@ from torch import Tensor
 
 from gcd_train.baselines.cameras import CameraPair
 from gcd_train.datasets.clip_source import Bytes
+from gcd_train.scene_view import SceneView
+
+OtherViews = Callable[[int], Sequence[Sequence[SceneView]]]
+"""The T views of each of so many further cameras of the scene. Raises DataError if it has fewer."""
+
+SourcePoints = Callable[[], Sequence[SceneView]]
+"""The T views of the source camera as the data set holds them. Raises DataError where one cannot be read."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -19,6 +27,10 @@ class SourceClip:
     source: uint8 [T, H, W, 3] RGB. source_depth: float32 [T, H, W], metres along the optical axis, 0 for the sky; for
     privileged predictors only. source_classes: uint8 [T, H, W]; None where the world has no ontology.
     cameras: of the clip, the source's as it is declared. fps: frames per second.
+    key: names the clip in its set; frames that others have made are found by it.
+    others: what further cameras of the scene saw, for predictors that are given them; None where there is one camera.
+    points: the source views at their full size, for privileged predictors only, with ids as in `source_classes`; None
+    where `source` is all there is.
     """
 
     source: Bytes
@@ -26,17 +38,27 @@ class SourceClip:
     source_classes: Bytes | None
     cameras: CameraPair
     fps: float
+    key: str = ""
+    others: OtherViews | None = None
+    points: SourcePoints | None = None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Prediction:
     """A view as it is measured.
 
-    video: float32 [T, 3, H, W] in [0, 1], or None. classes: uint8 [T, H, W], or None.
+    video: float32 [T, 3, H, W] in [0, 1], or None. classes: uint8 [T, H, W], or None. more: further draws of the same
+    view, of methods that draw.
     """
 
     video: Tensor | None = None
     classes: Tensor | None = None
+    more: "tuple[Prediction, ...]" = ()
+
+    @property
+    def draws(self) -> "tuple[Prediction, ...]":
+        """All draws, this one first."""
+        return (self, *self.more)
 
 
 class Predictor(Protocol):

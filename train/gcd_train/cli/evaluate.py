@@ -1,200 +1,161 @@
 """`gcd-train evaluate`: weights and what they have to beat, on held-out clips."""
 
-import math
-from collections.abc import Callable, Sequence
+import shlex
+import signal
+import sys
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
+from typer import Option
 
-from gcd_model import Synthesizer, load_synthesizer
-from gcd_model.geometry import CameraMount
-from gcd_train.baselines import Predictor, all_baselines, fit_statistics
+from gcd_model import RenderOptions
 from gcd_train.cli.errors import errors_shown
 from gcd_train.cli.progress_bar import progress_bar
-from gcd_train.datasets.paired import PairedClips, require_apart
-from gcd_train.errors import RecipeError
-from gcd_train.evaluation import (
-    Conditions,
-    Figures,
-    MountNumbers,
-    Report,
-    Shot,
-    SynthesizedViews,
-    best_of,
-    class_grid,
-    evaluate,
-    require_same_kind,
-    to_markdown,
-    write_contact_sheet,
-    write_report,
-)
+from gcd_train.evaluation import ClipWork, RunKeeper, measure_all
+from gcd_train.evaluation.asked import Asked, Candidate, Looks, Rivals, SceneWishes, declared_mount
+from gcd_train.evaluation.kept_frames import KeptViews
+from gcd_train.evaluation.opening import Choice, usual_samples
+from gcd_train.evaluation.outcome import write_outcome
+from gcd_train.evaluation.plan import note_of, planned
+from gcd_train.evaluation.protocols import FrameBounds
+from gcd_train.evaluation.spread import Account
 
-_LOG = Console(stderr=True)
+_LOG = Console(stderr=True, highlight=False)
 
-Made = TypeVar("Made")
+Folders = Annotated[list[Path], Option(help="Folder of pairs (several may be given), or one of whole scenes.")]
+Out = Annotated[Path, Option(help="Folder of the run: run.json, records, tables; one that is there is gone on with.")]
+WeightsPath = Annotated[str | None, Option(help="package:NAME or a path; without, baselines alone.")]
+Steps = Annotated[list[int] | None, Option(min=1, help="Also with so many steps of the sampler; may be repeated.")]
+Samples = Annotated[int | None, Option(min=1, help="Draws of each view; by default 1 of pairs, else by the protocol.")]
+Guidance = Annotated[tuple[float, float] | None, Option(help="Of the first and the last frame; by default as shipped.")]
+Train = Annotated[list[Path] | None, Option(help="Folder of training pairs: mean target, majority map.")]
+Baselines = Annotated[bool, Option(help="Also measure what has to be beaten; of pairs that needs --train.")]
+Methods = Annotated[list[str] | None, Option(help="These baselines, with commas between; by default the usual ones.")]
+Svd = Annotated[str | None, Option(help="Weights for vanilla_svd: svd.safetensors.")]
+Predictions = Annotated[list[str] | None, Option(help="NAME=FOLDER with frames of another method; may be repeated.")]
+LpipsWeights = Annotated[Path | None, Option("--lpips", help="Folder with LPIPS weights; without, no such figure.")]
+ProtocolName = Annotated[Literal["paper", "released"], Option(help="How clips are cut from whole scenes.")]
+Controls = Annotated[Path | None, Option(help="Scenes: control list, JSON.")]
+Split = Annotated[str | None, Option(help="Only scenes of a split: a name as driving-test, or FILE:test.")]
+Listed = Annotated[Path | None, Option("--list", help="Scenes: only those of a list, one a line.")]
+Trajectories = Annotated[int | None, Option(min=1, help="Scenes: clips of each; by default 4, or 1 if released.")]
+FrameStart = Annotated[int | None, Option(min=0, help="Scenes: first frame of every clip.")]
+FrameSkip = Annotated[int | None, Option(min=1, help="Scenes: frames from one of the clip to the next.")]
+Angles = Annotated[Literal["max90", "max180"] | None, Option(help="Scenes: how far goals are drawn; as the weights.")]
+PathKind = Annotated[Literal["gradual", "direct"] | None, Option(help="Scenes: as the weights by default.")]
+Modality = Annotated[Literal["rgb", "semantic"] | None, Option(help="Scenes: targets; as the weights by default.")]
+Exact = Annotated[bool, Option("--exact", help="Our scenes: targets from their geometry instead of from points.")]
+Camera = Annotated[list[str] | None, Option(help="Scenes: a camera to read; may be repeated. By default all.")]
+Limit = Annotated[int | None, Option(min=1, help="Only the first so many scenes.")]
+TrainLimit = Annotated[int, Option(min=1, help="At most so many training clips for the means.")]
+Height = Annotated[float | None, Option(help="Driving pairs: mount declared, height in metres; by default as trained.")]
+Tilt = Annotated[float | None, Option(help="Driving pairs: mount declared, degrees down; by default as trained.")]
+Views = Annotated[Literal["none", "last", "all"], Option(help="Frames to keep as PNG, for galleries.")]
+Workers = Annotated[int, Option(min=1, help="Processes.")]
+Ray = Annotated[str | None, Option("--ray", help="Run on this Ray cluster (auto, HOST:PORT; extra `cluster`).")]
+Seed = Annotated[int, Option(min=0, help="Of drawn clips and of all noise.")]
+SheetClips = Annotated[int, Option(min=0, help="Clips on the contact sheet; 0 for none.")]
+Device = Annotated[str, Option(help="auto, cpu, cuda or cuda:N.")]
+Dtype = Annotated[str | None, Option(help="float32, bfloat16 or float16.")]
 
 
 def evaluate_command(
-    data: Annotated[list[Path], typer.Option(help="Folder of held-out clips; several may be given.")],
-    out: Annotated[Path, typer.Option(help="Folder for evaluation.json, evaluation.md and contact_sheet.png.")],
-    weights: Annotated[str | None, typer.Option(help="package:NAME or a path; without, baselines alone.")] = None,
-    steps: Annotated[
-        list[int] | None, typer.Option(min=1, help="Also with so many steps of the sampler; may be repeated.")
-    ] = None,
-    train: Annotated[
-        list[Path] | None, typer.Option(help="Folder of training clips: mean target, majority map.")
-    ] = None,
-    baselines: Annotated[bool, typer.Option(help="Also measure what has to be beaten; needs --train.")] = True,
-    limit: Annotated[int | None, typer.Option(min=1, help="Only the first so many clips.")] = None,
-    train_limit: Annotated[int, typer.Option(min=1, help="At most so many training clips for the means.")] = 1000,
-    declared_height: Annotated[
-        float | None, typer.Option(help="Driving: mount declared, height in metres; by default as trained.")
-    ] = None,
-    declared_tilt: Annotated[
-        float | None, typer.Option(help="Driving: mount declared, degrees down; by default as trained.")
-    ] = None,
-    sheet_clips: Annotated[int, typer.Option(min=1, help="Clips on the contact sheet.")] = 4,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:N.")] = "auto",
-    dtype: Annotated[str | None, typer.Option(help="float32, bfloat16 or float16.")] = None,
+    data: Folders,
+    out: Out,
+    weights: WeightsPath = None,
+    steps: Steps = None,
+    samples: Samples = None,
+    guidance: Guidance = None,
+    train: Train = None,
+    baselines: Baselines = True,
+    methods: Methods = None,
+    svd: Svd = None,
+    predictions: Predictions = None,
+    lpips: LpipsWeights = None,
+    protocol: ProtocolName = "paper",
+    controls: Controls = None,
+    split: Split = None,
+    listed: Listed = None,
+    trajectories: Trajectories = None,
+    frame_start: FrameStart = None,
+    frame_skip: FrameSkip = None,
+    angles: Angles = None,
+    path: PathKind = None,
+    modality: Modality = None,
+    exact: Exact = False,
+    camera: Camera = None,
+    limit: Limit = None,
+    train_limit: TrainLimit = 1000,
+    declared_height: Height = None,
+    declared_tilt: Tilt = None,
+    views: Views = "none",
+    workers: Workers = 1,
+    ray: Ray = None,
+    seed: Seed = 0,
+    sheet_clips: SheetClips = 4,
+    device: Device = "auto",
+    dtype: Dtype = None,
 ) -> None:
-    """Measure weights and baselines on held-out clips, frames 2 to the last, and say what is reached."""
+    """Measure weights, baselines and others' frames on held-out clips, and say what is reached."""
     with errors_shown():
-        mount = _mount(declared_height, declared_tilt)
-        out.mkdir(parents=True, exist_ok=True)  # to know at once
-        clips = PairedClips.open(data, limit)
-        declared = _declared(mount, clips)
-        model = None if weights is None else load_synthesizer(weights, device=device, dtype=dtype)
-        views = () if model is None else _views(model, clips, steps or [])
-        training = _training_clips(train, train_limit) if baselines else None
-        rivals = () if training is None else _baselines(training, clips)
-        if not (views or rivals):
-            raise RecipeError("there is nothing to measure: give --weights, or leave out --no-baselines")
-        measured = _watched(
-            clips,
-            "held-out clips",
-            lambda tell: evaluate([*views, *rivals], clips, declared=declared, progress=tell),
+        choice = Choice(split=split, listed=listed, limit=limit)
+        looks = Looks(angles=angles, path=path, modality=modality)
+        bounds, mount = FrameBounds(start=frame_start, skip=frame_skip), declared_mount(declared_height, declared_tilt)
+        cut = SceneWishes(
+            looks=looks, bounds=bounds, controls=controls, clips=trajectories, exact=exact, cameras=camera or None
         )
-        report = Report(
-            conditions=_conditions(data, train or [], clips, training, model, declared),
-            classes=tuple(each.name for each in clips.classes),
-            model=measured[: len(views)],
-            baselines=measured[len(views) :],
+        rivals = Rivals(
+            usual=baselines, names=methods, train=train, train_limit=train_limit, svd=svd, predictions=predictions
         )
-        text = to_markdown(report)
-        write_report(report, text, out)
-        shots = report.conditions.shots[:sheet_clips]
-        write_contact_sheet(
-            out / "contact_sheet.png",
-            _shown([*views, *rivals], report),
-            clips,
-            range(len(shots)),
-            labels=[str(shot) for shot in shots],
-            declared=declared,
+        draws = usual_samples(data, protocol) if samples is None else samples
+        sampling = RenderOptions(samples=draws, guidance=guidance, seed=seed)
+        tested = Candidate(weights=weights, device=device, dtype=dtype, steps=steps, sampling=sampling)
+        asked = Asked(
+            data=data, protocol=protocol, choice=choice, cut=cut, mount=mount, tested=tested, rivals=rivals, lpips=lpips
         )
-    typer.echo(text)
-    _LOG.print(f"wrote {out}/evaluation.json, evaluation.md and contact_sheet.png", highlight=False, markup=False)
+        _evaluate(asked, out, views=views, workers=workers, ray=ray, sheet_clips=sheet_clips)
 
 
-def _mount(height_m: float | None, tilt_deg: float | None) -> CameraMount | None:
-    """The mount that is declared; None where nobody says any."""
-    if height_m is None and tilt_deg is None:
-        return None
-    usual = CameraMount()
-    return CameraMount(
-        height_m=usual.height_m if height_m is None else height_m,
-        tilt_deg=usual.tilt_deg if tilt_deg is None else tilt_deg,
+def _evaluate(asked: Asked, out: Path, *, views: KeptViews, workers: int, ray: str | None, sheet_clips: int) -> None:
+    out.mkdir(parents=True, exist_ok=True)  # to know at once
+    plan = planned(asked, progress_bar)
+    for line in plan.opened.notes:
+        _say(line)
+    keeper = RunKeeper(out)
+    keeper.begin(note_of(plan, _command_line()))
+    work = ClipWork(
+        folder=out.resolve(),
+        clips=plan.clips,
+        makers={method.name: method.make for method in plan.methods},
+        lpips=None if asked.lpips is None else asked.lpips.resolve(),
+        views=views,
     )
-
-
-def _declared(mount: CameraMount | None, clips: PairedClips) -> CameraMount | None:
-    """What everybody is told of the source camera's mount; None where there is no vehicle."""
-    if clips.camera == "none":
-        return mount or CameraMount()
-    if mount is not None:
-        raise RecipeError("these clips have no vehicle to mount a camera on: leave out --declared-height and -tilt")
-    return None
-
-
-def _training_clips(folders: Sequence[Path] | None, limit: int) -> PairedClips:
-    if not folders:
-        raise RecipeError("baselines want training clips for their means: give --train FOLDER, or --no-baselines")
-    return PairedClips.open(list(folders), limit)
-
-
-def _views(model: Synthesizer, clips: PairedClips, steps: Sequence[int]) -> tuple[SynthesizedViews, ...]:
-    """The model as it ships first, then with each other number of steps."""
-    shipped = model.traits.config.sampling.steps
-    others = [number for number in dict.fromkeys(steps) if number != shipped]
-    return tuple(SynthesizedViews.of(model, clips, number) for number in (None, *others))
-
-
-def _baselines(training: PairedClips, clips: PairedClips) -> tuple[Predictor, ...]:
-    """What has to be beaten. Raises DataError where the training clips are no measure for the held-out ones."""
-    require_same_kind(training, clips)
-    require_apart(training, clips)
-    statistics = _watched(training, "training clips", lambda tell: fit_statistics(training, progress=tell))
-    return all_baselines(statistics, len(clips.classes))
-
-
-def _shown(predictors: Sequence[Predictor], report: Report) -> list[Predictor]:
-    """The model, and the best baselines with and without the exact depth, by its kinds of figure."""
-    wanted = [each.name for each in report.model[:1]]
-    for figure in _compared(report):
-        for privileged in (False, True):
-            best = best_of([each for each in report.baselines if each.privileged == privileged], figure)
-            wanted += [] if best is None else [best.name]
-    return [each for each in predictors if each.name in wanted]
-
-
-def _compared(report: Report) -> list[Callable[[Figures], float]]:
-    def psnr(of: Figures) -> float:
-        return of.psnr_db
-
-    def miou(of: Figures) -> float:
-        return of.miou
-
-    return [figure for figure in (psnr, miou) if not (report.model and math.isnan(figure(report.model[0].total)))]
-
-
-def _conditions(
-    data: Sequence[Path],
-    train: Sequence[Path],
-    clips: PairedClips,
-    training: PairedClips | None,
-    model: Synthesizer | None,
-    declared: CameraMount | None,
-) -> Conditions:
-    return Conditions(
-        data=tuple(map(str, data)),
-        weights=None if model is None else model.traits.name,
-        sha256_12=None if model is None else model.traits.sha256_12,
-        steps=None if model is None else model.traits.config.sampling.steps,
-        shots=tuple(_shot(clips, number) for number in range(len(clips))),
-        frames=clips.frames,
-        size=(clips.height, clips.width),
-        grid=class_grid(clips),
-        camera=clips.camera,
-        true_mount=_numbers(clips.mount),
-        declared_mount=_numbers(declared),
-        train=() if training is None else tuple(map(str, train)),
-        train_clips=0 if training is None else len(training),
+    account = _measured(work, workers, ray)
+    for line in account.lines():
+        _say(line)
+    typer.echo(write_outcome(plan, work, sheet_clips))
+    _say(
+        f"wrote {out}/run.json, records, evaluation.json, evaluation.md" + " and contact_sheet.png" * (sheet_clips > 0)
     )
+    if account.failures:
+        raise typer.Exit(account.exit_code)
 
 
-def _shot(clips: PairedClips, number: int) -> Shot:
-    world, scene = clips.scene(number)
-    goal = clips.trajectory(number).goal_delta
-    change = None if goal is None else (goal.azimuth_deg, goal.elevation_deg, goal.radius_m)
-    return Shot(world=world, scene=scene, clip=clips.places[number][1], change=change)
+def _measured(work: ClipWork, workers: int, ray: str | None) -> Account:
+    if workers > 1 or ray is not None:
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that no worker is left behind
+    account = Account(clips=len(work.clips.keys))
+    with progress_bar("clips", len(work.clips.keys)) as show:
+        for account in measure_all(work, workers=workers, ray_address=ray):
+            show(account.done)
+    return account
 
 
-def _numbers(mount: CameraMount | None) -> MountNumbers | None:
-    return None if mount is None else MountNumbers(height_m=mount.height_m, tilt_deg=mount.tilt_deg)
+def _command_line() -> str:
+    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
-def _watched(clips: PairedClips, name: str, work: Callable[[Callable[[int, int], None]], Made]) -> Made:
-    """Do some work over clips behind a progress bar."""
-    with progress_bar(name, len(clips)) as show:
-        return work(lambda done, _: show(done))
+def _say(line: str) -> None:
+    _LOG.print(line, markup=False, soft_wrap=True)

@@ -18,7 +18,7 @@ from gcd_train.layouts.scene_sheet import write_scene_sheet
 from gcd_train.layouts.scene_writer import SceneFormat
 from gcd_train.scenes.contact_sheet import write_contact_sheet
 from gcd_train.scenes.film import write_film
-from gcd_train.scenes.pair_world import PairForm, World, driving_world, orbit_world
+from gcd_train.scenes.pair_world import CameraWay, PairForm, World, driving_world, orbit_world
 from gcd_train.scenes.worlds import SCENE_WORLDS, SceneWorld, WorldOptions, tabletop_world
 from gcd_train.scenes.writer import generate
 
@@ -131,6 +131,9 @@ def driving(
     height: Height = None,
     clips_per_shard: ClipsPerShard = 8,
     edition: Annotated[int, typer.Option(min=1, max=2, help="Pairs: 1, or 2 for the streets of whole scenes.")] = 1,
+    path: Annotated[CameraWay, typer.Option(help="Pairs: the target camera moves all the clip, or stands there.")] = (
+        "gradual"
+    ),
     mount_height: Annotated[float, typer.Option(help="Pairs: true height of the source camera, metres.")] = 1.55,
     mount_tilt: Annotated[float, typer.Option(help="Pairs: true tilt of the source camera, degrees down.")] = 0.0,
     contact_sheet: Sheet = None,
@@ -142,10 +145,10 @@ def driving(
     with errors_shown():
         place = _one_folder(folder, out)
         mount = WorldOptions(height_m=mount_height, tilt_deg=mount_tilt)
-        told = pairs or mount != WorldOptions() or edition != 1
+        told = pairs or mount != WorldOptions() or edition != 1 or path != "gradual"
         if _wants_pairs(told, clips, scenes, compact):
             form = PairForm.of(width, height, frames, oversample, clips_per_shard)
-            world = driving_world(form, mount, edition)
+            world = driving_world(form, mount, edition, path)
             _make_pairs(place, world, world.seeds_of(first_seed, clips or 100), workers, ray, contact_sheet)
             return
         drive = SCENE_WORLDS["driving"]
@@ -170,7 +173,7 @@ def _wants_pairs(pairs: bool, clips: int | None, scenes: int | None, compact: bo
     wanted = pairs or clips is not None
     if wanted and (scenes is not None or compact):
         raise RecipeError(
-            "--scenes and --compact make whole scenes; --clips, --pairs, a mount and an edition pairs; give one"
+            "--scenes and --compact make whole scenes; --clips, --pairs, a mount, an edition and a path pairs; give one"
         )
     return wanted
 

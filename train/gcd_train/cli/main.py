@@ -10,7 +10,11 @@ from rich.table import Table
 from gcd_model import DRIVING_SMALL, FAMILIES, SMALL, SVD_14, Family, ModelConfig
 from gcd_train.cli import bench, generate, lerobot, lora
 from gcd_train.cli.cache import cache
+from gcd_train.cli.calibrate import calibrate_command
 from gcd_train.cli.evaluate import evaluate_command
+from gcd_train.cli.findings import findings_command
+from gcd_train.cli.gallery import gallery_command
+from gcd_train.cli.report import report_command
 from gcd_train.cli.show import show
 from gcd_train.cli.train import recipes, train
 from gcd_train.cli.verify import verify_command
@@ -27,8 +31,12 @@ app.add_typer(bench.app, name="bench")
 app.add_typer(lerobot.app, name="export")
 app.add_typer(lora.app, name="lora")
 app.command()(cache)
+app.command("calibrate")(calibrate_command)
 app.command("evaluate")(evaluate_command)
+app.command("findings")(findings_command)
+app.command("gallery")(gallery_command)
 app.command("lerobot")(lerobot.lerobot_command)
+app.command("report")(report_command)
 app.command()(show)
 app.command()(recipes)
 app.command()(train)

@@ -20,6 +20,7 @@ from gcd_train.recipe import Recipe, StageName, load_recipe, packaged_recipes, t
 
 if TYPE_CHECKING:
     from gcd_train.engine.processes import Processes
+    from gcd_train.run_data import DataPlaces
 
 RecipeFile: TypeAlias = Annotated[
     str, Argument(metavar="RECIPE", help="A TOML file, or package:NAME for one that ships (`gcd-train recipes`).")
@@ -32,6 +33,9 @@ Valid: TypeAlias = Annotated[
     Path | None, Option(help="Held-out data of the same kind to measure on; left out, a part of --data (data.split).")
 ]
 Out: TypeAlias = Annotated[Path, Option(help="Folder of the run; run again to go on.")]
+Latents: TypeAlias = Annotated[
+    Path | None, Option(help="Folder for encoded clips, shared by runs of one autoencoder; else in --out.")
+]
 Stage: TypeAlias = Annotated[str | None, Option(help=f"Only this one: {', '.join(get_args(StageName))}.")]
 Threads: TypeAlias = Annotated[int | None, Option(min=1, help="CPU threads; else torch's own choice.")]
 Small: TypeAlias = Annotated[
@@ -48,6 +52,7 @@ def train(
     data: Data,
     out: Out,
     valid: Valid = None,
+    latents: Latents = None,
     stage: Stage = None,
     threads: Threads = None,
     small: Small = False,
@@ -61,9 +66,11 @@ def train(
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     if threads is not None:
         torch.set_num_threads(threads)
+    from gcd_train.run_data import DataPlaces
+
     with errors_shown():
         loaded = load_recipe(recipe, small=small, changes=changes or ())
-        _in_processes(loaded, data, valid, out, _stage_named(stage))
+        _in_processes(loaded, DataPlaces(data=data, valid=valid), out, latents, _stage_named(stage))
 
 
 def recipes(recipe: Shown = None, small: Small = False, changes: Changes = None) -> None:
@@ -91,19 +98,26 @@ def _row(recipe: Recipe) -> tuple[str, ...]:
     return kind, f"{model.base} ({model.family})", budget, f"{unet.clip_batch * unet.parts}", model.weights or "nothing"
 
 
-def _in_processes(recipe: Recipe, data: Path, valid: Path | None, out: Path, stage: StageName | None) -> None:
+def _in_processes(
+    recipe: Recipe, places: "DataPlaces", out: Path, latents: Path | None, stage: StageName | None
+) -> None:
     from gcd_train.engine.processes import processes_of
 
     with processes_of(recipe.compute) as processes:
         if not processes.first:
             logging.getLogger().setLevel(logging.WARNING)
-        _run(recipe, data, valid, out, stage, processes)
+        _run(recipe, places, out, latents, stage, processes)
 
 
 def _run(
-    recipe: Recipe, data: Path, valid: Path | None, out: Path, stage: StageName | None, processes: "Processes"
+    recipe: Recipe,
+    places: "DataPlaces",
+    out: Path,
+    latents: Path | None,
+    stage: StageName | None,
+    processes: "Processes",
 ) -> None:
-    from gcd_train.data_kinds import DataPlaces, open_data
+    from gcd_train.data_kinds import open_data
     from gcd_train.model_setup import family_of, model_config
     from gcd_train.monitor.board import TensorBoard
     from gcd_train.run_folder import RunFolder
@@ -117,13 +131,14 @@ def _run(
     signal.signal(signal.SIGINT, ask)
     signal.signal(signal.SIGTERM, ask)
     board = TensorBoard(out / "tensorboard") if recipe.log.tensorboard and processes.first else None
-    places = DataPlaces(data=data, valid=valid)
     opened = open_data(recipe, model_config(recipe.model), family_of(recipe.model), places)
     inputs = RunInputs(
         recipe=recipe,
         clips=opened.clips,
         valid=opened.valid,
         batches=opened.batches,
+        parts=opened.parts,
+        latents=latents,
         folder=RunFolder(out, board),
         stop=stop,
         processes=processes,

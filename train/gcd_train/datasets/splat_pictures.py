@@ -19,6 +19,9 @@ from gcd_train.errors import DataError
 from gcd_train.pointcloud import SplatOptions, published_picture, render_lens, splat, visibility
 from gcd_train.scene_view import SceneView
 
+SAME_POSE = 5e-3
+"""Largest difference between the entries of two poses at which a dataset's own camera stands for a drawn one."""
+
 
 @dataclass(frozen=True, slots=True)
 class _Frame:
@@ -60,7 +63,8 @@ class SplatPictures:
                 seen = views[place]
             else:
                 source = self._picture(views, world_from_source, lens)
-                seen = self._seen(views, world_from_source, lens) if self._visible else None
+                own = np.abs(views[place].world_from_camera - world_from_source).max() < SAME_POSE
+                seen = views[place] if own else self._seen(views, world_from_source, lens) if self._visible else None
             frames.append(self._frame(source, seen, views, world_from_target, lens))
         return PairPictures(
             source=np.stack([frame.source for frame in frames]),

@@ -17,11 +17,13 @@ class HeldOutClips(ClipSource, Protocol):
     camera: "none" for the one path of driving, "spherical" for a path of each clip's own.
     frames, height, width: T, H and W of each clip. hfov_deg: across the pictures, of orbits both cameras' own.
     scene: world and seed of the scene that a clip was cut from. trajectory: of a clip, from source to target.
+    name: of a clip in its world, its number in digits.
     """
 
     def __getitem__(self, number: int, /) -> PairedClip: ...
     def scene(self, number: int, /) -> tuple[str, int]: ...
     def trajectory(self, number: int, /) -> Trajectory: ...
+    def name(self, number: int, /) -> str: ...
     @property
     def camera(self) -> CameraControl: ...
     @property
@@ -36,6 +38,15 @@ class HeldOutClips(ClipSource, Protocol):
     def hfov_deg(self) -> float: ...
 
 
+class SizedClips(Protocol):
+    """Clips of one size."""
+
+    @property
+    def height(self) -> int: ...
+    @property
+    def width(self) -> int: ...
+
+
 def cameras_of(clips: HeldOutClips, number: int, declared: CameraMount | None = None) -> CameraPair:
     """Both cameras of a clip.
 
@@ -44,7 +55,8 @@ def cameras_of(clips: HeldOutClips, number: int, declared: CameraMount | None = 
     """
     if clips.camera == "none":
         mount = declared or clips.mount or CameraMount()
-        return CameraPair.driving(mount, frames=clips.frames, height=clips.height, width=clips.width)
+        reached = clips.trajectory(number).at_goal.index(True)
+        return CameraPair.driving(mount, frames=clips.frames, height=clips.height, width=clips.width, move_time=reached)
     return CameraPair.orbit(clips.trajectory(number), hfov_deg=clips.hfov_deg, height=clips.height, width=clips.width)
 
 
@@ -59,7 +71,7 @@ def source_side(clips: HeldOutClips, number: int, clip: PairedClip, declared: Ca
     )
 
 
-def class_grid(clips: HeldOutClips) -> tuple[int, int]:
+def class_grid(clips: SizedClips) -> tuple[int, int]:
     """Height and width at which class maps are compared: half the pictures', the grid of our small class head."""
     return clips.height // 2, clips.width // 2
 

@@ -26,7 +26,8 @@ class MountNumbers(msgspec.Struct, frozen=True, kw_only=True):
 class Shot(msgspec.Struct, frozen=True, kw_only=True):
     """One measured clip.
 
-    world, scene: the world and the seed of its scene. clip: its name in the shard, a number.
+    world, scene: the world and the seed of its scene. clip: its name in the shard, a number; of whole scenes its name
+        in the control list.
     change: where its target camera goes, azimuth and elevation in degrees and radius in metres, target minus source;
         None on the one path of driving.
     """
@@ -37,7 +38,8 @@ class Shot(msgspec.Struct, frozen=True, kw_only=True):
     change: tuple[float, float, float] | None = None
 
     def __str__(self) -> str:
-        name = f"{self.world} {self.scene}" + ("" if int(self.clip) == self.scene else f" ({self.clip})")
+        alike = self.clip.isdecimal() and int(self.clip) == self.scene
+        name = f"{self.world} {self.scene}" + ("" if alike else f" ({self.clip})")
         if self.change is None:
             return name
         azimuth_deg, elevation_deg, radius_m = self.change
@@ -48,6 +50,7 @@ class Conditions(msgspec.Struct, frozen=True, kw_only=True):
     """What the figures hold for.
 
     data, train: folders. weights: name of the model, None for baselines alone. steps: of its sampler, as shipped.
+    samples: draws of each view, of what draws. first_frame: that is measured, counted from 1.
     shots: the clips that were measured, in order. size, grid: height and width of pictures and of the class grid.
     true_mount: of the source camera in the data. declared_mount: what the model and the baselines were told of it. Both
     None where there is no vehicle.
@@ -67,6 +70,8 @@ class Conditions(msgspec.Struct, frozen=True, kw_only=True):
     declared_mount: MountNumbers | None
     train: tuple[str, ...]
     train_clips: int
+    samples: int = 1
+    first_frame: int = 2
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -1,48 +1,70 @@
-"""Predictors on held-out clips, one clip after the other."""
+"""Methods on held-out clips, one clip after the other."""
 
 import time
 from collections.abc import Callable, Sequence
 
-from gcd_model.geometry import CameraMount
-from gcd_train.baselines import Predictor
+from gcd_train.baselines import Prediction, Predictor
 from gcd_train.errors import DataError
+from gcd_train.evaluation.clips import EvaluationSet, HeldOutClip
 from gcd_train.evaluation.figures import Evaluation, summed_up
-from gcd_train.evaluation.held_out import HeldOutClips, class_grid, source_side
-from gcd_train.evaluation.measures import FIRST_MEASURED, Measures, TrueView, measure
+from gcd_train.evaluation.measured import measure
+from gcd_train.evaluation.record import ClipRecord
+from gcd_train.evaluation.tallies import FIRST_MEASURED, MAIN, Selection
+from gcd_train.metrics import Lpips
+
+
+def predicted_and_measured(
+    predictor: Predictor, clip: HeldOutClip, *, classes: int, lpips: Lpips | None = None
+) -> tuple[Prediction, ClipRecord]:
+    """What a method makes of a clip, and the record of that.
+
+    Args:
+        classes: how many there are, 0 for none. lpips: None for no such figure.
+    Raises: what the method raises; ShapeError, NonFiniteError: see `measure`.
+    """
+    start = time.perf_counter()
+    prediction = predictor.predict(clip.seen)
+    seconds = time.perf_counter() - start
+    record = measure(
+        clip,
+        prediction,
+        method=predictor.name,
+        privileged=predictor.privileged,
+        seconds=seconds,
+        classes=classes,
+        lpips=lpips,
+    )
+    return prediction, record
 
 
 def evaluate(
     predictors: Sequence[Predictor],
-    clips: HeldOutClips,
+    clips: EvaluationSet,
     *,
-    declared: CameraMount | None = None,
+    selection: Selection = MAIN,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Evaluation, ...]:
-    """Every predictor on the same clips, each read once.
+    """Every method on the same clips, each read once; nothing is kept but the figures.
 
     Args:
-        declared: mount that all predictors are told for the source camera of driving clips; None for the true one.
-        progress: called with (clips done, clips).
+        selection: frames and pixels that the figures are of. progress: called with (clips done, clips).
     Raises:
-        DataError: there is no clip, or a clip has no frame to measure.
+        DataError: there is no clip, a clip has no frame to measure, or one cannot be read.
     """
-    count, classes, grid = len(clips), len(clips.classes), class_grid(clips)
-    if count < 1 or clips.frames <= FIRST_MEASURED + 1:
-        raise DataError(f"evaluation wants a clip of 3 frames or more, got {count} of {clips.frames}; generate some")
-    measured: list[list[Measures]] = [[] for _ in predictors]
-    seconds = [0.0] * len(predictors)
-    for number in range(count):
-        clip = clips[number]
-        seen, true = source_side(clips, number, clip, declared), TrueView.of(clip, grid=grid, classes=classes)
-        for place, predictor in enumerate(predictors):
-            start = time.perf_counter()
-            prediction = predictor.predict(seen)
-            seconds[place] += time.perf_counter() - start
-            measured[place].append(measure(prediction, true, classes=classes))
+    require_measurable(clips)
+    records: list[list[ClipRecord]] = [[] for _ in predictors]
+    for done, key in enumerate(clips.keys, start=1):
+        clip = clips.clip(key)
+        for rows, predictor in zip(records, predictors, strict=True):
+            rows.append(predicted_and_measured(predictor, clip, classes=len(clips.classes))[1])
         if progress is not None:
-            progress(number + 1, count)
-    scenes = [clips.scene(number) for number in range(count)]
-    return tuple(
-        summed_up(predictor.name, each, scenes, seconds=spent, privileged=predictor.privileged)
-        for predictor, each, spent in zip(predictors, measured, seconds, strict=True)
-    )
+            progress(done, len(clips.keys))
+    return tuple(summed_up(rows, selection, classes=len(clips.classes)) for rows in records)
+
+
+def require_measurable(clips: EvaluationSet) -> None:
+    """Raises DataError where there is no clip, or none has a change between two measured frames."""
+    if not clips.keys or clips.frames <= FIRST_MEASURED + 1:
+        raise DataError(
+            f"evaluation wants a clip of 3 frames or more, got {len(clips.keys)} of {clips.frames}; generate some"
+        )

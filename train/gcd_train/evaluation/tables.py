@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from gcd_train.evaluation.figures import Evaluation, Figures, lead
 from gcd_train.evaluation.report import Report, best_of
 
-Rows = list[list[str]]
-
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Column:
@@ -35,6 +33,8 @@ _COLUMNS = (
     _PSNR,
     _Column(heading="last frame", figure=lambda f: f.last_psnr_db, digits=2),
     _SSIM,
+    _Column(heading="LPIPS", figure=lambda f: f.lpips, digits=3),
+    _Column(heading="diversity", figure=lambda f: f.diversity, digits=3),
     _Column(heading="gradient energy", figure=lambda f: f.gradient_energy, digits=2),
     _Column(heading="flicker", figure=lambda f: f.flicker, digits=2),
     _MIOU,
@@ -61,16 +61,20 @@ def _conditions(report: Report) -> list[str]:
     scenes = len({(shot.world, shot.scene) for shot in shots})
     folders = ", ".join(f"`{folder}`" for folder in given.data)
     lines = [
-        f"{len(shots)} clips of {scenes} scenes in {folders}, frames 2-{given.frames}; value ± standard error over "
-        "scenes. * uses the exact source depth."
+        f"{len(shots)} clips of {scenes} scenes in {folders}, frames {given.first_frame}-{given.frames}; value ± "
+        "standard error over scenes. * is given more than the source video."
     ]
     if given.weights is not None:
-        lines.append(f"`{given.weights}` as it ships: {_counted(given.steps or 0)} of its sampler, one sample.")
+        steps, samples = _counted(given.steps or 0, "step"), _counted(given.samples, "sample")
+        lines.append(f"`{given.weights}` as it ships: {steps} of its sampler, {samples}.")
     if given.true_mount is not None:
         lines.append(f"Source camera at {given.true_mount}; declared: {given.declared_mount}.")
     if report.classes:
         height, width = given.grid
         lines.append(f"Class figures at {width}x{height}, in brackets at picture size.")
+    totals = [each.total for each in report.evaluations]
+    if all(math.isnan(each.lpips) for each in totals) and any(not math.isnan(each.psnr_db) for each in totals):
+        lines.append("LPIPS: no weights given (`--lpips`).")
     return lines
 
 
@@ -140,8 +144,8 @@ def _clip_columns(report: Report) -> Iterator[tuple[str, list[str]]]:
             yield f"over {best.name}", [_with_error(value, math.nan, column.digits, sign="+") for value in apart]
 
 
-def _counted(steps: int) -> str:
-    return f"{steps} step{'' if steps == 1 else 's'}"
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def _with_error(value: float, error: float, digits: int, sign: str = "") -> str:

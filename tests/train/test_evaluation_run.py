@@ -1,0 +1,268 @@
+"""Runs that are kept: records, resuming, failures, processes, frames that are read back."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from driving_plane import PlaneClips
+from made_records import note, record
+from typer.testing import CliRunner
+
+from gcd_train.baselines import CopySource, Prediction, Predictor, SavedFrames, SourceClip, to_pictures
+from gcd_train.cli.main import app
+from gcd_train.datasets.paired import PairedClips
+from gcd_train.errors import DataError, RunError
+from gcd_train.evaluation import ClipWork, HeldOutClip, PairedSet, RunKeeper, folder_name, measure_all, read_run
+from gcd_train.evaluation.paired_set import chosen, identity_of
+from gcd_train.evaluation.spread import GIVE_UP_AFTER, Account
+
+
+@dataclass
+class Counting:
+    """Copies, counts how often, and refuses some clips."""
+
+    name: str = "counting"
+    refused: Sequence[str] = ()
+    privileged: bool = False
+    met: list[str] = field(default_factory=list)
+
+    def predict(self, clip: SourceClip) -> Prediction:
+        self.met.append(clip.key)
+        if clip.key in self.refused:
+            raise DataError(f"no frames for {clip.key}")
+        return Prediction(video=to_pictures(clip.source))
+
+
+class SomeDamaged(PairedSet):
+    """Pairs of which some cannot be read."""
+
+    damaged: Sequence[str] = ("plane-00000001",)
+
+    def clip(self, key: str, /) -> HeldOutClip:
+        if key in self.damaged:
+            raise DataError(f"shard of {key} is damaged")
+        return super().clip(key)
+
+
+class AllDamaged(SomeDamaged):
+    damaged = tuple(f"plane-{number:08d}" for number in range(20))
+
+
+def pairs(count: int = 3, kind: type[PairedSet] = PairedSet) -> PairedSet:
+    return kind(clips=PlaneClips.make(count), identity="plane")
+
+
+def finished(folder: Path, clips: PairedSet, *methods: Predictor) -> Account:
+    """The account at the end of a run."""
+    work = ClipWork(folder=folder, clips=clips, makers={each.name: lambda each=each: each for each in methods})
+    *_, last = measure_all(work)
+    return last
+
+
+def records_in(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder / "records")) for path in folder.glob("records/*/*.json"))
+
+
+# --- keeping -------------------------------------------------------------------------------------------------------
+
+
+def test_a_run_is_read_back_as_it_was_kept(tmp_path: Path) -> None:
+    keeper = RunKeeper(tmp_path)
+    told = note(methods={"b (2 steps)": {"weights": "12"}, "a": {"baseline": "a"}})
+    kept = [record("b (2 steps)", "k.1"), record("b (2 steps)", "k.0"), record("a", "k.0")]
+    keeper.begin(told)
+    for each in kept:
+        keeper.keep(each)
+    assert read_run(tmp_path) == (told, (kept[1], kept[0], kept[2]))
+
+
+def test_names_become_file_names_and_two_methods_never_share_a_folder(tmp_path: Path) -> None:
+    assert folder_name("scn02900.sample_00") == "scn02900.sample_00"
+    assert folder_name("driving-small (4 steps)") == "driving-small_4_steps"
+    assert folder_name("../..") not in ("..", ".", "")
+    with pytest.raises(RunError, match="would share the folder"):
+        RunKeeper(tmp_path).begin(note(methods={"a b": {}, "a/b": {}}))
+
+
+def test_a_run_goes_on_with_more_methods_and_keeps_its_first_command(tmp_path: Path) -> None:
+    RunKeeper(tmp_path).begin(note(methods={"a": {"seed": "0"}}, command="first"))
+    joined = RunKeeper(tmp_path).begin(note(methods={"b": {"seed": "0"}}, command="second"))
+    assert (joined.command, list(joined.methods)) == ("first", ["a", "b"])
+    assert read_run(tmp_path)[0] == joined
+
+
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [
+        ({"data_identity": "another"}, "data_identity was 0123456789ab, is another"),
+        ({"classes": ("road", "car")}, "classes was , is road, car"),
+        ({"methods": {"a": {"steps": "4"}}}, "steps of a was 1, is 4"),
+        ({"methods": {"a": {"steps": "1", "lpips": "vgg"}}}, "lpips of a was not told, is vgg"),
+    ],
+)
+def test_another_evaluation_is_refused_with_what_differs(tmp_path: Path, other: dict[str, object], said: str) -> None:
+    first = note(methods={"a": {"steps": "1"}})
+    RunKeeper(tmp_path).begin(first)
+    with pytest.raises(RunError, match=said):
+        RunKeeper(tmp_path).begin(msgspec.structs.replace(first, **other))
+    assert read_run(tmp_path)[0] == first
+
+
+def test_a_damaged_record_is_named_and_no_run_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"holds no run\.json"):
+        read_run(tmp_path)
+    keeper = RunKeeper(tmp_path)
+    keeper.begin(note(methods={"a": {}}))
+    keeper.keep(record("a", "k"))
+    (tmp_path / "records" / "a" / "k.json").write_bytes(b'{"method": "a"')
+    with pytest.raises(RunError, match=r"k\.json is damaged"):
+        read_run(tmp_path)
+
+
+# --- measuring -----------------------------------------------------------------------------------------------------
+
+
+def test_what_has_a_record_is_not_done_again(tmp_path: Path) -> None:
+    method, other = Counting(), Counting("other")
+    assert finished(tmp_path, pairs(2), method).lines()[0] == "clips: 2 measured, 0 there already; 0 failures"
+    (tmp_path / "records" / "counting" / "plane-00000000.json").unlink()
+    account = finished(tmp_path, pairs(3), method)
+    assert (account.there, account.measured, account.done) == (1, 2, 3)
+    assert method.met == ["plane-00000000", "plane-00000001", "plane-00000000", "plane-00000002"]
+    finished(tmp_path, pairs(3), method, other)
+    assert (len(method.met), other.met) == (4, [f"plane-0000000{n}" for n in range(3)])
+
+
+def test_a_clip_that_cannot_be_read_is_named_and_the_others_are_measured(tmp_path: Path) -> None:
+    account = finished(tmp_path, pairs(3, SomeDamaged), Counting())
+    assert account.failures == {"plane-00000001": "shard of plane-00000001 is damaged"}
+    assert account.exit_code != 0
+    assert records_in(tmp_path) == ["counting/plane-00000000.json", "counting/plane-00000002.json"]
+    assert account.lines()[1] == "  plane-00000001: shard of plane-00000001 is damaged"
+
+
+def test_a_method_that_fails_takes_nothing_from_the_others(tmp_path: Path) -> None:
+    account = finished(tmp_path, pairs(2), Counting(refused=["plane-00000000"]), CopySource())
+    assert account.failures == {"plane-00000000, counting": "no frames for plane-00000000"}
+    assert "copy_source/plane-00000000.json" in records_in(tmp_path)
+    assert "counting/plane-00000000.json" not in records_in(tmp_path)
+
+
+def test_a_run_in_which_nothing_goes_right_gives_up(tmp_path: Path) -> None:
+    account = finished(tmp_path, pairs(7, AllDamaged), Counting())
+    assert (account.measured, account.gave_up) == (GIVE_UP_AFTER, True)
+    assert "gave up" in account.lines()[-1]
+
+
+def test_a_folder_that_cannot_be_written_ends_the_run(tmp_path: Path) -> None:
+    (tmp_path / "records").write_text("a file where a folder should be")
+    with pytest.raises(RunError, match="cannot write"):
+        finished(tmp_path, pairs(2), Counting())
+
+
+def written(folder: Path, count: int, first_seed: int = 0) -> PairedClips:
+    return PairedClips.open(PlaneClips.make(count).write(folder, first_seed))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)  # each process imports torch
+def test_processes_find_what_one_finds(tmp_path: Path) -> None:
+    clips = PairedSet.of(written(tmp_path / "data", 4))
+    for workers in (1, 2):
+        work = ClipWork(folder=tmp_path / str(workers), clips=clips, makers={"copy_source": CopySource})
+        *_, account = measure_all(work, workers=workers)
+        assert (account.measured, account.failures) == (4, {})
+    for path in records_in(tmp_path / "1"):
+        one, two = (
+            msgspec.json.decode((tmp_path / each / "records" / path).read_bytes()) | {"seconds": 0} for each in "12"
+        )
+        assert one == two
+
+
+# --- frames --------------------------------------------------------------------------------------------------------
+
+
+def test_kept_frames_are_predictions_that_score_the_same(tmp_path: Path) -> None:
+    clips = pairs(1)
+    work = ClipWork(folder=tmp_path, clips=clips, makers={"copy_source": CopySource}, views="all")
+    *_, account = measure_all(work)
+    assert account.failures == {}
+    (place,) = (tmp_path / "views" / "copy_source").iterdir()
+    assert {path.name for path in place.iterdir()} >= {"source", "target", "sample_0", "classes_0", "target_classes"}
+    clip = clips.clip("plane-00000000")
+    read = SavedFrames.open("copy", tmp_path / "views" / "copy_source").predict(clip.seen)
+    assert read.video is not None
+    assert np.array_equal((read.video * 255).round().byte().permute(0, 2, 3, 1).numpy(), clip.seen.source)
+
+
+def test_only_the_last_frame_is_kept_where_that_is_asked(tmp_path: Path) -> None:
+    work = ClipWork(folder=tmp_path, clips=pairs(1), makers={"copy_source": CopySource}, views="last")
+    *_, account = measure_all(work)
+    assert account.done == 1
+    assert {path.name for path in (tmp_path / "views").rglob("*.png")} == {"0003.png"}
+
+
+# --- the command ---------------------------------------------------------------------------------------------------
+
+
+def test_the_identity_follows_the_pictures_and_not_the_place(tmp_path: Path) -> None:
+    clips = written(tmp_path / "a", 2)
+    assert identity_of(clips) == identity_of(written(tmp_path / "b", 2))
+    assert identity_of(clips) != identity_of(chosen(clips, limit=1))
+    assert identity_of(clips) != identity_of(written(tmp_path / "c", 2, first_seed=1))
+
+
+def test_a_limit_counts_scenes_and_a_split_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    clips = written(tmp_path, 4)
+    assert len(chosen(clips, limit=3)) == 3
+    assert [chosen(clips, scenes={("driving", 2)}).scene(0)] == [("driving", 2)]
+    with pytest.raises(DataError, match="none of the 4 clips"):
+        chosen(clips, scenes={("driving", 9)})
+
+
+def evaluated(folder: Path, *options: str) -> tuple[int, str]:
+    every = ["evaluate", "--data", str(folder / "data"), "--out", str(folder / "run"), "--sheet-clips", "1", *options]
+    result = CliRunner().invoke(app, every, env={"COLUMNS": "200"})
+    return result.exit_code, result.output
+
+
+def test_the_command_measures_and_goes_on(tmp_path: Path) -> None:
+    PlaneClips.make(2).write(tmp_path / "data", first_seed=1_000_000)
+    code, said = evaluated(tmp_path, "--methods", "copy_source", "--split", "driving-test", "--views", "all")
+    assert code == 0, said
+    assert "copy_source" in said
+    assert "has 2 of its 40 scenes" in said
+    for file in ("run.json", "evaluation.json", "evaluation.md", "contact_sheet.png"):
+        assert (tmp_path / "run" / file).is_file()
+    told, records = read_run(tmp_path / "run")
+    assert (told.protocol, told.kind, told.frames) == ("pairs", "driving", 4)
+    assert [each.key for each in records] == ["driving-01000000", "driving-01000001"]
+    frames = tmp_path / "run" / "views" / "copy_source"
+    code, said = evaluated(tmp_path, "--no-baselines", "--predictions", f"saved={frames}", "--split", "driving-test")
+    assert code == 0, said
+    told, records = read_run(tmp_path / "run")
+    assert list(told.methods) == ["copy_source", "saved"]
+    scores = {each.method: each.regions["all"].psnr_db for each in records if each.key == "driving-01000001"}
+    assert scores["saved"] == scores["copy_source"]
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "words"),
+    [
+        (["--methods", "copy_sauce"], 78, "did you mean copy_source"),
+        (["--methods", "copy_source", "--controls", "list.json"], 78, "these are pairs"),
+        (["--methods", "copy_source", "--split", "driving-tset"], 78, "did you mean driving-test"),
+        (["--methods", "copy_source", "--split", "drop-test"], 66, "is of the split"),
+        (["--no-baselines"], 78, "there is nothing to measure"),
+        (["--no-baselines", "--predictions", "frames"], 78, "NAME=FOLDER"),
+        ([], 78, "baselines want training clips"),
+    ],
+)
+def test_the_command_says_what_is_wrong(tmp_path: Path, options: list[str], code: int, words: str) -> None:
+    PlaneClips.make(1).write(tmp_path / "data")
+    found, said = evaluated(tmp_path, *options)
+    assert (found, words in said) == (code, True), said
+    assert "Traceback" not in said

@@ -1,0 +1,358 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from tiny_scenes4d import draw as drawn_by_rays
+from torch import Tensor
+from torch.testing import assert_close
+
+from gcd_model.geometry import Intrinsics, Spherical, Trajectory, relative_pose, to_pose
+from gcd_train.baselines import CameraPair, SourceClip
+from gcd_train.baselines.hexplane import HexPlane
+from gcd_train.errors import DataError, RecipeError
+from gcd_train.hexplane import (
+    Camera,
+    HexField,
+    HexPlanes,
+    HexPlaneSettings,
+    PosedPicture,
+    SceneBounds,
+    learn,
+)
+from gcd_train.hexplane.bounds import nearest_to_axes
+from gcd_train.hexplane.planes import SPACE, TIME, sampled
+from gcd_train.hexplane.rendering import render, resampled, weights
+from gcd_train.scene_view import SceneView
+
+LENS = Intrinsics.from_hfov(53.0, 24, 16)
+FRAMES = 2
+BOX_X = (-2.0, 2.0)
+"""Where the box stands in the first and in the last frame."""
+TINY = HexPlaneSettings(
+    updates=60,
+    rays=256,
+    coarse=16,
+    fine=12,
+    features=6,
+    hidden=24,
+    sides=(12, 24),
+    plane_rate=0.06,
+    head_rate=0.01,
+    smoothness=1e-4,
+)
+SOURCE, HELD_OUT = (15.0, 20.0), (60.0, 20.0)
+RING = [(105.0, 20.0), (330.0, 20.0), (50.0, 50.0), (30.0, 5.0)]
+
+
+def pose_of(angles: tuple[float, float]) -> Tensor:
+    return to_pose(Spherical(azimuth_deg=angles[0], elevation_deg=angles[1], radius_m=9.0))
+
+
+def view(angles: tuple[float, float], frame: int = 0) -> SceneView:
+    """A chequered ground and a box that moves."""
+    pose = pose_of(angles).numpy()
+    seen = drawn_by_rays(pose, LENS, box_x=BOX_X[frame])
+    return SceneView(
+        rgb=seen.rgb, depth=seen.depth, classes=seen.ids, instances=None, world_from_camera=pose, lens=LENS
+    )
+
+
+def video(angles: tuple[float, float]) -> list[SceneView]:
+    return [view(angles, frame) for frame in range(FRAMES)]
+
+
+def colours(views: list[SceneView]) -> Tensor:
+    """[T, 3, H, W]."""
+    return torch.from_numpy(np.stack([each.rgb for each in views])).permute(0, 3, 1, 2).float() / 255.0
+
+
+def posed(seen: SceneView) -> PosedPicture:
+    camera = Camera(lens=seen.lens, world_from_camera=torch.from_numpy(seen.world_from_camera), time=-1.0)
+    return PosedPicture(colours=colours([seen])[0], camera=camera)
+
+
+def bounds() -> SceneBounds:
+    return SceneBounds(centre=torch.tensor([1.0, -2.0, 0.5]), half_m=4.0, begin=0.5, reach=5.0)
+
+
+def source_clip() -> SourceClip:
+    """The box from a camera that stands; the view that is wanted stands too."""
+    path = relative_pose(pose_of(SOURCE), pose_of(HELD_OUT)).expand(FRAMES, 4, 4)
+    seen = video(SOURCE)
+    return SourceClip(
+        source=np.stack([each.rgb for each in seen]),
+        source_depth=np.stack([each.depth for each in seen]),
+        source_classes=None,
+        cameras=CameraPair(
+            ground_from_source=pose_of(SOURCE),
+            source=LENS,
+            target=LENS,
+            trajectory=Trajectory(source_from_target=path, delta=None, at_goal=(True,) * FRAMES, source=None),
+        ),
+        fps=12.0,
+        key="scn1.sample_00",
+        others=lambda count: [video(angles) for angles in RING[:count]],
+    )
+
+
+def psnr_db(one: Tensor, other: Tensor) -> float:
+    return -10.0 * math.log10(float(((one - other) ** 2).mean()))
+
+
+def test_planes_are_exact_on_what_is_linear_along_each_axis() -> None:
+    across, down = torch.linspace(-1, 1, 7).double(), torch.linspace(-1, 1, 5).double()[:, None]
+    table = 0.3 + 2.0 * across - 0.7 * down + 1.5 * across * down
+    at = torch.rand(50, 3, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 2 - 1
+    u, v = at[..., 0], at[..., 1]
+    values = sampled(table.expand(3, 1, 5, 7), at)[:, 0]
+    assert_close(values, (0.3 + 2.0 * u - 0.7 * v + 1.5 * u * v).T)
+
+
+def test_a_value_is_the_mean_of_four_cells_weighted_by_nearness() -> None:
+    table = torch.zeros(3, 1, 3, 3, dtype=torch.float64, requires_grad=True)
+    sampled(table, torch.tensor([[[0.25, -0.5]] * 3], dtype=torch.float64)).sum().backward()
+    assert table.grad is not None
+    expected = torch.tensor([[0.0, 0.375, 0.125], [0.0, 0.375, 0.125], [0.0, 0.0, 0.0]], dtype=torch.float64)
+    assert_close(table.grad[:, 0], expected.expand(3, 3, 3))
+
+
+def test_gradients_of_all_six_planes_are_those_of_small_changes() -> None:
+    planes = HexPlanes(features=2, side=3, moments=3, generator=torch.Generator().manual_seed(0)).double()
+    points = torch.rand(4, 4, generator=torch.Generator().manual_seed(2), dtype=torch.float64) * 2 - 1
+
+    def features(space: Tensor, time: Tensor) -> Tensor:
+        return torch.func.functional_call(planes, {"space": space, "time": time}, (points,))
+
+    assert torch.autograd.gradcheck(features, (planes.space, planes.time + 0.1))
+
+
+def test_each_plane_of_space_is_multiplied_with_the_plane_that_shares_no_axis_with_it() -> None:
+    assert [set(one) | set(other) for one, other in zip(SPACE, TIME, strict=True)] == [{0, 1, 2, 3}] * 3
+    planes = HexPlanes(features=1, side=4, moments=4, generator=torch.Generator().manual_seed(0))
+    line = torch.linspace(-1, 1, 4)
+    with torch.no_grad():
+        planes.space.copy_(line.expand(4, 4) + 10.0 * line[:, None])
+        planes.time.copy_(100.0 * line.expand(4, 4) + 1000.0 * line[:, None])
+    x, y, z, t = 0.2, -0.4, 0.7, 0.5
+    expected = [(x + 10 * y) * (100 * z + 1000 * t), (x + 10 * z) * (100 * y + 1000 * t)]
+    expected += [(y + 10 * z) * (100 * x + 1000 * t)]
+    assert_close(planes(torch.tensor([[x, y, z, t]]))[0], torch.tensor(expected), rtol=1e-4, atol=1e-2)
+
+
+def test_finer_planes_hold_what_the_coarser_ones_held() -> None:
+    planes = HexPlanes(features=3, side=5, moments=4, generator=torch.Generator().manual_seed(3))
+    points = torch.rand(40, 4, generator=torch.Generator().manual_seed(4)) * 2 - 1
+    before = planes(points)
+    planes.refine(9)
+    assert planes.space.shape == (3, 3, 9, 9)
+    assert planes.time.shape == (3, 3, 4, 9)
+    assert_close(planes(points), before)
+
+
+def test_planes_of_one_value_are_smooth_and_random_ones_are_rough() -> None:
+    planes = HexPlanes(features=2, side=6, moments=1, generator=torch.Generator().manual_seed(5))
+    assert planes.roughness() > 0.01
+    with torch.no_grad():
+        planes.space.fill_(0.3)
+    assert planes.roughness() == 0.0
+
+
+def test_what_does_not_add_to_the_light_of_a_ray_has_passed_through_all_of_it() -> None:
+    depth = torch.rand(20, 9, generator=torch.Generator().manual_seed(6)) * 2
+    share = weights(depth)
+    assert (share >= 0).all()
+    assert_close(1 - share.sum(dim=1), (-depth.sum(dim=1)).exp())
+
+
+def test_even_fog_dims_as_the_exponential_of_its_depth() -> None:
+    share = weights(torch.full((1, 8), 0.25))
+    assert_close(share[0, :4].sum(), torch.tensor(1 - math.exp(-1.0)))
+    assert_close(share[0, -1], torch.tensor(math.exp(-7 * 0.25) - math.exp(-8 * 0.25)))
+
+
+def test_light_has_the_gradients_of_small_changes() -> None:
+    depth = torch.rand(2, 5, generator=torch.Generator().manual_seed(7), dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(weights, (depth,))
+
+
+def test_samples_gather_where_the_light_is_and_keep_the_ends() -> None:
+    edges = torch.linspace(0, 1, 11).expand(1, 11)
+    share = F.one_hot(torch.tensor([6]), 10).float()
+    found = resampled(edges, share, 20, None)
+    assert (found.diff(dim=1) >= 0).all()
+    assert_close(found[0, [0, -1]], torch.tensor([0.0, 1.0]))
+    assert ((found > 0.6 - 1e-6) & (found < 0.7 + 1e-6)).sum() >= 18
+    moved = resampled(edges, share, 20, torch.Generator().manual_seed(0))
+    assert (moved.diff(dim=1) >= 0).all()
+    assert not torch.equal(moved, found)
+
+
+def test_the_cube_stands_where_cameras_of_an_orbit_look() -> None:
+    poses = torch.stack([pose_of(angles) for angles in [SOURCE, *RING]])
+    found = SceneBounds.around(poses)
+    assert_close(found.centre, torch.tensor([0.0, 0.0, 1.0]), rtol=0, atol=0.02)
+    assert found.half_m == pytest.approx(4.5, abs=0.01)
+    assert found.begin == pytest.approx(0.6, abs=0.01)
+    assert found.reach == pytest.approx(3.0, abs=0.01)
+
+
+def test_cameras_with_parallel_axes_look_at_what_lies_ahead() -> None:
+    pose = to_pose(Spherical(azimuth_deg=40.0, elevation_deg=10.0, radius_m=15.0))
+    ahead = pose[:3, 3] + 10.0 * pose[:3, 2]
+    assert_close(nearest_to_axes(torch.stack([pose, pose])), ahead)
+
+
+def test_all_of_space_fits_in_the_planes_and_the_cube_is_to_scale() -> None:
+    where = bounds()
+    directions = F.normalize(torch.randn(30, 3, generator=torch.Generator().manual_seed(8)), dim=-1)
+    distances = torch.tensor([0.0, 1.0, 3.9, 4.1, 10.0, 100.0, 1e6])
+    placed = where.to_planes(where.centre + distances[:, None, None] * directions)
+    assert (placed.abs() <= 1).all()
+    assert (placed.norm(dim=-1).diff(dim=0) > 0).all()
+    assert_close(placed[1], directions / 8.0)
+
+
+def test_samples_along_a_ray_are_even_between_its_ends() -> None:
+    distances = bounds().to_distance(torch.linspace(0, 1, 10))
+    assert_close(distances, torch.linspace(0.5 * 4.0, 5.0 * 4.0, 10))
+
+
+def test_nothing_but_fog_of_no_density_shows_the_background() -> None:
+    field = HexField(bounds(), FRAMES, TINY, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        field.density_head.bias.fill_(-1e4)
+    rays = Camera(lens=LENS, world_from_camera=torch.eye(4), time=0.0).rays()
+    assert_close(render(field, rays, coarse=8, fine=8), field.background(rays.directions))
+
+
+def test_rays_go_through_the_middles_of_their_pixels() -> None:
+    lens = replace(LENS, cx=10.0, cy=9.0)
+    pose = to_pose(Spherical(azimuth_deg=40.0, elevation_deg=10.0, radius_m=15.0))
+    rays = Camera(lens=lens, world_from_camera=pose, time=0.5).rays()
+    seen = ((rays.origins + 3.0 * rays.directions).double() - pose[:3, 3]) @ pose[:3, :3]
+    u, v = lens.fx * seen[:, 0] / seen[:, 2] + lens.cx, lens.fy * seen[:, 1] / seen[:, 2] + lens.cy
+    assert_close(u.view(16, 24), (torch.arange(24) + 0.5).expand(16, 24).double(), rtol=0, atol=1e-4)
+    assert_close(v.view(16, 24), (torch.arange(16) + 0.5)[:, None].expand(16, 24).double(), rtol=0, atol=1e-4)
+    assert_close(rays.directions.norm(dim=-1), torch.ones(len(rays.directions)))
+
+
+def test_a_narrowed_picture_keeps_its_mean_and_its_angles() -> None:
+    picture = posed(view(SOURCE))
+    small = picture.narrowed(12)
+    assert small.colours.shape == (3, 8, 12)
+    assert_close(small.colours.mean(), picture.colours.mean())
+    assert small.camera.lens.hfov_deg == pytest.approx(LENS.hfov_deg)
+    assert picture.narrowed(100) is picture
+
+
+def test_a_field_that_is_opaque_shows_the_colour_in_front_of_the_camera() -> None:
+    field = HexField(bounds(), FRAMES, TINY, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        field.density_head.bias.fill_(1e4)
+    rays = Camera(lens=LENS, world_from_camera=torch.eye(4), time=0.0).rays()
+    shown = render(field, rays, coarse=8, fine=8)
+    first = field.bounds.to_distance(
+        resampled(torch.linspace(0, 1, 9)[None], weights(torch.full((1, 8), 1e4)), 8, None)
+    )
+    near = rays.origins + first[0, :2].mean() * rays.directions
+    assert_close(shown, field.colour(field(near, rays.times)), rtol=0, atol=1e-3)
+
+
+def made(method: HexPlane) -> Tensor:
+    """The held-out view, [T, 3, H, W]."""
+    prediction = method.predict(source_clip()).video
+    assert prediction is not None
+    return prediction
+
+
+@pytest.fixture(scope="module")
+def learnt() -> Tensor:
+    """From the source and four more cameras."""
+    return made(HexPlane(views=5, settings=TINY, device="cpu"))
+
+
+def test_several_views_tell_what_another_camera_sees(learnt: Tensor) -> None:
+    target, source = colours(video(HELD_OUT)), colours(video(SOURCE))
+    one_colour = target.mean(dim=(2, 3), keepdim=True).expand_as(target)
+    assert learnt.shape == target.shape
+    assert psnr_db(learnt, target) > psnr_db(source, target) + 3.0
+    assert psnr_db(learnt, target) > psnr_db(one_colour, target) + 0.5
+
+
+def test_what_moves_is_where_it_is_at_each_moment(learnt: Tensor) -> None:
+    target = colours(video(HELD_OUT))
+    swapped = target.flip(0)
+    moved = ((target - swapped).abs().sum(dim=1, keepdim=True) > 0.2).expand_as(target)
+    assert psnr_db(learnt[moved], target[moved]) > psnr_db(learnt[moved], swapped[moved]) + 2.0
+
+
+@pytest.mark.slow
+def test_more_views_tell_more_than_one() -> None:
+    settings = replace(TINY, updates=200, smoothness=0.1)
+    target = colours(video(HELD_OUT))
+    reached = [psnr_db(made(HexPlane(views=views, settings=settings, device="cpu")), target) for views in (1, 5)]
+    assert reached[1] > reached[0] + 1.0
+
+
+def test_the_same_seed_learns_the_same_and_another_seed_something_else() -> None:
+    quick = HexPlane(settings=replace(TINY, updates=3), device="cpu")
+    assert torch.equal(made(quick), made(quick))
+    assert not torch.equal(made(quick), made(replace(quick, seed=1)))
+
+
+def test_learning_says_how_far_it_is() -> None:
+    heard: list[tuple[int, float]] = []
+    settings = replace(TINY, updates=5)
+    picture = posed(view(SOURCE))
+    around = SceneBounds.around(picture.camera.world_from_camera[None])
+    learn(
+        [picture],
+        around,
+        settings,
+        frames=1,
+        device="cpu",
+        progress=lambda number, error: heard.append((number, error)),
+    )
+    assert [number for number, _ in heard] == [0, 1, 2, 3, 4]
+    assert all(0 < error < 1 for _, error in heard)
+
+
+def test_a_view_has_the_size_that_was_asked_for_whatever_was_learnt() -> None:
+    narrow = replace(TINY, updates=1, picture_width=8)
+    assert made(HexPlane(settings=narrow, device="cpu")).shape == (FRAMES, 3, 16, 24)
+
+
+def test_it_is_privileged_from_two_views_on_and_named_after_them() -> None:
+    assert [(each.name, each.privileged) for each in (HexPlane(), HexPlane(views=8))] == [
+        ("hexplane_1", False),
+        ("hexplane_8", True),
+    ]
+
+
+def test_a_clip_with_one_camera_is_refused_by_name() -> None:
+    clip = replace(source_clip(), others=None)
+    with pytest.raises(DataError, match=r"hexplane_2 wants 2 cameras of a scene, but clip scn1\.sample_00 has one"):
+        HexPlane(views=2, settings=TINY).predict(clip)
+
+
+def test_cameras_of_another_length_are_refused() -> None:
+    def longer(count: int) -> list[list[SceneView]]:
+        return [[view(RING[0])] * (FRAMES + 1)] * count
+
+    clip = replace(source_clip(), others=longer)
+    with pytest.raises(DataError, match="must show 2 frames as the source does, got 3"):
+        HexPlane(views=2, settings=TINY).predict(clip)
+
+
+def test_numbers_that_make_no_sense_are_refused() -> None:
+    with pytest.raises(DataError, match="1 view or more, got 0"):
+        HexPlane(views=0)
+    with pytest.raises(RecipeError, match="sides of the planes rise"):
+        HexPlaneSettings(sides=(32, 16))
+    with pytest.raises(RecipeError, match="counts above 0"):
+        HexPlaneSettings(rays=0)
+    with pytest.raises(DataError, match="got none"):
+        learn([], bounds(), TINY, frames=1)

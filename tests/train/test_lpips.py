@@ -1,0 +1,180 @@
+"""LPIPS on random weights, in files as they are published, against a straight-line calculation."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.testing import assert_close
+
+from gcd_model.errors import ShapeError
+from gcd_train.errors import DataError
+from gcd_train.metrics import Lpips
+
+VGG_PLAN = (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512)
+VGG_COMPARED, ALEX_COMPARED = (3, 8, 15, 22, 29), (1, 4, 7, 9, 11)
+CHANNELS = {"vgg": (64, 128, 256, 512, 512), "alex": (64, 192, 384, 256, 256)}
+
+
+def vgg_features() -> nn.Sequential:
+    layers: list[nn.Module] = []
+    inputs = 3
+    for outputs in VGG_PLAN:
+        if outputs:
+            layers += [nn.Conv2d(inputs, outputs, 3, padding=1), nn.ReLU()]
+            inputs = outputs
+        else:
+            layers.append(nn.MaxPool2d(2))
+    return nn.Sequential(*layers)
+
+
+def alex_features() -> nn.Sequential:
+    return nn.Sequential(
+        *(nn.Conv2d(3, 64, 11, stride=4, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2)),
+        *(nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2)),
+        *(nn.Conv2d(192, 384, 3, padding=1), nn.ReLU()),
+        *(nn.Conv2d(384, 256, 3, padding=1), nn.ReLU()),
+        *(nn.Conv2d(256, 256, 3, padding=1), nn.ReLU()),
+    )
+
+
+def write(folder: Path, name: str, features: nn.Sequential, heads: dict[str, Tensor]) -> Path:
+    """Both files, in the older of torch's two formats, as the published ones are."""
+    folder.mkdir(exist_ok=True)
+    body = {f"features.{key}": value for key, value in features.state_dict().items()}
+    body["classifier.0.weight"] = torch.zeros(2, 2)
+    file = "vgg16-397923af.pth" if name == "vgg" else "alexnet-owt-7be5be79.pth"
+    torch.save(body, folder / file, _use_new_zipfile_serialization=False)
+    torch.save(heads, folder / f"{name}.pth", _use_new_zipfile_serialization=False)
+    return folder
+
+
+def random_heads(name: str) -> dict[str, Tensor]:
+    return {f"lin{i}.model.1.weight": torch.rand(1, channels, 1, 1) for i, channels in enumerate(CHANNELS[name])}
+
+
+class Made:
+    """A network of random weights, and the folder that holds them."""
+
+    def __init__(self, folder: Path, name: str) -> None:
+        torch.manual_seed(0)
+        self.name, self.features = name, vgg_features() if name == "vgg" else alex_features()
+        self.heads = random_heads(name)
+        self.folder = write(folder, name, self.features, self.heads)
+        self.lpips = Lpips.open(self.folder)
+
+    @torch.no_grad()
+    def by_hand(self, view: Tensor, target: Tensor) -> float:
+        """One frame, [3, H, W] each, from brightness -1 to 1 with the shift and scale of the paper's authors."""
+        shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
+        x, y = ((2 * each - 1 - shift[:, None, None]) / scale[:, None, None] for each in (view, target))
+        total, stage = 0.0, 0
+        for place, layer in enumerate(self.features):
+            x, y = layer(x), layer(y)
+            if place in (VGG_COMPARED if self.name == "vgg" else ALEX_COMPARED):
+                apart = (x / (x.norm(dim=0) + 1e-10) - y / (y.norm(dim=0) + 1e-10)) ** 2
+                weight = self.heads[f"lin{stage}.model.1.weight"].view(-1, 1, 1)
+                total, stage = total + float((apart * weight).sum(dim=0).mean()), stage + 1
+        assert stage == 5
+        return total
+
+
+@pytest.fixture(scope="module", params=["alex", "vgg"])
+def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Made:
+    name: str = request.param
+    return Made(tmp_path_factory.mktemp("lpips") / name, name)
+
+
+@pytest.fixture(scope="module")
+def alex(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    return Made(tmp_path_factory.mktemp("alex") / "weights", "alex")
+
+
+def pictures(count: int, size: int = 40) -> Tensor:
+    return torch.rand(count, 3, size, size + 3, generator=torch.Generator().manual_seed(count))
+
+
+def test_distances_are_those_calculated_by_hand(made: Made) -> None:
+    lpips = made.lpips
+    view, target = pictures(2), 1 - pictures(2)
+    by_hand = [made.by_hand(a, b) for a, b in zip(view, target, strict=True)]
+    assert min(by_hand) > 0.01
+    assert lpips(view, target).tolist() == pytest.approx(by_hand, rel=1e-4)
+    assert lpips.network == made.name
+
+
+def test_a_picture_has_no_distance_to_itself_and_the_same_both_ways_to_another(alex: Made) -> None:
+    lpips = alex.lpips
+    first, second = pictures(2), 1 - pictures(2)
+    assert lpips(first, first).tolist() == [0.0, 0.0]
+    assert_close(lpips(first, second), lpips(second, first))
+
+
+def test_draws_together_are_as_far_as_each_alone(alex: Made) -> None:
+    lpips = alex.lpips
+    draws, target = torch.stack([pictures(2), 0.5 * pictures(2), 1 - pictures(2)]), pictures(2).flip(0)
+    together = lpips.of_draws(draws, target)
+    assert_close(together, torch.stack([lpips(each, target) for each in draws]))
+
+
+def test_weights_are_told_apart_by_their_identity(alex: Made, tmp_path: Path) -> None:
+    other = write(tmp_path / "other", "alex", alex.features, random_heads("alex"))
+    assert Lpips.open(alex.folder).identity == alex.lpips.identity
+    assert alex.lpips.identity.startswith("alex-")
+    assert Lpips.open(other).identity != alex.lpips.identity
+
+
+def test_pictures_too_small_for_the_network_are_refused(made: Made) -> None:
+    least = {"vgg": 16, "alex": 31}[made.name]
+    lpips = made.lpips
+    square = torch.rand(1, 3, least, least)
+    assert lpips(square, square).tolist() == [0.0]
+    with pytest.raises(ShapeError, match=f"at least {least} pixels"):
+        lpips(square[..., 1:], square[..., 1:])
+
+
+def test_a_folder_without_both_files_is_refused_and_what_it_holds_is_said(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"is no folder; wanted torchvision's vgg16-\*\.pth"):
+        Lpips.open(tmp_path / "nowhere")
+    with pytest.raises(DataError, match=r"got no \.pth file"):
+        Lpips.open(tmp_path)
+    torch.save({}, tmp_path / "vgg16-397923af.pth")
+    with pytest.raises(DataError, match=r"got vgg16-397923af\.pth"):
+        Lpips.open(tmp_path)
+
+
+def test_two_files_that_could_both_be_meant_are_refused(alex: Made, tmp_path: Path) -> None:
+    folder = write(tmp_path / "two", "alex", alex.features, alex.heads)
+    torch.save({}, folder / "alexnet-older.pth")
+    with pytest.raises(DataError, match=r"holds 2 files alexnet-\*\.pth"):
+        Lpips.open(folder)
+
+
+def test_linear_weights_of_the_other_network_are_refused(alex: Made, tmp_path: Path) -> None:
+    folder = write(tmp_path / "mixed", "alex", alex.features, random_heads("vgg"))
+    with pytest.raises(DataError, match=r"lin1\.model\.1\.weight .* must be \[1, 192, 1, 1\], got \[1, 128, 1, 1\]"):
+        Lpips.open(folder)
+
+
+def test_files_that_lack_a_tensor_or_hold_no_numbers_are_refused(alex: Made, tmp_path: Path) -> None:
+    lacking = {name: value for name, value in alex.heads.items() if "lin3" not in name}
+    with pytest.raises(DataError, match=r"lack lin3\.model\.1\.weight"):
+        Lpips.open(write(tmp_path / "lacking", "alex", alex.features, lacking))
+    broken = {**alex.heads, "lin0.model.1.weight": torch.full((1, 64, 1, 1), torch.nan)}
+    with pytest.raises(DataError, match="not finite"):
+        Lpips.open(write(tmp_path / "broken", "alex", alex.features, broken))
+
+
+def test_damaged_files_and_files_of_code_are_one_line(alex: Made, tmp_path: Path) -> None:
+    folder = write(tmp_path / "bad", "alex", alex.features, alex.heads)
+    for content in (b"", b"no weights at all", (folder / "alex.pth").read_bytes()[:700]):
+        (folder / "alex.pth").write_bytes(content)
+        with pytest.raises(DataError, match=r"cannot read the LPIPS weights .*alex\.pth") as caught:
+            Lpips.open(folder)
+        assert "\n" not in str(caught.value)
+    torch.save(nn.Linear(2, 2), folder / "alex.pth")  # a pickled object: reading it would run code
+    with pytest.raises(DataError, match="cannot read"):
+        Lpips.open(folder)
+    torch.save([torch.zeros(2)], folder / "alex.pth")
+    with pytest.raises(DataError, match="must be named tensors, got list"):
+        Lpips.open(folder)

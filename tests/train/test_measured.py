@@ -1,0 +1,256 @@
+from collections.abc import Sequence
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+from driving_plane import PlaneClips
+from skimage.metrics import structural_similarity
+from torch import Tensor
+
+from gcd_model.errors import NonFiniteError, ShapeError
+from gcd_model.geometry import CameraMount
+from gcd_train.baselines import CameraPair, Prediction, SourceClip, to_pictures
+from gcd_train.evaluation.clips import HeldOutClip
+from gcd_train.evaluation.measured import measure
+from gcd_train.evaluation.record import ClipRecord, Counted, RegionRecord
+from gcd_train.metrics import NO_CLASS, Lpips, confusion_matrix, masked_psnr, masked_ssim, psnr, ssim
+
+FRAMES, HEIGHT, WIDTH, CLASSES = 4, 32, 48, 14
+
+
+def held_out(*, visible: bool = True, classes: bool = True) -> HeldOutClip:
+    """The painted plane; its left half was visible, of the last frame nothing."""
+    clip = PlaneClips.make(1)[0]
+    seen = np.zeros((FRAMES, HEIGHT, WIDTH), bool)
+    seen[:-1, :, : WIDTH // 2] = True
+    return HeldOutClip(
+        key="plane-0",
+        scene="plane",
+        seen=SourceClip(
+            source=clip.source,
+            source_depth=clip.source_depth,
+            source_classes=clip.source_classes,
+            cameras=CameraPair.driving(CameraMount(), frames=FRAMES, height=HEIGHT, width=WIDTH),
+            fps=10.0,
+        ),
+        target=clip.target,
+        target_classes=clip.target_classes if classes else None,
+        visible=seen if visible else None,
+        change=(30.0, 10.0, 0.0),
+    )
+
+
+def noisy(clip: HeldOutClip, seed: int) -> Prediction:
+    """The target with noise, and class maps of which some pixels are wrong."""
+    random = torch.Generator().manual_seed(seed)
+    target = to_pictures(clip.target)
+    video = (target + 0.1 * torch.randn(target.shape, generator=random)).clamp(0, 1)
+    labels = torch.randint(0, CLASSES, (FRAMES, HEIGHT, WIDTH), generator=random).to(torch.uint8)
+    return Prediction(video=video, classes=labels)
+
+
+def drawn(clip: HeldOutClip, draws: int) -> Prediction:
+    return replace(noisy(clip, 0), more=tuple(noisy(clip, seed) for seed in range(1, draws)))
+
+
+def record_of(
+    clip: HeldOutClip, prediction: Prediction, *, lpips: Lpips | None = None, whole: bool = True
+) -> ClipRecord:
+    return measure(
+        clip, prediction, method="noisy", privileged=False, seconds=2.5, classes=CLASSES, lpips=lpips, whole=whole
+    )
+
+
+def matrix(counted: Sequence[Counted]) -> Tensor:
+    """Of all frames together."""
+    confusion = torch.zeros(CLASSES, CLASSES, dtype=torch.int64)
+    for frame in counted:
+        for true, said, count in frame:
+            confusion[true, said] += count
+    return confusion
+
+
+def mixed(record: ClipRecord, frame: int) -> float:
+    """Squared error of a frame from that of its visible and its occluded pixels."""
+    total = 0.0
+    for region in (record.regions["visible"], record.regions["occluded"]):
+        assert region.psnr_db is not None
+        decibel = region.psnr_db[0][frame]
+        total += 0.0 if decibel is None else region.pixels[frame] * 10 ** (-decibel / 10)
+    return total
+
+
+def test_visible_and_occluded_pixels_make_up_all_of_them() -> None:
+    clip = held_out()
+    record = record_of(clip, noisy(clip, 0))
+    whole, parts = record.regions["all"], [record.regions["visible"], record.regions["occluded"]]
+    assert whole.pixels == (1.0,) * FRAMES
+    assert [a + b for a, b in zip(parts[0].pixels, parts[1].pixels, strict=True)] == [1.0] * FRAMES
+    assert whole.psnr_db is not None
+    squared = [10 ** (-(each or 0.0) / 10) for each in whole.psnr_db[0]]
+    assert [mixed(record, frame) for frame in range(FRAMES)] == pytest.approx(squared, rel=1e-5)
+    counted = [part.confusion for part in (whole, *parts)]
+    assert all(each is not None for each in counted)
+    for frame in range(FRAMES):  # lengths of gradients too are means over pixels
+        lengths = [0.0 if part.gradient is None else (part.gradient[0][frame] or 0.0) for part in (whole, *parts)]
+        shares = [part.pixels[frame] for part in parts]
+        assert shares[0] * lengths[1] + shares[1] * lengths[2] == pytest.approx(lengths[0], rel=1e-5)
+        assert lengths[0] > 0.0
+    everything, seen, unseen = (matrix(each) for each in counted if each is not None)
+    assert everything.equal(seen + unseen)
+
+
+def test_the_target_itself_is_perfect_in_every_frame_and_region() -> None:
+    clip = held_out()
+    perfect = Prediction(video=to_pictures(clip.target), classes=torch.from_numpy(clip.target_classes.copy()))
+    record = record_of(clip, perfect)
+    assert record.regions["all"].psnr_db == ((pytest.approx(100.0),) * FRAMES,)
+    assert record.regions["occluded"].ssim == ((pytest.approx(1.0),) * FRAMES,)
+    assert record.regions["all"].gradient == (record.regions["all"].gradient_target,)
+    assert record.step == (record.step_target,)
+    for counted in (record.grid_confusion, record.regions["all"].confusion):
+        assert counted is not None
+        assert all(true == said for frame in counted for true, said, _ in frame)
+
+
+def test_figures_of_each_draw_and_region_are_those_of_the_metrics() -> None:
+    clip = held_out()
+    prediction = drawn(clip, 3)
+    record, target = record_of(clip, prediction), to_pictures(clip.target)
+    seen = torch.from_numpy(clip.visible)
+    assert (record.draws, record.frames, record.seconds) == (3, FRAMES, 2.5)
+    for number, draw in enumerate(prediction.draws):
+        found, visible = record.regions["all"], record.regions["visible"]
+        assert found.psnr_db[number] == pytest.approx(psnr(draw.video, target).tolist())
+        assert found.ssim[number] == pytest.approx(ssim(draw.video, target).tolist(), abs=1e-6)
+        assert visible.psnr_db[number][:-1] == pytest.approx(masked_psnr(draw.video, target, seen)[:-1].tolist())
+        assert visible.ssim[number][:-1] == pytest.approx(masked_ssim(draw.video, target, seen)[:-1].tolist(), abs=1e-6)
+
+
+def test_ssim_of_a_record_is_scikit_images() -> None:
+    clip = held_out()
+    prediction = noisy(clip, 0)
+    theirs = structural_similarity(
+        to_pictures(clip.target)[2].double().numpy(),
+        prediction.video[2].double().numpy(),
+        channel_axis=0,
+        data_range=1.0,
+    )
+    assert record_of(clip, prediction).regions["all"].ssim[0][2] == pytest.approx(theirs, abs=1e-9)
+
+
+def test_a_frame_without_visible_pixels_has_none_of_their_figures() -> None:
+    clip = held_out()
+    visible = record_of(clip, drawn(clip, 2)).regions["visible"]
+    assert visible.pixels[-1] == 0.0
+    assert [each[-1] for each in (*visible.psnr_db, *visible.ssim, visible.diversity)] == [None] * 5
+    assert visible.confusion[-1] == ()
+    assert None not in visible.diversity[:-1]
+
+
+def test_confusions_are_summed_over_draws() -> None:
+    clip = held_out()
+    prediction = drawn(clip, 2)
+    true = torch.from_numpy(clip.target_classes)
+    expected = sum(confusion_matrix(draw.classes, true, CLASSES) for draw in prediction.draws)
+    assert matrix(record_of(clip, prediction).regions["all"].confusion).equal(expected)
+
+
+def test_diversity_needs_two_draws() -> None:
+    clip = held_out()
+    assert record_of(clip, noisy(clip, 0)).regions["all"].diversity is None
+    same = replace(noisy(clip, 0), more=(noisy(clip, 0),))
+    assert record_of(clip, same).regions["all"].diversity == pytest.approx((0.0,) * FRAMES, abs=1e-7)
+    assert min(record_of(clip, drawn(clip, 2)).regions["occluded"].diversity) > 0.02
+
+
+def test_regions_are_left_out_where_nobody_knows_them_or_asks_for_them() -> None:
+    assert set(record_of(held_out(visible=False), noisy(held_out(), 0)).regions) == {"all"}
+    clip = held_out()
+    short, long = record_of(clip, noisy(clip, 0), whole=False), record_of(clip, noisy(clip, 0))
+    assert short == msgspec.structs.replace(long, regions={"all": long.regions["all"]})
+
+
+def test_a_method_that_only_names_classes_has_no_picture_figures() -> None:
+    clip = held_out()
+    record = record_of(clip, Prediction(classes=noisy(clip, 0).classes))
+    region = record.regions["occluded"]
+    assert (region.psnr_db, region.ssim, region.diversity, region.gradient, record.step, record.lpips) == (None,) * 6
+    assert region.confusion is not None
+    assert record.grid_confusion is not None
+    assert len(record.step_target) == FRAMES - 1
+    assert len(record.step_target) == FRAMES - 1
+
+
+def test_without_classes_there_is_nothing_to_confuse() -> None:
+    clip = held_out(classes=False)
+    record = record_of(clip, noisy(clip, 0))
+    assert (record.grid_confusion, record.regions["all"].confusion) == (None, None)
+    pictures = Prediction(video=noisy(clip, 0).video)
+    assert record_of(held_out(), pictures).regions["all"].confusion is None
+
+
+def test_target_pixels_without_a_class_count_nowhere() -> None:
+    clip = held_out()
+    labels = clip.target_classes.copy()
+    labels[:, :10] = NO_CLASS  # five rows of the class grid, four of them and half of one in the sky
+    record = record_of(replace(clip, target_classes=labels), noisy(clip, 0))
+    pixels = [sum(count for _, _, count in frame) for frame in record.regions["all"].confusion]
+    cells = [sum(count for _, _, count in frame) for frame in record.grid_confusion]
+    assert pixels == [(HEIGHT - 10) * WIDTH] * FRAMES
+    assert cells == [(HEIGHT - 10) // 2 * WIDTH // 2] * FRAMES
+
+
+def test_an_odd_row_does_not_stop_the_class_grid() -> None:
+    clip = held_out()
+    odd = replace(clip, target=clip.target[:, 1:], target_classes=clip.target_classes[:, 1:], visible=None)
+    whole = noisy(clip, 0)
+    record = record_of(odd, Prediction(video=whole.video[:, :, 1:], classes=whole.classes[:, 1:]))
+    assert sum(count for _, _, count in record.grid_confusion[0]) == (HEIGHT - 1) // 2 * WIDTH // 2
+
+
+class HalfAway:
+    """Says that every view is half a unit away from its target."""
+
+    def of_draws(self, draws: Tensor, targets: Tensor) -> Tensor:
+        assert draws.shape[1:] == targets.shape
+        return torch.full(draws.shape[:2], 0.5)
+
+
+def test_lpips_is_measured_of_every_draw_where_weights_were_given() -> None:
+    clip = held_out()
+    assert record_of(clip, drawn(clip, 2)).lpips is None
+    given = record_of(clip, drawn(clip, 2), lpips=HalfAway())
+    assert given.lpips == ((0.5,) * FRAMES,) * 2
+
+
+def test_a_record_survives_the_way_through_json() -> None:
+    clip = held_out()
+    record = record_of(clip, drawn(clip, 2))
+    assert msgspec.json.decode(msgspec.json.encode(record), type=ClipRecord) == record
+    assert isinstance(record.regions["all"], RegionRecord)
+
+
+def test_views_of_another_size_or_length_are_refused() -> None:
+    clip = held_out()
+    video = noisy(clip, 0).video
+    for wrong in (video[:, :, 1:], video[1:]):
+        with pytest.raises(ShapeError, match="one shape"):
+            record_of(clip, Prediction(video=wrong))
+
+
+def test_draws_that_differ_in_kind_are_refused() -> None:
+    clip = held_out()
+    blind = replace(noisy(clip, 0), more=(Prediction(classes=noisy(clip, 1).classes),))
+    with pytest.raises(ShapeError, match=r"pictures of one shape, all or none of them; got \[\[4, 3, 32, 48\], None\]"):
+        record_of(clip, blind)
+
+
+def test_a_view_that_is_no_number_somewhere_is_an_error_not_a_missing_figure() -> None:
+    clip = held_out()
+    video = noisy(clip, 0).video
+    video[1, 0, 3, 3] = torch.nan
+    with pytest.raises(NonFiniteError, match="noisy on plane-0"):
+        record_of(clip, Prediction(video=video))

@@ -1,0 +1,428 @@
+"""Reports from runs that are made up: tables, intervals, curves, galleries, failure cases."""
+
+import csv
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from made_records import FRAMES, note, record, region
+from typer.testing import CliRunner
+
+from gcd_train.cli.main import app
+from gcd_train.errors import RunError
+from gcd_train.evaluation.keeping import RunKeeper
+from gcd_train.evaluation.record import ClipRecord, RunNote
+from gcd_train.evaluation.tallies import Selection
+from gcd_train.reports import (
+    PAPER_TABLES,
+    Choices,
+    Interval,
+    Measured,
+    Run,
+    all_plots,
+    difference,
+    differences,
+    drawn,
+    gather,
+    main_tables,
+    make_report,
+    row_label,
+    worst_clips,
+)
+from gcd_train.reports.curves import angle_bins
+from gcd_train.reports.intervals import scene_weights
+from gcd_train.reports.table import Cell, Row, Table, to_csv, to_markdown
+
+WEIGHTS = {"weights": "0123456789ab", "steps": "4"}
+SCENES = 6
+
+
+def records(method: str, shift: float = 0.0, *, occluded: float | None = 15.0, **more: object) -> list[ClipRecord]:
+    """Two clips of each of six scenes, each scene of another PSNR, turning further from scene to scene."""
+    made: list[ClipRecord] = []
+    for number in range(2 * SCENES):
+        scene, sample = divmod(number, 2)
+        value = 18.0 + scene + 0.25 * sample + shift
+        regions = {"all": region((value,) * FRAMES)}
+        if occluded is not None:
+            regions["occluded"] = region((None, *(occluded + scene + shift,) * (FRAMES - 1)))
+        angle = 15.0 * scene * (-1) ** sample
+        made.append(
+            record(method, f"scn{scene:05d}.sample_{sample:02d}", regions=regions, change=(angle, 5.0, 0.0), **more)  # pyright: ignore[reportArgumentType]
+        )
+    return made
+
+
+def run(note_: RunNote, *methods: Sequence[ClipRecord], folder: str = "run") -> Run:
+    return Run(folder=Path(folder), note=note_, records=tuple(each for method in methods for each in method))
+
+
+def measured(*methods: Sequence[ClipRecord], **told: object) -> Measured:
+    names = {each[0].method: {} if each[0].method in ("copy_source", "oracle") else WEIGHTS for each in methods}
+    (found,) = gather([run(note(methods=names, **told), *methods)])  # pyright: ignore[reportArgumentType]
+    return Measured(of=found)
+
+
+# --- intervals ----------------------------------------------------------------------------------------------------
+
+
+def test_every_draw_takes_as_many_scenes_as_there_are_and_the_same_seed_takes_the_same() -> None:
+    weights = scene_weights(7, draws=50, seed=1)
+    assert weights.shape == (50, 7)
+    np.testing.assert_array_equal(weights.sum(axis=1), 7.0)
+    np.testing.assert_array_equal(weights, scene_weights(7, draws=50, seed=1))
+    assert not np.array_equal(weights, scene_weights(7, draws=50, seed=2))
+
+
+def test_an_interval_of_a_mean_is_that_of_a_plain_bootstrap() -> None:
+    found = drawn(records("a"), Selection(), seed=4).interval("psnr_db")
+    scenes = 18.125 + np.arange(SCENES)
+    random = np.random.default_rng(0)
+    plain = scenes[random.integers(0, SCENES, size=(20_000, SCENES))].mean(axis=1)
+    assert found.value == pytest.approx(scenes.mean())
+    assert (found.low, found.high) == pytest.approx(tuple(np.quantile(plain, [0.025, 0.975])), abs=0.1)
+
+
+def test_intervals_of_pooled_classes_lie_around_the_figure_of_all() -> None:
+    clips = [
+        record("a", f"s{scene}", regions={"all": region(counts=[(0, 0, 50), (1, 1, 10 + scene), (1, 0, 9)])})
+        for scene in range(5)
+    ]
+    found = drawn(clips, Selection()).interval("miou_common")
+    assert found.low < found.value < found.high
+    assert found.value == pytest.approx((250 / 295 + 60 / 105) / 2)
+
+
+def test_a_difference_is_paired_so_a_constant_lead_has_a_narrow_interval() -> None:
+    first, other = (drawn(records(name, shift), Selection()) for name, shift in (("a", 0.5), ("b", 0.0)))
+    apart = difference(first, other, "psnr_db")
+    assert (apart.value, apart.low, apart.high) == pytest.approx((0.5, 0.5, 0.5))
+    assert apart.off_zero
+    assert first.interval("psnr_db").high - first.interval("psnr_db").low > 1.0
+
+
+def test_swapping_the_two_turns_a_difference_round() -> None:
+    first, other = (drawn(records(name, shift), Selection(), seed=2) for name, shift in (("a", 0.5), ("b", 0.0)))
+    there, back = difference(first, other, "ssim"), difference(other, first, "ssim")
+    assert (there.value, there.low, there.high) == pytest.approx((-back.value, -back.high, -back.low))
+
+
+def test_one_scene_has_no_bounds_and_no_claim() -> None:
+    found = drawn(records("a")[:2], Selection()).interval("psnr_db")
+    assert found.value == pytest.approx(18.125)
+    assert math.isnan(found.low)
+    assert not found.off_zero
+
+
+# --- tables -------------------------------------------------------------------------------------------------------
+
+
+def lines(text: str) -> list[dict[str, str]]:
+    return list(csv.DictReader(text.splitlines()))
+
+
+def test_a_table_of_the_paper_has_its_rows_and_nobody_is_given_a_printed_figure() -> None:
+    of = measured(records("gradual-max90"), kind="kubric", protocol="paper")
+    main, ablation = main_tables(of)
+    text = to_markdown(main)
+    (ours,) = [line for line in text.splitlines() if "gradual-max90" in line]
+    assert "20.6" in ours  # measured
+    assert "20.3, 0.587, 0.408, 18.6, 0.527" in ours  # printed, in a column of its own
+    for name in ("HexPlane", "4D-GS", "DynIBaR", "Vanilla SVD", "ZeroNVS", "Reproject RGB-D"):
+        (line,) = [line for line in text.splitlines() if line.startswith(f"| {name} |")]
+        assert line.count("not run") == 5
+    assert len(ablation.rows) == 8
+    direct = next(row for row in lines(to_csv(ablation)) if row["row"] == "GCD (direct, max 90, finetuned)")
+    assert (direct["method"], direct["PSNR all"], direct["PSNR all paper"]) == ("not run", "", "17.23")
+
+
+def test_without_weights_for_lpips_its_column_says_so() -> None:
+    main, _ = main_tables(measured(records("a"), records("b", lpips=0.25)))
+    cells = {row.method: str(row.cells[2]) for row in main.rows}
+    assert cells == {"a": "no weights given", "b": "0.250 [0.250, 0.250]"}
+
+
+def test_a_row_says_how_many_of_the_clips_it_has_and_what_it_was_given() -> None:
+    main, _ = main_tables(measured(records("a"), records("oracle", privileged=True)[:5]))
+    assert [(row.method, row.clips) for row in main.rows] == [("a", "12 of 12"), ("oracle *", "5 of 12")]
+    assert re.match(r"Frames 2-\d+ of 12 clips of 6 scenes\.", main.notes[0])
+
+
+def test_figures_of_the_table_are_of_its_frames() -> None:
+    clip = record("a", regions={"all": region((100.0, 10.0, 20.0, 30.0))})
+    main, last = main_tables(measured([clip]))
+    assert [str(table.rows[0].cells[0]) for table in (main, last)] == ["20.00", "30.00"]
+
+
+def test_clips_of_our_own_with_classes_have_columns_for_both() -> None:
+    counted = [
+        record("a", f"s{n}", regions={"all": region((20.0,) * 4, counts=[(0, 0, 9), (1, 0, 1)])}) for n in (1, 2)
+    ]
+    main, _ = main_tables(measured(counted, kind="driving", classes=("sky", "road")))
+    assert main.headings == ("PSNR all", "SSIM all", "LPIPS all", "mIoU all")
+    assert str(main.rows[0].cells[3]) == "0.450 [0.450, 0.450]"
+
+
+def test_pixels_that_nobody_knows_are_unknown_in_a_table_of_the_paper() -> None:
+    main, _ = main_tables(measured(records("gradual-90", occluded=None), kind="kubric", protocol="released"))
+    (row,) = [row for row in main.rows if row.method]
+    assert [str(cell) for cell in row.cells[3:]] == ["unknown", "unknown"]
+    assert "Unknown" in main.notes[1]
+
+
+@pytest.mark.parametrize(
+    ("method", "details", "table", "label"),
+    [
+        ("hexplane_4", {}, 0, "HexPlane"),
+        ("4D-GS", {}, 2, "4D-GS"),
+        ("Zero-NVS", {}, 0, "ZeroNVS"),
+        ("vanilla_svd", {}, 0, "Vanilla SVD"),
+        ("reproject_rgbd", {}, 2, "Reproject RGB-D"),
+        ("reproject_semd", {}, 4, "Reproject Sem-D"),
+        ("kubric_direct_max180", WEIGHTS, 1, "GCD (direct, max 180, finetuned)"),
+        ("mine", {"weights": "ab", "family": "kubric90"}, 0, "GCD (gradual, max 90, finetuned)"),
+        ("mine", {"weights": "sha 1902", "steps": "25"}, 0, None),
+        ("study-direct-scratch", WEIGHTS, 3, "GCD (direct, scratch)"),
+        ("pardom_gradual_semantic", WEIGHTS, 5, "GCD (gradual, finetuned)"),
+        ("copy_source", {}, 2, None),
+    ],
+)
+def test_a_method_finds_its_row(method: str, details: Mapping[str, str], table: int, label: str | None) -> None:
+    found = row_label(method, details, PAPER_TABLES[table])
+    assert found == label
+    assert found is None or any(row.label == found for row in PAPER_TABLES[table].rows)
+
+
+def test_a_user_may_say_where_a_method_stands() -> None:
+    of = measured(records("mine"), kind="kubric", protocol="paper")
+    placed = Measured(of=of.of, rows={"mine": "DynIBaR"})
+    table = main_tables(placed)[0]
+    assert [row.method for row in table.rows if row.label == "DynIBaR"] == ["mine"]
+
+
+def test_what_the_paper_does_not_have_stands_below() -> None:
+    table = main_tables(measured(records("copy_source"), kind="driving", protocol="released"))[0]
+    assert (table.rows[-1].label, table.rows[-1].method) == ("not in the paper", "copy_source")
+
+
+def test_a_bar_in_a_name_breaks_no_table() -> None:
+    cell = Cell(figure=Interval(value=1.0, low=0.5, high=1.5))
+    table = Table(name="t", title="T", headings=("x",), rows=(Row(label="a|b", cells=(cell,)),))
+    assert "| a\\|b |  |  | 1.00 [0.50, 1.50] |" in to_markdown(table)
+    assert lines(to_csv(table))[0]["x low"] == "0.5"
+
+
+# --- differences --------------------------------------------------------------------------------------------------
+
+
+def test_a_claim_is_made_only_where_zero_lies_outside() -> None:
+    noisy = [
+        record("noisy", each.key, regions={"all": region((18.0 + number % 12 * 0.5,) * 4)})
+        for number, each in enumerate(records("a"))
+    ]
+    of = measured(records("a", 1.0), records("b"), noisy)
+    found = {(each.other, each.column.heading): each for each in differences(of, of.of.method("a"))}
+    assert found["b", "PSNR all"].verdict == "better"
+    assert found["b", "PSNR occluded"].verdict == "better"
+    assert found["b", "SSIM all"].verdict == "open"
+    back = {(each.other, each.column.heading): each for each in differences(of, of.of.method("b"))}
+    assert back["a", "PSNR all"].verdict == "worse"
+
+
+def test_less_lpips_is_better() -> None:
+    of = measured(records("a", lpips=0.2), records("b", lpips=0.3))
+    (found,) = [each for each in differences(of, of.of.method("a")) if each.column.figure == "lpips"]
+    assert (found.apart.value, found.verdict) == (pytest.approx(-0.1), "better")
+
+
+def test_methods_are_compared_on_the_clips_that_both_have() -> None:
+    of = measured(records("a"), records("b", 1.0)[3:])
+    found = differences(of, of.of.method("a"))
+    assert {each.clips for each in found} == {9}
+    assert found[0].apart.value == pytest.approx(-1.0)
+
+
+def test_a_method_that_was_not_run_is_no_lead() -> None:
+    of = measured(records("a"))
+    with pytest.raises(RunError, match="no method is called 'c'"):
+        of.of.method("c")
+
+
+# --- runs ---------------------------------------------------------------------------------------------------------
+
+
+def test_runs_on_the_same_clips_make_one_set_and_others_their_own() -> None:
+    one = run(note(methods={"a": WEIGHTS}), records("a"), folder="one")
+    two = run(note(methods={"b": WEIGHTS, "a": WEIGHTS}), records("b"), records("a"), folder="two")
+    other = run(note(methods={"a": WEIGHTS}, data_identity="else"), records("a"), folder="three")
+    sets = gather([one, other, two])
+    assert [[method.name for method in each.methods] for each in sets] == [["a", "b"], ["a"]]
+    assert sets[0].method("a").folder == Path("one")
+
+
+def test_two_methods_of_one_name_are_refused() -> None:
+    one = run(note(methods={"a": WEIGHTS}), records("a"), folder="one")
+    two = run(note(methods={"a": {"weights": "other"}}), records("a"), folder="two")
+    with pytest.raises(RunError, match="a is another method in one than in two"):
+        gather([one, two])
+
+
+def test_the_same_clips_measured_in_another_way_are_refused() -> None:
+    one, two = (run(note(protocol=name), records("a"), folder=name) for name in ("paper", "released"))
+    with pytest.raises(RunError, match="released has protocol released, paper has paper"):
+        gather([one, two])
+
+
+def test_last_frames_of_two_ways_to_the_same_goals_are_compared(tmp_path: Path) -> None:
+    folders = [tmp_path / "gradual", tmp_path / "direct"]
+    for number, folder in enumerate(folders):
+        keeper, name = RunKeeper(folder), folder.name
+        keeper.begin(note(methods={name: WEIGHTS, "copy_source": {}}, data_identity=name))
+        for each in (*records(name, 1.0 - number), *records("copy_source", -number)):
+            keeper.keep(each)
+    text = make_report(folders, tmp_path / "out", Choices(drawn=False, worst=0)).read_text()
+    together = text.split("## The last frame together")[1]
+    assert "### gradual against the others, last frame" in together
+    assert "| direct | **+1.00 [+1.00, +1.00]** better" in together
+    assert "| copy_source | **+1.00 [+1.00, +1.00]** better" in together  # of the first set
+    assert "frames 2-4" not in together
+    assert (tmp_path / "out" / "last-frame-1" / "tables" / "last_frame.csv").is_file()
+
+
+# --- curves and failures ------------------------------------------------------------------------------------------
+
+
+def test_error_against_angle_is_of_the_last_frame_and_either_way_round() -> None:
+    of = measured(records("a"))
+    (curve,) = next(plot for plot in all_plots(of) if plot.name == "psnr_by_angle").curves
+    assert [point.x for point in curve.points] == [0.0, 15.0, 30.0, 45.0, 60.0, 75.0]
+    assert [point.y.value for point in curve.points] == pytest.approx([18.125 + scene for scene in range(SCENES)])
+    assert {point.clips for point in curve.points} == {2}
+
+
+def test_many_angles_are_put_together_in_steps_of_15_degrees() -> None:
+    assert angle_bins([0.0, 15.04, 180.0]) == [0.0, 15.0, 180.0]
+    assert angle_bins([float(angle) for angle in range(20)])[14:17] == [7.5, 22.5, 22.5]
+    assert angle_bins([180.0, *map(float, range(20))])[0] == 172.5
+
+
+def test_similarity_is_shown_over_the_views_that_hexplane_is_given() -> None:
+    of = measured(records("hexplane_8"), records("hexplane_1"), records("a"))
+    plot = next(plot for plot in all_plots(of) if plot.name == "ssim_by_views")
+    assert [(curve.name, [point.x for point in curve.points]) for curve in plot.curves] == [
+        ("HexPlane, all", [1.0, 8.0]),
+        ("HexPlane, occluded", [1.0, 8.0]),
+    ]
+    assert [level.name for level in plot.levels] == ["a, all"]
+
+
+def test_one_path_for_all_has_no_angles_and_its_frames_begin_with_the_second() -> None:
+    fixed = [record("a", f"s{number}") for number in range(3)]
+    (plot,) = all_plots(measured(fixed))
+    assert plot.name == "by_frame"
+    assert [point.x for point in plot.curves[0].points] == [2, 3, 4]
+
+
+def test_the_worst_clips_are_named_with_who_does_best_there() -> None:
+    of = measured(records("a"), records("b", 1.0), records("c", -1.0))
+    found = worst_clips(of, of.of.method("a"), 2)
+    assert [each.key for each in found] == ["scn00000.sample_00", "scn00000.sample_01"]
+    assert (found[0].value, found[0].occluded, found[0].best, found[0].best_value) == (18.0, 15.0, "b", 19.0)
+
+
+# --- the whole report ---------------------------------------------------------------------------------------------
+
+
+def picture(folder: Path, shade: int, frames: int = FRAMES) -> None:
+    folder.mkdir(parents=True)
+    for number in range(frames):
+        assert cv2.imwrite(str(folder / f"{number:04d}.png"), np.full((32, 47, 3), shade + number, np.uint8))
+
+
+def kept(folder: Path, *, views: bool = True) -> Path:
+    """A run of two methods on the disk."""
+    keeper, both = RunKeeper(folder), ("gradual (1 step)", "copy_source")
+    keeper.begin(note(methods={both[0]: WEIGHTS, both[1]: {}}))
+    for number, method in enumerate(both):
+        for each in records(method, -number):
+            keeper.keep(each)
+            if views and each.key.endswith("00"):
+                at = keeper.views(method, each.key)
+                for name, shade in (("source", 10), ("target", 200), ("sample_0", 60 + 60 * number)):
+                    picture(at / name, shade)
+    return folder
+
+
+def test_a_report_is_written_from_records_and_kept_frames(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    given = ("report", kept(tmp_path / "run"), "--out", out, "--clips", 2, "--worst", 1)
+    done = CliRunner().invoke(app, [str(each) for each in given])
+    assert done.exit_code == 0, done.output
+    text = (out / "report.md").read_text()
+    assert "gcd-train evaluate --data held-out --out run" in text
+    assert "digest 0123456789ab" in text
+    assert "weights 0123456789ab, steps 4" in text
+    assert "**+1.00 [+1.00, +1.00]** better" in text
+    assert "Of 6 scenes alone" in text
+    assert "nan" not in text
+    links = [part.split(")")[0] for part in text.split("](")[1:]]
+    assert [link for link in links if not (out / link).is_file()] == []
+    assert {"tables/main.csv", "tables/figures.csv", "plots/psnr_by_angle.png", "gallery/sheet.png"} <= set(links)
+    figures = lines((out / "tables" / "figures.csv").read_text())
+    (last,) = [
+        each
+        for each in figures
+        if (each["method"], each["frames"], each["pixels"], each["figure"])
+        == ("copy_source", "last", "occluded", "psnr_db")
+    ]
+    assert float(last["value"]) == pytest.approx(14.0 + 2.5)
+
+
+def test_a_gallery_has_source_methods_and_target_and_plays(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    make_report([kept(tmp_path / "run")], out, Choices(clips=2, worst=0, drawn=False))
+    sheet = cv2.imread(str(out / "gallery" / "sheet.png"))
+    assert sheet is not None
+    height = 3 * 14 + 4  # of a row: its label's three lines, as these pictures are lower, and a gap
+    assert sheet.shape == (2 * 4 * height, 140 + FRAMES * (47 + 4), 3)
+    assert [int(sheet[row * height, 141, 0]) for row in range(4)] == [10, 60, 120, 200]
+    video = cv2.VideoCapture(str(next((out / "gallery").glob("*.mp4"))))
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == FRAMES + 7  # the last is held
+    assert video.get(cv2.CAP_PROP_FRAME_WIDTH) == 4 * (47 + 4)
+
+
+def test_a_run_without_kept_frames_has_a_report_without_a_gallery(tmp_path: Path) -> None:
+    path = make_report([kept(tmp_path / "run", views=False)], tmp_path / "out", Choices(drawn=False))
+    assert "evaluate with `--views all`" in path.read_text()
+    assert not (tmp_path / "out" / "gallery").exists()
+    assert not (tmp_path / "out" / "plots" / "by_frame.png").exists()
+    assert (tmp_path / "out" / "plots" / "by_frame.csv").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "hint"),
+    [
+        (("--row", "mine"), 78, "METHOD=ROW"),
+        (("--lead", "nobody"), 73, "no method is called 'nobody'"),
+        (("--row", "nobody=DynIBaR"), 73, "no method is called 'nobody'"),
+    ],
+)
+def test_a_wrong_option_is_said_in_one_line(tmp_path: Path, arguments: tuple[str, ...], code: int, hint: str) -> None:
+    given = ("report", str(kept(tmp_path / "run", views=False)), "--out", str(tmp_path / "out"), "--no-plots")
+    done = CliRunner().invoke(app, [*given, *arguments])
+    assert done.exit_code == code
+    assert hint in done.output
+
+
+def test_an_empty_run_is_refused(tmp_path: Path) -> None:
+    RunKeeper(tmp_path).begin(note(methods={"a": {}}))
+    with pytest.raises(RunError, match="holds no record yet"):
+        Run.read(tmp_path)
+    (tmp_path / "run.json").write_text(json.dumps({"command": 1}))
+    with pytest.raises(RunError, match="no note of a run"):
+        Run.read(tmp_path)

@@ -1,0 +1,172 @@
+"""Frames that other methods saved: found in every layout, checked, and scored as they are."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from driving_plane import PlaneClips
+
+from gcd_model.geometry import CameraMount
+from gcd_train.baselines import CameraPair, SavedFrames, SourceClip, find_draws, to_pictures
+from gcd_train.datasets.skips import FileFault
+from gcd_train.errors import DataError
+
+FRAMES, HEIGHT, WIDTH = 3, 32, 48
+KEY = "scn02900.sample_02"
+PLANE = PlaneClips.make(1, frames=FRAMES, height=HEIGHT, width=WIDTH)
+CLIP = PLANE[0]
+SEEN = SourceClip(
+    source=CLIP.source,
+    source_depth=CLIP.source_depth,
+    source_classes=CLIP.source_classes,
+    cameras=CameraPair.driving(CameraMount(), frames=FRAMES, height=HEIGHT, width=WIDTH),
+    fps=10.0,
+    key=KEY,
+)
+
+
+def save(folder: Path, video: np.ndarray = CLIP.target, *, first: int = 0, suffix: str = ".png") -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, frame in enumerate(video, start=first):
+        assert cv2.imwrite(str(folder / f"{number:04d}{suffix}"), np.ascontiguousarray(frame[..., ::-1]))
+    return folder
+
+
+def save_video(path: Path, video: np.ndarray = CLIP.target) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    size = (video.shape[2], video.shape[1])
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, size)
+    for frame in video:
+        writer.write(np.ascontiguousarray(frame[..., ::-1]))
+    writer.release()
+    return path
+
+
+def predicted(folder: Path) -> list[torch.Tensor]:
+    made = SavedFrames.open("other", folder).predict(SEEN)
+    assert all(draw.classes is None for draw in made.draws)
+    return [draw.video for draw in made.draws if draw.video is not None]
+
+
+def assert_target(draws: list[torch.Tensor], count: int = 1) -> None:
+    assert len(draws) == count
+    assert all(torch.equal(draw, to_pictures(CLIP.target)) for draw in draws)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_pictures_in_the_clips_folder_are_its_only_draw(tmp_path: Path, first: int) -> None:
+    save(tmp_path / KEY, first=first)
+    assert_target(predicted(tmp_path))
+
+
+def test_each_samples_folder_is_a_draw_in_the_order_of_its_number(tmp_path: Path) -> None:
+    for number in (10, 2, 0):
+        save(tmp_path / KEY / f"sample_{number}", CLIP.target // (number + 1))
+    save(tmp_path / KEY / "target")
+    save(tmp_path / KEY / "source", CLIP.source)
+    draws = predicted(tmp_path)
+    assert_target(draws[:1])
+    assert [torch.equal(d, to_pictures(CLIP.target // n)) for d, n in zip(draws, (1, 3, 11), strict=True)] == [True] * 3
+
+
+@pytest.mark.parametrize("place", [f"{KEY}.mp4", f"{KEY}/sample_0.mp4", "extra/t_000_n0_c02_scn02900_fs0_pred_s0.mp4"])
+def test_videos_are_read_too(tmp_path: Path, place: str) -> None:
+    save_video(tmp_path / place)
+    (draw,) = predicted(tmp_path)
+    assert draw.shape == (FRAMES, 3, HEIGHT, WIDTH)
+    assert (draw - to_pictures(CLIP.target)).abs().mean() < 0.05
+
+
+def test_pictures_win_over_a_video_of_the_same_name(tmp_path: Path) -> None:
+    for place in (f"{KEY}/sample_0", "extra/t_000_n0_c02_scn02900_fs0_pred_s0"):
+        save(tmp_path / place)
+        save_video(tmp_path / f"{place}.mp4", CLIP.target // 2)
+    assert_target(predicted(tmp_path))
+    assert_target(predicted(tmp_path / "extra"))
+
+
+@pytest.mark.parametrize("inside", ["extra", ""])
+def test_outputs_of_the_papers_script_are_found_by_scene_and_trajectory(tmp_path: Path, inside: str) -> None:
+    wrong = CLIP.target // 2
+    for control, scene in (("_c00", "scn02900"), ("_c02", "scn02901"), ("_c12", "scn02900"), ("", "scn02900")):
+        save(tmp_path / inside / f"kg90_000_n0{control}_{scene}_fs2_fr12_az30_el5_rd0_pred_s0", wrong)
+    for sample in (0, 1):
+        save(tmp_path / inside / f"kg90_007_n0_c02_scn02900_fs2_fr12_az30_el5_rd0_pred_s{sample}")
+    save(tmp_path / inside / "kg90_007_n0_c02_scn02900_fs2_fr12_az30_el5_rd0_gt", wrong)
+    assert_target(predicted(tmp_path), count=2)
+
+
+def test_an_output_without_a_number_is_the_first_trajectorys(tmp_path: Path) -> None:
+    save(tmp_path / "extra" / "kg90_000_n0_scn02900_fs2_fr12_az30_el5_rd0_pred_s0")
+    assert len(find_draws(tmp_path, "scn02900.sample_00")) == len(find_draws(tmp_path, "scn02900")) == 1
+    with pytest.raises(DataError, match="holds no frames"):
+        find_draws(tmp_path, KEY)
+
+
+def test_outputs_of_several_models_are_not_mixed(tmp_path: Path) -> None:
+    for model in (0, 1):
+        save(tmp_path / "extra" / f"kg90_000_n{model}_c02_scn02900_fs2_pred_s0")
+    with pytest.raises(DataError, match=f"clip {KEY} several times: kg90_000_n0.*kg90_000_n1"):
+        find_draws(tmp_path, KEY)
+
+
+def test_a_clip_that_is_not_there_is_named_with_what_was_looked_for(tmp_path: Path) -> None:
+    save(tmp_path / "another")
+    (tmp_path / KEY).mkdir()
+    with pytest.raises(DataError, match=f"holds no frames for clip {KEY}: wanted {KEY}/0000.png"):
+        predicted(tmp_path)
+
+
+def test_a_name_that_is_a_path_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"must be a file name, got '\.\./x'"):
+        find_draws(tmp_path, "../x")
+
+
+def test_another_length_or_size_is_refused_not_resized(tmp_path: Path) -> None:
+    save(tmp_path / "short" / KEY, CLIP.target[:2])
+    with pytest.raises(DataError, match=f"holds 2 frames, clip {KEY} has 3"):
+        predicted(tmp_path / "short")
+    save(tmp_path / "small" / KEY, CLIP.target[:, ::2])
+    with pytest.raises(DataError, match="frame 0 is 48 x 16, the target 48 x 32"):
+        predicted(tmp_path / "small")
+
+
+def test_a_missing_frame_is_noticed(tmp_path: Path) -> None:
+    save(tmp_path / KEY)
+    (tmp_path / KEY / "0001.png").unlink()
+    with pytest.raises(DataError, match=r"holds frames \[0, 2\]"):
+        predicted(tmp_path)
+
+
+def test_a_damaged_picture_or_video_is_named(tmp_path: Path) -> None:
+    save(tmp_path / "a" / KEY)
+    (tmp_path / "a" / KEY / "0001.png").write_bytes(b"none")
+    with pytest.raises(FileFault, match=r"0001\.png"):
+        predicted(tmp_path / "a")
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / f"{KEY}.mp4").write_bytes(b"none")
+    with pytest.raises(FileFault, match="holds no frame that can be decoded"):
+        predicted(tmp_path / "b")
+
+
+def test_painted_frames_become_class_maps_by_the_nearest_colour(tmp_path: Path) -> None:
+    colours = np.array([kind.colour for kind in PLANE.classes], np.int64)
+    painted = (colours[CLIP.target_classes] + np.array([6, -6, 5])).clip(0, 255).astype(np.uint8)
+    save(tmp_path / KEY, painted)
+    made = SavedFrames.open("other", tmp_path, painted=PLANE.classes).predict(SEEN)
+    assert made.video is None
+    assert made.classes is not None
+    assert np.array_equal(made.classes.numpy(), CLIP.target_classes)
+
+
+def test_a_folder_that_is_none_is_refused_at_once(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="which is no folder; give NAME=FOLDER"):
+        SavedFrames.open("other", tmp_path / "nowhere")
+
+
+def test_a_saved_method_may_be_privileged(tmp_path: Path) -> None:
+    assert not SavedFrames.open("other", tmp_path).privileged
+    assert replace(SavedFrames.open("4d_gs", tmp_path), privileged=True).privileged

@@ -1,0 +1,292 @@
+"""Clips of whole scenes: which there are, the same in any list, and what methods are shown of them."""
+
+import json
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_scenes4d import draw, kubric_poses, write_driving, write_kubric
+from typer.testing import CliRunner
+
+from gcd_model.geometry import Spherical
+from gcd_train.cli.main import app
+from gcd_train.datasets.clip_frames import FrameSampling
+from gcd_train.datasets.public_splits import public_split, public_split_names
+from gcd_train.datasets.trajectories import OrbitSampling
+from gcd_train.errors import DataError, RecipeError
+from gcd_train.evaluation import EvaluationSet, read_run
+from gcd_train.evaluation.opening import Choice, SceneCuts, data_kind, open_scenes, usual_samples
+from gcd_train.evaluation.protocols import PAPER_SOURCE, RELEASED_SOURCE, DrawnControls, FrameBounds, ReleasedControl
+from gcd_train.evaluation.scene_set import far_apart
+from gcd_train.pointcloud import visibility
+
+VIEWS = tuple(f"view{number}" for number in range(4))
+KUBRIC = SceneCuts(frames=3, height=32, width=48, cameras=VIEWS, bounds=FrameBounds(start=0, skip=1))
+DRIVING = replace(KUBRIC, cameras=("camera0", "yaw-0", "yaw-60"))
+DRAWN = DrawnControls(
+    seed=3, clips=4, frames=FrameSampling(clip=14, strides=(1, 2), latest_start=6), orbit=OrbitSampling()
+)
+
+
+@pytest.fixture(scope="module")
+def kubric(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("kubric")
+    for number in (2900, 2901):
+        write_kubric(root, number, frames=4)
+    return root
+
+
+@pytest.fixture(scope="module")
+def driving(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("driving")
+    write_driving(root, 5, frames=4)
+    return root
+
+
+def opened(root: Path, cuts: SceneCuts, **choice: object) -> EvaluationSet:
+    return open_scenes(root, Choice(**choice), cuts).clips  # pyright: ignore[reportArgumentType]
+
+
+# --- which clips ---------------------------------------------------------------------------------------------------
+
+
+def test_drawn_clips_start_at_the_papers_source_and_stay_in_bounds() -> None:
+    for scene in ("scn02900", "scn02999"):
+        for name in DRAWN.names(scene):
+            control = DRAWN.control(scene, name, 60)
+            assert control.start == PAPER_SOURCE == Spherical(azimuth_deg=15.0, elevation_deg=5.0, radius_m=15.0)
+            assert control.goal is not None
+            change = control.goal - PAPER_SOURCE
+            assert abs(change.azimuth_deg) <= 90
+            assert -5 <= change.elevation_deg <= 30
+            assert abs(change.radius_m) <= 3
+            assert control.frame_skip in (1, 2)
+            assert 0 <= control.frame_start <= 6
+
+
+def test_a_scene_has_the_same_clips_whatever_others_there_are_and_another_seed_has_others() -> None:
+    first = [DRAWN.control("scn02900", name, 60) for name in DRAWN.names("scn02900")]
+    assert first == [DRAWN.control("scn02900", name, 60) for name in DRAWN.names("scn02900")]
+    assert len({str(each.goal) for each in first}) == 4
+    assert first[0].goal != DRAWN.control("scn02901", "sample_00", 60).goal
+    assert first[0].goal != replace(DRAWN, seed=4).control("scn02900", "sample_00", 60).goal
+
+
+def test_frames_of_the_command_line_leave_the_goals_as_they_are() -> None:
+    told = replace(DRAWN, bounds=FrameBounds(start=5, skip=3)).control("scn02900", "sample_01", 60)
+    assert (told.frame_start, told.frame_skip) == (5, 3)
+    assert told.goal == DRAWN.control("scn02900", "sample_01", 60).goal
+
+
+def test_the_released_script_makes_one_clip_of_its_own_angles() -> None:
+    control = ReleasedControl(orbit=True, bounds=FrameBounds(skip=4)).control("scn02900", "sample_00", 60)
+    assert control.start == RELEASED_SOURCE
+    assert control.goal == Spherical(azimuth_deg=50.0, elevation_deg=25.0, radius_m=15.0)
+    assert (control.frame_start, control.frame_skip) == (0, 4)
+
+
+def controls(folder: Path, scenes: list[str], samples: int = 3) -> Path:
+    """From where the tiny scenes' first camera stands."""
+    entry = {"frame_start": 1, "frame_skip": 1, "spherical_start": [20, 35, 15], "spherical_end": [50, 40, 14]}
+    path = folder / "controls.json"
+    path.write_text(json.dumps({scene: {f"sample_{k:02d}": entry for k in range(samples)} for scene in scenes}))
+    return path
+
+
+def test_a_control_list_says_which_clips_there_are_and_who_is_missing_is_told(kubric: Path, tmp_path: Path) -> None:
+    listed = controls(tmp_path, ["test/scn02901", "scn02999"])
+    found = open_scenes(kubric, Choice(), replace(KUBRIC, controls=listed, clips=2, bounds=FrameBounds()))
+    assert found.clips.keys == ("scn02901.sample_00", "scn02901.sample_01")
+    assert "scn02900" in "".join(found.notes)
+    clip = found.clips.clip("scn02901.sample_01")
+    assert clip.change == pytest.approx((30.0, 5.0, -1.0))
+    assert clip.seen.fps == 24.0
+
+
+def test_a_source_that_is_a_camera_of_the_scene_has_its_own_depth(kubric: Path, tmp_path: Path) -> None:
+    cuts = replace(KUBRIC, controls=controls(tmp_path, ["scn02900"]), clips=1, bounds=FrameBounds())
+    seen = opened(kubric, cuts).clip("scn02900.sample_00").seen
+    true = draw(seen.cameras.ground_from_source.numpy(), seen.cameras.source)
+    near = true.depth < 40
+    assert np.abs(seen.source_depth[0] - true.depth)[near].max() < 1e-3
+    assert seen.points is not None
+    assert [view.depth.shape for view in seen.points()] == [(32, 48)] * 3
+
+
+def test_its_own_points_tell_what_that_camera_saw(kubric: Path, tmp_path: Path) -> None:
+    cuts = replace(KUBRIC, controls=controls(tmp_path, ["scn02900"]), clips=1, bounds=FrameBounds())
+    clip = opened(kubric, cuts).clip("scn02900.sample_00")
+    assert clip.seen.points is not None
+    assert clip.visible is not None
+    poses = (clip.seen.cameras.ground_from_source @ clip.seen.cameras.source_from_target).numpy()
+    for view, pose, visible in zip(clip.seen.points(), poses, clip.visible, strict=True):
+        assert (visibility(view, pose, view.lens, width=48, height=32) == visible).mean() > 0.999
+
+
+def test_scenes_are_drawn_as_often_as_the_protocol_says_and_pairs_once(kubric: Path, tmp_path: Path) -> None:
+    assert [usual_samples([kubric], protocol) for protocol in ("paper", "released")] == [4, 2]
+    assert usual_samples([tmp_path], "paper") == 1
+
+
+def test_bounds_win_over_controls_in_the_released_protocol_only(kubric: Path, tmp_path: Path) -> None:
+    listed = replace(KUBRIC, controls=controls(tmp_path, ["scn02900"]))
+    with pytest.raises(RecipeError, match="the paper's protocol takes frames from the controls"):
+        opened(kubric, listed)
+    released = opened(kubric, replace(listed, protocol="released"))
+    assert released.keys == ("scn02900.sample_00",)
+
+
+def test_lists_and_splits_choose_scenes(kubric: Path, tmp_path: Path) -> None:
+    listed = tmp_path / "test2.txt"
+    listed.write_text("# two\ndata/test/scn02901\nkubric/scn02900  # invalid\nscn02950\n")
+    found = open_scenes(kubric, Choice(listed=listed), KUBRIC)
+    assert {key.partition(".")[0] for key in found.clips.keys} == {"scn02901"}
+    assert any("invalid" in line for line in found.notes)
+    assert any("scn02950" in line for line in found.notes)
+    assert len(opened(kubric, KUBRIC, split="kubric4d-test20").keys) == 8
+    assert len(opened(kubric, KUBRIC, limit=1).keys) == 4
+    with pytest.raises(DataError, match="no scene of the list or split"):
+        opened(kubric, KUBRIC, split="kubric4d-train")
+    with pytest.raises(RecipeError, match="not both"):
+        opened(kubric, KUBRIC, split="kubric4d-test", listed=listed)
+
+
+def test_a_split_file_of_parallel_domain_names_its_part(driving: Path, tmp_path: Path) -> None:
+    file = tmp_path / "split.json"
+    file.write_text(json.dumps({"train": ["a/scene_000005"], "val": [], "test": ["scene_000006"]}))
+    assert len(opened(driving, DRIVING, split=f"{file}:train").keys) == 4
+    with pytest.raises(DataError, match="no scene of the list or split"):
+        opened(driving, DRIVING, split=str(file))
+
+
+def test_the_identity_follows_scenes_and_cuts(kubric: Path) -> None:
+    first = opened(kubric, KUBRIC).identity
+    assert first == opened(kubric, KUBRIC).identity
+    others = [replace(KUBRIC, seed=1), replace(KUBRIC, gradual=False), replace(KUBRIC, far=True)]
+    assert (
+        len({first, opened(kubric, KUBRIC, limit=1).identity, *(opened(kubric, each).identity for each in others)}) == 5
+    )
+
+
+def test_public_splits_of_a_world_share_no_scene() -> None:
+    assert {"driving-test", "drop-test", "tabletop-test", "kubric4d-test20"} <= set(public_split_names())
+    for world in ("driving", "drop", "tabletop", "kubric4d"):
+        parts = [public_split(f"{world}-{part}") for part in ("train", "valid", "test")]
+        assert all(len(part) > 0 for part in parts)
+        runs = [run for part in parts for run in part.runs]
+        assert all(a.stop <= b.start or b.stop <= a.start for i, a in enumerate(runs) for b in runs[i + 1 :])
+    assert 2900 in public_split("kubric4d-test")
+    assert 1_000_039 in public_split("driving-test")
+    assert 1_000_040 not in public_split("driving-test")
+
+
+# --- what is shown -------------------------------------------------------------------------------------------------
+
+
+def test_a_clip_of_an_orbit_shows_what_its_cameras_see(kubric: Path) -> None:
+    clips = pickle.loads(pickle.dumps(opened(kubric, KUBRIC, limit=1)))  # as another process gets it
+    assert (clips.kind, clips.camera, len(clips.classes)) == ("kubric", "spherical", 0)
+    clip = clips.clip("scn02900.sample_02")
+    cameras = clip.seen.cameras
+    true = draw(cameras.ground_from_source.numpy(), cameras.source)
+    near = (true.depth < 40) & (clip.seen.source_depth[0] > 0)
+    assert near.mean() > 0.3
+    assert np.median(np.abs(clip.seen.source_depth[0] / true.depth - 1)[near]) < 0.05  # of points, few and coarse
+    assert clip.visible is not None
+    assert clip.visible.shape == (3, 32, 48)
+    assert clip.seen.points is None  # no camera of the scene stands at the source
+    assert cameras.trajectory.goal_delta is not None
+    assert clip.change == pytest.approx(
+        (
+            cameras.trajectory.goal_delta.azimuth_deg,
+            cameras.trajectory.goal_delta.elevation_deg,
+            cameras.trajectory.goal_delta.radius_m,
+        )
+    )
+
+
+def test_further_cameras_are_given_at_the_clips_size_and_times(kubric: Path) -> None:
+    clip = opened(kubric, KUBRIC, limit=1).clip("scn02900.sample_00")
+    assert clip.seen.others is not None
+    views = clip.seen.others(2)
+    assert [len(each) for each in views] == [3, 3]
+    assert all((view.lens.width, view.lens.height) == (48, 32) for each in views for view in each)
+    poses = [each[0].world_from_camera for each in views]
+    assert all(any(np.allclose(pose, known, atol=1e-5) for known in kubric_poses()) for pose in poses)
+    assert views[0][0].rgb.tobytes() != views[0][2].rgb.tobytes()
+    with pytest.raises(DataError, match="3 cameras beside the source"):
+        clip.seen.others(4)
+
+
+def test_cameras_are_taken_far_from_each_other() -> None:
+    places = np.array([[0.0, 0, 0], [1, 0, 0], [10, 0, 0], [6, 0, 0]])
+    assert far_apart(places) == [0, 2, 3, 1]
+
+
+def test_a_driving_clip_has_the_forward_cameras_own_depth_and_classes(driving: Path) -> None:
+    clips = opened(driving, replace(DRIVING, semantic=True))
+    clip = clips.clip("scene_000005.sample_00")
+    assert (clips.kind, clips.camera, clip.change) == ("driving", "none", None)
+    names = [each.name for each in clips.classes]
+    assert names == ["Car", "Road", "Sky", "Void"]
+    pose, lens = clip.seen.cameras.ground_from_source.numpy(), clip.seen.cameras.source
+    true = draw(pose, lens, box_x=9.0)
+    ids = np.array([names.index({5: "Car", 24: "Road", 29: "Sky"}[k]) for k in true.ids.ravel()]).reshape(32, 48)
+    assert clip.seen.source_classes is not None
+    assert (clip.seen.source_classes[0] == ids).mean() > 0.9
+    ratio = clip.seen.source_depth[0] / true.depth
+    assert np.median(np.abs(ratio - 1)) < 0.1
+    assert clip.target_classes is not None
+    assert set(np.unique(clip.target_classes)) <= set(range(4))
+    assert clip.visible is not None
+    assert clip.visible[0].mean() > 0.95
+    assert clip.seen.points is not None
+    assert [view.rgb.shape for view in clip.seen.points()] == [(36, 48, 3)] * 3
+
+
+def test_colours_alone_have_no_classes_and_kubric_never_has(driving: Path, kubric: Path) -> None:
+    assert opened(driving, DRIVING).classes == ()
+    with pytest.raises(RecipeError, match="Kubric-4D has no classes"):
+        opened(kubric, replace(KUBRIC, semantic=True))
+
+
+def test_a_direct_path_is_at_its_goal_from_the_first_frame_on(driving: Path) -> None:
+    for gradual, arrives in ((True, 2), (False, 0)):
+        clip = opened(driving, replace(DRIVING, gradual=gradual)).clip("scene_000005.sample_00")
+        assert clip.seen.cameras.trajectory.at_goal.index(True) == arrives
+
+
+def test_a_missing_file_is_named_with_its_clip(kubric: Path, tmp_path: Path) -> None:
+    write_kubric(tmp_path, 7, frames=3)
+    clips = opened(tmp_path, replace(KUBRIC, frames=2))
+    (tmp_path / "scn00007" / "frames_p0_v2" / "rgba_00001.png").unlink()
+    with pytest.raises(DataError, match="rgba_00001"):
+        clips.clip("scn00007.sample_00")
+
+
+def test_what_a_folder_holds_is_seen_by_its_names(kubric: Path, driving: Path, tmp_path: Path) -> None:
+    assert (data_kind([kubric]), data_kind([driving]), data_kind([tmp_path])) == (
+        "kubric4d",
+        "parallel_domain4d",
+        "pairs",
+    )
+    with pytest.raises(DataError, match="one folder"):
+        data_kind([kubric, driving])
+    with pytest.raises(DataError, match="cannot be read"):
+        data_kind([tmp_path / "nowhere"])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)  # points at the published size
+def test_the_command_measures_whole_scenes(tmp_path: Path) -> None:
+    write_kubric(tmp_path / "data", 2900, frames=15)
+    folders = ["--data", str(tmp_path / "data"), "--out", str(tmp_path / "run"), "--split", "kubric4d-test20"]
+    cut = ["--trajectories", "1", "--frame-start", "0", "--frame-skip", "1", "--sheet-clips", "0"]
+    cameras = [word for view in VIEWS for word in ("--camera", view)]
+    result = CliRunner().invoke(app, ["evaluate", *folders, *cut, *cameras, "--methods", "copy_source"])
+    assert result.exit_code == 0, result.output
+    told, (record,) = read_run(tmp_path / "run")
+    assert (told.kind, told.protocol, told.frames, told.width) == ("kubric", "paper", 14, 384)
+    assert (record.key, record.scene, len(record.regions)) == ("scn02900.sample_00", "scn02900", 3)

@@ -1,0 +1,132 @@
+"""`gcd-train calibrate`: how far the deviation over samples can be trusted, and the scale that corrects it."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from rich.console import Console
+from typer import Option, echo
+
+from gcd_train.cli.errors import errors_shown
+from gcd_train.cli.progress_bar import progress_bar
+from gcd_train.errors import DataError, RecipeError
+
+if TYPE_CHECKING:
+    from gcd_model import Synthesizer
+    from gcd_train.baselines import Predictor
+    from gcd_train.evaluation.calibration import Distances
+    from gcd_train.evaluation.clips import EvaluationSet
+    from gcd_train.evaluation.opening import Choice
+
+_LOG = Console(stderr=True, highlight=False)
+
+
+def calibrate_command(
+    data: Annotated[list[Path], Option(help="Held-out clips: folders of pairs, or a folder in a published layout.")],
+    weights: Annotated[str, Option(help="package:NAME or a path.")],
+    out: Annotated[Path, Option(help="Folder for calibration.json, calibration.md and reliability.png.")],
+    store: Annotated[
+        Path | None, Option(help="Also write the weights with the scale here, a new .safetensors file.")
+    ] = None,
+    samples: Annotated[int, Option(min=2, help="Draws of each view; the scale is for as many.")] = 4,
+    steps: Annotated[int | None, Option(min=1, help="Steps of the sampler instead of the shipped number.")] = None,
+    seed: Annotated[int, Option(min=0, help="Of the noise samples begin with.")] = 0,
+    split: Annotated[str | None, Option(help="Only scenes of a split, by its name such as driving-test.")] = None,
+    limit: Annotated[int | None, Option(min=1, help="Only the first so many scenes.")] = None,
+    device: Annotated[str, Option(help="auto, cpu, cuda or cuda:N.")] = "auto",
+    dtype: Annotated[str | None, Option(help="float32, bfloat16 or float16.")] = None,
+) -> None:
+    """Measure how often the truth lies within the intervals of the samples, and the scale that makes it as meant."""
+    with errors_shown():
+        from gcd_model import RenderOptions, convert_weights, load_synthesizer
+        from gcd_train.evaluation.calibration import calibrate
+        from gcd_train.evaluation.calibration_report import CalibrationNote, write_calibration
+        from gcd_train.evaluation.opening import Choice
+        from gcd_train.evaluation.synthesized import SynthesizedViews
+        from gcd_train.show.matplotlib_door import require_matplotlib
+
+        require_matplotlib()  # now, not after an hour
+        path = None if store is None else _weights_file(weights, store, steps)
+        model = load_synthesizer(weights, device=device, dtype=dtype)
+        clips = _clips(data, Choice(split=split, limit=limit), model, seed)
+        views = SynthesizedViews.of(model, clips, RenderOptions(steps=steps, samples=samples, seed=seed))
+        if views.paints_classes:
+            raise RecipeError(f"{model.traits.name} paints classes, which have no intervals; calibrate one of colours")
+        measured, unreadable = _measured(clips, views)
+        found = calibrate(measured)
+        note = CalibrationNote(
+            weights=model.traits.name,
+            sha256_12=model.traits.sha256_12,
+            data=tuple(map(str, data)),
+            data_identity=clips.identity,
+            clips=len(measured),
+            unreadable=unreadable,
+            samples=samples,
+            steps=steps or model.traits.config.sampling.steps,
+            seed=seed,
+            found=found,
+        )
+        text = write_calibration(note, out)
+        if path is not None and store is not None:
+            convert_weights(path, store, uncertainty_scale=found.scale)
+    echo(text)
+    written = f"{out}/calibration.json, calibration.md and reliability.png" + ("" if store is None else f", {store}")
+    _LOG.print(f"wrote {written}", markup=False, soft_wrap=True)
+
+
+def _clips(data: Sequence[Path], choice: "Choice", model: "Synthesizer", seed: int) -> "EvaluationSet":
+    """The clips; of whole scenes four each, with goals drawn by the seed as the model was trained."""
+    from gcd_train.evaluation.opening import SceneCuts, data_kind, open_pairs, open_scenes
+
+    traits = model.traits
+    if data_kind(data) == "pairs":
+        opened = open_pairs(data, choice, None)
+    else:
+        far, size = traits.family is not None and traits.family.name == "kubric180", traits.config
+        cuts = SceneCuts(
+            seed=seed,
+            far=far,
+            gradual=traits.move_time > 0,
+            frames=size.frames,
+            height=size.height,
+            width=size.width,
+        )
+        opened = open_scenes(data[0], choice, cuts)
+    for note in opened.notes:
+        _LOG.print(note, markup=False, soft_wrap=True)
+    return opened.clips
+
+
+def _weights_file(weights: str, store: Path, steps: int | None) -> Path:
+    """The file whose copy gets the scale; what is wrong with --store is said before anything is measured."""
+    from gcd_model.loading import packaged_weights
+
+    if steps is not None:
+        raise RecipeError("a stored scale is for the steps that ship: leave out --steps, or --store")
+    if store.exists() or store.suffix != ".safetensors" or not store.parent.is_dir():
+        raise RecipeError(f"--store wants the name of a new .safetensors file in a folder that exists, got {store}")
+    kind, _, name = weights.partition(":")
+    if kind == "random":
+        raise RecipeError(f"{weights} is no file that a scale could be stored with; leave out --store")
+    return packaged_weights(name) if kind == "package" else Path(weights)
+
+
+def _measured(clips: "EvaluationSet", views: "Predictor") -> "tuple[Sequence[Distances], tuple[str, ...]]":
+    """Of every clip that can be read; of the others the reason. Raises DataError where none can."""
+    from gcd_train.evaluation.calibration import distances
+
+    measured: list[Distances] = []
+    unreadable: list[str] = []
+    with progress_bar("held-out clips", len(clips.keys)) as show:
+        for number, key in enumerate(clips.keys, 1):
+            try:
+                clip = clips.clip(key)
+            except DataError as error:
+                unreadable.append(f"{key}: {error}")
+                _LOG.print(f"left out {key}: {error}", markup=False, soft_wrap=True)
+            else:
+                measured.append(distances(clip, views.predict(clip.seen)))
+            show(number)
+    if not measured:
+        raise DataError(f"none of the {len(clips.keys)} clips can be read: {unreadable[0]}")
+    return measured, tuple(unreadable)

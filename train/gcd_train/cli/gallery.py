@@ -1,0 +1,125 @@
+"""`gcd-train gallery`: views of real videos, for which there is no ground truth."""
+
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from rich.console import Console
+from typer import Argument, Option
+
+from gcd_train.cli.errors import errors_shown
+from gcd_train.cli.progress_bar import progress_bar
+from gcd_train.errors import DataError, RecipeError
+
+if TYPE_CHECKING:
+    from gcd_model import SphericalDelta, ViewSynthesizer
+    from gcd_train.gallery import RealVideo, Viewed, ViewRecipe, WindowChoice
+
+_LOG = Console(stderr=True, highlight=False)
+
+
+def gallery_command(
+    videos: Annotated[list[Path], Argument(metavar="VIDEOS", help="Videos, folders of videos, folders of pictures.")],
+    weights: Annotated[str, Option(help="package:NAME, random:FAMILY or a path.")],
+    out: Annotated[Path, Option(help="Folder for index.html, sheets and videos.")] = Path("gallery"),
+    angles: Annotated[
+        list[str] | None,
+        Option(help="Goal as AZIMUTH,ELEVATION,RADIUS: degrees, and units of the trained scenes; may be repeated."),
+    ] = None,
+    windows: Annotated[int, Option(min=1, help="At most so many windows of each video.")] = 2,
+    start: Annotated[float, Option(min=0.0, help="Where the first window begins, seconds.")] = 0.0,
+    rate: Annotated[float | None, Option(min=0.1, help="Frames a second of folders of pictures.")] = None,
+    hfov: Annotated[
+        float | None,
+        Option(min=1.0, max=179.0, help="Field of view of the videos, degrees across; cut to the model's."),
+    ] = None,
+    mount_height: Annotated[
+        float | None, Option(min=0.1, help="Driving: height of the camera above the road, metres; else as trained.")
+    ] = None,
+    mount_tilt: Annotated[
+        float | None, Option(help="Driving: tilt of the camera, degrees down; else as trained.")
+    ] = None,
+    samples: Annotated[int, Option(min=1, help="Draws of each view.")] = 1,
+    steps: Annotated[int | None, Option(min=1, help="Steps of the sampler instead of the shipped number.")] = None,
+    seed: Annotated[int, Option(min=0, help="Of the noise samples begin with.")] = 0,
+    family: Annotated[str | None, Option(help="Family of the weights, where their file does not tell.")] = None,
+    device: Annotated[str, Option(help="auto, cpu, cuda or cuda:N.")] = "auto",
+    dtype: Annotated[str | None, Option(help="float32, bfloat16 or float16.")] = None,
+) -> None:
+    """View real videos from other cameras: sheets, videos, and a page of them all. A bad video is one line."""
+    with errors_shown():
+        from gcd_model import load_synthesizer
+        from gcd_train.gallery import ViewRecipe, WindowChoice, find_videos, write_page
+        from gcd_train.gallery.viewed import paths
+
+        found = find_videos(videos)
+        recipe = ViewRecipe(
+            angles=tuple(_angles(text) for text in angles or ()),
+            samples=samples,
+            steps=steps,
+            seed=seed,
+            height_m=mount_height,
+            tilt_deg=mount_tilt,
+        )
+        model = load_synthesizer(weights, family=family, device=device, dtype=dtype)
+        paths(model.traits, recipe)  # refuses what cannot be viewed before any video is read
+        choice = WindowChoice(count=windows, start_s=start, rate=rate, hfov_deg=hfov)
+        viewed, faults = _viewed(found, model, choice, recipe, out)
+        write_page(viewed, faults, _facts(model, recipe), out / "index.html")
+        if not viewed:
+            raise DataError(f"none of {len(found)} videos can be shown; {faults[0]}")
+    _LOG.print(f"wrote {out}/index.html: {len(viewed)} windows", markup=False, soft_wrap=True)
+
+
+def _angles(text: str) -> "SphericalDelta":
+    """`30,15,0` as a goal; the radius may be left out, and the elevation too."""
+    from gcd_model import SphericalDelta
+
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if not 1 <= len(numbers) <= 3:
+        raise RecipeError(f"--angles wants AZIMUTH,ELEVATION,RADIUS in numbers such as 30,15,0, got {text!r}")
+    azimuth_deg, elevation_deg, radius_m = (*numbers, 0.0, 0.0)[:3]
+    return SphericalDelta(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, radius_m=radius_m)
+
+
+def _viewed(
+    videos: "Sequence[RealVideo]",
+    model: "ViewSynthesizer",
+    choice: "WindowChoice",
+    recipe: "ViewRecipe",
+    out: Path,
+) -> "tuple[list[Viewed], list[str]]":
+    """What was shown, and a line for each video that could not be."""
+    from gcd_train.gallery import read_windows, view_window, write_viewed
+
+    viewed: list[Viewed] = []
+    faults: list[str] = []
+    with progress_bar("videos", len(videos)) as show:
+        for number, video in enumerate(videos, 1):
+            try:
+                windows = read_windows(video, model.traits, choice)
+            except DataError as error:
+                faults.append(str(error))
+                _LOG.print(f"left out: {error}", markup=False, soft_wrap=True)
+                windows = ()
+            for window in windows:
+                viewed.append(view_window(model, window, recipe))
+                write_viewed(viewed[-1], out)
+            show(number)
+    return viewed, faults
+
+
+def _facts(model: "ViewSynthesizer", recipe: "ViewRecipe") -> list[tuple[str, str]]:
+    traits = model.traits
+    family = "unknown" if traits.family is None else traits.family.name
+    return [
+        ("command", shlex.join(["gcd-train", *sys.argv[1:]])),
+        ("weights", f"{traits.name} ({traits.sha256_12}), family {family}" + ("" if traits.trained else ", untrained")),
+        ("steps", str(recipe.steps or traits.config.sampling.steps)),
+        ("samples, seed", f"{recipe.samples}, {recipe.seed}"),
+    ]

@@ -1,0 +1,51 @@
+"""`gcd-train report`: runs of `gcd-train evaluate` as tables, plots and galleries."""
+
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gcd_train.cli.errors import errors_shown
+from gcd_train.errors import RecipeError
+
+
+def report_command(
+    runs: Annotated[list[Path], typer.Argument(help="Folders that `gcd-train evaluate` wrote.", metavar="RUN...")],
+    out: Annotated[Path, typer.Option(help="Folder for report.md, tables/, plots/, gallery/ and worst/.")],
+    lead: Annotated[
+        list[str] | None, typer.Option(help="Method to compare with all others; by default every model.")
+    ] = None,
+    row: Annotated[
+        list[str] | None, typer.Option(help="METHOD=ROW: where a method stands in the paper's tables.")
+    ] = None,
+    clips: Annotated[int, typer.Option(min=0, help="Clips in the gallery.")] = 4,
+    worst: Annotated[int, typer.Option(min=0, help="Worst clips of each compared method.")] = 4,
+    plots: Annotated[bool, typer.Option(help="Draw plots; needs matplotlib.")] = True,
+    seed: Annotated[int, typer.Option(help="Of the draws of scenes that intervals come from.")] = 0,
+) -> None:
+    """Write the paper's tables, or the same for our own clips, from what was measured; nothing is measured again."""
+    from gcd_train.reports.pages import Choices, make_report  # here: `--help` wants none of it
+
+    with errors_shown():
+        choices = Choices(
+            leads=tuple(lead or ()), rows=_rows(row or ()), clips=clips, worst=worst, drawn=plots, seed=seed
+        )
+        path = make_report(runs, out, choices, command=_command(sys.argv))
+    typer.echo(f"wrote {path}")
+
+
+def _rows(given: Sequence[str]) -> dict[str, str]:
+    """METHOD=ROW, several times."""
+    pairs = [text.partition("=") for text in given]
+    for text, (method, _, label) in zip(given, pairs, strict=True):
+        if not method or not label:
+            raise RecipeError(f"--row wants METHOD=ROW, got {text!r}; write --row 'my-model=GCD (gradual, finetuned)'")
+    return {method: label for method, _, label in pairs}
+
+
+def _command(words: Sequence[str]) -> str:
+    """The line as it was typed, without the folder of the program."""
+    return shlex.join([Path(words[0]).name, *words[1:]])

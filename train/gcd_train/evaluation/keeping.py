@@ -1,0 +1,145 @@
+"""A run's folder: what it says of itself, one record for each method and clip, and the frames that are kept.
+
+    run.json                         what all records have in common (RunNote)
+    records/METHOD/KEY.json          one method on one clip (ClipRecord)
+    views/METHOD/KEY/sample_0/0000.png
+                                     frames that a method made; source/ and target/ beside. views/METHOD is a folder
+                                     that `--predictions` reads.
+
+Files appear whole or not at all, so a run that was killed goes on where it stopped.
+"""
+
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from gcd_train.errors import RunError
+from gcd_train.evaluation.record import ClipRecord, RunNote
+
+RUN_FILE = "run.json"
+_SAME = ("data_identity", "kind", "modality", "protocol", "frames", "height", "width", "fps", "seed", "classes")
+_PACKAGE = "gcd-node"
+_SHOWN = 48  # letters of a value in a message
+
+
+def folder_name(name: str) -> str:
+    """A method's or a clip's name as the name of a folder or file: letters, digits, dots, underscores, hyphens."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("_.") or "_"
+
+
+@dataclass(frozen=True, slots=True)
+class RunKeeper:
+    """Keeps the records of one run in its folder."""
+
+    folder: Path
+
+    def begin(self, note: RunNote) -> RunNote:
+        """Write `run.json`, or add this note's methods to the one that is there, whose command and time stay.
+
+        Returns: what now stands there.
+        Raises:
+            RunError: the folder holds records of another evaluation, two methods would share a folder, or nothing can
+                be written.
+        """
+        path = self.folder / RUN_FILE
+        if path.exists():
+            note = _joined(self.folder, _read_note(path), note)
+        _require_own_folders(note.methods)
+        write_whole(path, msgspec.json.format(msgspec.json.encode(note), indent=1))
+        return note
+
+    def has(self, method: str, key: str) -> bool:
+        """Whether there is a record."""
+        return self._record(method, key).exists()
+
+    def read(self, method: str, key: str) -> ClipRecord:
+        """A record that there is. Raises RunError if it is damaged."""
+        return _read_record(self._record(method, key))
+
+    def keep(self, record: ClipRecord) -> None:
+        """Write a record; one that is there is replaced. Raises RunError if it cannot be written."""
+        write_whole(self._record(record.method, record.key), msgspec.json.encode(record))
+
+    def views(self, method: str, key: str) -> Path:
+        """Where the frames of a method on a clip lie."""
+        return self.folder / "views" / folder_name(method) / folder_name(key)
+
+    def _record(self, method: str, key: str) -> Path:
+        return self.folder / "records" / folder_name(method) / f"{folder_name(key)}.json"
+
+
+def read_run(folder: Path | str) -> tuple[RunNote, tuple[ClipRecord, ...]]:
+    """What a run says of itself, and its records: method by method in the note's order, clips by name.
+
+    Raises:
+        RunError: there is no run, or a file of it is damaged.
+    """
+    folder = Path(folder)
+    if not (folder / RUN_FILE).is_file():
+        raise RunError(f"{folder} holds no {RUN_FILE}; make a run with `gcd-train evaluate --out {folder}`")
+    note = _read_note(folder / RUN_FILE)
+    places = [folder / "records" / folder_name(method) for method in note.methods]
+    return note, tuple(_read_record(path) for place in places for path in sorted(place.glob("*.json")))
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file under its name only once it is complete. Raises RunError if it cannot be written."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_bytes(data)
+        partial.replace(path)
+    except OSError as error:
+        raise RunError(f"cannot write {path}: {error.strerror}; free some space, or choose another --out") from error
+
+
+def _read_note(path: Path) -> RunNote:
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=RunNote)
+    except (OSError, msgspec.MsgspecError) as error:
+        raise RunError(f"{path} is no note of a run ({error}); delete the run, or choose another folder") from error
+
+
+def _read_record(path: Path) -> ClipRecord:
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=ClipRecord)
+    except (OSError, msgspec.MsgspecError) as error:
+        raise RunError(f"{path} is damaged ({error}); delete it and evaluate again, the others are kept") from error
+
+
+def _joined(folder: Path, found: RunNote, new: RunNote) -> RunNote:
+    """The note that is there with the new methods. Raises RunError where records of both would not go together."""
+    differ = {name: (getattr(found, name), getattr(new, name)) for name in _SAME}
+    differ[_PACKAGE] = (found.versions.get(_PACKAGE), new.versions.get(_PACKAGE))
+    for method in found.methods.keys() & new.methods.keys():
+        differ |= _differences(method, found.methods[method], new.methods[method])
+    told = [f"{name} was {_short(was)}, is {_short(now)}" for name, (was, now) in differ.items() if was != now]
+    if told:
+        raise RunError(
+            f"{folder} holds records of another evaluation: {'; '.join(told)}. Choose another --out, or delete it"
+        )
+    return msgspec.structs.replace(found, methods={**found.methods, **new.methods})
+
+
+def _differences(method: str, was: Mapping[str, str], now: Mapping[str, str]) -> dict[str, tuple[str, str]]:
+    names = dict.fromkeys([*was, *now])
+    return {f"{name} of {method}": (was.get(name, "not told"), now.get(name, "not told")) for name in names}
+
+
+def _short(value: object) -> str:
+    text = ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
+    return text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"
+
+
+def _require_own_folders(methods: Mapping[str, object]) -> None:
+    places: dict[str, str] = {}
+    for method in methods:
+        other = places.setdefault(folder_name(method), method)
+        if other != method:
+            raise RunError(
+                f"the methods {other!r} and {method!r} would share the folder {folder_name(method)}; rename one"
+            )

@@ -1,0 +1,65 @@
+"""Frames that a run keeps for galleries, as PNG files; `SavedFrames` reads them back."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from gcd_model.class_head import palette
+from gcd_model.config import SemanticClass
+from gcd_train.baselines import Prediction, to_labels
+from gcd_train.datasets.clip_source import Bytes
+from gcd_train.evaluation.clips import HeldOutClip
+from gcd_train.evaluation.keeping import write_whole
+
+KeptViews: TypeAlias = Literal["none", "last", "all"]
+"""Which frames are kept: none, the last of each clip, or all."""
+
+
+def write_views(
+    folder: Path, clip: HeldOutClip, prediction: Prediction, which: KeptViews, classes: Sequence[SemanticClass]
+) -> None:
+    """Write `source/`, `target/` and `sample_0/` and so on, each frame under its number from 0000.png on.
+
+    A method that makes class maps alone has them painted there; one that makes both has `classes_0/` and
+    `target_classes/` beside. classes: the ontology. Raises RunError if a file cannot be written.
+    """
+    if which == "none":
+        return
+    strips = {"source": clip.seen.source, "target": clip.target}
+    for number, draw in enumerate(prediction.draws):
+        labels = None if draw.classes is None or not classes else painted(draw.classes, classes)
+        if draw.video is not None:
+            strips[f"sample_{number}"] = to_bytes(draw.video)
+        if labels is not None:
+            strips[f"sample_{number}" if draw.video is None else f"classes_{number}"] = labels
+    true = to_labels(clip.target_classes)
+    if true is not None and classes and "classes_0" in strips:
+        strips["target_classes"] = painted(true, classes)
+    for name, frames in strips.items():
+        for t in range(len(frames) - 1 if which == "last" else 0, len(frames)):
+            write_whole(folder / name / f"{t:04d}.png", png(frames[t]))
+
+
+def painted(labels: Tensor, classes: Sequence[SemanticClass]) -> Bytes:
+    """Class ids uint8 [T, H, W] in colours, uint8 [T, H, W, 3]; what is of no class is black."""
+    colours = torch.zeros(256, 3, dtype=torch.uint8)
+    known = palette(tuple(classes))
+    colours[: len(known)] = known
+    return colours[labels.long()].numpy()
+
+
+def to_bytes(video: Tensor) -> Bytes:
+    """float32 [T, 3, H, W] in [0, 1] -> uint8 [T, H, W, 3]."""
+    return (video.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
+
+
+def png(picture: Bytes) -> bytes:
+    """A PNG file of an RGB picture, uint8 [H, W, 3]."""
+    done, data = cv2.imencode(".png", cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2BGR))
+    assert done, "PNG takes any picture"
+    return data.tobytes()

@@ -1,0 +1,174 @@
+"""What is measured: weights, baselines and saved frames, each by a name, a way to make it anywhere, and what it is."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from pathlib import Path
+
+from gcd_model import RenderOptions, Synthesizer, load_synthesizer
+from gcd_model.config import CameraControl, SemanticClass
+from gcd_train.baselines import (
+    VANILLA_SVD,
+    BaselineSettings,
+    Predictor,
+    SavedFrames,
+    build,
+    described,
+    usual_baselines,
+)
+from gcd_train.errors import DataError, RecipeError
+from gcd_train.evaluation.spread import Maker
+from gcd_train.evaluation.synthesized import ClipFacts, SynthesizedViews
+
+_DIGITS = 12
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Method:
+    """One row of a table. make: the method itself, in any process. told: what it is, for `run.json`."""
+
+    name: str
+    make: Maker
+    told: dict[str, str]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Form:
+    """The form of clips, to be sent to other processes without the clips; see `ClipFacts`."""
+
+    frames: int
+    height: int
+    width: int
+    camera: CameraControl
+    classes: tuple[SemanticClass, ...]
+
+    @classmethod
+    def of(cls, clips: ClipFacts) -> "Form":
+        """Of some clips."""
+        return cls(
+            frames=clips.frames,
+            height=clips.height,
+            width=clips.width,
+            camera=clips.camera,
+            classes=tuple(clips.classes),
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Weights:
+    """Weights by name or path, and where they compute; see `load_synthesizer`."""
+
+    path: str
+    device: str = "auto"
+    dtype: str | None = None
+
+    def open(self) -> Synthesizer:
+        """The model, opened once in each process. Raises CheckpointError."""
+        return _opened(self)
+
+
+def of_weights(weights: Weights, clips: ClipFacts, options: RenderOptions, steps: Sequence[int]) -> tuple[Method, ...]:
+    """The weights as they ship, then with each other number of steps.
+
+    Args:
+        options: guidance, samples and seed count. steps: the shipped number is passed over.
+    Raises:
+        DataError: the weights do not fit the clips. CheckpointError: they cannot be opened.
+    """
+    shipped = weights.open().traits.config.sampling.steps
+    others = [number for number in dict.fromkeys(steps) if number != shipped]
+    return tuple(_of_weights(weights, clips, replace(options, steps=number)) for number in (None, *others))
+
+
+def of_baselines(names: Sequence[str] | None, settings: BaselineSettings, trained_on: str) -> tuple[Method, ...]:
+    """Baselines by name; those that need nothing but the data where none are named.
+
+    Args:
+        trained_on: identity of the training clips, "nothing" without.
+    Raises:
+        RecipeError: there is none of a name, or it lacks what it needs.
+    """
+    chosen = usual_baselines(settings) if names is None else names
+    for name in chosen:
+        if name != VANILLA_SVD or settings.svd is None:
+            build(name, settings)  # to refuse at once; weights are opened where they are used
+    told = {"samples": str(settings.samples), "seed": str(settings.seed), "means of": trained_on}
+    told |= {"published rounding": "yes"} if settings.published else {}
+    return tuple(
+        Method(
+            name=name,
+            make=partial(build, name, settings),
+            told={"baseline": name, **told, **described(name, settings)},
+        )
+        for name in chosen
+    )
+
+
+def of_saved_frames(named: Sequence[str], painted: Sequence[SemanticClass]) -> tuple[Method, ...]:
+    """Methods whose frames lie in folders.
+
+    Args:
+        named: `NAME=FOLDER` each. painted: the classes in whose colours they are; empty for photographs.
+    Raises:
+        RecipeError: one has no name or no folder. DataError: there is no such folder.
+    """
+    return tuple(_of_saved_frames(each, tuple(painted)) for each in named)
+
+
+def require_names_apart(methods: Sequence[Method]) -> None:
+    """Raises RecipeError where two methods have one name."""
+    names = [method.name for method in methods]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise RecipeError(
+            f"each method needs a name of its own, got {twice[0]} twice; rename the frames of --predictions"
+        )
+
+
+def _of_weights(weights: Weights, clips: ClipFacts, options: RenderOptions) -> Method:
+    made = SynthesizedViews.of(weights.open(), clips, options)
+    traits = made.synthesizer.traits
+    sampling = traits.config.sampling
+    guidance = options.guidance or sampling.guidance
+    told = {
+        "weights": traits.sha256_12,
+        "family": "unknown" if traits.family is None else traits.family.name,
+        "steps": str(options.steps or sampling.steps),
+        "guidance": f"{guidance[0]:g} to {guidance[1]:g}",
+        "samples": str(options.samples),
+        "seed": str(options.seed),
+        "precision": traits.precision,
+    }
+    return Method(name=made.name, make=partial(_synthesized, weights, Form.of(clips), options), told=told)
+
+
+def _synthesized(weights: Weights, form: Form, options: RenderOptions) -> Predictor:
+    return SynthesizedViews.of(weights.open(), form, options)
+
+
+@lru_cache(maxsize=1)
+def _opened(weights: Weights) -> Synthesizer:
+    return load_synthesizer(weights.path, device=weights.device, dtype=weights.dtype)
+
+
+def _of_saved_frames(named: str, painted: tuple[SemanticClass, ...]) -> Method:
+    name, separator, folder = named.partition("=")
+    if not (name and separator and folder):
+        raise RecipeError(f"frames of another method are given as NAME=FOLDER, got {named!r}")
+    place = Path(folder).resolve()
+    SavedFrames.open(name, place)  # to refuse at once
+    told = {"frames in": folder, "digest": _listing(place)}
+    return Method(name=name, make=partial(SavedFrames.open, name, place, painted=painted), told=told)
+
+
+def _listing(folder: Path) -> str:
+    """Digest of the names and sizes of all files below."""
+    digest = hashlib.sha256()
+    try:
+        for path in sorted(folder.rglob("*")):
+            if path.is_file():
+                digest.update(f"{path.relative_to(folder)} {path.stat().st_size}\n".encode())
+    except OSError as error:
+        raise DataError(f"{folder} cannot be read ({error}); give NAME=FOLDER") from error
+    return digest.hexdigest()[:_DIGITS]

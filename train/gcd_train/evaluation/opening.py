@@ -1,0 +1,287 @@
+"""From the folders and options of a user to the clips that are measured."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, TypeAlias, get_args
+
+import msgspec
+
+from gcd_model.geometry import CameraMount
+from gcd_train.datasets.clip_frames import CLIP, DRIVING_FRAMES, KUBRIC_FRAMES, FrameSampling
+from gcd_train.datasets.controls import read_controls
+from gcd_train.datasets.kubric4d import Kubric4D
+from gcd_train.datasets.paired import PairedClips
+from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
+from gcd_train.datasets.public_splits import PublicSplit, public_split
+from gcd_train.datasets.skips import Skips
+from gcd_train.datasets.splits import Part, present, read_scene_list, read_split
+from gcd_train.datasets.trajectories import DrivingSampling, OrbitSampling, Sampling
+from gcd_train.datasets.view_pairs import ViewPairs
+from gcd_train.errors import DataError, RecipeError
+from gcd_train.evaluation.clips import EvaluationSet
+from gcd_train.evaluation.paired_set import PairedSet, chosen
+from gcd_train.evaluation.protocols import (
+    AS_PLANNED,
+    CLIPS,
+    SAMPLES,
+    ClipControls,
+    DrawnControls,
+    FrameBounds,
+    ListedControls,
+    ProtocolName,
+    ReleasedControl,
+)
+from gcd_train.evaluation.scene_set import SceneSet
+from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
+from gcd_train.layouts.manifest import MANIFEST
+
+DataKind: TypeAlias = Literal["pairs", "kubric4d", "parallel_domain4d"]
+"""What a folder holds."""
+
+_PARTS: dict[str, Part] = {part: part for part in get_args(Part)}
+_DIGITS = 12
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Choice:
+    """Which scenes of a folder. split: a public one's name, or a split file with `:train`, `:val` or `:test` after it.
+
+    listed: a file with a scene a line. limit: only the first so many.
+    """
+
+    split: str | None = None
+    listed: Path | None = None
+    limit: int | None = None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SceneCuts:
+    """How clips are cut from whole scenes.
+
+    controls: a control list, None for the protocol's own. clips: of each scene, None for the protocol's number.
+    bounds: first frame and stride of the command line. far: up to 180 degrees of azimuth and 60 of elevation, not 90
+    and 30. gradual: the camera moves through the clip; otherwise it is at the goal from the first frame on.
+    semantic: targets are painted in the colours of their classes. exact: drawn from the geometry of our own scenes.
+    cameras: that a scene must have, None for the published ones. frames, height, width: T, H and W.
+    """
+
+    protocol: ProtocolName = "paper"
+    controls: Path | None = None
+    clips: int | None = None
+    seed: int = 0
+    bounds: FrameBounds = AS_PLANNED
+    far: bool = False
+    gradual: bool = True
+    semantic: bool = False
+    exact: bool = False
+    cameras: tuple[str, ...] | None = None
+    frames: int = CLIP
+    height: int = 256
+    width: int = 384
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Opened:
+    """Clips to be measured. notes: what of the split or list is not there, line by line."""
+
+    clips: EvaluationSet
+    notes: tuple[str, ...] = ()
+
+
+def data_kind(folders: Sequence[Path]) -> DataKind:
+    """What the folders hold. Raises DataError for nothing that is known, or several folders of scenes."""
+    found = _kind(_names(folders[0]))
+    if found != "pairs" and len(folders) > 1:
+        raise DataError(f"scenes are taken from one folder, got {len(folders)}; give one --data, or pairs")
+    return found
+
+
+def usual_samples(folders: Sequence[Path], protocol: ProtocolName) -> int:
+    """Draws of each view where nobody says how many. Raises DataError as `data_kind`."""
+    return 1 if data_kind(folders) == "pairs" else SAMPLES[protocol]
+
+
+def _kind(names: Sequence[str]) -> DataKind:
+    if any(kubric4d_names.scene_number(name) is not None for name in names):
+        return "kubric4d"
+    if any(parallel_domain4d_names.scene_number(name) is not None for name in names):
+        return "parallel_domain4d"
+    return "pairs"
+
+
+def open_pairs(folders: Sequence[Path], choice: Choice, mount: CameraMount | None) -> Opened:
+    """Pairs of the folders.
+
+    Args:
+        mount: what everybody is told of the source camera of driving clips; None for the usual one.
+    Raises:
+        DataError: see `PairedClips.open`. RecipeError: a list, no such split, or a mount where there is no vehicle.
+    """
+    if choice.listed is not None:
+        raise RecipeError("--list names whole scenes, and these are pairs; give --split NAME, or leave it out")
+    clips, notes = PairedClips.open([folder.resolve() for folder in folders]), Skips()  # processes may stand elsewhere
+    scenes = [clips.scene(number) for number in range(len(clips))]
+    wanted = None
+    if choice.split is not None:
+        split = public_split(choice.split)
+        wanted = {(world, seed) for world, seed in scenes if world == split.world and seed in split}
+        _note_missing(split, {seed for _, seed in wanted}, notes)
+    return Opened(
+        clips=PairedSet.of(chosen(clips, scenes=wanted, limit=choice.limit), declared=_declared(mount, clips)),
+        notes=tuple(notes.lines()),
+    )
+
+
+def open_scenes(folder: Path, choice: Choice, cuts: SceneCuts) -> Opened:
+    """Whole scenes, in either layout.
+
+    Raises:
+        DataError: no scene is left, or a list or a control list cannot be read. RecipeError: options that contradict
+            each other, or no such split.
+    """
+    folder = folder.resolve()  # processes may stand elsewhere
+    orbits, notes = data_kind([folder]) == "kubric4d", Skips()
+    whole = _kubric(folder, cuts) if orbits else _driving(folder, cuts)
+    controls = _controls(cuts, orbits=orbits)
+    scenes = _wanted(whole.scenes, choice, notes)
+    scenes = _controlled(scenes, controls, cuts, notes)[: choice.limit]
+    data = whole.only(scenes)
+    pairs = ViewPairs(
+        data,
+        _sampling(cuts, orbits=orbits),
+        cuts.seed,
+        (cuts.width, cuts.height),
+        modality="classes" if cuts.semantic else "rgb",
+        class_ids=cuts.semantic,
+        visible=True,
+        exact=cuts.exact,
+        published=cuts.protocol == "released",
+    )
+    clips = SceneSet(
+        pairs=pairs,
+        controls=controls,
+        frames=cuts.frames,
+        height=cuts.height,
+        width=cuts.width,
+        fps=data.fps / (cuts.bounds.skip or 1),
+        kind="kubric" if orbits else "driving",
+        identity=_identity(folder, scenes, cuts),
+        semantic=cuts.semantic,
+    )
+    return Opened(clips=clips, notes=tuple(notes.lines()))
+
+
+def _declared(mount: CameraMount | None, clips: PairedClips) -> CameraMount | None:
+    """None where there is no vehicle."""
+    if clips.camera == "none":
+        return mount or CameraMount()
+    if mount is not None:
+        raise RecipeError("these clips have no vehicle to mount a camera on: leave out --declared-height and -tilt")
+    return None
+
+
+def _kubric(folder: Path, cuts: SceneCuts) -> Kubric4D:
+    if cuts.semantic:
+        raise RecipeError("Kubric-4D has no classes: leave out --modality semantic")
+    cameras = cuts.cameras or kubric4d_names.CAMERAS
+    return Kubric4D.open(folder, cameras=cameras, published=cuts.protocol == "released")
+
+
+def _driving(folder: Path, cuts: SceneCuts) -> ParallelDomain4D:
+    cameras = cuts.cameras or parallel_domain4d_names.CAMERAS
+    return ParallelDomain4D.open(folder, cameras=cameras, classes=cuts.semantic)
+
+
+def _names(folder: Path) -> list[str]:
+    try:
+        return [path.name for path in folder.iterdir()]
+    except OSError as error:
+        raise DataError(f"{folder} cannot be read ({error}); give a folder with pairs or with scenes") from error
+
+
+def _note_missing(split: PublicSplit, there: set[int], notes: Skips) -> None:
+    """A part that is open-ended in practice, as `train`, is not missed."""
+    if there and len(there) < len(split) and not split.name.endswith("-train"):
+        notes.add(split.name, "--data", f"has {len(there)} of its {len(split)} scenes")
+
+
+def _wanted(there: Sequence[str], choice: Choice, notes: Skips) -> tuple[str, ...]:
+    if choice.listed is not None and choice.split is not None:
+        raise RecipeError("give --list or --split, not both")
+    if choice.listed is not None:
+        return present(read_scene_list(choice.listed, notes).scenes, there, notes, choice.listed)
+    if choice.split is None:
+        return tuple(there)
+    place, _, part = choice.split.rpartition(":")
+    file = Path(place if part in _PARTS and place else choice.split)
+    if file.is_file():
+        return present(read_split(file, _PARTS.get(part, "test")), there, notes, file)
+    split = public_split(choice.split)
+    scenes = tuple(scene for scene in there if _seed(scene) in split)
+    _note_missing(split, {_seed(scene) for scene in scenes}, notes)
+    return scenes
+
+
+def _seed(scene: str) -> int:
+    number = kubric4d_names.scene_number(scene)
+    return (parallel_domain4d_names.scene_number(scene) or 0) if number is None else number
+
+
+def _controlled(scenes: Sequence[str], controls: ClipControls, cuts: SceneCuts, notes: Skips) -> tuple[str, ...]:
+    """Those of which there are clips; the others are counted."""
+    for scene in scenes:
+        if not controls.names(scene):
+            notes.add(scene, str(cuts.controls), "has no control for it")
+    return tuple(scene for scene in scenes if controls.names(scene))
+
+
+def _controls(cuts: SceneCuts, *, orbits: bool) -> ClipControls:
+    clips = CLIPS[cuts.protocol] if cuts.clips is None else cuts.clips
+    if cuts.controls is not None:
+        if cuts.protocol == "paper" and cuts.bounds != AS_PLANNED:
+            raise RecipeError(
+                "the paper's protocol takes frames from the controls; leave out --frame-start and --frame-skip, or "
+                "give --protocol released"
+            )
+        return ListedControls(controls=read_controls(cuts.controls), clips=clips, bounds=cuts.bounds)
+    if cuts.protocol == "released":
+        return ReleasedControl(orbit=orbits, bounds=cuts.bounds)
+    return DrawnControls(
+        seed=cuts.seed,
+        clips=clips,
+        frames=_frames(cuts, orbits=orbits),
+        orbit=_orbit(cuts) if orbits else None,
+        bounds=cuts.bounds,
+    )
+
+
+def _frames(cuts: SceneCuts, *, orbits: bool) -> FrameSampling:
+    usual = KUBRIC_FRAMES if orbits else DRIVING_FRAMES
+    return FrameSampling(clip=cuts.frames, strides=usual.strides, latest_start=usual.latest_start)
+
+
+def _orbit(cuts: SceneCuts) -> OrbitSampling:
+    azimuth_deg, elevation_deg = (180.0, 60.0) if cuts.far else (90.0, 30.0)
+    return OrbitSampling(
+        max_azimuth_deg=azimuth_deg,
+        max_elevation_deg=elevation_deg,
+        gradual=cuts.gradual,
+        frames=_frames(cuts, orbits=True),
+    )
+
+
+def _sampling(cuts: SceneCuts, *, orbits: bool) -> Sampling:
+    return _orbit(cuts) if orbits else DrivingSampling(gradual=cuts.gradual, frames=_frames(cuts, orbits=False))
+
+
+def _identity(folder: Path, scenes: Sequence[str], cuts: SceneCuts) -> str:
+    """Of the scenes by name, what ours say of their files, and how clips are cut."""
+    digest = hashlib.sha256(msgspec.json.encode(replace(cuts, controls=None), order="sorted"))
+    if cuts.controls is not None:
+        digest.update(cuts.controls.read_bytes())
+    for scene in scenes:
+        manifest = folder / scene / MANIFEST
+        digest.update(scene.encode() + (manifest.read_bytes() if manifest.is_file() else b""))
+    return digest.hexdigest()[:_DIGITS]

@@ -1,0 +1,221 @@
+"""What a user asks of an evaluation, worked out: the clips, the methods, and what the run says of itself."""
+
+import platform
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TypeAlias
+
+import torch
+
+from gcd_model import Traits
+from gcd_train.baselines import BaselineSettings, TargetStatistics, fit_statistics
+from gcd_train.datasets.paired import PairedClips, require_apart
+from gcd_train.errors import RecipeError
+from gcd_train.evaluation.asked import Asked, SceneWishes
+from gcd_train.evaluation.clips import EvaluationSet
+from gcd_train.evaluation.held_out import require_same_kind
+from gcd_train.evaluation.methods import (
+    Method,
+    Weights,
+    of_baselines,
+    of_saved_frames,
+    of_weights,
+    require_names_apart,
+)
+from gcd_train.evaluation.opening import Opened, SceneCuts, data_kind, open_pairs, open_scenes
+from gcd_train.evaluation.paired_set import PairedSet, identity_of
+from gcd_train.evaluation.record import RunNote
+from gcd_train.layouts.manifest import package_version
+from gcd_train.metrics import Lpips
+
+ProgressBar: TypeAlias = Callable[[str, int], AbstractContextManager[Callable[[int], None]]]
+"""Shows how far some work is: its name and its steps; gives what is called with the steps done."""
+
+_NEAR_DEG = 90.0
+"""Families that were trained up to this azimuth have goals drawn up to it, others up to 180 degrees."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Training:
+    """Pairs whose means stand in for what nobody saw. identity: of the clips. count: how many."""
+
+    statistics: TargetStatistics
+    identity: str
+    count: int
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Plan:
+    """What is to be done.
+
+    models, rivals: methods, in the order of the table. model: what is known of the weights, None without. painted:
+    targets are class maps in colours.
+    """
+
+    asked: Asked
+    opened: Opened
+    models: tuple[Method, ...]
+    rivals: tuple[Method, ...]
+    model: Traits | None
+    training: Training | None
+    painted: bool
+
+    @property
+    def clips(self) -> EvaluationSet:
+        """To be measured on."""
+        return self.opened.clips
+
+    @property
+    def methods(self) -> tuple[Method, ...]:
+        """All, the weights first."""
+        return self.models + self.rivals
+
+
+def planned(asked: Asked, bar: ProgressBar) -> Plan:
+    """Open the data and the weights, and choose the methods.
+
+    Raises:
+        DataError: data or frames are missing, or do not fit together. RecipeError: options contradict each other, or
+            there is nothing to measure. CheckpointError: weights cannot be opened.
+    """
+    kind = data_kind(asked.data)
+    if kind == "pairs":
+        _require_pairs_options(asked)
+        opened, model = open_pairs(asked.data, asked.choice, asked.mount), _model(asked)
+        painted = False
+    else:
+        model = _model(asked)
+        cuts = _cuts(asked, model)
+        opened, painted = open_scenes(asked.data[0], asked.choice, cuts), cuts.semantic
+    training = _training(asked, opened.clips, bar)
+    models = (
+        ()
+        if model is None
+        else of_weights(_weights(asked), opened.clips, asked.tested.sampling, asked.tested.steps or ())
+    )
+    rivals = _rivals(asked, opened.clips, training, painted=painted)
+    if not (models or rivals):
+        raise RecipeError("there is nothing to measure: give --weights, or leave out --no-baselines")
+    require_names_apart([*models, *rivals])
+    return Plan(
+        asked=asked, opened=opened, models=models, rivals=rivals, model=model, training=training, painted=painted
+    )
+
+
+def note_of(plan: Plan, command: str) -> RunNote:
+    """What the run says of itself. command: the line that began it. Raises DataError for unusable LPIPS weights."""
+    clips, asked = plan.clips, plan.asked
+    lpips = {} if asked.lpips is None else {"lpips": Lpips.open(asked.lpips).identity}
+    return RunNote(
+        command=command,
+        made=datetime.now(UTC).isoformat(timespec="seconds"),
+        versions={
+            "gcd-node": package_version(),
+            "torch": str(torch.__version__),
+            "python": platform.python_version(),
+        },
+        data=tuple(map(str, asked.data)),
+        data_identity=clips.identity,
+        kind=clips.kind,
+        modality="semantic" if plan.painted else "rgb",
+        protocol="pairs" if isinstance(clips, PairedSet) else asked.protocol,
+        frames=clips.frames,
+        height=clips.height,
+        width=clips.width,
+        fps=clips.fps,
+        seed=asked.tested.sampling.seed,
+        classes=tuple(each.name for each in clips.classes),
+        methods={method.name: {**method.told, **lpips} for method in plan.methods},
+    )
+
+
+def _weights(asked: Asked) -> Weights:
+    named = asked.tested.weights or ""
+    path = str(Path(named).resolve()) if Path(named).exists() else named  # processes may stand elsewhere
+    return Weights(path=path, device=asked.tested.device, dtype=asked.tested.dtype)
+
+
+def _model(asked: Asked) -> Traits | None:
+    return None if asked.tested.weights is None else _weights(asked).open().traits
+
+
+def _require_pairs_options(asked: Asked) -> None:
+    """Pairs were cut when they were made."""
+    if asked.cut != SceneWishes() or asked.protocol != "paper":
+        raise RecipeError(
+            "these are pairs, cut when they were made: leave out --protocol, --controls, --trajectories, "
+            "--frame-start, --frame-skip, --angles, --path, --modality, --exact and --camera"
+        )
+
+
+def _cuts(asked: Asked, model: Traits | None) -> SceneCuts:
+    """What was asked for, and what suits the weights where nothing was."""
+    if asked.mount is not None:
+        raise RecipeError("scenes tell where their cameras are: leave out --declared-height and --declared-tilt")
+    wishes, looks, form = asked.cut, asked.cut.looks, SceneCuts()
+    limits = None if model is None or model.family is None else model.family.limits
+    far = limits is not None and limits.azimuth_deg > _NEAR_DEG
+    semantic = model is not None and model.family is not None and model.family.output == "semantic"
+    config = form if model is None else model.config
+    return SceneCuts(
+        protocol=asked.protocol,
+        controls=wishes.controls,
+        clips=wishes.clips,
+        seed=asked.tested.sampling.seed,
+        bounds=wishes.bounds,
+        far=far if looks.angles is None else looks.angles == "max180",
+        gradual=(model is None or model.move_time > 0) if looks.path is None else looks.path == "gradual",
+        semantic=semantic if looks.modality is None else looks.modality == "semantic",
+        exact=wishes.exact,
+        cameras=tuple(wishes.cameras) if wishes.cameras else None,
+        frames=config.frames,
+        height=config.height,
+        width=config.width,
+    )
+
+
+def _training(asked: Asked, clips: EvaluationSet, bar: ProgressBar) -> Training | None:
+    """Raises DataError where the training clips are no measure for the held-out ones."""
+    told = asked.rivals
+    if not told.usual or not told.train:
+        return None
+    if not isinstance(clips, PairedSet):
+        raise RecipeError("means are taken over pairs, and these are scenes: leave out --train")
+    training = PairedClips.open(list(told.train), told.train_limit)
+    require_same_kind(training, clips.clips)
+    if isinstance(clips.clips, PairedClips):
+        require_apart(training, clips.clips)
+    with bar("training clips", len(training)) as show:
+        statistics = fit_statistics(training, progress=lambda done, _: show(done))
+    return Training(statistics=statistics, identity=identity_of(training), count=len(training))
+
+
+def _rivals(asked: Asked, clips: EvaluationSet, training: Training | None, *, painted: bool) -> tuple[Method, ...]:
+    told = asked.rivals
+    settings = BaselineSettings(
+        frames=clips.frames,
+        height=clips.height,
+        width=clips.width,
+        classes=tuple(clips.classes),
+        painted=painted,
+        statistics=None if training is None else training.statistics,
+        svd=told.svd,
+        device=asked.tested.device,
+        dtype=asked.tested.dtype,
+        samples=asked.tested.sampling.samples,
+        seed=asked.tested.sampling.seed,
+        published=asked.protocol == "released",
+    )
+    saved = of_saved_frames(told.predictions or (), clips.classes if painted else ())
+    if not told.usual:
+        return saved
+    names = None if told.names is None else [name.strip() for name in ",".join(told.names).split(",") if name.strip()]
+    if names is None and training is None and isinstance(clips, PairedSet):
+        raise RecipeError(
+            "baselines want training clips for their means: give --train FOLDER, name some that need none with "
+            "--methods, or --no-baselines"
+        )
+    return of_baselines(names, settings, "nothing" if training is None else training.identity) + saved

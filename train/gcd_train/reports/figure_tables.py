@@ -1,0 +1,166 @@
+"""The main tables of a set of clips: the paper's, or the same columns for clips of our own."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from gcd_train.evaluation.class_counts import ClassCounts, class_counts
+from gcd_train.evaluation.record import Region
+from gcd_train.evaluation.tallies import FIGURE_NAMES, Selection, Span
+from gcd_train.reports.intervals import Drawn, Interval, drawn
+from gcd_train.reports.material import EvaluatedSet, Method
+from gcd_train.reports.paper import CLASS_COLUMNS, PICTURE_COLUMNS, Column, PaperRow, PaperTable, row_label, tables_for
+from gcd_train.reports.table import NO_WEIGHTS, NOT_RUN, NOTHING, Cell, Row, Table, csv_text
+
+_SPANS: tuple[Span, ...] = ("2-last", "last", "all")
+_BRACKETS = "In brackets: 95 % interval, bootstrap over scenes. * is given more than the source video."
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Measured:
+    """A set of clips with the sums of its methods, each worked out once.
+
+    seed: of the bootstrap. rows: method to the row of the paper's tables that a user says it belongs in.
+    """
+
+    of: EvaluatedSet
+    seed: int = 0
+    rows: Mapping[str, str] = field(default_factory=dict[str, str])
+    _known: dict[tuple[str, Selection], Drawn] = field(
+        default_factory=dict[tuple[str, Selection], Drawn], init=False, repr=False, compare=False
+    )
+
+    _counts: dict[str, ClassCounts] = field(
+        default_factory=dict[str, ClassCounts], init=False, repr=False, compare=False
+    )
+
+    def sums(self, method: Method, selection: Selection) -> Drawn:
+        """A method's sums for some frames and pixels."""
+        at = (method.name, selection)
+        if at not in self._known:
+            self._known[at] = drawn(method.records, selection, seed=self.seed, counts=self._counted(method))
+        return self._known[at]
+
+    def _counted(self, method: Method) -> ClassCounts:
+        if method.name not in self._counts:
+            self._counts[method.name] = class_counts(method.records, len(self.of.note.classes))
+        return self._counts[method.name]
+
+    def interval(self, method: Method, column: Column, frames: Span | int) -> Interval:
+        """One figure with its bounds."""
+        return self.sums(method, Selection(frames=frames, region=column.region)).interval(column.figure)
+
+
+def main_tables(measured: Measured, spans: Sequence[Span] = ("2-last", "last")) -> tuple[Table, ...]:
+    """The paper's tables for clips of its sets, tables of the same columns under their own title for others.
+
+    Args:
+        spans: only tables over these frames.
+    """
+    wanted = tables_for(measured.of.note)
+    if wanted:
+        return tuple(_paper_table(measured, each) for each in wanted if each.frames in spans)
+    columns = _columns(measured.of)
+    return tuple(_own_table(measured, columns, frames) for frames in spans)
+
+
+def all_figures(measured: Measured) -> str:
+    """Every figure of every method, frames and pixels with its interval, as CSV: one figure a line."""
+    lines: list[list[str]] = []
+    for method in measured.of.methods:
+        for frames in _SPANS:
+            for region in measured.of.regions:
+                sums = measured.sums(method, Selection(frames=frames, region=region))
+                for name in FIGURE_NAMES:
+                    cell = Cell(figure=sums.interval(name))
+                    if cell.numbers()[0]:
+                        lines.append([method.name, frames, region, name, *cell.numbers(), str(len(method.records))])
+    return csv_text(["method", "frames", "pixels", "figure", "value", "low", "high", "clips"], lines)
+
+
+def _columns(of: EvaluatedSet) -> tuple[Column, ...]:
+    pictures = any(method.makes_pictures for method in of.methods)
+    classes = any(method.makes_classes for method in of.methods)
+    every = (*(PICTURE_COLUMNS if pictures else ()), *(CLASS_COLUMNS if classes else ()))
+    return tuple(column for column in every if column.region in of.regions)
+
+
+def _own_table(measured: Measured, columns: Sequence[Column], frames: Span) -> Table:
+    told = _frames_told(measured, frames)
+    rows = [_measured_row(measured, method, columns, frames, PaperRow(label="")) for method in measured.of.methods]
+    return Table(
+        name="main" if frames == "2-last" else "last_frame",
+        title=f"{measured.of.title}: {told}",
+        headings=tuple(column.heading for column in columns),
+        rows=tuple(rows),
+        notes=_notes(measured, columns, frames),
+    )
+
+
+def _paper_table(measured: Measured, table: PaperTable) -> Table:
+    placed: dict[str, list[Method]] = {}
+    for method in measured.of.methods:
+        label = measured.rows.get(method.name) or row_label(method.name, method.details, table)
+        placed.setdefault(label or "", []).append(method)
+    rows: list[Row] = []
+    for row in table.rows:
+        found = placed.pop(row.label, [])
+        rows += [_measured_row(measured, each, table.columns, table.frames, row) for each in found]
+        rows += [] if found else [_not_run(row, table.columns)]
+    left = [each for methods in placed.values() for each in methods] if table.frames == "2-last" else []
+    rows += [
+        _measured_row(measured, each, table.columns, table.frames, PaperRow(label="not in the paper")) for each in left
+    ]
+    return Table(
+        name=table.name,
+        title=f"{table.title} ({measured.of.title})",
+        headings=tuple(column.heading for column in table.columns),
+        rows=tuple(rows),
+        notes=_notes(measured, table.columns, table.frames),
+    )
+
+
+def _measured_row(measured: Measured, method: Method, columns: Sequence[Column], frames: Span, row: PaperRow) -> Row:
+    printed = (*row.printed, *(None,) * len(columns))
+    return Row(
+        label=row.label,
+        method=method.name + (" *" if method.privileged else ""),
+        clips=f"{len(method.records)} of {len(measured.of.keys)}",
+        cells=tuple(
+            Cell(
+                figure=measured.interval(method, column, frames),
+                digits=column.digits,
+                note=_why_not(measured.of, method, column),
+                paper=paper,
+            )
+            for column, paper in zip(columns, printed, strict=False)
+        ),
+    )
+
+
+def _not_run(row: PaperRow, columns: Sequence[Column]) -> Row:
+    printed = (*row.printed, *(None,) * len(columns))
+    cells = tuple(Cell(note=NOT_RUN, paper=paper) for _, paper in zip(columns, printed, strict=False))
+    return Row(label=row.label, cells=cells)
+
+
+def _why_not(of: EvaluatedSet, method: Method, column: Column) -> str:
+    """What stands where there is no figure."""
+    if column.figure == "lpips" and method.makes_pictures:
+        return NO_WEIGHTS
+    return "unknown" if _unknown_region(of, column.region) else NOTHING
+
+
+def _unknown_region(of: EvaluatedSet, region: Region) -> bool:
+    return region not in of.regions
+
+
+def _frames_told(measured: Measured, frames: Span) -> str:
+    return "last frame" if frames == "last" else f"frames 2-{measured.of.note.frames}"
+
+
+def _notes(measured: Measured, columns: Sequence[Column], frames: Span) -> tuple[str, ...]:
+    of, told = measured.of, _frames_told(measured, frames)
+    notes = [f"{told[0].upper()}{told[1:]} of {len(of.keys)} clips of {of.scenes} scenes. {_BRACKETS}"]
+    if any(_unknown_region(of, column.region) for column in columns):
+        notes.append("Unknown: nobody knows which pixels of these clips the source camera saw.")
+    return tuple(notes)

@@ -1,0 +1,228 @@
+"""The report as a folder: `report.md`, its tables as CSV, plots, galleries and videos."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from gcd_train.errors import RunError
+from gcd_train.evaluation.keeping import folder_name
+from gcd_train.evaluation.report import write_file
+from gcd_train.evaluation.tallies import Span
+from gcd_train.reports import comparison, failures
+from gcd_train.reports.comparison import Difference
+from gcd_train.reports.curves import all_plots, curves_csv
+from gcd_train.reports.drawing import draw
+from gcd_train.reports.figure_tables import Measured, all_figures, main_tables
+from gcd_train.reports.galleries import shown_clips, strips, write_sheet, write_video
+from gcd_train.reports.material import EvaluatedSet, Method, Run, gather, on_the_same_goals
+from gcd_train.reports.paper import is_model
+from gcd_train.reports.table import markdown_rows, to_csv, to_markdown
+from gcd_train.show.matplotlib_door import require_matplotlib
+
+FEWEST_SCENES = 10
+"""With fewer a report warns: the bootstrap knows no more scenes than it is given."""
+
+_SPANS: tuple[Span, ...] = ("2-last", "last")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Choices:
+    """What a report shows.
+
+    leads: methods that are compared with all others; empty for every model, or the first method where there is none.
+    rows: method to its row in the paper's tables, where name and note do not tell. clips: in the gallery. worst: clips
+    of each lead among the failures. drawn: whether there are plots, which want matplotlib. seed: of the bootstrap.
+    """
+
+    leads: tuple[str, ...] = ()
+    rows: Mapping[str, str] = field(default_factory=dict[str, str])
+    clips: int = 4
+    worst: int = 4
+    drawn: bool = True
+    seed: int = 0
+
+
+def make_report(folders: Sequence[Path], out: Path, choices: Choices | None = None, *, command: str = "") -> Path:
+    """Read runs and write everything about them. Nothing is measured again.
+
+    Args:
+        folders: of runs. command: the line that makes this report, for its first page.
+    Returns:
+        The path of `report.md`.
+    Raises:
+        RunError: a run cannot be read, two do not go together, or a file cannot be written.
+        RenderError: plots are wanted and matplotlib is not installed.
+    """
+    choices = choices or Choices()
+    if choices.drawn:
+        require_matplotlib()
+    runs = tuple(Run.read(folder) for folder in folders)
+    sets = gather(runs)
+    _require_known((*choices.leads, *choices.rows), sets)
+    pages = [_first_page(runs, command, choices)]
+    for number, each in enumerate(sets, start=1):
+        place = "." if len(sets) == 1 else f"{number}-{each.note.kind}-{each.note.modality}"
+        pages.append("\n".join(_Writer(of=each, out=out, place=place, choices=choices).sections()))
+    for number, each in enumerate(on_the_same_goals(sets), start=1):
+        writer = _Writer(of=each, out=out, place=f"last-frame-{number}", choices=choices)
+        pages.append("\n".join(writer.last_frames()))
+    path = out / "report.md"
+    write_file(path, ("\n".join(pages).rstrip() + "\n").encode())
+    return path
+
+
+def leads(of: EvaluatedSet, choices: Choices) -> tuple[Method, ...]:
+    """The methods of a set that are compared with all its others; those of the choice that it has."""
+    if choices.leads:
+        return tuple(method for name in choices.leads for method in of.methods if method.name == name)
+    models = tuple(method for method in of.methods if is_model(method.name, method.details))
+    return models or of.methods[:1]
+
+
+def _require_known(names: Sequence[str], sets: Sequence[EvaluatedSet]) -> None:
+    """Raises RunError for a method that none of the sets has."""
+    known = dict.fromkeys(method.name for each in sets for method in each.methods)
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise RunError(f"no method is called {unknown[0]!r} in these runs; there are {', '.join(known)}")
+
+
+def _first_page(runs: Sequence[Run], command: str, choices: Choices) -> str:
+    """What the figures were made by: commands, seeds, digests."""
+    lines = ["# Report", ""]
+    if command:
+        lines += ["```bash", command, "```", ""]
+    lines += [f"Intervals: 95 %, 10 000 draws of scenes, seed {choices.seed}.", ""]
+    for run in runs:
+        lines += [f"## Run {run.folder.name}", "", "```bash", run.note.command, "```", "", *_note_lines(run), ""]
+    return "\n".join(lines)
+
+
+def _note_lines(run: Run) -> list[str]:
+    note = run.note
+    versions = ", ".join(f"{name} {version}" for name, version in note.versions.items())
+    facts = (
+        ("made", f"{note.made}, {versions}"),
+        ("clips", f"{', '.join(note.data)}, digest {note.data_identity}"),
+        ("protocol", f"{note.protocol}, seed {note.seed}"),
+        ("size", f"{note.frames} frames of {note.width}x{note.height} at {note.fps:g} fps"),
+    )
+    rows = [[name, _details(details)] for name, details in note.methods.items()]
+    return [*(f"- {name}: {told}" for name, told in facts), "", *markdown_rows(["method", "what it is"], rows)]
+
+
+def _details(details: Mapping[str, str]) -> str:
+    return ", ".join(f"{name} {value}" for name, value in details.items())
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Writer:
+    """One set's part of the report. place: its folder within `out`."""
+
+    of: EvaluatedSet
+    out: Path
+    place: str
+    choices: Choices
+
+    def sections(self) -> Iterator[str]:
+        measured = Measured(of=self.of, seed=self.choices.seed, rows=self.choices.rows)
+        first = leads(self.of, self.choices)
+        yield f"## {self.of.title}\n"
+        yield from self._tables(measured)
+        yield from self._differences(measured, first, _SPANS)
+        yield from self._plots(measured)
+        yield from self._gallery()
+        yield from self._failures(measured, first)
+
+    def last_frames(self) -> Iterator[str]:
+        """Only what the last frame tells, of methods that go there in different ways."""
+        measured = Measured(of=self.of, seed=self.choices.seed, rows=self.choices.rows)
+        yield f"## The last frame together: {self.of.title}\n"
+        yield "These sets go different ways to the same goals, so their last frames are comparable and no others.\n"
+        yield from self._main_tables(measured, ("last",))
+        yield from self._differences(measured, leads(self.of, self.choices), ("last",))
+
+    def _main_tables(self, measured: Measured, spans: Sequence[Span]) -> Iterator[str]:
+        for table in main_tables(measured, spans):
+            self._write(f"tables/{table.name}.csv", to_csv(table))
+            yield f"{to_markdown(table)}\n{self._link(f'tables/{table.name}.csv')}\n"
+
+    def _tables(self, measured: Measured) -> Iterator[str]:
+        yield from self._main_tables(measured, _SPANS)
+        self._write("tables/figures.csv", all_figures(measured))
+        self._write("tables/clips.csv", failures.clips_csv(measured))
+        yield (
+            f"All figures with their intervals: {self._link('tables/figures.csv')}; "
+            f"clip by clip: {self._link('tables/clips.csv')}.\n"
+        )
+
+    def _differences(self, measured: Measured, first: Sequence[Method], spans: Sequence[Span]) -> Iterator[str]:
+        every: list[Difference] = []
+        for frames in spans:
+            told = "last frame" if frames == "last" else f"frames 2-{self.of.note.frames}"
+            for lead in first:
+                found = comparison.differences(measured, lead, frames)
+                every += found
+                if found:
+                    yield f"### {lead.name} against the others, {told}\n"
+                    yield comparison.to_markdown(found)
+        if every:
+            self._write("tables/differences.csv", comparison.to_csv(every))
+            yield (
+                "How far it lies above the other on the same clips; bold where zero lies outside the 95 % interval, "
+                f"which is paired over scenes. {self._link('tables/differences.csv')}\n"
+            )
+        if every and self.of.scenes < FEWEST_SCENES:
+            yield f"Of {self.of.scenes} scenes alone: too few to rest a claim on, whatever is bold.\n"
+
+    def _plots(self, measured: Measured) -> Iterator[str]:
+        for plot in all_plots(measured):
+            self._write(f"plots/{plot.name}.csv", curves_csv(plot))
+            told = f"{plot.up} by {plot.across}"
+            if self.choices.drawn:
+                draw(plot, self._path(f"plots/{plot.name}.png"))
+                yield f"### {plot.title}: {told}\n\n![{told}]({self._name(f'plots/{plot.name}.png')})\n"
+            yield f"The numbers: {self._link(f'plots/{plot.name}.csv')}\n"
+
+    def _gallery(self) -> Iterator[str]:
+        keys = shown_clips(self.of, self.of.methods, self.choices.clips)
+        if keys:
+            yield "### Gallery\n"
+            yield from self._shown("gallery", keys)
+        else:
+            yield "No frames were kept, so there is no gallery: evaluate with `--views all`.\n"
+
+    def _failures(self, measured: Measured, first: Sequence[Method]) -> Iterator[str]:
+        for lead in first if self.choices.worst else ():
+            found = failures.worst_clips(measured, lead, self.choices.worst)
+            yield f"### Worst clips of {lead.name}\n"
+            yield failures.to_markdown(failures.worst_figure(lead), found)
+            kept = set(shown_clips(self.of, (lead,), len(self.of.keys)))
+            keys = tuple(each.key for each in found if each.key in kept)
+            if keys:
+                yield from self._shown(f"worst/{folder_name(lead.name)}", keys)
+
+    def _shown(self, folder: str, keys: Sequence[str]) -> Iterator[str]:
+        """A sheet of clips, and a video of each."""
+        clips = [(key, strips(self.of.methods, key)) for key in keys]
+        write_sheet(clips, self._path(f"{folder}/sheet.png"))
+        yield f"![{', '.join(keys)}]({self._name(f'{folder}/sheet.png')})\n"
+        names = [f"{folder}/{folder_name(key)}.mp4" for key in keys]
+        made = [
+            write_video(rows, self.of.note.fps, self._path(name)) for name, (_, rows) in zip(names, clips, strict=True)
+        ]
+        videos = [self._link(name) for name, done in zip(names, made, strict=True) if done]
+        if videos:
+            yield f"Videos: {', '.join(videos)}\n"
+
+    def _name(self, name: str) -> str:
+        return name if self.place == "." else f"{self.place}/{name}"
+
+    def _path(self, name: str) -> Path:
+        return self.out / self._name(name)
+
+    def _link(self, name: str) -> str:
+        return f"[{Path(name).name}]({self._name(name)})"
+
+    def _write(self, name: str, text: str) -> None:
+        write_file(self._path(name), text.encode())
