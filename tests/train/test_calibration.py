@@ -1,0 +1,200 @@
+"""Intervals of the deviation over samples against truths whose spread is known."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from driving_plane import PlaneClips
+from tiny_driving import write_untrained
+from torch import Tensor
+from typer import Typer
+from typer.testing import CliRunner
+
+from gcd_model import View, load_synthesizer
+from gcd_model.checkpoints import inspect_weights
+from gcd_model.geometry import CameraMount, driving_trajectory
+from gcd_train.baselines import CameraPair, Prediction, SourceClip
+from gcd_train.cli.calibrate import calibrate_command
+from gcd_train.errors import DataError
+from gcd_train.evaluation.calibration import (
+    LEVELS,
+    Distances,
+    best_scale,
+    calibrate,
+    coverage,
+    deviation,
+    distances,
+    miscoverage,
+)
+from gcd_train.evaluation.clips import HeldOutClip
+
+T, H, W = 4, 48, 64
+
+
+def held_out(target: Tensor, *, scene: str = "a", visible: np.ndarray | None = None) -> HeldOutClip:
+    """target: [T, 3, H, W] in [0, 1]."""
+    pictures = (target * 255).round().clamp(0, 255).to(torch.uint8).permute(0, 2, 3, 1).numpy()
+    seen = SourceClip(
+        source=pictures,
+        source_depth=np.ones((T, H, W), np.float32),
+        source_classes=None,
+        cameras=CameraPair.driving(CameraMount(), frames=T, height=H, width=W),
+        fps=10.0,
+    )
+    return HeldOutClip(key=f"{scene}-0", scene=scene, seen=seen, target=pictures, visible=visible)
+
+
+def drawn(*videos: Tensor) -> Prediction:
+    first, *more = (Prediction(video=video) for video in videos)
+    return replace(first, more=tuple(more))
+
+
+def spread_by(share: float, *, seed: int = 0, scene: str = "a", visible: np.ndarray | None = None) -> Distances:
+    """A truth that lies so many deviations from the mean, as a standard deviation; the deviation differs by pixel."""
+    random = torch.Generator().manual_seed(seed)
+    std = 0.02 + 0.03 * torch.rand(T, 1, H, W, generator=random)
+    truth = 0.5 + share * std * torch.randn(T, 3, H, W, generator=random)
+    return distances(
+        held_out(truth, scene=scene, visible=visible), drawn(0.5 + std.expand(T, 3, H, W), 0.5 - std.expand(T, 3, H, W))
+    )
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0, 2.0])
+def test_the_scale_is_the_truths_own_spread(share: float) -> None:
+    counts = spread_by(share).counts["all"]
+    assert best_scale(counts) == pytest.approx(share, rel=0.03)
+    assert miscoverage(counts, share) < 0.01
+
+
+def test_an_honest_deviation_holds_what_it_says_at_every_level() -> None:
+    counts = spread_by(1.0).counts["all"]
+    assert [coverage(counts, level) for level in LEVELS] == pytest.approx(LEVELS, abs=0.015)
+
+
+def test_an_interval_holds_more_the_wider_it_is() -> None:
+    counts = spread_by(1.0).counts["all"]
+    held = [coverage(counts, 0.5, scale) for scale in (0.0001, 0.1, 0.5, 1.0, 2.0, 1000.0)]
+    assert held == sorted(held)
+    assert held[0] < 0.001
+    assert held[-1] == 1.0
+
+
+def test_a_half_as_wide_interval_holds_what_tables_of_the_normal_say() -> None:
+    counts = spread_by(2.0).counts["all"]
+    assert coverage(counts, 0.9) == pytest.approx(0.589, abs=0.015)  # P(|N| < 1.645 / 2)
+    assert coverage(counts, 0.5) == pytest.approx(0.264, abs=0.015)  # P(|N| < 0.674 / 2)
+
+
+def test_the_deviation_is_that_of_a_view() -> None:
+    samples = torch.rand(3, T, 3, H, W, generator=torch.Generator().manual_seed(1))
+    path = driving_trajectory(frames=T, move_time=T - 1)
+    view = View(samples=samples, latents=torch.zeros(1), trajectory=path, motion_bucket=0.0, uncertainty_scale=2.5)
+    assert view.std is not None
+    assert view.uncertainty is not None
+    assert torch.equal(deviation(samples), view.std)
+    assert torch.equal(view.uncertainty, 2.5 * view.std)
+    assert replace(view, uncertainty_scale=None).uncertainty is None
+
+
+def test_the_first_frame_does_not_count() -> None:
+    draws = torch.rand(2, T, 3, H, W, generator=torch.Generator().manual_seed(2))
+    truth = torch.full((T, 3, H, W), 0.5)
+    other = truth.clone()
+    other[0] = 0.0
+    both = [distances(held_out(each), drawn(*draws)).counts["all"] for each in (truth, other)]
+    assert np.array_equal(*both)
+    assert both[0].sum() == (T - 1) * 3 * H * W
+
+
+def test_visible_and_occluded_pixels_are_counted_apart() -> None:
+    visible = np.zeros((T, H, W), np.bool_)
+    visible[:, :, : W // 4] = True
+    counts = spread_by(1.0, visible=visible).counts
+    assert counts["visible"].sum() * 3 == counts["occluded"].sum()
+    assert np.array_equal(counts["visible"] + counts["occluded"], counts["all"])
+
+
+def test_flat_pixels_are_held_as_often_as_their_rounding_has_it() -> None:
+    """Draws that miss a rounded truth by a tenth of a grey level are neither always right nor always wrong."""
+    level = 0.1 / 255
+    truth = torch.full((T, 3, H, W), 128 / 255)
+    counts = distances(held_out(truth), drawn(truth - level, truth + level)).counts["all"]
+    assert coverage(counts, 0.5) == pytest.approx(2 * 0.674 * 0.1, abs=0.01)  # of one level, what the interval takes
+
+
+def test_samples_that_do_not_differ_have_no_scale() -> None:
+    same = torch.full((T, 3, H, W), 0.3)
+    counts = distances(held_out(same + 0.1), drawn(same, same)).counts["all"]
+    assert coverage(counts, 0.95, 1e6) == 0.0
+    with pytest.raises(DataError, match="the samples are all the same"):
+        best_scale(counts)
+
+
+def test_one_draw_gives_no_interval() -> None:
+    with pytest.raises(DataError, match="2 or more draws of a picture, got 1"):
+        distances(held_out(torch.zeros(T, 3, H, W)), drawn(torch.zeros(T, 3, H, W)))
+
+
+def test_the_scale_of_one_half_is_reported_on_the_other() -> None:
+    found = calibrate([spread_by(1.0 if i % 2 else 3.0, seed=i, scene=f"s{i}") for i in range(4)])
+    assert found.fitted == ("s0", "s2")
+    assert found.reported == ("s1", "s3")
+    assert found.scale == pytest.approx(3.0, rel=0.03)
+    assert found.regions["all"].miscoverage < 0.01  # these need no scale
+    assert found.regions["all"].miscoverage_scaled > 0.2
+    assert list(found.regions) == ["all"]
+
+
+def test_one_scene_is_not_enough() -> None:
+    with pytest.raises(DataError, match="2 wanted, got 1"):
+        calibrate([spread_by(1.0), spread_by(1.0, seed=1)])
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_untrained(tmp_path_factory.mktemp("weights"))
+
+
+def run(*words: object) -> tuple[int, str]:
+    app = Typer()
+    app.command()(calibrate_command)
+    made = CliRunner().invoke(app, [*map(str, words)])
+    return made.exit_code, made.output
+
+
+def test_the_command_reports_and_stores_a_scale(tmp_path: Path, weights: Path) -> None:
+    data = PlaneClips.make(2, width=64).write(tmp_path / "clips", 1)
+    stored = tmp_path / "calibrated.safetensors"
+    code, said = run("--data", data, "--weights", weights, "--out", tmp_path / "out", "--samples", 2, "--store", stored)
+    assert code == 0, said
+    note = json.loads((tmp_path / "out" / "calibration.json").read_text())
+    scale = note["found"]["scale"]
+    assert set(note["found"]["regions"]) == {"all", "visible", "occluded"}
+    assert f"**Scale {scale:.3g}**" in (tmp_path / "out" / "calibration.md").read_text()
+    assert (tmp_path / "out" / "reliability.png").read_bytes().startswith(b"\x89PNG")
+    assert inspect_weights(weights).uncertainty_scale is None
+    assert inspect_weights(stored).uncertainty_scale == scale
+    assert load_synthesizer(stored, device="cpu").traits.uncertainty_scale == scale
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--store", "{weights}"], "--store wants the name of a new .safetensors file"),
+        (["--store", "{folder}/new.safetensors", "--steps", "4"], "leave out --steps, or --store"),
+    ],
+)
+def test_a_scale_that_cannot_be_stored_is_refused_before_measuring(
+    tmp_path: Path, weights: Path, more: list[str], said: str
+) -> None:
+    filled = [word.format(weights=weights, folder=tmp_path) for word in more]
+    code, shown = run("--data", tmp_path / "none", "--weights", weights, "--out", tmp_path / "out", *filled)
+    assert code == 78
+    assert said in " ".join(shown.split())
+    assert not (tmp_path / "out").exists()

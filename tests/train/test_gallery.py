@@ -1,0 +1,316 @@
+"""Real videos: which frames become windows, what is shown of them, and what is said of bad ones."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+import torch
+from tiny_driving import write_untrained
+from typer import Typer
+from typer.testing import CliRunner
+
+from gcd_model import (
+    DRIVING_SMALL,
+    FAMILIES,
+    SMALL,
+    Augmentation,
+    Clip,
+    OptionError,
+    RenderOptions,
+    SourceFeatures,
+    SphericalDelta,
+    Traits,
+    Trajectory,
+    View,
+    ViewRangeError,
+)
+from gcd_train.cli.gallery import gallery_command
+from gcd_train.errors import DataError, RecipeError
+from gcd_train.gallery import ViewRecipe, WindowChoice, Windowed, find_videos, read_windows, view_window
+from gcd_train.gallery.real_video import fitted, kept_share
+from gcd_train.gallery.viewed import mounted, paths
+
+T, H, W = 4, 32, 64
+REAL = Path(__file__).parents[2].parent / "shared" / "real"
+
+
+def traits(family: str = "kubric90") -> Traits:
+    """Of a network that takes four small frames."""
+    camera = FAMILIES[family].camera
+    unet = SMALL.unet if camera != "none" else msgspec.structs.replace(SMALL.unet, camera_width=0)
+    return Traits(
+        name="fake",
+        config=msgspec.structs.replace(SMALL, camera=camera, unet=unet, frames=T, height=H, width=W),
+        family=FAMILIES[family],
+        move_time=T - 1,
+        sha256_12="0" * 12,
+        precision="float32",
+        device="cpu",
+        uncertainty_scale=2.0,
+    )
+
+
+def write_video(path: Path, frames: int, fps: float, *, size: tuple[int, int] = (W, H)) -> Path:
+    """Frame n is as bright as 4 n."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), fps, size)
+    for number in range(frames):
+        video.write(np.full((size[1], size[0], 3), 4 * number, np.uint8))
+    video.release()
+    return path
+
+
+def numbers(window: Windowed) -> list[int]:
+    """Which frames of such a video these are."""
+    return [round(float(frame.mean()) / 4) for frame in window.pictures]
+
+
+def windows_of(path: Path, choice: WindowChoice | None = None, family: str = "kubric90") -> tuple[Windowed, ...]:
+    (video,) = find_videos([path])
+    return read_windows(video, traits(family), choice or WindowChoice())
+
+
+@pytest.mark.parametrize(
+    ("fps", "family", "told", "expected"),
+    [
+        (24.0, "kubric90", 24.0, [0, 1, 2, 3]),
+        (30.0, "kubric90", 24.0, [0, 1, 3, 4]),
+        (20.0, "driving", 10.0, [0, 2, 4, 6]),
+        (7.5, "driving", 5.0, [0, 2, 3, 5]),
+    ],
+)
+def test_frames_come_at_the_highest_trained_rate(
+    tmp_path: Path, fps: float, family: str, told: float, expected: list[int]
+) -> None:
+    (window,) = windows_of(write_video(tmp_path / "a.avi", 12, fps), WindowChoice(count=1), family)
+    assert (window.fps, window.trained_rate) == (told, True)
+    assert numbers(window) == expected
+
+
+def test_a_slow_video_keeps_its_own_rate_and_says_so(tmp_path: Path) -> None:
+    (window,) = windows_of(write_video(tmp_path / "a.avi", 5, 3.0), WindowChoice(count=1), "driving")
+    assert (window.fps, window.trained_rate) == (3.0, False)
+    assert numbers(window) == [0, 1, 2, 3]
+
+
+def test_windows_reach_from_the_start_to_the_end_and_do_not_overlap(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "a.avi", 20, 10.0)
+    choice = WindowChoice(count=3, start_s=0.2)
+    assert [numbers(window) for window in windows_of(path, choice, "driving")] == [
+        [2, 3, 4, 5],
+        [9, 10, 11, 12],
+        [16, 17, 18, 19],
+    ]
+    many = windows_of(path, WindowChoice(count=99), "driving")
+    assert [number for window in many for number in numbers(window)] == list(range(20))
+
+
+def test_a_start_that_is_no_number_is_refused() -> None:
+    with pytest.raises(RecipeError, match="that are numbers"):
+        WindowChoice(start_s=float("nan"))
+
+
+def test_a_folder_of_pictures_is_a_video_in_the_order_of_names(tmp_path: Path) -> None:
+    for number in (11, 9, 10, 8):
+        cv2.imwrite(str(tmp_path / f"im_{number}.png"), np.full((H, W, 3), 4 * number, np.uint8))
+    (window,) = windows_of(tmp_path, WindowChoice(rate=10.0), "driving")
+    assert numbers(window) == [8, 9, 10, 11]
+    with pytest.raises(DataError, match="give it with --rate"):
+        windows_of(tmp_path)
+
+
+def test_the_middle_is_kept_in_the_networks_shape() -> None:
+    picture = np.zeros((40, 200, 3), np.uint8)
+    picture[:, 60:140] = 200  # the middle 2:1
+    assert fitted(picture, 64, 32).shape == (32, 64, 3)
+    assert fitted(picture, 64, 32).min() == 200
+    assert fitted(picture[:, 60:140], 32, 16, share=0.5).min() == 200
+
+
+@pytest.mark.parametrize(("hfov", "trained", "share"), [(None, 53.0, 1.0), (60.0, None, 1.0), (50.0, 85.0, 1.0)])
+def test_what_is_not_too_wide_is_kept_whole(hfov: float | None, trained: float | None, share: float) -> None:
+    assert kept_share(hfov, trained) == share
+
+
+def test_the_angle_of_what_is_kept_is_told(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "a.avi", 8, 24.0, size=(64, 64))
+    (wide, *_), (narrow, *_) = (windows_of(path, WindowChoice(hfov_deg=hfov)) for hfov in (90.0, 40.0))
+    assert wide.hfov_deg == pytest.approx(53.13, abs=0.01)
+    assert narrow.hfov_deg == pytest.approx(40.0)
+    assert windows_of(path)[0].hfov_deg is None
+
+
+def test_what_is_too_wide_is_cut_to_the_trained_angle() -> None:
+    assert kept_share(90.0, 53.13) == pytest.approx(0.5, abs=1e-4)  # tan 26.565 deg is a half
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "is no whole video file"),
+        (b"just some text, renamed", "is no whole video file"),
+        (b"\0\0\0\x18ftypmp42" + b"\0" * 64, "cannot be decoded"),
+    ],
+)
+def test_what_is_no_video_is_refused_by_name(tmp_path: Path, content: bytes, said: str) -> None:
+    (tmp_path / "broken.mp4").write_bytes(content)
+    with pytest.raises(DataError, match=rf"broken.mp4 {said}"):
+        windows_of(tmp_path / "broken.mp4")
+
+
+def test_a_short_video_is_refused_with_what_it_lacks(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="has 3 frames at 24 a second; 4 at 24 a second from 0 s on want 4"):
+        windows_of(write_video(tmp_path / "a.avi", 3, 24.0))
+
+
+def test_nothing_to_show_is_said(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="holds neither videos nor pictures"):
+        find_videos([tmp_path])
+    with pytest.raises(DataError, match="does not exist"):
+        find_videos([tmp_path / "absent"])
+
+
+def test_videos_of_one_name_get_files_of_their_own(tmp_path: Path) -> None:
+    paths = [tmp_path / place / "drive 1.avi" for place in ("a", "b")]
+    for path in paths:
+        path.parent.mkdir()
+        path.touch()
+    assert [video.name for video in find_videos(paths)] == ["drive_1", "drive_1.2"]
+
+
+# --- views ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Mirror:
+    """Gives the source back, each sample darker."""
+
+    traits: Traits
+    paths: list[Trajectory] = field(default_factory=list)
+
+    def encode(
+        self, clip: Clip, augmentation: Augmentation | None = None, extra: torch.Tensor | None = None
+    ) -> SourceFeatures:
+        return SourceFeatures(tokens=None, latents=clip.video, extra=None, fps=clip.fps, augmentation=0.0)
+
+    def render(
+        self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
+    ) -> list[View]:
+        self.paths += trajectories
+        assert options is not None
+        video = (features.latents + 1) / 2
+        samples = torch.stack([video * (1 - sample / 10) for sample in range(options.samples)])
+        scale = self.traits.uncertainty_scale
+        return [
+            View(samples=samples, latents=samples, trajectory=path, motion_bucket=0.0, uncertainty_scale=scale)
+            for path in trajectories
+        ]
+
+
+def a_window() -> Windowed:
+    pictures = np.full((T, H, W, 3), 100, np.uint8)
+    size = (W, H)
+    return Windowed(
+        video="a.mp4", name="a-0", number=0, start_s=0.0, pictures=pictures, fps=12.0, trained_rate=True, size=size
+    )
+
+
+def test_each_angle_is_a_row_below_the_input() -> None:
+    model = Mirror(traits())
+    angles = (SphericalDelta(azimuth_deg=40.0), SphericalDelta(elevation_deg=20.0, radius_m=1.0))
+    viewed = view_window(model, a_window(), ViewRecipe(angles=angles))
+    assert [strip.name for strip in viewed.strips] == ["input", "az +40 el +0 r +0", "az +0 el +20 r +1"]
+    assert [path.goal_delta for path in model.paths] == list(angles)
+    assert all(len(strip.frames) == T for strip in viewed.strips)
+    assert np.array_equal(viewed.strips[1].frames[0], viewed.strips[0].frames[0])
+
+
+def test_samples_come_with_their_uncertainty() -> None:
+    viewed = view_window(Mirror(traits()), a_window(), ViewRecipe(angles=(SphericalDelta(azimuth_deg=9.0),), samples=2))
+    names = [strip.name for strip in viewed.strips]
+    assert names[1:3] == ["az +9 el +0 r +0", "az +9 el +0 r +0 sample 2"]
+    shown = re.fullmatch(r"uncertainty, white (\S+)", names[3])
+    assert shown is not None
+    assert float(shown[1]) == pytest.approx(2.0 * 0.05 * 100 / 255, abs=1e-3)  # scale x half the difference
+
+
+def test_a_driving_view_knows_how_the_camera_is_mounted() -> None:
+    warping = replace(traits("driving"), config=msgspec.structs.replace(DRIVING_SMALL, frames=T, height=H, width=W))
+    usual = warping.mount
+    assert usual is not None
+    assert mounted(warping, ViewRecipe(), None) is None
+    assert mounted(warping, ViewRecipe(tilt_deg=4.0), 60.0) == replace(usual, tilt_deg=4.0, hfov_deg=60.0)
+    ((name, path),) = paths(warping, ViewRecipe(height_m=2.0))
+    ((_, trained),) = paths(warping, ViewRecipe())
+    lower = trained.source_from_target[-1, 1, 3] - path.source_from_target[-1, 1, 3]  # y is down
+    assert name == "view"
+    assert float(lower) == pytest.approx(-(2.0 - usual.height_m), abs=1e-6)
+    with pytest.raises(OptionError, match="has no vehicle's view"):
+        paths(traits(), ViewRecipe(height_m=2.0))
+
+
+def test_a_goal_outside_the_family_is_refused() -> None:
+    with pytest.raises(ViewRangeError, match="azimuth_deg 120 is outside"):
+        view_window(Mirror(traits()), a_window(), ViewRecipe(angles=(SphericalDelta(azimuth_deg=120.0),)))
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_untrained(tmp_path_factory.mktemp("weights"))
+
+
+def run(*words: object) -> tuple[int, str]:
+    app = Typer()
+    app.command()(gallery_command)
+    made = CliRunner().invoke(app, [*map(str, words)])
+    return made.exit_code, " ".join(made.output.split())
+
+
+def test_the_command_shows_good_videos_and_names_bad_ones(tmp_path: Path, weights: Path) -> None:
+    write_video(tmp_path / "in" / "a<b>.avi", 6, 10.0)
+    (tmp_path / "in" / "bad.mp4").write_bytes(b"no video")
+    out = tmp_path / "out"
+    code, said = run(tmp_path / "in", "--weights", weights, "--out", out)
+    assert code == 0, said
+    assert "bad.mp4 is no whole video file" in said
+    page = (out / "index.html").read_text()
+    assert "a&lt;b&gt;.avi, window 1" in page
+    assert "bad.mp4 is no whole video file" in page
+    named = set(re.findall(r'(?:href|src)="([^"]+)"', page))
+    assert named == {"a_b-0.png", "a_b-0.mp4"}
+    assert all((out / name).is_file() for name in named)
+    sheet = cv2.imread(str(out / "a_b-0.png"))
+    assert sheet is not None
+    assert sheet.shape[0] >= 3 * H  # input, view, classes
+
+
+@pytest.mark.parametrize(
+    ("more", "code", "said"),
+    [
+        (["--angles", "30,15"], 78, "takes no camera command"),
+        (["--angles", "left"], 78, "--angles wants AZIMUTH,ELEVATION,RADIUS"),
+        ([], 66, "none of 1 videos can be shown"),
+    ],
+)
+def test_what_cannot_be_shown_is_one_line(tmp_path: Path, weights: Path, more: list[str], code: int, said: str) -> None:
+    (tmp_path / "bad.mp4").write_bytes(b"no video")
+    found, shown = run(tmp_path / "bad.mp4", "--weights", weights, "--out", tmp_path / "out", *more)
+    assert found == code
+    assert said in shown
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not REAL.is_dir(), reason="the real videos are not here")
+def test_real_videos_are_shown_by_the_packaged_model(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    code, said = run(REAL, "--weights", "package:driving-small", "--windows", 1, "--out", out)
+    assert code == 0, said
+    assert len(list(out.glob("*.png"))) == len(list(REAL.glob("*.mp4"))) == len(list(out.glob("*.mp4")))
