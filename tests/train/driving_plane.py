@@ -140,6 +140,9 @@ class PlaneClips:
     def seed(self, number: int) -> int:
         return number
 
+    def name(self, number: int) -> str:
+        return f"{number:08d}"
+
     def scene(self, number: int) -> tuple[str, int]:
         return "plane", number // self.clips_per_scene
 

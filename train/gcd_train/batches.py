@@ -12,7 +12,7 @@ from gcd_model.plane_warp import WarpPictures
 from gcd_train.clip_warps import ClipWarps
 from gcd_train.conditioner import Conditioner
 from gcd_train.datasets.clip_source import ClipSource, to_network
-from gcd_train.datasets.latents import LatentClips, LatentRows
+from gcd_train.datasets.latents import EncodedClips, LatentRows
 from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.objective import Batch, drop_streams
@@ -44,7 +44,7 @@ class BatchMaker(Protocol):
 class EncodedBatches:
     """Batches of what the latents stage wrote."""
 
-    def __init__(self, clips: LatentClips, config: ModelConfig, recipe: UNetRecipe, precision: Precision) -> None:
+    def __init__(self, clips: EncodedClips, config: ModelConfig, recipe: UNetRecipe, precision: Precision) -> None:
         self._clips, self._recipe, self._precision = clips, recipe, precision
         self._conditioner = Conditioner(config, recipe, precision)
 

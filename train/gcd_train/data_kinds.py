@@ -8,14 +8,13 @@ from gcd_model import Family, ModelConfig
 from gcd_model.networks import Networks
 from gcd_train.batches import BatchMaker, BatchSource
 from gcd_train.datasets.clip_frames import DRIVING_FRAMES, KUBRIC_FRAMES, FrameSampling
-from gcd_train.datasets.clip_source import ClipSource, PaintedClips
 from gcd_train.datasets.kubric4d import Kubric4D
-from gcd_train.datasets.paired import PairedClips, require_apart
 from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
 from gcd_train.datasets.sample_clips import SampleClips
 from gcd_train.datasets.skips import Skips
 from gcd_train.datasets.splits import Part, kubric_split, present, read_split
 from gcd_train.datasets.trajectories import DrivingSampling, OrbitSampling, Sampling
+from gcd_train.datasets.videos import VideoSamples
 from gcd_train.datasets.view_pairs import ViewPairs
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.latent_cache import CachedLatents
@@ -23,32 +22,14 @@ from gcd_train.latent_cache.batches import CachedBatches
 from gcd_train.lerobot.pairs import LeRobotOptions, LeRobotPairs
 from gcd_train.model_setup import digest_of
 from gcd_train.pair_batches import PairBatches
+from gcd_train.pair_data import open_pairs, require_image_to_video
 from gcd_train.precision import Precision
 from gcd_train.recipe import DataRecipe, Recipe
+from gcd_train.run_data import DataPlaces, RunData
 from gcd_train.sample_loader import Samples
 
 _FIXED_SEED = 0  # of the clips that are measured on: the same ones in every run
 Set = TypeVar("Set", Kubric4D, ParallelDomain4D)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class RunData:
-    """clips: to learn from, for stages that take them one by one, all at the recipe's fps. valid: held out.
-
-    batches: how the U-Net's batches are made where they come neither from encoded clips nor from `clips`.
-    """
-
-    clips: ClipSource
-    valid: ClipSource
-    batches: BatchMaker | None = None
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class DataPlaces:
-    """The folders a user names. data: to learn from. valid: held out; None to hold out a part of `data`."""
-
-    data: Path
-    valid: Path | None = None
 
 
 def open_data(recipe: Recipe, config: ModelConfig, family: Family, places: DataPlaces) -> RunData:
@@ -58,6 +39,8 @@ def open_data(recipe: Recipe, config: ModelConfig, family: Family, places: DataP
         DataError: no such data there, nothing is left to measure on, or both parts share scenes.
         RecipeError: an option does not fit the data or the family.
     """
+    if recipe.data.task == "image-to-video":
+        require_image_to_video(recipe, config)
     opening = _Opening(recipe, config, family, places)
     match recipe.data.kind:
         case "pairs":
@@ -83,11 +66,7 @@ class _Opening:
 
     def pairs(self) -> RunData:
         valid = self._valid_folder("pairs have no split of their own")
-        clips, held_out = PairedClips.open(self.places.data), PairedClips.open(valid)
-        require_apart(clips, held_out)
-        if self._data.modality == "semantic":
-            return RunData(clips=PaintedClips(clips), valid=PaintedClips(held_out))
-        return RunData(clips=clips, valid=held_out)
+        return open_pairs(self.recipe, self.config, self.places.data, valid)
 
     def views(self) -> RunData:
         if self._data.kind == "kubric4d":
@@ -196,10 +175,14 @@ class _Opening:
 
     def _clips(self, samples: Samples, count: int, fps: float) -> SampleClips:
         origin = digest_of(self._data, str(self.places.data))
+        if self._data.task == "image-to-video":
+            samples, count = VideoSamples(samples), 2 * count
         return SampleClips(samples, count, camera=self.config.camera, fps=fps, origin=origin)
 
     def _sampled(self, samples: Samples) -> BatchMaker:
         recipe = self.recipe
+        if recipe.data.task == "image-to-video":
+            samples = VideoSamples(samples)
 
         def batches(networks: Networks, precision: Precision, /) -> BatchSource:
             loader = recipe.data.loader

@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from gcd_model import FAMILIES, SMALL, SVD_14, Family, ModelConfig
-from gcd_model.config import DRIVING_SEMANTIC_SMALL, DRIVING_SMALL, OBJECTS_SMALL, CameraControl
+from gcd_model.config import DRIVING_SEMANTIC_SMALL, DRIVING_SMALL, OBJECTS_SMALL, PLAIN_SMALL, CameraControl
 from gcd_model.errors import OptionError
 from gcd_model.gcd_layout import gcd_state
 from gcd_model.networks import Networks, empty_networks
@@ -22,6 +22,7 @@ _BASES: dict[str, ModelConfig] = {
     "driving-small": DRIVING_SMALL,
     "driving-semantic-small": DRIVING_SEMANTIC_SMALL,
     "objects-small": OBJECTS_SMALL,
+    "plain-small": PLAIN_SMALL,
     "svd-14": SVD_14,
     "small": SMALL,
 }

@@ -15,6 +15,7 @@ from gcd_model import ModelConfig
 from gcd_model.carry_over import DIFFUSION, carried_over
 from gcd_model.checkpoints import LoadedWeights, load_weights
 from gcd_model.errors import CheckpointError
+from gcd_model.loading import packaged_weights
 from gcd_model.networks import Networks
 from gcd_train.errors import RecipeError
 from gcd_train.recipe import ModelRecipe
@@ -38,7 +39,7 @@ def start_networks(recipe: ModelRecipe, config: ModelConfig, seed: int) -> Netwo
     if ":" not in recipe.weights and not Path(recipe.weights).exists():
         raise RecipeError(f"model.weights, {recipe.weights}, is not there; give its place: --set model.weights=FILE")
     networks = fresh_networks(config, seed)
-    loaded = load_weights(recipe.weights, ask_family=False)
+    loaded = loaded_base(recipe.weights)
     try:
         over = carried_over(loaded.networks, config, anew=DIFFUSION if recipe.scratch else ())
     except CheckpointError as error:
@@ -51,9 +52,10 @@ def start_networks(recipe: ModelRecipe, config: ModelConfig, seed: int) -> Netwo
 
 def carried_leftovers(recipe: ModelRecipe) -> Mapping[str, Tensor]:
     """Weights of the file training started from that nothing here uses; see gcd_model.gcd_layout."""
-    return {} if recipe.weights is None else load_weights(recipe.weights, ask_family=False).carried
+    return {} if recipe.weights is None else loaded_base(recipe.weights).carried
 
 
 def loaded_base(path: str) -> LoadedWeights:
-    """A weight file of any layout, whatever its family. Raises CheckpointError."""
-    return load_weights(path, ask_family=False)
+    """A weight file of any layout, or `package:NAME`, whatever its family. Raises CheckpointError."""
+    kind, _, name = path.partition(":")
+    return load_weights(packaged_weights(name) if kind == "package" else path, ask_family=False)

@@ -2,6 +2,7 @@
 
 import logging
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TypeVar
 
 import torch
@@ -12,17 +13,16 @@ from gcd_model.networks import Networks, weights_digest
 from gcd_model.own_format import Card
 from gcd_train.batches import BatchMaker, BatchSource, EncodedBatches, PixelBatches
 from gcd_train.clip_fit import require_fit
-from gcd_train.conditioner import Conditioner
 from gcd_train.datasets.clip_source import ClipSource, KeptClips, numbers_of
-from gcd_train.datasets.latents import LatentClips
+from gcd_train.datasets.latents import EncodedClips, LatentClips
 from gcd_train.datasets.predictions import Predictions, PredictionsMeta, write_predictions
 from gcd_train.draws import Draws
+from gcd_train.encodings import Encodings, autoencoder_digest, class_weights
 from gcd_train.engine.engine import Engine
 from gcd_train.engine.processes import ALONE, Processes
-from gcd_train.errors import RecipeError, RunError
+from gcd_train.errors import RecipeError
 from gcd_train.loop import Loop, LoopOptions, Task
 from gcd_train.lora import adapter_of, merge_lora
-from gcd_train.losses import COLOUR_WEIGHTS, class_frequency_weights
 from gcd_train.model_setup import (
     copy_of,
     digest_of,
@@ -38,7 +38,6 @@ from gcd_train.recipe import DecoderRecipe, Recipe, StageName, UNetRecipe, VAERe
 from gcd_train.run_folder import RunFolder
 from gcd_train.stages.decoder import DecoderData, DecoderTask, Predictor
 from gcd_train.stages.export import ExportJob, export
-from gcd_train.stages.latents import LatentsJob, encode_clips
 from gcd_train.stages.unet import UNetTask
 from gcd_train.stages.vae import VAETask
 from gcd_train.start import carried_leftovers, start_networks
@@ -55,6 +54,7 @@ class RunInputs:
     """What a run works with. clips: to learn from. valid: held out, to measure on. stop: asked between updates.
 
     batches: makes the U-Net's batches where they come neither from encoded clips nor from `clips`.
+    parts: see `RunData`. latents: a folder for encoded clips that several runs share; None for the run's own.
     processes: this one among those of the run.
     """
 
@@ -64,6 +64,8 @@ class RunInputs:
     folder: RunFolder
     stop: StopSignal
     batches: BatchMaker | None = None
+    parts: tuple[ClipSource, ...] = ()
+    latents: Path | None = None
     processes: Processes = ALONE
 
 
@@ -80,6 +82,17 @@ class Trainer:
         self._engine = Engine(processes=inputs.processes, compute=inputs.recipe.compute)
         for clips in (inputs.clips, inputs.valid):
             require_fit(clips, self._config, inputs.recipe.unet.fps)
+        self._encodings = Encodings(
+            recipe=inputs.recipe,
+            config=self._config,
+            family=self._family,
+            precision=self._precision,
+            sets=inputs.parts or (inputs.clips,),
+            as_videos=bool(inputs.parts),
+            folder=inputs.folder.stage("latents"),
+            shared=inputs.latents,
+            stop=inputs.stop,
+        )
 
     def run(self, only: StageName | None = None) -> None:
         """Every stage that is not finished, or just one; several processes train the U-Net, one of them the rest.
@@ -138,7 +151,7 @@ class Trainer:
             shape = digest_of(config.unet, config.prediction, config.plane_warp, seed)
             model = self._recipe.model
             part = "" if model.train == "all" else f"-{base_digest(networks.state_dict())}-{digest_of(model.lora)}"
-            return f"{_autoencoder_digest(networks)}-{shape}{part}"
+            return f"{autoencoder_digest(networks)}-{shape}{part}"
         mix = digest_of(config.plane_warp, config.plane_mix, config.sampling)
         return f"{weights_digest(networks.unet.state_dict())}-{digest_of(seed)}-{mix}"
 
@@ -167,20 +180,7 @@ class Trainer:
         self._loop(task, "vae", recipe, identity)
 
     def _encode(self) -> None:
-        recipe, networks = _present(self._recipe.latents), self._networks("vae")
-        job = LatentsJob(
-            folder=self._folder.stage("latents"),
-            networks=networks,
-            clips=self._inputs.clips,
-            recipe=recipe,
-            precision=self._precision,
-            seed=self._recipe.seed,
-            conditioner=Conditioner(self._config, self._recipe.unet, self._precision, self._family),
-            class_weights=COLOUR_WEIGHTS[self._recipe.unet.loss.class_weights],
-            identity=self._latents_identity(networks),
-            stop=self._inputs.stop,
-        )
-        encode_clips(job)
+        self._encodings.encode(self._networks("vae"))
 
     def _train_unet(self) -> None:
         recipe, networks = self._recipe.unet, self._networks("vae")
@@ -189,7 +189,7 @@ class Trainer:
         if self._recipe.compute.frozen == "bfloat16":
             halve_frozen(networks)
         self._precision.placed(networks if recipe.source == "pixels" else networks.unet)  # encoders only to encode
-        clips = self._latent_clips(networks) if recipe.source == "latents" else None
+        clips = self._encodings.opened(networks) if recipe.source == "latents" else None
         task = UNetTask(
             networks,
             self._batches(networks, clips),
@@ -204,7 +204,7 @@ class Trainer:
     def _train_decoder(self) -> None:
         recipe, networks = _present(self._recipe.decoder), self._networks("vae", "unet")
         identity = self._identity("decoder", networks)
-        clips = self._latent_clips(networks)
+        clips = self._encodings.pairs(networks)
         self._precision.placed(networks)
         data = DecoderData(
             clips=KeptClips(self._inputs.clips, numbers_of(self._inputs.clips, clips.meta.seeds)),
@@ -249,23 +249,7 @@ class Trainer:
         count = self._recipe.log.valid_clips
         return Validation(self._inputs.valid, self._family, count=count, plane_mix=plane_mix)
 
-    def _latents_identity(self, networks: Networks) -> str:
-        recipe, config = self._recipe, self._config
-        steered = (config.plane_warp, config.camera, self._family.name, recipe.unet.motion_bucket)
-        weighed = recipe.unet.loss.class_weights
-        told = digest_of(_present(recipe.latents), recipe.seed, self._inputs.clips.origin, steered, weighed)
-        return f"{_autoencoder_digest(networks)}-{told}"
-
-    def _latent_clips(self, networks: Networks) -> LatentClips:
-        clips = LatentClips.open(self._folder.stage("latents"))
-        if clips.meta.identity != self._latents_identity(networks):
-            raise RunError(
-                f"{self._folder.stage('latents')} was made by another autoencoder, of other clips or with other "
-                "options than this run's; delete it and run the latents stage again"
-            )
-        return clips.resident(self._precision.device) if self._recipe.compute.resident else clips
-
-    def _batches(self, networks: Networks, clips: LatentClips | None) -> BatchSource:
+    def _batches(self, networks: Networks, clips: EncodedClips | None) -> BatchSource:
         recipe, made = self._recipe.unet, self._inputs.batches
         if clips is None and made is not None:
             return made(networks, self._precision)
@@ -273,26 +257,12 @@ class Trainer:
             return PixelBatches(self._inputs.clips, networks, recipe, self._precision, self._family)
         return EncodedBatches(clips, self._config, recipe, self._precision)
 
-    def _weights(self, clips: LatentClips | None) -> Weights:
+    def _weights(self, clips: EncodedClips | None) -> Weights:
         loss, device = self._recipe.unet.loss, self._precision.device
         if clips is None:
             return Weights()
         channels = torch.tensor(clips.meta.sensitivity, device=device) if loss.sensitivity else None
         return Weights(channels=channels, classes=class_weights(clips, loss.class_power, device))
-
-
-def class_weights(clips: LatentClips, power: float, device: torch.device) -> torch.Tensor | None:
-    """Weights of the classes by their frequency in the encoded clips, [K]; None without class maps."""
-    if not clips.meta.class_counts:
-        return None
-    return class_frequency_weights(torch.tensor(clips.meta.class_counts), power).to(device)
-
-
-def _autoencoder_digest(networks: Networks) -> str:
-    parts = (networks.target_encoder, networks.condition_encoder, networks.decoder)
-    return weights_digest(
-        {f"{i}.{name}": value for i, part in enumerate(parts) for name, value in part.state_dict().items()}
-    )
 
 
 def _present(table: Table | None) -> Table:

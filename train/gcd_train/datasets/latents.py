@@ -16,7 +16,7 @@ clips.json      while unfinished: how many clips are done
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Protocol, Self
 
 import msgspec
 import numpy as np
@@ -115,6 +115,20 @@ def picture_bytes(pictures: WarpPictures) -> dict[str, Tensor]:
     """The arrays they are kept in, by name: pictures as uint8, mid grey as 128; rays float16."""
     rows = {name: (getattr(pictures, name) * _BYTES).round() + _GREY for name in _PICTURES}
     return {**{name: row.clamp(0, 255).to(torch.uint8) for name, row in rows.items()}, "rays": pictures.rays.half()}
+
+
+class EncodedClips(Protocol):
+    """Clips as the U-Net learns from them. `LatentClips` and `LatentVideos` are two."""
+
+    meta: LatentsMeta
+
+    def rows(self, clips: Tensor, frames: Tensor, mirrored: Tensor, device: torch.device) -> LatentRows:
+        """The frames (clips[i], frames[i]), mirrored where the flag says so; all int64 or bool [N] on the CPU."""
+        ...
+
+    def names(self, clips: Tensor) -> tuple[str, ...]:
+        """What the clips are called in messages."""
+        ...
 
 
 class LatentClips:

@@ -66,9 +66,9 @@ class PairedClips:
         Shards still being written are left out.
 
         Raises: DataError if one is no data folder, a shard is damaged, there is no clip, or the folders differ in size,
-            frames, rate, lens, classes or camera control.
+            frames, rate, lens, classes, camera control or path.
         """
-        found = _data_folders(folder)
+        found = data_folders(folder)
         worlds = tuple(read_world(each) for each in found)
         _require_alike(found, worlds)
         places = [_places(each, world) for each, world in zip(found, worlds, strict=True)]
@@ -88,6 +88,10 @@ class PairedClips:
         """World and seed of the scene that a clip was cut from."""
         world = self.world_of(index)
         return world.name, world.scene_of(int(self.places[index][1]))
+
+    def name(self, index: int) -> str:
+        """Of a clip in its world: the number it was made from, in digits."""
+        return self.places[index][1]
 
     def __len__(self) -> int:
         return len(self.places)
@@ -123,7 +127,7 @@ class PairedClips:
         Raises: DataError if the shard is damaged.
         """
         if self.world.camera == "fixed":
-            return driving_trajectory(frames=self.frames, move_time=self.frames - 1, mount=self.mount)
+            return driving_trajectory(frames=self.frames, move_time=self.world.move_time, mount=self.mount)
         orbit = self.orbit(index)
         azimuth_deg, elevation_deg, radius_m = orbit.change
         return spherical_trajectory(
@@ -232,10 +236,10 @@ def require_apart(training: PairedClips, held_out: PairedClips) -> None:
         )
 
 
-def _data_folders(folder: Path | str | Sequence[Path | str]) -> list[Path]:
-    """The folders meant: one, several, or those in a folder that is none itself."""
+def data_folders(folder: Path | str | Sequence[Path | str]) -> list[Path]:
+    """The data folders meant: one, several, or those in a folder that is none itself. Raises DataError."""
     if not isinstance(folder, Path | str):
-        found = [each for one in folder for each in _data_folders(one)]
+        found = [each for one in folder for each in data_folders(one)]
         if not found:
             raise DataError("no data folder is given; name at least one")
         if len(set(found)) < len(found):
@@ -249,13 +253,13 @@ def _data_folders(folder: Path | str | Sequence[Path | str]) -> list[Path]:
 def _require_alike(folders: Sequence[Path], worlds: Sequence[World]) -> None:
     def common(world: World) -> tuple[object, ...]:
         size = world.width, world.height, world.frames, world.fps, world.hfov_deg
-        return *size, world.camera, world.classes, None if world.camera == "orbit" else world.options
+        return *size, world.camera, world.path, world.classes, None if world.camera == "orbit" else world.options
 
     for folder, world in zip(folders, worlds, strict=True):
         if common(world) != common(worlds[0]):
             raise DataError(
                 f"{folder} and {folders[0]} do not go together: clips of one training are alike in size, frames, rate, "
-                "lens, classes and camera; generate both with the same options"
+                "lens, classes, camera and path; generate both with the same options"
             )
 
 

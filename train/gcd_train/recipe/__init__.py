@@ -1,7 +1,7 @@
 """What a training run does, as a recipe file states it (TOML): every option is named here, with its meaning."""
 
 from gcd_train.recipe.compute import ComputeRecipe, LogRecipe
-from gcd_train.recipe.data import DataKind, DataRecipe, FramesRecipe, LoaderRecipe, Modality, OrbitRecipe
+from gcd_train.recipe.data import DataKind, DataRecipe, DataTask, FramesRecipe, LoaderRecipe, Modality, OrbitRecipe
 from gcd_train.recipe.export import ExportRecipe
 from gcd_train.recipe.loading import load_recipe, parse_recipe
 from gcd_train.recipe.merging import PACKAGED, packaged_recipes
@@ -21,6 +21,7 @@ __all__ = [
     "Count",
     "DataKind",
     "DataRecipe",
+    "DataTask",
     "DecoderRecipe",
     "EmaRecipe",
     "ExportRecipe",

@@ -9,6 +9,7 @@ from gcd_train.recipe.values import Count, NotNegative, Positive, Share
 
 DataKind: TypeAlias = Literal["pairs", "kubric4d", "parallel_domain4d", "lerobot", "cache"]
 Modality: TypeAlias = Literal["rgb", "semantic"]
+DataTask: TypeAlias = Literal["views", "image-to-video"]
 Bounds: TypeAlias = tuple[float, float]
 
 
@@ -67,6 +68,8 @@ class DataRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     kind: "pairs" of `gcd-train generate`; a set in the layout of "kubric4d" or "parallel_domain4d", published or
     ours; "lerobot" with calibrated cameras; a latent "cache" (unet.source "cache").
+    task: "views" of the source along the target camera's path; or "image-to-video", to start from: both sides of every
+    pair are videos, each to be continued from its first frame, and nobody is told of cameras.
     modality: targets in colour, or painted by class.
     path: "gradual" moves all the way through the clip, "direct" stands at the goal from the first frame on.
     move_time: the frame in which a gradual move is done, the last if left out.
@@ -79,6 +82,7 @@ class DataRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     """
 
     kind: DataKind = "pairs"
+    task: DataTask = "views"
     modality: Modality = "rgb"
     path: Literal["gradual", "direct"] = "gradual"
     move_time: Annotated[int, Meta(ge=0)] | None = None
@@ -93,6 +97,10 @@ class DataRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     orbit: OrbitRecipe = OrbitRecipe()
     loader: LoaderRecipe = LoaderRecipe()
     lerobot: LeRobotRecipe = LeRobotRecipe()
+
+    def __post_init__(self) -> None:
+        if self.task == "image-to-video" and (self.modality != "rgb" or self.kind == "cache"):
+            raise ValueError('data.task "image-to-video" learns from videos in colour, and from no cache')
 
     def goal_frame(self, frames: int) -> int:
         """The frame of T in which the camera is at its goal: 0 for direct, T - 1 for gradual, or `move_time`."""

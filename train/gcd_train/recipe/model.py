@@ -58,7 +58,9 @@ class ModelRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     `gcd-train families`. frames, height, width: trained length and size in pixels, left out as the base has them.
     """
 
-    base: Literal["driving-small", "driving-semantic-small", "objects-small", "svd-14", "small"] = "driving-small"
+    base: Literal["driving-small", "driving-semantic-small", "objects-small", "plain-small", "svd-14", "small"] = (
+        "driving-small"
+    )
     camera: CameraControl | None = None
     prediction: Literal["v", "x0"] | None = None
     steps: Count | None = None

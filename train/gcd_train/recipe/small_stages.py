@@ -48,7 +48,8 @@ class DecoderRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """The plane-mix decoder, on frozen predictions of the U-Net.
 
     clips: how many clips to predict beforehand. batch: frames a batch, drawn as runs of `run` consecutive frames.
-    gradient, ssim: weights beside the L1. class_map: weight of the refined class map's cross-entropy.
+    gradient, ssim, energy: weights beside the L1; energy asks for as much drawn in each cell of 8 pixels, see
+    `picture_losses.energy_l1`. class_map: weight of the refined class map's cross-entropy.
     finetune_vae: train the autoencoder's decoder, too, at vae_rate times the rate; wants a run above 1.
     """
 
@@ -60,6 +61,7 @@ class DecoderRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     run: Count = 1
     gradient: NotNegative = 0.4
     ssim: NotNegative = 0.4
+    energy: NotNegative = 0.0
     class_map: NotNegative = 0.1
     class_power: NotNegative = 0.35
     finetune_vae: bool = False

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeAlias
 
 import msgspec
 from msgspec import Meta
@@ -19,10 +19,12 @@ DEPTH_UNIT_M = 1 / 256
 """Depth is stored in these, as 16 bit."""
 STAGE_HFOV_DEG = math.degrees(2 * math.atan(0.5))
 """Kubric-4D's lens, as the worlds on its stage have it."""
-_LATER = ("camera", "clips_per_scene", "edition", "stride")
+_LATER = ("camera", "clips_per_scene", "edition", "stride", "path")
 """Fields that came later: they are told only where they say something, so that what was told before stays."""
 
 Numbers = tuple[float, float, float]
+CameraWay: TypeAlias = Literal["gradual", "direct"]
+"""How the target camera reaches its goal: over the whole clip, or it stands there from the first frame on."""
 
 
 class Orbit(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -45,7 +47,7 @@ class World(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     world itself gives its target camera, or "orbit", a path over the sphere that is drawn for each clip.
     clips_per_scene: how many clips are cut from what was simulated once; clip k of scene s has the number
     s * clips_per_scene + k. edition: of the world, see `SceneWorld`. stride: time steps of the scene from one frame of
-    the clip to the next.
+    the clip to the next. path: how the target camera of a "fixed" world reaches its goal.
     """
 
     name: str
@@ -63,6 +65,12 @@ class World(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     clips_per_scene: Annotated[int, Meta(ge=1)] = 1
     edition: Annotated[int, Meta(ge=1)] = 1
     stride: Annotated[int, Meta(ge=1)] = 1
+    path: CameraWay = "gradual"
+
+    @property
+    def move_time(self) -> int:
+        """The frame in which the target camera is at its goal."""
+        return 0 if self.path == "direct" else self.frames - 1
 
     def scene_of(self, seed: int) -> int:
         """The seed of the scene that a clip was cut from."""
@@ -105,10 +113,10 @@ class PairForm:
         )
 
 
-def driving_world(form: PairForm, mount: WorldOptions, edition: int = 1) -> World:
+def driving_world(form: PairForm, mount: WorldOptions, edition: int = 1, path: CameraWay = "gradual") -> World:
     """Pairs of the forward camera and the path to the view from above.
 
-    mount: where the source camera really sits. edition: see `driving_scene`.
+    mount: where the source camera really sits. edition: see `driving_scene`. path: how the target camera gets there.
     Raises: PoseError if that is no mount.
     """
     CameraMount(height_m=mount.height_m, tilt_deg=mount.tilt_deg)  # refuses what is none before anything is made
@@ -123,6 +131,7 @@ def driving_world(form: PairForm, mount: WorldOptions, edition: int = 1) -> Worl
         clips_per_shard=form.clips_per_shard,
         options=mount,
         edition=edition,
+        path=path,
     )
 
 

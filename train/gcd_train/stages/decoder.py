@@ -23,7 +23,7 @@ from gcd_train.draws import Draws
 from gcd_train.errors import RecipeError
 from gcd_train.loop import Progress, StepLoss
 from gcd_train.objective import class_map_loss
-from gcd_train.picture_losses import gradient_l1, ssim
+from gcd_train.picture_losses import energy_l1, gradient_l1, ssim
 from gcd_train.precision import Precision
 from gcd_train.recipe import DecoderRecipe
 from gcd_train.schedule import ParameterGroup
@@ -187,6 +187,9 @@ class DecoderTask:
             "ssim": ssim(picture, target),
         }
         total = parts["l1"] + recipe.gradient * parts["gradient"] + recipe.ssim * (1 - parts["ssim"])
+        if recipe.energy:
+            parts["energy"] = energy_l1(picture, target)
+            total = total + recipe.energy * parts["energy"]
         if logits is not None and classes is not None and recipe.class_map:
             counted = torch.ones(len(classes), dtype=torch.bool, device=classes.device)
             parts["class_map"] = class_map_loss(logits, classes, counted, self._data.class_weights)

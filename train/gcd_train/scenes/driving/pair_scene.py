@@ -6,7 +6,7 @@ behind the car, 10 frames per second.
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,30 @@ HFOV_DEG = 85.0
 _FOCUS_AHEAD_M = 28.0
 
 
-def driving_scene(seed: int, *, frames: int = 14, mount: CameraMount | None = None, edition: int = 1) -> Scene:
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Ride:
+    """How a scene is seen. move_time: the frame in which the target camera is at its goal."""
+
+    frames: int
+    mount: CameraMount
+    move_time: int
+
+    def cameras(self, ego: Floats) -> dict[str, NDArray[np.float64]]:
+        """world_from_camera [T, 4, 4] of the source and of the target camera; both ride on the vehicle."""
+        world_from_vehicle, source = rigid(ego), self.mount.vehicle_from_camera.numpy()
+        path = driving_trajectory(frames=self.frames, move_time=self.move_time, mount=self.mount)
+        goal = source @ path.source_from_target.numpy()
+        return {"source": world_from_vehicle @ source, "target": world_from_vehicle @ goal}
+
+
+def driving_scene(
+    seed: int,
+    *,
+    frames: int = 14,
+    mount: CameraMount | None = None,
+    edition: int = 1,
+    move_time: int | None = None,
+) -> Scene:
     """A scene that depends on nothing but its arguments.
 
     Args:
@@ -35,15 +58,17 @@ def driving_scene(seed: int, *, frames: int = 14, mount: CameraMount | None = No
         mount: where the source camera sits, if not where ParallelDomain-4D has it; the target path stays.
         edition: 1 for the world that the packaged model was trained in, 2 for the grown one. Both speak of the class
             head's thirteen classes.
+        move_time: the frame in which the target camera is at its goal, the last if left out; 0 is the direct path.
     Raises:
         DataError: there is no such edition.
     """
     if edition not in _EDITIONS:
         raise DataError(f"the driving world has editions 1 and 2, got {edition}; leave it out for the first one")
-    return _EDITIONS[edition](seed, frames, mount or CameraMount())
+    last = frames - 1 if move_time is None else move_time
+    return _EDITIONS[edition](seed, _Ride(frames=frames, mount=mount or CameraMount(), move_time=last))
 
 
-def _first_edition(seed: int, frames: int, mount: CameraMount) -> Scene:
+def _first_edition(seed: int, ride: _Ride) -> Scene:
     random = np.random.default_rng([seed, 0x6D])
     road = random_road(random)
     name = str(random.choice(list(DISTRICTS), p=[0.4, 0.3, 0.18, 0.12]))
@@ -51,34 +76,34 @@ def _first_edition(seed: int, frames: int, mount: CameraMount) -> Scene:
     parts = [sky_dome(), *surroundings(road, DISTRICTS[name], random)]
     traffic = random_traffic(road, random)
     light = _random_light(random)
-    rows = traffic.poses(road, frames)
+    rows = traffic.poses(road, ride.frames)
     return Scene(
         parts=(*parts, *_bodies(traffic)),
         sheets=tuple(sheets),
         poses=upright(rows),
         focus=ahead_of(rows[:, EGO_BODY]),
-        cameras=_cameras(rows[:, EGO_BODY], frames, mount),
-        hfov_deg=mount.hfov_deg,
+        cameras=ride.cameras(rows[:, EGO_BODY]),
+        hfov_deg=ride.mount.hfov_deg,
         light=light,
         facts=_facts(seed, name, road, traffic),
     )
 
 
-def _grown_edition(seed: int, frames: int, mount: CameraMount) -> Scene:
-    world = grown_world(seed, frames)
+def _grown_edition(seed: int, ride: _Ride) -> Scene:
+    world = grown_world(seed, ride.frames)
     return Scene(
         parts=tuple(replace(part, label=coarse(part.label)) for part in world.parts),
         sheets=tuple(replace(sheet, label=coarse(sheet.label)) for sheet in world.sheets),
         poses=world.poses,
         focus=ahead_of(world.ego),
-        cameras=_cameras(world.ego, frames, mount),
-        hfov_deg=mount.hfov_deg,
+        cameras=ride.cameras(world.ego),
+        hfov_deg=ride.mount.hfov_deg,
         light=world.weather.light,
         facts=world.facts,
     )
 
 
-_EDITIONS: dict[int, Callable[[int, int, CameraMount], Scene]] = {1: _first_edition, 2: _grown_edition}
+_EDITIONS: dict[int, Callable[[int, _Ride], Scene]] = {1: _first_edition, 2: _grown_edition}
 
 
 def _bodies(traffic: Traffic) -> list[Part]:
@@ -89,14 +114,6 @@ def _bodies(traffic: Traffic) -> list[Part]:
     for index, row in enumerate(traffic.parked, start=len(traffic.movers)):
         parts += [part.of(instance=2 + index % 254) for part in row]
     return parts
-
-
-def _cameras(ego: Floats, frames: int, mount: CameraMount) -> dict[str, NDArray[np.float64]]:
-    """world_from_camera [T, 4, 4] of the source and of the target camera; both ride on the vehicle."""
-    world_from_vehicle = rigid(ego)
-    source = mount.vehicle_from_camera.numpy()
-    path = driving_trajectory(frames=frames, move_time=frames - 1, mount=mount).source_from_target.numpy()
-    return {"source": world_from_vehicle @ source, "target": world_from_vehicle @ (source @ path)}
 
 
 def ahead_of(ego: Floats) -> Floats:

@@ -1,0 +1,99 @@
+"""Driving pairs whose target camera stands at its goal from the first frame on, beside those where it moves there."""
+
+import json
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gcd_model.geometry import CameraMount, driving_trajectory
+from gcd_train.datasets.paired import PairedClips
+from gcd_train.errors import DataError
+from gcd_train.evaluation.held_out import cameras_of
+from gcd_train.model_setup import model_config
+from gcd_train.pair_data import open_pairs
+from gcd_train.recipe import load_recipe
+from gcd_train.scenes.driving.pair_scene import driving_scene
+from gcd_train.scenes.pair_world import CameraWay, PairForm, World, agree, driving_world, read_world
+from gcd_train.scenes.worlds import WorldOptions
+
+FORM = PairForm(width=48, height=32, frames=3, oversample=1)
+
+
+def world(path: CameraWay, mount: WorldOptions | None = None) -> World:
+    return driving_world(FORM, mount or WorldOptions(), 1, path)
+
+
+def folder(place: Path, path: CameraWay, first_seed: int = 0) -> Path:
+    """A data folder that says what it is; its one clip is a name without pictures."""
+    place.mkdir(parents=True)
+    agree(place, world(path))
+    with zipfile.ZipFile(place / f"shard-{first_seed:08d}-0001.zip", "w") as archive:
+        archive.writestr(f"{first_seed:08d}/scene.json", "{}")
+    return place
+
+
+# laws
+
+
+def test_a_direct_target_stands_where_a_gradual_one_arrives_and_the_source_is_the_same() -> None:
+    gradual, direct = driving_scene(3, frames=3), driving_scene(3, frames=3, move_time=0)
+    np.testing.assert_array_equal(direct.cameras["source"], gradual.cameras["source"])
+    np.testing.assert_allclose(direct.cameras["target"][-1], gradual.cameras["target"][-1], atol=1e-9)
+    between = np.linalg.inv(direct.cameras["source"]) @ direct.cameras["target"]
+    np.testing.assert_allclose(between, np.repeat(between[-1:], 3, 0), atol=1e-6)
+    assert not np.allclose(gradual.cameras["target"][0], direct.cameras["target"][0])
+
+
+@pytest.mark.parametrize(("path", "goal"), [("gradual", 2), ("direct", 0)])
+def test_clips_and_methods_follow_the_path_that_the_world_tells(path: CameraWay, goal: int, tmp_path: Path) -> None:
+    clips = PairedClips.open(folder(tmp_path / "data", path))
+    wanted = driving_trajectory(frames=3, move_time=goal, mount=CameraMount()).source_from_target
+    for trajectory in (clips.trajectory(0), cameras_of(clips, 0).trajectory):
+        np.testing.assert_allclose(trajectory.source_from_target.numpy(), wanted.numpy(), atol=1e-9)
+        assert trajectory.at_goal.index(True) == goal
+    lower = CameraMount(height_m=1.2)
+    declared = cameras_of(clips, 0, lower).trajectory.source_from_target
+    np.testing.assert_allclose(declared, driving_trajectory(frames=3, move_time=goal, mount=lower).source_from_target)
+
+
+def test_the_path_is_told_where_it_is_direct_and_folders_without_a_word_are_gradual(tmp_path: Path) -> None:
+    for path in ("gradual", "direct"):
+        agree_in = tmp_path / path
+        agree_in.mkdir()
+        agree(agree_in, world(path))
+        assert read_world(agree_in) == world(path)
+    assert "path" not in json.loads((tmp_path / "gradual" / "world.json").read_text())
+    assert json.loads((tmp_path / "direct" / "world.json").read_text())["path"] == "direct"
+
+
+# examples
+
+
+def test_clips_of_both_paths_do_not_go_together(tmp_path: Path) -> None:
+    folder(tmp_path / "gradual", "gradual")
+    folder(tmp_path / "direct", "direct")
+    with pytest.raises(DataError, match="camera and path"):
+        PairedClips.open(tmp_path)
+
+
+def test_a_recipe_for_the_other_path_is_refused(tmp_path: Path) -> None:
+    recipe = load_recipe("package:study-gradual-scratch")
+    places = folder(tmp_path / "train", "direct"), folder(tmp_path / "valid", "direct", 1_000_000)
+    with pytest.raises(DataError, match=r"goal in frame 0, the recipe's data\.path says frame 2"):
+        open_pairs(recipe, model_config(recipe.model), *places)
+    direct = load_recipe("package:study-direct-scratch")
+    assert len(open_pairs(direct, model_config(direct.model), *places).clips) == 1
+
+
+def test_image_to_video_takes_both_paths_and_no_scene_that_is_held_out(tmp_path: Path) -> None:
+    for path in ("gradual", "direct"):
+        folder(tmp_path / "train" / path, path)
+        folder(tmp_path / "valid" / path, path, 1_000_000)
+    recipe = load_recipe("package:study-pretrain")
+    opened = open_pairs(recipe, model_config(recipe.model), tmp_path / "train", tmp_path / "valid")
+    assert (len(opened.clips), len(opened.parts), len(opened.valid)) == (4, 2, 4)
+    assert opened.parts[0].origin != opened.parts[1].origin
+    with pytest.raises(DataError, match="share 1 scenes"):
+        open_pairs(recipe, model_config(recipe.model), tmp_path / "train", tmp_path / "train" / "direct")

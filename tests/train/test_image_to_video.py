@@ -1,0 +1,215 @@
+"""Videos out of pairs: what is learned before views, from pictures, from latents and from samples of a data set."""
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+from tiny_world import FRAMES, Never, TinyClips, TinyOrbits
+
+from gcd_model import FAMILIES, ModelConfig, load_synthesizer
+from gcd_model.checkpoints import save_weights
+from gcd_model.networks import Networks, random_networks
+from gcd_model.own_format import Card
+from gcd_train.conditioner import Conditioner
+from gcd_train.datasets.clip_source import ClipSource
+from gcd_train.datasets.dataset4d import PairSample
+from gcd_train.datasets.latent_videos import LatentVideos
+from gcd_train.datasets.latents import LatentClips
+from gcd_train.datasets.skips import Skips
+from gcd_train.datasets.videos import VideoClips, VideoSamples
+from gcd_train.errors import RecipeError
+from gcd_train.model_setup import model_config
+from gcd_train.pair_data import open_pairs, require_image_to_video
+from gcd_train.precision import Precision
+from gcd_train.recipe import Recipe, load_recipe
+from gcd_train.run_folder import RunFolder
+from gcd_train.stages.latents import LatentsJob, encode_clips
+from gcd_train.start import start_networks
+from gcd_train.trainer import RunInputs, Trainer
+
+CPU = torch.device("cpu")
+SMALLER = ("model.unet.multipliers=[1,2,2]", "model.vae.width=16", "model.vae.multipliers=[1,1,2]", "log.valid_clips=1")
+
+
+def recipe(name: str, *changes: str) -> Recipe:
+    return load_recipe(f"package:{name}", small=True, changes=[*SMALLER, *changes])
+
+
+def encoded(folder: Path, networks: Networks, told: Recipe, clips: ClipSource) -> LatentClips:
+    assert told.latents is not None
+    precision = Precision.of(told.compute)
+    job = LatentsJob(
+        folder=folder,
+        networks=networks,
+        clips=clips,
+        recipe=msgspec.structs.replace(told.latents, flip=True, limit=None),
+        conditioner=Conditioner(networks.config, told.unet, precision, FAMILIES["svd"]),
+        class_weights=(),
+        precision=precision,
+        seed=1,
+        identity="test",
+        stop=Never(),
+    )
+    encode_clips(job)
+    return LatentClips.open(folder)
+
+
+# laws
+
+
+def test_both_sides_of_a_pair_are_videos_that_begin_with_their_condition() -> None:
+    pairs, orbits = TinyClips(2), TinyOrbits(1)
+    videos = VideoClips([pairs, orbits])
+    assert len(videos) == 6
+    for number in range(6):
+        first, video = videos.rgb(number)
+        assert (first == video[0]).all()
+        assert not (video == video[0]).all()
+        poses = videos.trajectory(number).source_from_target
+        assert torch.equal(poses, torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1))
+    shown = [videos.rgb(number)[1] for number in (0, 1, 2, 5)]
+    wanted = [pairs.rgb(0)[0], pairs.rgb(0)[1], orbits.rgb(0)[0], pairs.rgb(1)[1]]
+    assert all(np.array_equal(one, other) for one, other in zip(shown, wanted, strict=True))
+    assert len({videos.seed(number) for number in range(6)}) == 6
+
+
+def test_encoded_pairs_read_as_videos_are_the_encoded_videos(tmp_path: Path) -> None:
+    told = recipe("study-pretrain")
+    networks = random_networks(model_config(told.model), seed=5)
+    sets = (TinyClips(2), TinyClips(1, seed=7))
+    parts = [encoded(tmp_path / str(number), networks, told, clips) for number, clips in enumerate(sets)]
+    videos = LatentVideos(parts, networks.config.vae.scale)
+    again = encoded(tmp_path / "videos", networks, told, VideoClips(sets))
+    place = {seed: number for number, seed in enumerate(again.meta.seeds)}
+    order = [
+        place[part * 10**15 + 2 * seed + side] for part in (0, 1) for seed in parts[part].meta.seeds for side in (0, 1)
+    ]
+    clips, frames = torch.tensor([3, 0, 5, 4, 1]), torch.tensor([0, 1, 3, 2, 3])
+    mirrored = torch.tensor([False, True, True, False, False])
+    rows = videos.rows(clips, frames, mirrored, CPU)
+    wanted = again.rows(torch.tensor(order)[clips], frames, mirrored, CPU)
+    torch.testing.assert_close(rows.target, wanted.target, atol=2e-3, rtol=0)  # kept as float16
+    torch.testing.assert_close(rows.source, wanted.source, atol=2e-3, rtol=0)
+    assert torch.equal(rows.motion, wanted.motion)
+    assert videos.meta.clips == len(again.meta.seeds) == 6
+    assert videos.names(torch.tensor([0, 5])) == ("clip 100, its source", "clip 100, its target")
+    assert sum(videos.meta.sensitivity) == pytest.approx(sum(parts[0].meta.sensitivity), rel=1e-5)
+
+
+class TwoSamples:
+    """Samples with a path over the sphere."""
+
+    def __init__(self) -> None:
+        self.skips = Skips()
+
+    def __len__(self) -> int:
+        return 2
+
+    def sample(self, index: int) -> PairSample:
+        source, target = TinyOrbits(2).rgb(index)
+        path = TinyOrbits(2).trajectory(index)
+        assert path.delta is not None
+        return PairSample(
+            source=source,
+            target=target,
+            target_classes=np.zeros(target.shape[:3], np.uint8),
+            source_from_target=path.source_from_target.numpy(),
+            start=path.source,
+            deltas=path.delta.numpy(),
+            motion=100,
+            fps=12.0,
+            scene=f"scene {index}",
+            frame_numbers=(0, 2, 4, 6),
+            reversed=False,
+            visible=np.ones(target.shape[:3], np.bool_),
+        )
+
+
+def test_samples_of_a_data_set_become_videos_that_nobody_steers() -> None:
+    videos = VideoSamples(TwoSamples())
+    assert len(videos) == 4
+    for index in range(4):
+        video, pair = videos.sample(index), TwoSamples().sample(index // 2)
+        assert np.array_equal(video.target, pair.target if index % 2 else pair.source)
+        assert (video.source == video.target[0]).all()
+        assert (video.start, video.deltas, video.target_classes, video.visible) == (None, None, None, None)
+        assert video.scene == pair.scene
+        assert np.array_equal(video.source_from_target, np.tile(np.eye(4), (FRAMES, 1, 1)))
+
+
+# examples
+
+
+@pytest.fixture(scope="module")
+def autoencoder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A weight file whose autoencoder all trainings here start from."""
+    config: ModelConfig = model_config(recipe("study-pretrain").model)
+    path = tmp_path_factory.mktemp("weights") / "start.safetensors"
+    networks = random_networks(config, seed=2).half()  # as what is exported, so that the autoencoder stays the same
+    save_weights(networks, path, Card(name="start", config=config, family="svd", move_time=3))
+    return path
+
+
+def trainer(folder: Path, told: Recipe, latents: Path, parts: tuple[ClipSource, ...] = ()) -> Trainer:
+    videos = VideoClips(parts) if parts else None
+    inputs = RunInputs(
+        recipe=told,
+        clips=videos or TinyClips(2),
+        valid=videos or TinyClips(1, seed=9),
+        folder=RunFolder(folder),
+        stop=Never(),
+        parts=parts,
+        latents=latents,
+    )
+    return Trainer(inputs)
+
+
+def test_views_start_from_what_continues_pictures_and_nothing_is_encoded_twice(
+    autoencoder: Path, tmp_path: Path
+) -> None:
+    latents, other = tmp_path / "latents", TinyClips(2, seed=4)
+    other.origin = "tiny direct"
+    first = recipe("study-pretrain", f"model.weights={autoencoder}")
+    trainer(tmp_path / "first", first, latents, (TinyClips(2), other)).run()
+    weights = tmp_path / "first" / "study-pretrain-small.safetensors"
+    made = load_synthesizer(weights, device="cpu")
+    assert made.traits.family is FAMILIES["svd"]
+    before = {path: path.stat().st_mtime_ns for path in latents.rglob("*.npy")}
+    assert len({path.parent for path in before}) == 2
+    assert not (tmp_path / "first" / "latents").exists()
+    then = recipe("study-gradual-pretrained", f"model.weights={weights}")
+    trainer(tmp_path / "second", then, latents).run("latents")
+    assert {path: path.stat().st_mtime_ns for path in latents.rglob("*.npy")} == before
+    start = start_networks(then.model, model_config(then.model), then.seed)
+    assert torch.equal(start.unet.conv_out.weight, made.networks.unet.conv_out.weight.float())
+    scratch = recipe("study-gradual-scratch", f"model.weights={weights}")
+    anew = start_networks(scratch.model, model_config(scratch.model), scratch.seed)
+    assert not torch.equal(anew.unet.stem.weight, start.unet.stem.weight)
+    assert torch.equal(anew.decoder.stem.weight, start.decoder.stem.weight)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        (["model.family=driving"], 'give model.family "svd"'),
+        (["model.base=driving-small", "model.weights=x"], "warp along"),
+    ],
+)
+def test_a_model_for_something_else_is_refused(changes: list[str], said: str) -> None:
+    told = recipe("study-pretrain", *changes)
+    with pytest.raises(RecipeError, match=said):
+        require_image_to_video(told, model_config(told.model))
+
+
+@pytest.mark.parametrize("change", ["data.modality=semantic", "data.kind=cache"])
+def test_painted_targets_and_caches_are_no_videos(change: str) -> None:
+    with pytest.raises(RecipeError, match="learns from videos in colour"):
+        recipe("study-pretrain", change)
+
+
+def test_latents_that_were_encoded_unalike_are_no_videos(tmp_path: Path) -> None:
+    told = recipe("study-pretrain", "latents.sample=true")
+    with pytest.raises(RecipeError, match="one shared autoencoder"):
+        open_pairs(told, model_config(told.model), tmp_path, tmp_path)

@@ -1,0 +1,168 @@
+"""The small-scale study: its recipes differ in what is studied alone, its script runs, its claims are weighed."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import pytest
+from headless import needs_egl
+from made_records import FRAMES, note, record, region
+from typer.testing import CliRunner
+
+from gcd_model.config import DRIVING_SMALL
+from gcd_train.cli.main import app
+from gcd_train.errors import RunError
+from gcd_train.model_setup import model_config, sampled_as_trained
+from gcd_train.recipe import Recipe, load_recipe
+from gcd_train.reports.findings import Claim, findings, study_claims, to_markdown
+from gcd_train.reports.material import Run
+
+ROOT = Path(__file__).parents[2]
+SCRIPT = ROOT / "launch" / "small-study.sh"
+VIEWS = tuple(f"study-{path}-{start}" for path in ("gradual", "direct") for start in ("pretrained", "scratch"))
+
+
+def without_what_is_studied(recipe: Recipe) -> Recipe:
+    model = msgspec.structs.replace(recipe.model, weights=None, scratch=False)
+    data = msgspec.structs.replace(recipe.data, path="gradual")
+    return msgspec.structs.replace(
+        recipe, name="study", model=model, data=data, vae=load_recipe("package:driving-small").vae
+    )
+
+
+@pytest.mark.parametrize("small", [False, True])
+def test_the_four_trainings_differ_in_path_and_start_alone(small: bool) -> None:
+    recipes = {name: load_recipe(f"package:{name}", small=small) for name in VIEWS}
+    assert len({msgspec.json.encode(without_what_is_studied(each)) for each in recipes.values()}) == 1
+    for name, each in recipes.items():
+        assert each.data.path == name.split("-")[1]
+        assert each.model.scratch == name.endswith("scratch")
+        assert (each.model.weights == "package:driving-small") == name.endswith("scratch")
+
+
+def test_pretraining_sees_the_same_clips_through_the_same_autoencoder() -> None:
+    first, then = load_recipe("package:study-pretrain"), load_recipe("package:study-gradual-scratch")
+    assert (first.latents, first.seed, first.model.weights) == (then.latents, then.seed, "package:driving-small")
+    assert first.data.task == "image-to-video"
+    assert model_config(first.model) == model_config(then.model)
+    assert model_config(first.model).vae == DRIVING_SMALL.vae
+
+
+def test_the_models_have_the_papers_form() -> None:
+    recipe = load_recipe("package:study-gradual-pretrained")
+    config = sampled_as_trained(model_config(recipe.model), recipe.unet)
+    assert (config.plane_warp, config.plane_mix, config.class_head, config.extra_condition_channels) == (
+        None,
+        None,
+        None,
+        0,
+    )
+    assert config.sampling.steps > 1
+    assert config.unet.widths == DRIVING_SMALL.unet.widths
+    assert 0 < recipe.unet.noise.fixed_share < 1
+
+
+# the script
+
+
+def commands() -> list[list[str]]:
+    """Every call in the script: command, then its words."""
+    text = SCRIPT.read_text().replace("\\\n", " ")
+    return [line.split() for line in re.findall(r"^ *gcd_train (?!\()(.+)$", text, flags=re.MULTILINE)]
+
+
+def test_the_script_parses_and_its_options_exist() -> None:
+    there = shutil.which("bash")
+    assert there is not None, "the project's own scripts need bash"
+    checked = subprocess.run([there, "-n", str(SCRIPT)], capture_output=True, text=True, check=False)
+    assert checked.returncode == 0, checked.stderr
+    called = commands()
+    assert [words[0] for words in called] == [
+        *["generate"] * 3,
+        *["train"] * 3,
+        *["evaluate"] * 2,
+        "findings",
+        "report",
+    ]
+    for words in called:
+        command = words[:2] if words[0] == "generate" else words[:1]
+        shown = CliRunner().invoke(app, [*command, "--help"], env={"COLUMNS": "200"})
+        assert [word for word in words if re.match(r"--[a-z]", word) and word not in shown.output] == []
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@needs_egl
+def test_the_whole_study_runs_in_its_tiny_form(tmp_path: Path) -> None:
+    """From no data to the report, twice: the second time nothing is made anew. About three minutes of CPU."""
+    pytest.importorskip("matplotlib", reason="needs the extra `scenes`: pip install 'gcd-node[scenes]'")
+    there = shutil.which("bash")
+    assert there is not None, "the project's own scripts need bash"
+    told = {**os.environ, "PYTHON": sys.executable, "SMALL": "yes", "HEXPLANE": "no"}
+    call = [there, str(SCRIPT), str(tmp_path)]
+    subprocess.run(call, env=told, check=True)
+    table = (tmp_path / "findings" / "findings.md").read_text()
+    claims = study_claims("-small")
+    assert all(f"| {claim.first} | {claim.other} |" in table for claim in claims)
+    assert table.count("not run") == 1  # HexPlane
+    assert (tmp_path / "report" / "report.md").stat().st_size > 1000
+    kept = [path for path in tmp_path.rglob("*") if path.suffix in (".npy", ".pt", ".zip") or "records" in path.parts]
+    before = {path: path.stat().st_mtime_ns for path in kept if path.is_file()}
+    subprocess.run(call, env=told, check=True)
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+# the claims
+
+
+def measured(identity: str, last_db: dict[str, float], scenes: int = 6) -> Run:
+    """Methods whose last frame is so good, a little less in every other scene; all frames before are at 10 dB."""
+    records = [
+        record(name, f"driving-{scene}", regions={"all": region([10.0] * (FRAMES - 1) + [value - scene % 2])})
+        for name, value in last_db.items()
+        for scene in range(scenes)
+    ]
+    return Run(folder=Path(identity), note=note(kind="driving", data_identity=identity), records=tuple(records))
+
+
+def test_methods_on_two_paths_are_compared_in_their_last_frame_scene_by_scene() -> None:
+    runs = [measured("gradual", {"a": 22.0}), measured("direct", {"b": 20.0, "c": 25.0})]
+    claims = [Claim(text="x", first="a", other=other, frames="last") for other in ("b", "c", "nobody")]
+    ahead, behind, unknown = findings(runs, claims)
+    psnr = next(each for each in ahead.apart if each.column.heading == "PSNR all")
+    assert (psnr.apart.value, psnr.apart.low, psnr.clips, psnr.verdict) == (
+        pytest.approx(2.0),
+        pytest.approx(2.0),
+        6,
+        "better",
+    )
+    assert behind.apart[0].verdict == "worse"
+    assert unknown.apart == ()
+    table = to_markdown([ahead, behind, unknown]).splitlines()
+    assert sum("+2.00 [+2.00, +2.00] | 6 | holds" in line for line in table) == 1
+    assert sum("-3.00 [-3.00, -3.00] | 6 | the opposite holds" in line for line in table) == 1
+    assert "not run" in table[-1]
+
+
+def test_a_difference_that_scenes_do_not_agree_on_is_not_shown() -> None:
+    swinging = [record("b", f"driving-{scene}", psnr_db=20.0 + 3.0 * (-1) ** scene) for scene in range(6)]
+    steady = measured("gradual", {"a": 20.0})
+    run = Run(folder=Path("b"), note=note(kind="driving", data_identity="direct"), records=tuple(swinging))
+    (found,) = findings([steady, run], [Claim(text="x", first="a", other="b", frames="last")])
+    assert next(each for each in found.apart if each.column.heading == "PSNR all").verdict == "open"
+    assert "not shown" in to_markdown([found])
+
+
+def test_a_method_that_was_measured_on_two_sets_is_refused() -> None:
+    with pytest.raises(RunError, match="measured on two sets of clips"):
+        findings([measured("gradual", {"a": 1.0}), measured("direct", {"a": 1.0})], study_claims())
+
+
+def test_the_studys_claims_name_the_models_that_its_recipes_make() -> None:
+    named = {name for claim in study_claims() for name in (claim.first, claim.other)}
+    assert set(VIEWS) <= named
+    assert {claim.frames for claim in study_claims() if "gradual" in claim.text} == {"last"}
