@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from rich.console import Console
 from typer import Argument, Option
 
+from gcd_model.errors import NonFiniteError
 from gcd_train.cli.errors import errors_shown
 from gcd_train.cli.progress_bar import progress_bar
 from gcd_train.errors import DataError, RecipeError
@@ -104,14 +105,22 @@ def _viewed(
             try:
                 windows = read_windows(video, model.traits, choice)
             except DataError as error:
-                faults.append(str(error))
-                _LOG.print(f"left out: {error}", markup=False, soft_wrap=True)
+                _leave_out(str(error), faults)
                 windows = ()
             for window in windows:
-                viewed.append(view_window(model, window, recipe))
+                try:
+                    viewed.append(view_window(model, window, recipe))
+                except NonFiniteError as error:
+                    _leave_out(f"{video.path}: {error}", faults)
+                    break
                 write_viewed(viewed[-1], out)
             show(number)
     return viewed, faults
+
+
+def _leave_out(fault: str, faults: list[str]) -> None:
+    faults.append(fault)
+    _LOG.print(f"left out: {fault}", markup=False, soft_wrap=True)
 
 
 def _facts(model: "ViewSynthesizer", recipe: "ViewRecipe") -> list[tuple[str, str]]:

@@ -163,12 +163,14 @@ def _of_saved_frames(named: str, painted: tuple[SemanticClass, ...]) -> Method:
 
 
 def _listing(folder: Path) -> str:
-    """Digest of the names and sizes of all files below."""
+    """Digest of the names and contents of all files below: frames that are made anew are another method."""
     digest = hashlib.sha256()
     try:
         for path in sorted(folder.rglob("*")):
             if path.is_file():
-                digest.update(f"{path.relative_to(folder)} {path.stat().st_size}\n".encode())
+                with path.open("rb") as file:
+                    content = hashlib.file_digest(file, "sha256").hexdigest()
+                digest.update(f"{path.relative_to(folder)} {content}\n".encode())
     except OSError as error:
         raise DataError(f"{folder} cannot be read ({error}); give NAME=FOLDER") from error
     return digest.hexdigest()[:_DIGITS]
