@@ -28,6 +28,7 @@ class FakeRay:
 
     def __init__(self, lost: set[int]) -> None:
         self.lost, self.most_out, self.cancelled, self.stopped = lost, 0, 0, False
+        self.resources = {"CPU": 2.0}
         self.out: list[tuple[Any, Any]] = []
 
     def is_initialized(self) -> bool:
@@ -40,7 +41,7 @@ class FakeRay:
         self.stopped = True
 
     def cluster_resources(self) -> dict[str, float]:
-        return {"CPU": 2.0}
+        return self.resources
 
     def put(self, value: Any) -> Any:
         return value
@@ -89,7 +90,16 @@ class TestWithoutACluster:
         assert outcomes[1].kind == "DataError"
         assert "lost again and again (The node died.)" in (outcomes[5].error or "")
         assert (fake.most_out, fake.stopped) == (4, True)
-        assert fake.task_options == {"num_cpus": 1, "max_retries": 3}
+        assert fake.task_options == {"num_cpus": 1, "num_gpus": 0.0, "max_retries": 3}
+
+    @pytest.mark.parametrize(("there", "given", "out"), [(0.0, 0.0, 16), (1.0, 0.5, 4), (3.0, 0.5, 12)])
+    def test_items_that_ask_for_gpus_are_given_them_where_there_are_any(
+        self, fake: FakeRay, there: float, given: float, out: int
+    ) -> None:
+        fake.resources = {"CPU": 8.0} | ({"GPU": there} if there else {})
+        assert len(list(map_items(square, range(40), ray_address="auto", gpus=0.5))) == 40
+        assert fake.task_options == {"num_cpus": 1, "num_gpus": given, "max_retries": 2}
+        assert fake.most_out == out
 
     def test_leaving_early_cancels_what_is_out(self, fake: FakeRay) -> None:
         outcomes: Any = map_items(square, range(100), ray_address="auto")

@@ -52,6 +52,7 @@ def map_items(
     workers: int = 1,
     ray_address: str | None = None,
     retries: int = 2,
+    gpus: float = 0.0,
 ) -> Iterator[Outcome[Item, Value]]:
     """Outcomes in the order in which they are finished. Items are taken as workers come free.
 
@@ -64,13 +65,15 @@ def map_items(
         ray_address: of a running cluster (`auto`, or HOST:PORT); None for this machine alone. The same version of
             this package, and the folders that `function` uses, must be on every node.
         retries: how often an item is given to another worker after one was killed.
+        gpus: GPUs, or share of one, that an item is given on a cluster that has any: Ray hides them from what asks for
+            none.
     Raises:
         RunError: there is no such cluster, or the extra `cluster` is not installed.
     """
     if ray_address is not None:
         from gcd_train.map_on_ray import map_on_ray  # it stands on this module
 
-        return map_on_ray(function, items, address=ray_address, retries=retries)
+        return map_on_ray(function, items, address=ray_address, retries=retries, gpus=gpus)
     if workers == 1:
         return (done(function, item) for item in items)
     return _Pool(function, workers, retries).run(iter(items))

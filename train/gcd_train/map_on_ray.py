@@ -11,15 +11,15 @@ from typing import Any
 from gcd_train.errors import RunError
 from gcd_train.map_items import Outcome, done, one_thread_each
 
-_TASKS_PER_CORE = 2
+_TASKS_AT_ONCE = 2  # for each that can be worked on: one is done, one waits
 _LOOK_AGAIN_S = 5.0
 _ANSWER_S = 10.0
 
 
 def map_on_ray(
-    function: Callable[[Any], Any], items: Iterable[Any], *, address: str, retries: int
+    function: Callable[[Any], Any], items: Iterable[Any], *, address: str, retries: int, gpus: float = 0.0
 ) -> Generator[Outcome[Any, Any]]:
-    """Outcomes in the order in which they are finished; twice as many items are out as the cluster has cores.
+    """Outcomes in the order in which they are finished; twice as many items are out as the cluster can work on.
 
     Ray gives an item to another worker when its own is killed or its node lost. Stops a connection that it made.
 
@@ -31,7 +31,8 @@ def map_on_ray(
     if ours:
         _connect(ray, address)
     try:
-        yield from _mapped(ray, function, iter(items), retries)
+        share = gpus if ray.cluster_resources().get("GPU", 0.0) else 0.0
+        yield from _mapped(ray, function, iter(items), retries, share)
     finally:
         if ours:
             ray.shutdown()
@@ -72,14 +73,14 @@ def _unanswered(address: str, error: Exception) -> RunError:
 
 
 def _mapped(
-    ray: Any, function: Callable[[Any], Any], items: Iterator[Any], retries: int
+    ray: Any, function: Callable[[Any], Any], items: Iterator[Any], retries: int, gpus: float
 ) -> Generator[Outcome[Any, Any]]:
-    task = ray.remote(_on_a_node).options(num_cpus=1, max_retries=retries)
+    task = ray.remote(_on_a_node).options(num_cpus=1, num_gpus=gpus, max_retries=retries)
     shared = ray.put(function)
     out: dict[Any, Any] = {}
     try:
         while True:
-            for item in islice(items, max(0, _wanted(ray) - len(out))):
+            for item in islice(items, max(0, _wanted(ray, gpus) - len(out))):
                 out[task.remote(shared, item)] = item
             if not out:
                 return
@@ -91,9 +92,11 @@ def _mapped(
             ray.cancel(reference)
 
 
-def _wanted(ray: Any) -> int:
+def _wanted(ray: Any, gpus: float) -> int:
     """Nodes come and go."""
-    return max(_TASKS_PER_CORE, int(_TASKS_PER_CORE * ray.cluster_resources().get("CPU", 1)))
+    there = ray.cluster_resources()
+    at_once = min(there.get("CPU", 1.0), there.get("GPU", 0.0) / gpus if gpus else float("inf"))
+    return max(_TASKS_AT_ONCE, int(_TASKS_AT_ONCE * at_once))
 
 
 def _on_a_node(function: Callable[[Any], Any], item: Any) -> tuple[Any, str | None, str | None]:

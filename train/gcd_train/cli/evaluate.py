@@ -132,7 +132,7 @@ def _evaluate(asked: Asked, out: Path, *, views: KeptViews, workers: int, ray: s
         lpips=None if asked.lpips is None else asked.lpips.resolve(),
         views=views,
     )
-    account = _measured(work, workers, ray)
+    account = _measured(work, workers, ray, asked.tested.device)
     for line in account.lines():
         _say(line)
     typer.echo(write_outcome(plan, work, sheet_clips))
@@ -143,12 +143,12 @@ def _evaluate(asked: Asked, out: Path, *, views: KeptViews, workers: int, ray: s
         raise typer.Exit(account.exit_code)
 
 
-def _measured(work: ClipWork, workers: int, ray: str | None) -> Account:
+def _measured(work: ClipWork, workers: int, ray: str | None, device: str) -> Account:
     if workers > 1 or ray is not None:
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that no worker is left behind
     account = Account(clips=len(work.clips.keys))
     with progress_bar("clips", len(work.clips.keys)) as show:
-        for account in measure_all(work, workers=workers, ray_address=ray):
+        for account in measure_all(work, workers=workers, ray_address=ray, gpus=float(device != "cpu")):
             show(account.done)
     return account
 

@@ -139,11 +139,13 @@ class Account:
         self.gave_up = self._in_a_row >= GIVE_UP_AFTER
 
 
-def measure_all(work: ClipWork, *, workers: int = 1, ray_address: str | None = None) -> Iterator[Account]:
+def measure_all(
+    work: ClipWork, *, workers: int = 1, ray_address: str | None = None, gpus: float = 0.0
+) -> Iterator[Account]:
     """Measure every method on every clip that has no record of it; gives the account after every clip, the same object.
 
     Args:
-        workers, ray_address: see `map_items`.
+        workers, ray_address, gpus: see `map_items`.
     Raises:
         DataError: there is nothing to measure. RunError: nothing can be written, or as `map_items`.
     """
@@ -153,7 +155,7 @@ def measure_all(work: ClipWork, *, workers: int = 1, ray_address: str | None = N
     items = _missing(work)
     account = Account(clips=len(work.clips.keys), there=len(work.clips.keys) - len(items))
     yield account
-    for outcome in map_items(work, items, workers=workers, ray_address=ray_address):
+    for outcome in map_items(work, items, workers=workers, ray_address=ray_address, gpus=gpus):
         account.add(outcome)
         yield account
         if account.gave_up:
