@@ -51,4 +51,4 @@ else
   gcd_train generate driving --out "$RUN/train" --clips "$CLIPS"
 fi
 gcd_train train "package:$MODEL-gpu" --data "$RUN/train" --valid "$RUN/valid" --out "$RUN"
-gcd_train evaluate --weights "$RUN/$MODEL.safetensors" --data "$RUN/test" --train "$RUN/train" --out "$RUN/report"
+gcd_train evaluate --weights "$RUN/$MODEL.safetensors" --data "$RUN/test" --train "$RUN/train" --steps 1 --steps 4 --out "$RUN/report"
