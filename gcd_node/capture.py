@@ -7,7 +7,7 @@ from typing import Generic, TypeVar
 
 from gcd_node.errors import TooShortError
 from gcd_node.frame import FrameSource
-from gcd_node.window import FrameWindow, WindowBuilder
+from gcd_node.window import Filling, FrameWindow, WindowBuilder
 
 T = TypeVar("T")
 
@@ -24,6 +24,7 @@ class Newest(Generic[T]):
         self._changed = threading.Condition()
         self._slot: list[T] = []
         self._dropped = 0
+        self._nudges = 0
         self._finished = False
         self._closed = False
         self._error: Exception | None = None
@@ -52,14 +53,20 @@ class Newest(Generic[T]):
             self._changed.notify_all()
             return True
 
-    def take(self) -> T | None:
+    def take(self, meanwhile: Callable[[], bool] | None = None) -> T | None:
         """Wait for an item. None after `close`, or after `finish` once the last item was taken.
 
+        Args:
+            meanwhile: what to do while there is nothing to take: called until it returns False, and anew after every
+                `nudge`. An item that comes is taken as soon as the call under way returns.
         Raises:
-            the error given to `finish`, once, after the last item was taken.
+            the error given to `finish`, once, after the last item was taken; what `meanwhile` raises.
         """
+        asleep, nudges = meanwhile is None, 0
+        while not self._await(asleep, nudges):
+            nudges = self._nudges
+            asleep = meanwhile is None or not meanwhile()
         with self._changed:
-            self._changed.wait_for(lambda: self._closed or self._finished or bool(self._slot))
             if self._closed:
                 return None
             if self._slot:
@@ -69,6 +76,23 @@ class Newest(Generic[T]):
         if error is not None:
             raise error
         return None
+
+    def nudge(self) -> None:
+        """Giver: there may be something to do for a taker who waits."""
+        with self._changed:
+            self._nudges += 1
+            self._changed.notify_all()
+
+    def _await(self, asleep: bool, nudges: int) -> bool:
+        """Whether `take` need not wait any longer. asleep: return only then, or after another nudge than these."""
+        with self._changed:
+            if asleep:
+                self._changed.wait_for(lambda: self._due or self._nudges != nudges)
+            return self._due
+
+    @property
+    def _due(self) -> bool:
+        return self._closed or self._finished or bool(self._slot)
 
     def finish(self, error: Exception | None = None) -> None:
         """Giver: nothing more comes. What was left can still be taken; then `take` raises `error`, if there is one."""
@@ -85,13 +109,38 @@ class Newest(Generic[T]):
             self._changed.notify_all()
 
 
+class WindowSlot(Newest[FrameWindow]):
+    """The slot for windows; it also shows what the next window holds so far."""
+
+    def __init__(self, *, lossless: bool = False) -> None:
+        super().__init__(lossless=lossless)
+        self._filling: Filling | None = None
+
+    @property
+    def filling(self) -> Filling | None:
+        """What the next window holds so far; None where nobody knows."""
+        return self._filling
+
+    def show(self, filling: Filling) -> None:
+        """Reader: this is what the next window holds so far. Never waits."""
+        self._filling = filling
+        self.nudge()
+
+    def put(self, item: FrameWindow) -> bool:
+        """See Newest."""
+        self._filling = None  # it is this window's
+        return super().put(item)
+
+
 def read(
     source: FrameSource,
     windows: WindowBuilder,
-    newest: Newest[FrameWindow],
+    newest: WindowSlot,
     clock_ns: Callable[[], int] = time.monotonic_ns,
 ) -> None:
     """Reader thread: every frame is used; of complete windows the newest wins.
+
+    Of the window that fills, the slot shows every frame as it arrives.
 
     Returns when the source has ended or `newest` was closed; an error of the source goes to whoever takes from
     `newest`. To stop early, close `newest` first, then the source.
@@ -107,12 +156,11 @@ def read(
         newest.finish()
 
 
-def _read_all(
-    source: FrameSource, windows: WindowBuilder, newest: Newest[FrameWindow], clock_ns: Callable[[], int]
-) -> None:
+def _read_all(source: FrameSource, windows: WindowBuilder, newest: WindowSlot, clock_ns: Callable[[], int]) -> None:
     for frame in source.frames():
         for window in windows.push(frame, clock_ns()):
             newest.put(window)
+        newest.show(windows.filling)
         if newest.closed:
             return
     for window in windows.flush():

@@ -10,7 +10,17 @@ from typing import Literal, TypeAlias
 
 import torch
 
-from gcd_model import FAMILIES, CheckpointError, ModelError, Traits, WeightsReport, inspect_weights, load_synthesizer
+from gcd_model import (
+    FAMILIES,
+    CheckpointError,
+    ModelError,
+    Schedule,
+    Traits,
+    WeightsReport,
+    inspect_weights,
+    is_export,
+    load_synthesizer,
+)
 from gcd_node.config import ModelSection, NodeConfig, RecordConfig
 from gcd_node.errors import ConfigError, NodeError, SourceLostError
 from gcd_node.frame import Frame, FrameSource, SourceInfo
@@ -18,8 +28,9 @@ from gcd_node.life.live_config import LiveConfig
 from gcd_node.optics.source_pose import in_words
 from gcd_node.recording.folder import LimitReachedError, check_folder
 from gcd_node.rendering.preparation import prepare_run
+from gcd_node.rendering.sampling import drawing_options
 from gcd_node.rendering.virtual_view import VirtualViews
-from gcd_node.session import model_threads, open_session
+from gcd_node.session import load_model, model_threads, open_session
 from gcd_node.sources import open_source
 from gcd_node.wire.endpoints import resolve_endpoint
 
@@ -150,6 +161,8 @@ def _weights(section: ModelSection, known: _Known) -> str:
         known.traits = load_synthesizer(section.weights, device="cpu").traits
         raise _DoubtfulError(f"{section.weights}: these weights are random, so every picture is noise")
     path = _packaged(name) if kind == "package" else Path(section.weights)
+    if is_export(path):
+        return _exported(path, section, known)
     report = inspect_weights(
         path, family=section.family, head_width=section.head_width, image_heads=section.image_heads
     )
@@ -157,6 +170,13 @@ def _weights(section: ModelSection, known: _Known) -> str:
     known.weight_bytes = report.parameters * _BYTES.get(known.traits.precision, 4)
     family = "unknown" if known.traits.family is None else known.traits.family.name
     return f"{known.traits.name}, family {family}, {report.parameters / 1e6:.1f} M parameters"
+
+
+def _exported(folder: Path, section: ModelSection, known: _Known) -> str:
+    """Of an export: it is loaded, as nothing less says whether onnxruntime takes it here."""
+    known.traits = load_model(section).traits
+    known.weight_bytes = sum(file.stat().st_size for file in folder.iterdir() if file.is_file())
+    return f"{known.traits.name}, {known.traits.precision}, an export of {known.weight_bytes / 1e6:.1f} MB"
 
 
 def _adapted(section: ModelSection) -> Traits:
@@ -236,10 +256,8 @@ def _views(config: NodeConfig, traits: Traits, info: SourceInfo) -> str:
 def _time(config: NodeConfig, traits: Traits, info: SourceInfo) -> str:
     _, fps = prepare_run(config, traits, info)
     period_s = (config.window.stride or traits.config.frames) / fps
-    model, sampling = config.model, traits.config.sampling
-    steps = model.steps or sampling.steps
-    branches = 1 if (model.guidance or sampling.guidance) == (1.0, 1.0) else 2
-    runs = steps * branches * model.samples * len(config.view)
+    model = config.model
+    runs = Schedule.of(traits.config, drawing_options(model)).evaluations * model.samples * len(config.view)
     return (
         f"a window every {period_s:.2f} s, {runs} network evaluations each, so {1000 * period_s / runs:.1f} ms for one "
         f"if none is to be left out; {model_threads(model)} CPU threads"

@@ -14,6 +14,7 @@ from gcd_node.config_changes import with_changes
 from gcd_node.errors import ConfigError
 
 Positive: TypeAlias = Annotated[float, Meta(gt=0)]
+NotNegative: TypeAlias = Annotated[float, Meta(ge=0)]
 Count: TypeAlias = Annotated[int, Meta(ge=1)]
 _LEAST_ROTATE_MB, _LEAST_ROTATE_S = 0.1, 1.0
 ViewId: TypeAlias = Annotated[str, Meta(pattern=r"^(?!src$)[a-z0-9_]{1,16}$(?!\n)")]  # src is the input
@@ -61,7 +62,7 @@ LIVE_KINDS: frozenset[SourceKind] = frozenset({"v4l2", "rtsp", "oak"})
 class SourceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Where frames come from.
 
-    path: a video file, a folder of images or an MCAP log; `package:drive.mp4` is the clip that ships.
+    path: a video file, a folder of images or an MCAP log; `package:drive.mp4` and `package:workbench.mp4` ship.
     device: of `v4l2` a number or a path such as /dev/video0 (left out, 0); one in /dev/v4l/by-id stays the same when
         cables move. Of `oak` an id, USB port or address; left out, the only one there is, and that one again when it
         was lost.
@@ -139,10 +140,14 @@ class WindowConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The model and how it is sampled. What is left out is as the checkpoint was made for.
 
-    weights: a checkpoint, a diffusers folder, `package:NAME`, or `random:FAMILY` (noise, for trying the plumbing).
+    weights: a checkpoint, a diffusers folder, an export, `package:NAME`, or `random:FAMILY` (noise, for the plumbing).
+    engine: what computes: "torch", "cuda" (compiled, on a GPU) or "onnxruntime" (exports); left out, what fits weights.
+    providers: of onnxruntime, by its own names, best first; left out, its CPU one, or on device "cuda" its CUDA one.
     adapter: file of a low-rank adapter trained on these weights; family and move_time are then the adapter's.
     threads: CPU threads for the model, and for OpenCV beside it; leave the rest of the robot its cores.
-    guidance: scale of the first and of the last frame.
+    quality: "exact" draws as the checkpoint was made for; "fast" and "fastest" take fewer steps where it has many.
+    steps, solver, guidance, guidance_interval: what is stated wins over quality. guidance: scale of the first and of
+        the last frame; guidance_interval: lowest and highest noise level at which it applies (left out, at all).
     cond_aug: strength of the noise on the conditioning frames.
     """
 
@@ -150,10 +155,15 @@ class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     adapter: str | None = None
     family: str | None = None
     device: str = "auto"
+    engine: Literal["torch", "cuda", "onnxruntime"] | None = None
+    providers: tuple[str, ...] = ()
     dtype: str | None = None
     threads: Count | None = None
+    quality: Literal["exact", "fast", "fastest"] = "exact"
     steps: Count | None = None
+    solver: Literal["euler", "dpmpp_2m"] | None = None
     guidance: tuple[float, float] | None = None
+    guidance_interval: tuple[NotNegative, NotNegative] | None = None
     samples: Count = 1
     seed: int = 0
     motion_bucket: float | None = None
@@ -161,6 +171,11 @@ class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     cond_aug: Annotated[float, Meta(ge=0)] | None = None
     head_width: Count | None = None
     image_heads: Count | None = None
+
+    def __post_init__(self) -> None:
+        low, high = self.guidance_interval or (0.0, 0.0)
+        if low > high:
+            raise ValueError(f"guidance_interval goes from a noise level up to another, got {low:g} to {high:g}")
 
 
 class ViewConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -7,6 +7,7 @@ from msgspec.structs import replace
 
 from gcd_model import ASSUMED_SOURCE, Traits
 from gcd_node.config import ModelSection, NodeConfig, SourcePose, WindowConfig
+from gcd_node.rendering.sampling import sampler_in_use
 
 
 def config_digest(config: NodeConfig, traits: Traits) -> str:
@@ -30,14 +31,20 @@ def config_digest(config: NodeConfig, traits: Traits) -> str:
 
 def _model(section: ModelSection, traits: Traits) -> ModelSection:
     sampling, family, tower = traits.config.sampling, traits.family, traits.config.image_encoder
+    used = sampler_in_use(section, traits)
     return replace(
         section,
         device="auto",
         threads=None,
+        engine=None,
+        providers=(),
         dtype=None,
         family=section.family if family is None else family.name,
-        steps=section.steps or sampling.steps,
-        guidance=section.guidance or sampling.guidance,
+        quality="exact",
+        steps=used.steps,
+        solver=used.solver,
+        guidance=used.guidance,
+        guidance_interval=used.guidance_interval,
         cond_aug=sampling.augmentation if section.cond_aug is None else section.cond_aug,
         move_time=traits.move_time if section.move_time is None else section.move_time,
         motion_bucket=family.motion_bucket if section.motion_bucket is None and family else section.motion_bucket,
@@ -47,11 +54,11 @@ def _model(section: ModelSection, traits: Traits) -> ModelSection:
 
 
 def _told(section: ModelSection) -> dict[str, object]:
-    """Without an adapter where there is none: recordings made before adapters could be named keep their name."""
+    """Without what is newer than the first recordings and as it was then, so that those keep their name."""
     told: dict[str, object] = msgspec.structs.asdict(section)
-    if section.adapter is None:
-        del told["adapter"]
-    return told
+    as_ever = {"adapter": None, "quality": "exact", "solver": "euler", "guidance_interval": None}
+    as_ever |= {"engine": None, "providers": ()}
+    return {name: value for name, value in told.items() if name not in as_ever or value != as_ever[name]}
 
 
 def _window(section: WindowConfig, traits: Traits) -> WindowConfig:

@@ -68,6 +68,8 @@ def load_model(section: ModelSection) -> ViewSynthesizer:
             head_width=section.head_width,
             image_heads=section.image_heads,
             adapter=section.adapter,
+            engine=section.engine,
+            providers=section.providers,
         )
     except OptionError as error:
         raise ConfigError(f"[model]: {error}") from error

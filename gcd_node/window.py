@@ -50,6 +50,21 @@ class FrameWindow:
     epoch: int
 
 
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Filling:
+    """The frames that the next window holds so far: from none to all but one. Fields as of FrameWindow, which will hold
+    the same, if nothing comes between.
+
+    clip: float32 [n, 3, H, W] in [-1, 1]; not to be changed.
+    """
+
+    clip: NDArray[np.float32]
+    stamps_ns: tuple[int, ...]
+    seqs: tuple[int, ...]
+    fps: float
+    epoch: int
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class WindowCounts:
     """What a builder has done so far.
@@ -161,6 +176,18 @@ class WindowBuilder:
     def next_id(self) -> int:
         """What the next window will be called."""
         return self._first_id + self._totals["built"]
+
+    @property
+    def filling(self) -> Filling:
+        """What the next window holds so far."""
+        placed = list(self._placed)
+        return Filling(
+            clip=self._pixels.filled(len(placed)),
+            stamps_ns=tuple(each.stamp_ns for each in placed),
+            seqs=tuple(each.seq for each in placed),
+            fps=self.fps,
+            epoch=self._epoch,
+        )
 
     @property
     def epoch(self) -> int:

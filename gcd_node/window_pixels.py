@@ -20,9 +20,9 @@ class WindowPixels:
         """Take the picture of one place: u8 [H, W, 3].
 
         Places are filled one after another, from 0, or after `hand_over` from any other: then what comes before it is
-        how the last window ended. Pictures of one window have one size.
+        how the last window ended. Pictures of one window have one size. What was ever given away stays as it was.
         """
-        if not self._images.flags.writeable or self._images.shape[1:] != image.shape:
+        if place == 0 or not self._images.flags.writeable or self._images.shape[1:] != image.shape:
             self._begin(image, place)
         self._images[place] = image
         write_planes(image, self._clip[place])
@@ -31,6 +31,12 @@ class WindowPixels:
         """The whole window, u8 [T, H, W, 3] RGB and float32 [T, 3, H, W] in [-1, 1]; nothing of it changes any more."""
         self._images.setflags(write=False)
         return self._images, self._clip
+
+    def filled(self, count: int) -> NDArray[np.float32]:
+        """The first `count` places of the next window, float32 [count, 3, H, W] in [-1, 1]; nothing of them changes any
+        more. After `hand_over` these are how the last window ended."""
+        begin = 0 if self._images.flags.writeable else self._frames - count
+        return self._clip[begin : begin + count]
 
     def _begin(self, image: Image, shared: int) -> None:
         """Other arrays, which begin with the last `shared` places of these."""

@@ -8,10 +8,16 @@ from rich.console import Console
 from rich.table import Table
 from typer import Option
 
+from gcd_node.cli.bench_model import model
+from gcd_node.cli.bench_page import page
+from gcd_node.cli.bench_stream import stream
 from gcd_node.cli.soak import quiet_node
 from gcd_node.load.bench import BenchOptions, BenchReport, Latency, bench_node
 
 bench = typer.Typer(no_args_is_help=True, help="Measure on this machine.")
+bench.command("model")(model)
+bench.command("stream")(stream)
+bench.command("page")(page)
 
 Windows: TypeAlias = Annotated[int, Option(min=3, help="Windows for the latency.")]
 SlowWindows: TypeAlias = Annotated[int, Option(min=3, help="Windows of the slow model.")]

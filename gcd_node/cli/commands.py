@@ -3,6 +3,7 @@
 from gcd_node.cli.bench import bench
 from gcd_node.cli.check import check_launch
 from gcd_node.cli.control import ctl, keys
+from gcd_node.cli.export import export
 from gcd_node.cli.node import demo, run, view
 from gcd_node.cli.replay import diff, replay_launch
 from gcd_node.cli.root import new_app
@@ -22,6 +23,7 @@ app.command("replay")(replay_launch)
 app.command()(diff)
 app.command()(status)
 app.command()(synthesize)
+app.command()(export)
 app.command()(ctl)
 app.command()(soak)
 app.add_typer(keys, name="keys")

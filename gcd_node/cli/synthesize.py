@@ -9,7 +9,16 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from typer import Argument, Option
 
-from gcd_model import Augmentation, RenderOptions, SphericalDelta, ViewSynthesizer, load_synthesizer
+from gcd_model import (
+    Augmentation,
+    EngineName,
+    Quality,
+    RenderOptions,
+    SolverName,
+    SphericalDelta,
+    ViewSynthesizer,
+    load_synthesizer,
+)
 from gcd_node.cli.weights import FamilyOption, HeadWidth, ImageHeads
 from gcd_node.config import SourcePose
 from gcd_node.errors import UsageError
@@ -35,7 +44,7 @@ Input: TypeAlias = Annotated[
     Argument(metavar="INPUT", help="A video, a folder of pictures, a still, or .npy: float32 [T, H, W, 3] in 0..1."),
 ]
 Weights: TypeAlias = Annotated[
-    str, Option(help="A checkpoint, a diffusers folder, package:NAME, or random:FAMILY (noise).")
+    str, Option(help="A checkpoint, a diffusers folder, an export, package:NAME, or random:FAMILY (noise).")
 ]
 Out: TypeAlias = Annotated[Path, Option(help="Folder for frames, video and pictures.")]
 Azimuth: TypeAlias = Annotated[
@@ -77,10 +86,26 @@ Fps: TypeAlias = Annotated[
 ]
 Height: TypeAlias = Annotated[int | None, Option(help="Instead of the trained height.", rich_help_panel=_CLIP)]
 Width: TypeAlias = Annotated[int | None, Option(help="Instead of the trained width.", rich_help_panel=_CLIP)]
+QualityChoice: TypeAlias = Annotated[
+    Quality,
+    Option(
+        help="As the model was made for, or in fewer steps where it takes many; other options win.",
+        rich_help_panel=_SAMPLING,
+    ),
+]
 Steps: TypeAlias = Annotated[int | None, Option(help="Denoising steps.", rich_help_panel=_SAMPLING)]
+Solver: TypeAlias = Annotated[
+    SolverName | None, Option(help="Euler steps as published, or of second order.", rich_help_panel=_SAMPLING)
+]
 Guidance: TypeAlias = Annotated[
     tuple[float, float] | None,
     Option(metavar="FIRST LAST", help="Scale of the first and the last frame.", rich_help_panel=_SAMPLING),
+]
+GuidanceInterval: TypeAlias = Annotated[
+    tuple[float, float] | None,
+    Option(
+        metavar="LOW HIGH", help="Noise levels at which guidance applies; by default all.", rich_help_panel=_SAMPLING
+    ),
 ]
 Seed: TypeAlias = Annotated[int, Option(help="Of all random draws.", rich_help_panel=_SAMPLING)]
 Samples: TypeAlias = Annotated[
@@ -103,6 +128,14 @@ AdapterFile: TypeAlias = Annotated[
     Path | None, Option("--adapter", help="Low-rank adapter trained on these weights.", rich_help_panel=_MODEL)
 ]
 Device: TypeAlias = Annotated[str, Option(help="auto, cpu, cuda, cuda:1, ...", rich_help_panel=_MODEL)]
+EngineChoice: TypeAlias = Annotated[
+    EngineName | None,
+    Option("--engine", help="What computes: cuda for a GPU, onnxruntime for an export.", rich_help_panel=_MODEL),
+]
+Provider: TypeAlias = Annotated[
+    list[str] | None,
+    Option(help="Execution provider of onnxruntime, by its own name; several, best first.", rich_help_panel=_MODEL),
+]
 Dtype: TypeAlias = Annotated[str | None, Option(help="float32, bfloat16 or float16.", rich_help_panel=_MODEL)]
 
 
@@ -128,8 +161,11 @@ def synthesize(
     fps: Fps = None,
     height: Height = None,
     width: Width = None,
+    quality: QualityChoice = "exact",
     steps: Steps = None,
+    solver: Solver = None,
     guidance: Guidance = None,
+    guidance_interval: GuidanceInterval = None,
     seed: Seed = 0,
     samples: Samples = 1,
     motion_bucket: MotionBucket = None,
@@ -138,6 +174,8 @@ def synthesize(
     save: Save = None,
     family: FamilyOption = None,
     device: Device = "auto",
+    engine: EngineChoice = None,
+    provider: Provider = None,
     dtype: Dtype = None,
     head_width: HeadWidth = None,
     image_heads: ImageHeads = None,
@@ -145,20 +183,20 @@ def synthesize(
 ) -> None:
     """See one clip from another camera, offline.
 
-    Writes frames, a video, an input-above-view strip and, if the model makes one, the class map; with several samples
-    also where they differ.
+    Writes frames, a video, input above view, the class map if the model makes one, and where several samples differ.
     """
     clip = ClipRequest(start=start, stride=stride, fps=fps, height=height, width=width, hfov_deg=hfov_deg)
     source = _pose((source_elevation_deg, source_radius), (mount_height, mount_forward, mount_left, mount_tilt))
     delta = _delta(azimuth_deg, elevation_deg, radius)
     wanted = ViewRequest(delta=delta, poses=poses, trajectory=trajectory, move_time=move_time, source=source)
     injected = InjectedNoise() if noise is None else read_noise(noise)
-    options = RenderOptions(steps=steps, guidance=guidance, samples=samples, seed=seed, motion_bucket=motion_bucket)
-    options = replace(options, initial_noise=injected.initial)
+    named = RenderOptions(steps=steps, solver=solver, guidance=guidance, guidance_interval=guidance_interval)
+    sampler = replace(named, quality=quality)
+    options = replace(sampler, samples=samples, seed=seed, motion_bucket=motion_bucket, initial_noise=injected.initial)
     _require_possible(input_path, save, samples)
-    load = partial(load_synthesizer, weights, adapter=adapter, family=family, device=device, dtype=dtype)
+    load = partial(load_synthesizer, weights, adapter=adapter, family=family, device=device, dtype=dtype, engine=engine)
     with Console(stderr=True, markup=False).status(f"loading {weights}"):
-        model = load(head_width=head_width, image_heads=image_heads)
+        model = load(head_width=head_width, image_heads=image_heads, providers=provider or ())
     augmentation = Augmentation(strength=cond_aug, seed=seed, noise=injected.augmentation)
     _run(_Order(model, input_path, clip, wanted, options, augmentation), out, save)
 

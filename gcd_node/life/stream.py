@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
-from gcd_node.capture import Newest, read
+from gcd_node.capture import WindowSlot, read
 from gcd_node.config import NodeConfig
 from gcd_node.errors import ConfigError
 from gcd_node.frame import Frame, FrameSource, SourceInfo
@@ -20,7 +20,7 @@ from gcd_node.optics.calibration import LensModel
 from gcd_node.publishing.input_preview import InputPreview
 from gcd_node.rendering.model_worker import ModelWorker, WorkCounts, WorkerParts
 from gcd_node.rendering.virtual_view import VirtualViews
-from gcd_node.window import FrameWindow, Reason, WindowBuilder
+from gcd_node.window import Reason, WindowBuilder
 from gcd_node.wire.input_preview import Shot
 from gcd_node.wire.view_message import Run
 
@@ -99,7 +99,7 @@ class Stream:
             first_id=begin.window_id,
             first_epoch=begin.epoch,
         )
-        self._newest = Newest[FrameWindow](lossless=config.source.pace == "lockstep")
+        self._newest = WindowSlot(lossless=config.source.pace == "lockstep")
         self._watch = SourceWatch(source, reopen, self, _patience(config))
         self._preview = InputPreview(worker.outbox, lambda: self.run)
         self.worker = ModelWorker(worker, self._known.of)
@@ -245,6 +245,7 @@ class Stream:
     def source_broken(self, reason: Reason) -> None:
         """Begin a new epoch; see WatchListener."""
         self._builder.restart(reason)
+        self._newest.show(self._builder.filling)
 
     def source_opened(self, info: SourceInfo) -> bool:
         """Work out anew what is known of the source; see WatchListener. False if the model cannot be given what it

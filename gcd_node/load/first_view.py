@@ -55,7 +55,7 @@ def _first_view_s() -> float:
                 received = views.receive(1000 * _PATIENCE_S)
                 took_s = time.monotonic() - started_s
             finally:
-                _end(process)
+                end_process(process)
     if received is None:
         raise NodeError(f"no first view within {_PATIENCE_S:g} s; see what `gcd-node demo` says")
     return took_s
@@ -67,7 +67,8 @@ def _config(folder: Path) -> NodeConfig:
     return replace(config, source=replace(config.source, pace="realtime"), model=replace(config.model, threads=1))
 
 
-def _end(process: "subprocess.Popen[bytes]") -> None:
+def end_process(process: "subprocess.Popen[bytes]") -> None:
+    """Ask it to end, and make it end if it does not within 20 s."""
     process.terminate()
     try:
         process.wait(_END_S)

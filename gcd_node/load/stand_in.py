@@ -49,7 +49,7 @@ class StandInModel:
         self._work_s, self._nan_every = work_s, nan_every
         self._rendered = 0
         self.taken_ns = 0
-        """When it was last given a clip, monotonic clock."""
+        """When it was last given a frame, or a window to render; monotonic clock."""
 
     def encode(
         self, clip: Clip, augmentation: Augmentation | None = None, extra: torch.Tensor | None = None
@@ -63,6 +63,7 @@ class StandInModel:
         self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
     ) -> list[View]:
         """See ViewSynthesizer. Always the same picture, whatever is asked for."""
+        self.taken_ns = time.monotonic_ns()
         options = RenderOptions() if options is None else options
         self._work(options)
         self._rendered += 1

@@ -1,6 +1,8 @@
-"""The model thread: takes windows, renders every view of each, hands the messages over. Owns the device."""
+"""The model thread: takes windows, renders every view of each, hands the messages over. Owns the device.
 
-import hashlib
+Longer than most files: all that a window may meet on its way through one thread.
+"""
+
 import logging
 import threading
 import time
@@ -10,18 +12,8 @@ from dataclasses import dataclass, field, replace
 
 import torch
 
-from gcd_model import (
-    Augmentation,
-    Cancelled,
-    Clip,
-    DeviceMemoryError,
-    NonFiniteError,
-    OptionError,
-    RenderOptions,
-    Traits,
-    View,
-)
-from gcd_node.capture import Newest
+from gcd_model import Cancelled, DeviceMemoryError, NonFiniteError, RenderOptions, View
+from gcd_node.capture import WindowSlot
 from gcd_node.health.announcer import Announcer
 from gcd_node.health.monitor import IDLE, Health
 from gcd_node.health.report import Level
@@ -29,13 +21,17 @@ from gcd_node.life.live_config import LiveConfig, Settings
 from gcd_node.publishing.dispatcher import Dispatcher
 from gcd_node.publishing.outbox import Outbox
 from gcd_node.rendering.degrade import WHOLE, Rung, rungs
+from gcd_node.rendering.encoded_frames import EncodedFrames, EncodeTerms
 from gcd_node.rendering.endings import Endings
 from gcd_node.rendering.idle import IdleRule
 from gcd_node.rendering.interruption import interruptible
 from gcd_node.rendering.model_slot import ModelSlot
+from gcd_node.rendering.sampling import drawing_options, sampler_in_use
+from gcd_node.rendering.seeds import window_seed
 from gcd_node.rendering.setbacks import Setbacks
 from gcd_node.rendering.virtual_view import VirtualView, VirtualViews
-from gcd_node.window import FrameWindow
+from gcd_node.rendering.warm_up import render_grey
+from gcd_node.window import Filling, FrameWindow
 from gcd_node.wire.view_message import Rendered, Run, messages, newest_ns, utc_offset_ns
 
 _LOG = logging.getLogger(__name__)
@@ -101,6 +97,8 @@ class ModelWorker:
         self._setbacks = Setbacks(parts.health, parts.announcer)
         self._cancel = threading.Event()
         self._beat_s: float | None = None
+        self._encoded = EncodedFrames(self._beat)
+        self._may_encode_ahead = True
 
     @property
     def silent_s(self) -> float:
@@ -112,8 +110,8 @@ class ModelWorker:
         """Abandon the window in work at the next layer of a network; from any thread."""
         self._cancel.set()
 
-    def work(self, newest: Newest[FrameWindow]) -> None:
-        """Take windows and publish their views.
+    def work(self, newest: WindowSlot) -> None:
+        """Take windows and publish their views; while there is none, encode what has arrived of the next.
 
         Raises:
             ModelFailedError: three windows in a row could not be used, or there is no memory however little is asked.
@@ -129,12 +127,13 @@ class ModelWorker:
             self.warm.set()
             self._dispatcher.finish(abandon=self._cancel.is_set())
 
-    def _work(self, newest: Newest[FrameWindow]) -> None:
+    def _work(self, newest: WindowSlot) -> None:
         if self._realtime:
             self._warm_up()
         self._ready()
         self.warm.set()
-        while (window := newest.take()) is not None:
+        while (window := newest.take(lambda: self._encode_ahead(newest.filling))) is not None:
+            self._may_encode_ahead = True
             self._endings.announce_due(self.counts.last_window_id)
             if not self._rests():
                 self._beat()
@@ -159,20 +158,41 @@ class ModelWorker:
     def _rung(self) -> Rung:
         return self._setbacks.rung
 
+    @property
+    def _watchers(self) -> int:
+        return self._parts.outbox.stats.readers.watchers
+
     def _rests(self) -> bool:
         """Whether nobody would see this window."""
-        rests = self._idle.rests(self._parts.outbox.stats.readers.watchers)
+        rests = self._idle.rests(self._watchers)
         if rests:
             self._parts.health.raise_reason(IDLE, Level.OK)
         else:
             self._parts.health.clear_reason(IDLE)
         return rests
 
+    def _encode_ahead(self, filling: Filling | None) -> bool:
+        """Encode one frame of the window that fills; False if there is nothing to do."""
+        if filling is None or not self._may_encode_ahead or self._idle.rests(self._watchers):
+            return False
+        run = self._run(self._parts.live.settings(), filling.epoch)
+        try:
+            return self._encoded.ahead(self._parts.model.synthesizer, filling, _terms(run))
+        except DeviceMemoryError as error:
+            _LOG.warning("nothing is encoded before the next window is there: %s", error)
+            self._encoded.forget()
+            self._may_encode_ahead = False
+            return False
+        finally:
+            self._ready()
+
+    def _run(self, settings: Settings, epoch: int) -> Run:
+        return replace(self._run_of(epoch), config=settings.config, traits=self._parts.model.traits)
+
     def _job(self, window: FrameWindow) -> _Job:
         """A command that comes from here on is for the next window."""
         settings = self._parts.live.settings()
-        known = self._run_of(window.epoch)
-        run = replace(known, config=settings.config, traits=self._parts.model.traits)
+        run = self._run(settings, window.epoch)
         views = self._views.following(settings, run.mount)
         return _Job(window=window, settings=settings, run=run, views=views[:1] if self._rung.single else views)
 
@@ -180,26 +200,28 @@ class ModelWorker:
         """Render a grey clip in one step, so that the first window does not pay for what happens only once."""
         self._parts.health.model("warming")
         self._beat_s = time.monotonic()
-        settings, run, synthesizer = self._parts.live.settings(), self._run_of(-1), self._parts.model.synthesizer
-        video = torch.zeros(run.traits.config.frames, 3, *_warm_up_size(run.traits))
-        grey = Clip(video=video, fps=run.traits.fps, mount=run.mount)
-        paths = [view.planned() for view in self._views.following(settings, run.mount)]
+        settings, mount = self._parts.live.settings(), self._run_of(-1).mount
+        paths = [view.planned() for view in self._views.following(settings, mount)]
         try:
-            synthesizer.render(synthesizer.encode(grey), paths, self._options(settings, 0, steps=1))
+            render_grey(self._parts.model.synthesizer, paths, mount, self._options(settings, 0, steps=1))
         except (NonFiniteError, DeviceMemoryError) as error:
             _LOG.warning("the warm-up came to nothing: %s", error)  # windows are dealt with one by one
 
     def _options(self, settings: Settings, seed: int, *, steps: int | None) -> RenderOptions:
         model = settings.config.model
-        return RenderOptions(
+        samples = 1 if self._rung.single else model.samples
+        return replace(
+            drawing_options(model),
             steps=steps,
-            guidance=model.guidance,
-            samples=1 if self._rung.single else model.samples,
+            samples=samples,
             seed=seed,
-            motion_bucket=model.motion_bucket,
-            progress=lambda done, steps: self._beat(),
+            whole_levels=samples == 1 and self._parts.model.traits.device.startswith("cuda"),
+            progress=self._step_done,
             cancel=self._cancel,
         )
+
+    def _step_done(self, _done: int, _steps: int) -> None:
+        self._beat()
 
     def _render_or_count(self, job: _Job) -> None:
         """One retry, with another seed or with less asked; a window that fails again is counted and not published."""
@@ -210,6 +232,7 @@ class ModelWorker:
             if failure is None:
                 self._setbacks.none()
                 return
+            self._encoded.forget()
             if isinstance(failure, NonFiniteError):
                 _LOG.warning("window %d: %s", job.window.window_id, failure)
             else:
@@ -251,7 +274,7 @@ class ModelWorker:
         )
 
     def _asked_steps(self, job: _Job) -> int:
-        return job.run.config.model.steps or job.run.traits.config.sampling.steps
+        return sampler_in_use(job.run.config.model, job.run.traits).steps
 
     def _publish(self, job: _Job, seed: int) -> None:
         started_ns = time.monotonic_ns()
@@ -281,8 +304,7 @@ class ModelWorker:
     def _draw(self, job: _Job, seed: int, steps: int | None) -> list[View]:
         synthesizer, health = self._parts.model.synthesizer, self._parts.health
         started_s = time.monotonic()
-        clip = Clip(video=torch.from_numpy(job.window.clip), fps=job.window.fps, mount=job.run.mount)
-        features = synthesizer.encode(clip, Augmentation(strength=job.run.config.model.cond_aug, seed=seed))
+        features = self._encoded.features(synthesizer, job.window, _terms(job.run))
         encoded_s = time.monotonic()
         health.stage("encode", encoded_s - started_s)
         self._beat()
@@ -308,20 +330,5 @@ class ModelWorker:
             self._parts.on_window(WindowReport(window=job.window, render_s=seconds, age_ms=age_ms))
 
 
-def _warm_up_size(traits: Traits) -> tuple[int, int]:
-    """Height and width of the clip to warm up with: half of each on a CPU, where a whole rendering takes longer than
-    all that happens only once, and puts off the first view."""
-    height, width = traits.config.height, traits.config.width
-    if traits.device != "cpu":
-        return height, width
-    try:
-        traits.check_size(height // 2, width // 2)
-    except OptionError:
-        return height, width
-    return height // 2, width // 2
-
-
-def window_seed(config_digest: str, window_id: int, attempt: int) -> int:
-    """The seed of a window: the same in every run of a configuration, below 2^48 so that JSON holds it."""
-    text = f"{config_digest}/{window_id}/{attempt}"
-    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:6], "big")
+def _terms(run: Run) -> EncodeTerms:
+    return EncodeTerms(digest=run.digest, strength=run.config.model.cond_aug, mount=run.mount)

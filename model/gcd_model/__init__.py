@@ -9,7 +9,7 @@ The node imports from here only. Source: Van Hoorick et al., "Generative Camera 
 
 from gcd_model.checkpoints import WeightsReport, convert_weights, inspect_weights
 from gcd_model.class_head import palette
-from gcd_model.clip import Augmentation, Clip, RenderOptions, View
+from gcd_model.clip import QUALITIES, SOLVERS, Augmentation, Clip, Quality, RenderOptions, SolverName, View
 from gcd_model.conditioning import SourceFeatures
 from gcd_model.config import (
     DRIVING_CLASSES,
@@ -49,7 +49,27 @@ from gcd_model.geometry import (
     pose_trajectory,
     spherical_trajectory,
 )
-from gcd_model.loading import load_synthesizer
+from gcd_model.loading import ENGINES, EngineName, load_synthesizer
+from gcd_model.measuring import (
+    IMPLEMENTATIONS,
+    STAGES,
+    Difference,
+    Implementation,
+    ImplementationName,
+    MemoryFigures,
+    ModelBench,
+    ModelBenchOptions,
+    StageFigures,
+    StageName,
+    bench_model,
+    load_measured,
+    save_random,
+)
+from gcd_model.onnx_export import is_export
+from gcd_model.onnx_manifest import ExportPrecision, Manifest
+from gcd_model.onnx_source import export_weights
+from gcd_model.quality import Sampler, sampler_of
+from gcd_model.schedule import Schedule
 from gcd_model.settings import explain_settings_error
 from gcd_model.synthesizer import Synthesizer, ViewSynthesizer, synthesize
 from gcd_model.traits import ASSUMED_SOURCE, Traits
@@ -59,9 +79,14 @@ __all__ = [
     "DRIVING_CLASSES",
     "DRIVING_SEMANTIC_SMALL",
     "DRIVING_SMALL",
+    "ENGINES",
     "FAMILIES",
+    "IMPLEMENTATIONS",
     "OBJECTS_SMALL",
+    "QUALITIES",
     "SMALL",
+    "SOLVERS",
+    "STAGES",
     "SVD_14",
     "Augmentation",
     "CameraMount",
@@ -70,20 +95,35 @@ __all__ = [
     "Clip",
     "DeltaFit",
     "DeviceMemoryError",
+    "Difference",
+    "EngineName",
+    "ExportPrecision",
     "Family",
+    "Implementation",
+    "ImplementationName",
     "Intrinsics",
+    "Manifest",
+    "MemoryFigures",
+    "ModelBench",
+    "ModelBenchOptions",
     "ModelConfig",
     "ModelError",
     "NonFiniteError",
     "OptionError",
     "Orbit",
     "PoseError",
+    "Quality",
     "RenderOptions",
+    "Sampler",
+    "Schedule",
     "SemanticClass",
     "ShapeError",
+    "SolverName",
     "SourceFeatures",
     "Spherical",
     "SphericalDelta",
+    "StageFigures",
+    "StageName",
     "Synthesizer",
     "Traits",
     "Trajectory",
@@ -93,16 +133,22 @@ __all__ = [
     "ViewRangeError",
     "ViewSynthesizer",
     "WeightsReport",
+    "bench_model",
     "center_crop_box",
     "convert_weights",
     "driving_trajectory",
     "explain_settings_error",
+    "export_weights",
     "fitted_trajectory",
     "inspect_weights",
+    "is_export",
+    "load_measured",
     "load_synthesizer",
     "nearest_delta",
     "palette",
     "pose_trajectory",
+    "sampler_of",
+    "save_random",
     "spherical_trajectory",
     "synthesize",
 ]

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from gcd_model.adapter import Adapter, adapted
 from gcd_model.diffusers_folder import PARTS, chosen_file, folder_hints, shards
-from gcd_model.errors import CheckpointError
+from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.examination import (
     Examined,
     Options,
@@ -37,9 +37,10 @@ from gcd_model.file_kind import FETCH_AGAIN, HEAD, FileKind, check_archive, file
 from gcd_model.gcd_layout import CARRIED
 from gcd_model.lightning import Contents, contents
 from gcd_model.networks import Networks, weights_digest
-from gcd_model.own_format import Card, Entry, precision
+from gcd_model.own_format import CONFIG_KEY, Card, Entry, precision
+from gcd_model.packed import divided
 from gcd_model.restricted_pickle import RestrictedPickle, check_storages
-from gcd_model.weights_export import Content, Report, write_published, write_safetensors, written_dtype
+from gcd_model.weights_export import Report, own_content, write_published, write_safetensors, written_dtype
 from gcd_model.weights_report import Layout, WeightsReport
 
 _log = logging.getLogger(__name__)
@@ -197,14 +198,17 @@ def convert_weights(
     Args:
         layout: "gcd-node" leaves behind what inference does not use; "gcd-ckpt" is for the released code, see
             `gcd_state`, and holds all weights in memory where `dtype` changes them.
-        dtype: store in this precision, else as it is. The decoder, which computes in float32, is never narrowed.
+        dtype: store in this precision, or in "int8", a quarter of float32, which networks are unpacked from; else as it
+            is. What computes in float32 (decoder, plane mix) is never narrowed. "int8" is for our own layout.
         uncertainty_scale: what was measured, instead of what the file says; see `Traits`.
         progress: called with (bytes written, bytes).
     Returns:
         The report of the new file.
     Raises: as `load_weights`; OptionError if `out` exists and `overwrite` is not set, or the layout cannot hold it.
     """
-    wanted = None if dtype is None else precision(dtype)
+    if dtype == "int8" and layout == "gcd-ckpt":
+        raise OptionError("the published layout has no place for int8; take another precision, or layout gcd-node")
+    wanted = None if dtype is None or dtype == "int8" else precision(dtype)
     options = Options(family=family, head_width=head_width, image_heads=image_heads, frames=frames)
     examined = _examined(Path(path), options)
     with _about(path):
@@ -223,8 +227,8 @@ def convert_weights(
         write_published(Path(out), state, card, carried=_carried(examined), overwrite=overwrite)
     else:
         shapes = examined.networks.state_dict()
-        entries = {name: Entry(tuple(shapes[name].shape), dtype) for name, dtype in dtypes.items()}
-        content = Content(entries, examined.tensor, card.to_metadata())
+        entries = {name: Entry(tuple(shapes[name].shape), kind) for name, kind in dtypes.items()}
+        content = own_content(entries, examined.tensor, card, packed=dtype == "int8")
         write_safetensors(Path(out), content, overwrite=overwrite, report=progress)
     return inspect_weights(out)
 
@@ -236,8 +240,7 @@ def save_weights(networks: Networks, out: str | Path, card: Card, *, overwrite: 
     """
     state: dict[str, Tensor] = networks.state_dict()
     entries = {name: Entry(tuple(tensor.shape), tensor.dtype) for name, tensor in state.items()}
-    content = Content(entries, state.__getitem__, card.to_metadata())
-    write_safetensors(Path(out), content, overwrite=overwrite)
+    write_safetensors(Path(out), own_content(entries, state.__getitem__, card), overwrite=overwrite)
 
 
 def digest(files: tuple[Path, ...], *, full: bool = False) -> str:
@@ -297,11 +300,13 @@ def read_weights(path: Path) -> WeightsFile:
     if path.is_dir():
         return _read_folder(path)
     held, metadata = _read_file(path)
+    tensors, scales = divided(held.tensors) if CONFIG_KEY in (metadata or {}) else (held.tensors, {})
     return WeightsFile(
         name=path.stem,
-        layout=layout_of(held.tensors, metadata),
+        layout=layout_of(tensors, metadata),
         files=(path,),
-        tensors=held.tensors,
+        tensors=tensors,
+        scales=scales,
         metadata=held.notes if metadata is None else metadata,
         yaml=_yaml_beside(path),
         optimizer_size=held.optimizer_size,

@@ -3,13 +3,26 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol, TypeAlias, get_args
 
 import torch
 from torch import Tensor
 
 from gcd_model.errors import OptionError, ShapeError
 from gcd_model.geometry import CameraMount, Trajectory
+
+SolverName = Literal["euler", "dpmpp_2m"]
+"""How the probability-flow ODE is followed: one network evaluation a step, of first or of second order."""
+SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
+
+Quality = Literal["exact", "fast", "fastest"]
+"""How much of a checkpoint's own sampling is kept, see `quality`."""
+QUALITIES: tuple[Quality, ...] = get_args(Quality)
+
+Guidance: TypeAlias = tuple[float, float]
+"""Scale of the first and of the last frame, linear between."""
+NoiseInterval: TypeAlias = tuple[float, float]
+"""A lowest and a highest noise level, both within."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -44,8 +57,8 @@ class Clip:
 class View:
     """The clip as another camera would have seen it. Every pixel is generated.
 
-    samples: float32 [S, T, 3, H, W], RGB in [0, 1], on the CPU; S draws of the same view. A model whose device makes
-        whole levels gives those, uint8 in 0..255; none of ours does.
+    samples: float32 [S, T, 3, H, W], RGB in [0, 1], on the CPU; S draws of the same view. Where whole levels were asked
+        for, uint8 in 0..255.
     latents: float32 [S, T, C, h, w], what was decoded, in the scaled space the network works in.
     trajectory: the camera path that was asked for.
     motion_bucket: the motion number the network was told.
@@ -112,21 +125,30 @@ class CancelSignal(Protocol):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class RenderOptions:
-    """How to sample. None means: as the checkpoint was made for.
+    """How to sample. None means: as `quality` has it, which by default is what the checkpoint was made for.
 
     steps: network evaluations. guidance: scale of the first and the last frame, linear between.
+    guidance_interval: lowest and highest noise level at which guidance applies; elsewhere the conditional branch counts
+        alone and is computed alone (Kynkäänniemi et al. 2024). None: everywhere, unless the quality has an interval.
+    solver: "euler" as published, or "dpmpp_2m", of second order, which needs fewer steps for the same error.
+    quality: what is left open here is the checkpoint's own ("exact"), or cheaper; see `sampler_of`.
     samples: draws per view. seed: sample s draws from (seed, s), whatever else is rendered with it.
     initial_noise: float32 [T, C, h, w] or [S, T, C, h, w], unit variance, used instead of a draw.
     motion_bucket: the motion number, instead of the formula's.
+    whole_levels: pictures as uint8, which is what a GPU hands over fastest.
     progress: called with (steps done, steps). cancel: asked between steps.
     """
 
     steps: int | None = None
-    guidance: tuple[float, float] | None = None
+    guidance: Guidance | None = None
+    guidance_interval: NoiseInterval | None = None
+    solver: SolverName | None = None
+    quality: Quality = "exact"
     samples: int = 1
     seed: int = 0
     initial_noise: Tensor | None = None
     motion_bucket: float | None = None
+    whole_levels: bool = False
     progress: Callable[[int, int], None] | None = None
     cancel: CancelSignal | None = None
 
@@ -136,3 +158,10 @@ class RenderOptions:
         numbers = (*(self.guidance or ()), 0.0 if self.motion_bucket is None else self.motion_bucket)
         if not all(map(math.isfinite, numbers)):
             raise OptionError(f"guidance and motion bucket must be finite, got {self.guidance}, {self.motion_bucket}")
+        low, high = self.guidance_interval or (0.0, math.inf)
+        if not 0.0 <= low <= high:
+            raise OptionError(f"guidance_interval goes from a noise level up to another, got {low:g} to {high:g}")
+        if self.solver not in (None, *SOLVERS):
+            raise OptionError(f"the solver must be one of {', '.join(SOLVERS)}, got {self.solver!r}")
+        if self.quality not in QUALITIES:
+            raise OptionError(f"the quality must be one of {', '.join(QUALITIES)}, got {self.quality!r}")

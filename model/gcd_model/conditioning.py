@@ -51,23 +51,24 @@ class SourceFeatures:
             video=None if self.video is None else self.video[start:stop],
         )
 
-    def followed_by(self, later: Self) -> Self:
-        """These frames and then the later ones. Raises ShapeError unless both were encoded alike."""
-        if self._kind() != later._kind():
+    def followed_by(self, *later: Self) -> Self:
+        """These frames and then the later ones, in the order given. Raises ShapeError unless all were encoded alike."""
+        if any(self._kind() != each._kind() for each in later):
             raise ShapeError(
                 "features of another frame rate, augmentation, mount or model cannot be joined; encode them alike"
             )
         return replace(
             self,
-            tokens=_joined(self.tokens, later.tokens),
-            latents=torch.cat([self.latents, later.latents]),
-            extra=_joined(self.extra, later.extra),
-            video=_joined(self.video, later.video),
+            tokens=_joined([self.tokens, *(each.tokens for each in later)]),
+            latents=torch.cat([self.latents, *(each.latents for each in later)]),
+            extra=_joined([self.extra, *(each.extra for each in later)]),
+            video=_joined([self.video, *(each.video for each in later)]),
         )
 
 
-def _joined(first: Tensor | None, second: Tensor | None) -> Tensor | None:
-    return None if first is None or second is None else torch.cat([first, second])
+def _joined(parts: list[Tensor | None]) -> Tensor | None:
+    there = [part for part in parts if part is not None]
+    return torch.cat(there) if there else None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -115,6 +116,18 @@ def relative_pose_features(source_from_target: Tensor) -> Tensor:
     return source_from_target[:, :3, :].flatten(1).float()
 
 
+def camera_features(control: CameraControl, trajectory: Trajectory) -> Tensor:
+    """What a camera path is to the network, float32 [T, F]; F as in `CAMERA_FEATURES`.
+
+    Raises: ShapeError for a network steered by angles and a path that has none.
+    """
+    if control == "relative_pose":
+        return relative_pose_features(trajectory.source_from_target)
+    if trajectory.delta is None:
+        raise ShapeError("this checkpoint is steered by angles and radius; plan the path with `plan_view`")
+    return spherical_features(trajectory.delta)
+
+
 class CameraEmbedder(nn.Module):
     """One linear map of the camera features; the U-Net's own MLP follows."""
 
@@ -125,13 +138,7 @@ class CameraEmbedder(nn.Module):
 
     def forward(self, trajectory: Trajectory) -> Tensor:
         """The path's camera vectors, [T, W]."""
-        if self.control == "relative_pose":
-            features = relative_pose_features(trajectory.source_from_target)
-        elif trajectory.delta is not None:
-            features = spherical_features(trajectory.delta)
-        else:
-            raise ShapeError("this checkpoint is steered by angles and radius; plan the path with `plan_view`")
-        return self.proj(features.to(self.proj.weight))
+        return self.proj(camera_features(self.control, trajectory).to(self.proj.weight))
 
 
 def condition_latents(

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from gcd_model.class_head import class_map, nearest_classes
 from gcd_model.config import SemanticClass
-from gcd_model.networks import Networks
+from gcd_model.download import Download
+from gcd_model.engine import Engine
 from gcd_model.vae import to_pixels
 
 
@@ -33,48 +34,84 @@ class LayerStack:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Pictures:
-    """One view on the CPU: pixels [S, T, 3, H, W], RGB in [0, 1]; classes uint8 [S, T, H, W] or None."""
+    """One view on the CPU: pixels [S, T, 3, H, W], RGB; classes uint8 [S, T, H, W] or None.
+
+    pixels: float32 in [0, 1], or whole levels, uint8 in 0..255. finite: what was decoded held neither NaN nor Inf.
+    """
 
     pixels: Tensor
     classes: Tensor | None
+    finite: bool
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Finish:
+    """What becomes of decoded pictures.
+
+    painted: the classes in whose colours the model paints. whole_levels: as uint8.
+    """
+
+    painted: tuple[SemanticClass, ...] = ()
+    whole_levels: bool = False
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Coming:
+    """A decoded clip that may still be arriving. finite: bool, on the device."""
+
+    pixels: Download
+    classes: Download | None
+    finite: Tensor
 
 
 def decode(
-    networks: Networks,
-    denoised: Denoised,
-    stacks: Sequence[LayerStack | None],
-    painted: tuple[SemanticClass, ...] = (),
+    engine: Engine, scale: float, denoised: Denoised, stacks: Sequence[LayerStack | None], finish: Finish | None = None
 ) -> list[Pictures]:
-    """Decode view by view, one clip at a time.
+    """Decode view by view, one clip at a time; while one is decoded, the one before it arrives on the CPU.
 
-    stacks: one per view; None for models without plane mix. painted: the classes in whose colours the model paints.
+    scale: of the VAE. stacks: one per view; None for models without plane mix.
     """
-    views: list[Pictures] = []
+    finish = Finish() if finish is None else finish
+    views: list[list[_Coming]] = []
     for v, stack in enumerate(stacks):
         logits = denoised.class_logits
-        clips = [
-            _decoded_clip(networks, latents, None if logits is None else logits[v, s], stack)
-            for s, latents in enumerate(denoised.latents[v])
-        ]
-        if painted:
-            clips = [(pixels, nearest_classes(pixels, painted)) for pixels, _ in clips]
-        classes = [clip_classes for _, clip_classes in clips if clip_classes is not None]
         views.append(
-            Pictures(
-                pixels=torch.stack([pixels for pixels, _ in clips]), classes=torch.stack(classes) if classes else None
-            )
+            [
+                _decoded_clip(engine, scale, latents, None if logits is None else logits[v, s], stack, finish)
+                for s, latents in enumerate(denoised.latents[v])
+            ]
         )
-    return views
+    return [_arrived(clips) for clips in views]
 
 
 def _decoded_clip(
-    networks: Networks, latents: Tensor, logits: Tensor | None, stack: LayerStack | None
-) -> tuple[Tensor, Tensor | None]:
-    """latents: [T, C, h, w], scaled. Pixels [T, 3, H, W] and class ids [T, H, W], on the CPU."""
-    decoder, mix = networks.decoder, networks.plane_mix
-    unscaled = (latents / networks.config.vae.scale).to(decoder.stem.weight)
-    decoded = decoder(unscaled, len(latents))
-    if mix is not None and stack is not None:
-        decoded, logits = mix(decoded, stack.warped, stack.valid, latents.to(decoded), logits)
-    classes = None if logits is None else class_map(logits, *decoded.shape[-2:]).cpu()
-    return to_pixels(decoded).cpu(), classes
+    engine: Engine, scale: float, latents: Tensor, logits: Tensor | None, stack: LayerStack | None, finish: Finish
+) -> _Coming:
+    """latents: [T, C, h, w], scaled. Pixels [T, 3, H, W] and class ids [T, H, W]."""
+    decoded = engine.decode(latents / scale)
+    if stack is not None:
+        decoded, logits = engine.mix(decoded, stack.warped, stack.valid, latents, logits)
+    pixels = to_pixels(decoded)
+    classes = None if logits is None else class_map(logits, *decoded.shape[-2:])
+    if finish.painted:
+        classes = nearest_classes(pixels, finish.painted)
+    return _Coming(
+        pixels=Download(whole_levels(pixels) if finish.whole_levels else pixels),
+        classes=None if classes is None else Download(classes),
+        finite=decoded.isfinite().all(),
+    )
+
+
+def whole_levels(pixels: Tensor) -> Tensor:
+    """[0, 1] -> uint8 in 0..255, the nearest level."""
+    return (pixels * 255).round().to(torch.uint8)
+
+
+def _arrived(clips: list[_Coming]) -> Pictures:
+    """The samples of one view."""
+    classes = [clip.classes.result() for clip in clips if clip.classes is not None]
+    return Pictures(
+        pixels=torch.stack([clip.pixels.result() for clip in clips]),
+        classes=torch.stack(classes) if classes else None,
+        finite=all(clip.finite.item() for clip in clips),
+    )

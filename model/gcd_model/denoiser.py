@@ -1,14 +1,62 @@
 """The network as the sampler calls it: preconditioned, guided, with the class logits of the last step."""
 
-import torch
+from typing import Protocol
+
 from torch import Tensor
 
 from gcd_model.class_head import ClassHead
 from gcd_model.conditioning import Conditioning
-from gcd_model.config import Prediction
 from gcd_model.noise import preconditioning
 from gcd_model.sampler import guided
-from gcd_model.unet import VideoUNet
+from gcd_model.schedule import Schedule
+from gcd_model.unet import StageInputs, UNetPlan, VideoUNet
+
+
+class Backbone(Protocol):
+    """Whatever evaluates the network F."""
+
+    def plan(self, labels: Tensor, given: Conditioning) -> UNetPlan:
+        """All that does not depend on the pixels. labels: float32 [S], c_noise of every step, anywhere."""
+        ...
+
+    def predict(self, rows: Tensor, condition: Tensor, inputs: tuple[StageInputs, ...]) -> Tensor:
+        """One evaluation, see `VideoUNet.forward`. rows: float32 [N, C, h, w] -> float32, the same shape."""
+        ...
+
+    def predict_classes(
+        self, rows: Tensor, condition: Tensor, inputs: tuple[StageInputs, ...], branches: int
+    ) -> tuple[Tensor, Tensor | None]:
+        """The same, with class logits of the conditional branch, float32 [N / branches, K, h', w'].
+
+        None for a model without class head.
+        """
+        ...
+
+
+class TorchBackbone:
+    """U-Net and class head as they are, in the U-Net's own precision. Source: `Backbone`."""
+
+    def __init__(self, unet: VideoUNet, head: ClassHead | None) -> None:
+        self._unet, self._head = unet, head
+
+    def plan(self, labels: Tensor, given: Conditioning) -> UNetPlan:
+        """See Backbone."""
+        on_device = labels.to(self._unet.stem.weight.device)
+        return self._unet.plan(on_device, given.vector, given.camera, given.tokens, repeats=given.branches)
+
+    def predict(self, rows: Tensor, condition: Tensor, inputs: tuple[StageInputs, ...]) -> Tensor:
+        """See Backbone."""
+        return self._unet(rows.to(self._unet.stem.weight), condition, inputs).float()
+
+    def predict_classes(
+        self, rows: Tensor, condition: Tensor, inputs: tuple[StageInputs, ...], branches: int
+    ) -> tuple[Tensor, Tensor | None]:
+        """See Backbone."""
+        if self._head is None:
+            return self.predict(rows, condition, inputs), None
+        features = self._unet.features(rows.to(self._unet.stem.weight), condition, inputs)
+        logits = self._head(features.chunk(branches)[-1]).float()
+        return self._unet.project(features).float(), logits
 
 
 class Denoiser:
@@ -18,41 +66,39 @@ class Denoiser:
         before that and without class head.
     """
 
-    def __init__(
-        self,
-        unet: VideoUNet,
-        head: ClassHead | None,
-        given: Conditioning,
-        sigmas: Tensor,
-        guidance: Tensor,
-        prediction: Prediction,
-    ) -> None:
-        """sigmas: [S + 1], the sampler's. guidance: [T], scale per frame."""
-        self._unet, self._head, self._given, self._guidance = unet, head, given, guidance
-        levels = preconditioning(sigmas[:-1], prediction)
+    def __init__(self, backbone: Backbone, given: Conditioning, schedule: Schedule) -> None:
+        self._backbone, self._given, self._schedule = backbone, given, schedule
+        levels = preconditioning(schedule.sigmas[:-1], schedule.prediction)
         self._c_in, self._c_out, self._c_skip = (c.tolist() for c in (levels.c_in, levels.c_out, levels.c_skip))
-        labels = levels.c_noise.float().to(unet.stem.weight.device)
-        self._plan = unet.plan(labels, given.vector, given.camera, given.tokens, repeats=given.branches)
+        self._plan = backbone.plan(levels.c_noise.float(), given)
+        self._guidance = schedule.guidance.to(given.latents.device)
         self.class_logits: Tensor | None = None
 
     def __call__(self, x: Tensor, step: int) -> Tensor:
         """x: [K, T, C, h, w] float32 -> the same shape."""
-        branches = self._given.branches
-        rows = (x * self._c_in[step]).flatten(0, 1).to(self._unet.stem.weight).repeat(branches, 1, 1, 1)
-        raw = self._network(rows, step).float().unflatten(0, (-1, *x.shape[:2]))
+        branches = 2 if self._schedule.guided[step] else 1
+        rows = (x * self._c_in[step]).flatten(0, 1).repeat(branches, 1, 1, 1)
+        raw = self._network(rows, step, branches).unflatten(0, (-1, *x.shape[:2]))
         denoised = self._c_skip[step] * x + self._c_out[step] * raw  # [R, K, T, C, h, w]
         return guided(denoised[0], denoised[1], self._guidance) if branches == 2 else denoised[0]
 
-    def _network(self, rows: Tensor, step: int) -> Tensor:
-        inputs = self._plan.step(step)
-        if self._head is None or step + 1 < len(self._c_in):
-            return self._unet(rows, self._given.latents, inputs)
-        features = self._unet.features(rows, self._given.latents, inputs)
-        conditional = features.chunk(self._given.branches)[-1]
-        self.class_logits = self._head(conditional).float()
-        return self._unet.project(features)
+    def _network(self, rows: Tensor, step: int, branches: int) -> Tensor:
+        condition, inputs = self._given.latents, self._plan.step(step)
+        if branches < self._given.branches:
+            condition = condition.chunk(self._given.branches)[-1]
+            inputs = tuple(_conditional(each, self._given.branches) for each in inputs)
+        if step + 1 < len(self._c_in):
+            return self._backbone.predict(rows, condition, inputs)
+        raw, self.class_logits = self._backbone.predict_classes(rows, condition, inputs, branches)
+        return raw
 
 
-def start_noise(noise: Tensor, sigmas: Tensor, views: int) -> Tensor:
-    """Where sampling starts: unit noise [S, T, C, h, w] -> [views * S, T, C, h, w], as strong as the first level."""
-    return noise.repeat(views, 1, 1, 1, 1) * torch.sqrt(sigmas[0] ** 2 + 1).item()
+def _conditional(inputs: StageInputs, branches: int) -> StageInputs:
+    """What the conditional rows alone are given; they come last."""
+    spatial, temporal = inputs.spatial_cross, inputs.temporal_cross
+    return StageInputs(
+        inputs.spatial_embedding.chunk(branches)[-1],
+        inputs.temporal_embedding.chunk(branches)[-1],
+        None if spatial is None else spatial.chunk(branches)[-1],
+        None if temporal is None else temporal.chunk(branches)[-1],
+    )

@@ -1,12 +1,14 @@
 """The parts every network here is built of: residual block, attention, feed-forward, up-sampling."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Generic, TypeVar, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+from gcd_model.frugal import frugal, rows_at_once
 
 Kept = TypeVar("Kept")
 Layer = TypeVar("Layer", bound=nn.Module)
@@ -215,8 +217,25 @@ class FeedForward(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """x: [..., C]."""
-        value, gate = self.expand(x).chunk(2, dim=-1)
-        return self.contract(value * F.gelu(gate))
+        rows = x.reshape(-1, x.shape[-1])
+        at_once = rows_at_once(rows, self.contract.in_features)
+        if at_once >= len(rows):
+            return self._few(x)
+        result = torch.empty_like(rows)
+        for few, into in zip(rows.split(at_once), result.split(at_once), strict=True):
+            into.copy_(self._few(few))
+        return result.view_as(x)
+
+    def _few(self, x: Tensor) -> Tensor:
+        value, gate = self._halves(x)
+        gated = F.gelu(gate)
+        return self.contract(gated.mul_(value) if frugal(x) else value * gated)
+
+    def _halves(self, x: Tensor) -> Iterable[Tensor]:
+        if not frugal(x) or type(self.expand) is not nn.Linear:  # an adapter computes more than its weight says
+            return self.expand(x).chunk(2, dim=-1)
+        halves = zip(self.expand.weight.chunk(2), self.expand.bias.chunk(2), strict=True)
+        return (F.linear(x, weight, bias) for weight, bias in halves)
 
 
 class Downsample(nn.Module):

@@ -1,20 +1,29 @@
 """From the name of a checkpoint to a synthesizer on a device."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, get_args
 
 import msgspec
 import torch
 
 from gcd_model.checkpoints import LoadedWeights, load_adapted, load_weights, read_adapter
 from gcd_model.config import SMALL
+from gcd_model.engine import Engine
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.examination import Options
 from gcd_model.families import family_named
 from gcd_model.networks import Networks, random_networks, weights_digest
+from gcd_model.onnx_export import is_export
+from gcd_model.onnx_loading import load_export
 from gcd_model.own_format import FULL_PRECISION, precision
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
+
+EngineName = Literal["torch", "cuda", "onnxruntime"]
+"""What can compute networks; see `Engine`."""
+ENGINES: tuple[EngineName, ...] = get_args(EngineName)
 
 PACKAGED = Path(__file__).parent / "weights"
 """Where the weights that ship with the package lie."""
@@ -30,22 +39,48 @@ def load_synthesizer(
     image_heads: int | None = None,
     frames: int | None = None,
     adapter: str | Path | None = None,
+    engine: EngineName | None = None,
+    providers: Sequence[str] = (),
 ) -> Synthesizer:
     """A checkpoint, ready to run.
 
     Args:
         source: a path; `package:NAME`, weights that ship with the package; or `random:FAMILY`, small random networks
-            whose views are noise.
+            whose views are noise. The folder of an export is run by onnxruntime, anything else by torch.
         family: see `load_weights`. device: "auto" (CUDA where there is one), "cpu", "cuda" or "cuda:N".
         dtype: "float32", "bfloat16" or "float16"; else float32 on the CPU, bfloat16 on CUDA. The VAE decoder
             stays float32 (on CUDA torch may use TF32 in its convolutions, see torch.backends.cudnn).
         head_width, image_heads, frames: see `load_weights`.
         adapter: file of a low-rank adapter that was trained on these weights; family and path are then the adapter's.
+        engine: what computes the networks: "torch" as they are, or "cuda", compiled and as CUDA graphs, for a GPU; it
+            settles the decoder's precision itself, see `CudaOptions`. "onnxruntime" runs the folder of an export,
+            and nothing else does. None: what the source is for.
+        providers: of onnxruntime, see `load_export`.
     Raises:
         CheckpointError: see `load_weights`; or the adapter was trained on other weights.
         OptionError: an option is unknown or contradicts the checkpoint.
     """
-    place = _place(device, dtype)
+    if is_export(source):
+        _require_export_options(source, engine, (family, dtype, head_width, image_heads, frames, adapter))
+        return load_export(source, device=device, providers=providers)
+    _require_no_export_options(source, engine, providers)
+    place = _place(device, dtype, engine or "torch")
+    loaded = loaded_weights(
+        source, family=family, head_width=head_width, image_heads=image_heads, frames=frames, adapter=adapter
+    )
+    return _synthesizer(loaded, place)
+
+
+def loaded_weights(
+    source: str | Path,
+    *,
+    family: str | None = None,
+    head_width: int | None = None,
+    image_heads: int | None = None,
+    frames: int | None = None,
+    adapter: str | Path | None = None,
+) -> LoadedWeights:
+    """Weights by any name that `load_synthesizer` takes but an export's; arguments and errors are its."""
     kind, _, name = str(source).partition(":")
     if isinstance(source, str) and kind == "random":
         _require_no_overrides(source, family, head_width, image_heads)
@@ -62,7 +97,13 @@ def load_synthesizer(
         )
     if adapter is not None:
         loaded = load_adapted(loaded, read_adapter(adapter))
-    return Synthesizer(_moved(loaded.networks, place), _traits(loaded, place))
+    return loaded
+
+
+def placed_synthesizer(loaded: LoadedWeights, *, device: str = "auto", dtype: str | None = None) -> Synthesizer:
+    """Weights that were loaded or made elsewhere, ready to run. Raises OptionError as `load_synthesizer`."""
+    place = _place(device, dtype)
+    return _synthesizer(loaded, place)
 
 
 def packaged_weights(name: str) -> Path:
@@ -99,6 +140,26 @@ def _require_no_overrides(source: str, *given: object) -> None:
         raise OptionError(f"{source} takes neither family, head width nor image heads; leave them out")
 
 
+def _require_export_options(source: str | Path, engine: EngineName | None, given: Sequence[object]) -> None:
+    if engine not in (None, "onnxruntime"):
+        raise OptionError(
+            f"{source} is an export, which the engine onnxruntime runs; for {engine} give the weights it was made from"
+        )
+    if any(option is not None for option in given):
+        raise OptionError(
+            f"{source} is an export and says all of itself; leave out family, dtype, head width, image heads, frames "
+            "and adapter, or export the weights again with them"
+        )
+
+
+def _require_no_export_options(source: str | Path, engine: EngineName | None, providers: Sequence[str]) -> None:
+    if engine == "onnxruntime" or providers:
+        raise OptionError(
+            f"the engine onnxruntime runs exports, and {source} is none; "
+            f"make one: gcd-node export --weights {source} --onnx FOLDER"
+        )
+
+
 @dataclass(frozen=True, slots=True)
 class _Place:
     """Where the networks compute, and in which precision."""
@@ -106,12 +167,17 @@ class _Place:
     device: torch.device
     dtype: torch.dtype
     precision: str
+    engine: EngineName = "torch"
 
 
-def _place(device: str, dtype: str | None) -> _Place:
+def _place(device: str, dtype: str | None, engine: EngineName = "torch") -> _Place:
     chosen = _device(device)
+    if engine not in ENGINES:
+        raise OptionError(f"the engine must be one of {', '.join(ENGINES)}, got {engine!r}")
+    if engine == "cuda" and chosen.type != "cuda":
+        raise OptionError(f"the engine cuda needs a CUDA device, got {chosen}; take the engine torch")
     name = dtype or ("bfloat16" if chosen.type == "cuda" else "float32")
-    return _Place(chosen, precision(name), name)
+    return _Place(chosen, precision(name), name, engine)
 
 
 def _device(name: str) -> torch.device:
@@ -123,6 +189,18 @@ def _device(name: str) -> torch.device:
     if kind == "cuda" and int(index or 0) >= torch.cuda.device_count():
         raise OptionError(f"device {name} was asked for, this machine has {torch.cuda.device_count()} CUDA devices")
     return torch.device(name)
+
+
+def _synthesizer(loaded: LoadedWeights, place: _Place) -> Synthesizer:
+    networks = _moved(loaded.networks, place)
+    engine = _cuda_engine(networks) if place.engine == "cuda" else None
+    return Synthesizer(networks, _traits(loaded, place), engine)
+
+
+def _cuda_engine(networks: Networks) -> Engine:
+    from gcd_model.cuda_engine import CudaEngine  # torch.compile takes seconds to import
+
+    return CudaEngine(networks)
 
 
 def _moved(networks: Networks, place: _Place) -> Networks:

@@ -12,7 +12,8 @@ import torch
 from gcd_model.config import ModelConfig
 from gcd_model.errors import CheckpointError, OptionError
 
-FORMAT = "1"
+FORMAT, PACKED_FORMAT = "1", "2"
+"""Of files whose weights are numbers as they are, and of those that hold some in eight bits."""
 CONFIG_KEY = "gcd.config"
 _SCALE_KEY = "gcd.uncertainty_scale"
 
@@ -26,7 +27,7 @@ PRECISIONS: dict[str, torch.dtype] = {
 FULL_PRECISION = ("decoder", "plane_mix")
 """Networks that compute in float32 whatever --dtype says: what they make is looked at."""
 
-_DTYPES = {torch.float64: "F64", torch.float32: "F32", torch.bfloat16: "BF16", torch.float16: "F16"}
+_DTYPES = {torch.float64: "F64", torch.float32: "F32", torch.bfloat16: "BF16", torch.float16: "F16", torch.int8: "I8"}
 
 
 def precision(name: str) -> torch.dtype:
@@ -58,11 +59,11 @@ class Card:
         if scale is not None and not 0 < scale < math.inf:
             raise OptionError(f"the uncertainty scale must be a positive number, got {scale:g}; measure it again")
 
-    def to_metadata(self) -> dict[str, str]:
-        """As safetensors metadata: text to text."""
+    def to_metadata(self, *, packed: bool = False) -> dict[str, str]:
+        """As safetensors metadata: text to text. packed: whether weights are stored in eight bits."""
         scale = self.uncertainty_scale
         return {
-            "gcd.format": FORMAT,
+            "gcd.format": PACKED_FORMAT if packed else FORMAT,
             CONFIG_KEY: msgspec.json.encode(self.config).decode(),
             "gcd.name": self.name,
             "gcd.family": self.family or "",
@@ -75,9 +76,10 @@ class Card:
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str]) -> Self:
         """Raises CheckpointError for another format or a damaged config."""
-        if metadata.get("gcd.format", FORMAT) != FORMAT:
+        if metadata.get("gcd.format", FORMAT) not in (FORMAT, PACKED_FORMAT):
             raise CheckpointError(
-                f"its format is {metadata['gcd.format']!r}, this version reads {FORMAT!r}; install a newer gcd-node"
+                f"its format is {metadata['gcd.format']!r}, this version reads {FORMAT!r} and {PACKED_FORMAT!r}; "
+                "install a newer gcd-node"
             )
         try:
             return cls(

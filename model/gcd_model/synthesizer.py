@@ -16,16 +16,15 @@ from gcd_model.conditioning import (
     condition_tokens,
     micro_conditioning,
 )
-from gcd_model.decoding import Denoised, LayerStack, Pictures, decode
-from gcd_model.denoiser import Denoiser, start_noise
+from gcd_model.decoding import Denoised, Finish, LayerStack, Pictures, decode
+from gcd_model.engine import Engine, TorchEngine
 from gcd_model.errors import DeviceMemoryError, NonFiniteError, OptionError, ShapeError
 from gcd_model.geometry import CameraMount, Trajectory
-from gcd_model.image_encoder import clip_pixels
 from gcd_model.layers import prepare
 from gcd_model.networks import Networks
-from gcd_model.noise import edm_sigmas, guidance_scale, unit_noise
+from gcd_model.noise import unit_noise
 from gcd_model.plane_warp import PathWarpCache, PathWarps
-from gcd_model.sampler import euler
+from gcd_model.schedule import Schedule
 from gcd_model.traits import Traits
 
 Given = ParamSpec("Given")
@@ -90,12 +89,14 @@ class Synthesizer:
     in float32.
     """
 
-    def __init__(self, networks: Networks, traits: Traits) -> None:
+    def __init__(self, networks: Networks, traits: Traits, engine: Engine | None = None) -> None:
+        """engine: what computes the networks; torch itself where none is given."""
         self._networks, self._traits = networks, traits
         config = traits.config
         self._warps = None if config.plane_warp is None else PathWarpCache(config.plane_warp, config.vae.down_factor)
         networks.requires_grad_(False)
         prepare(networks)
+        self._engine: Engine = TorchEngine(networks) if engine is None else engine
 
     @property
     def traits(self) -> Traits:
@@ -129,7 +130,7 @@ class Synthesizer:
         noisy = clip.video + strength * noise.to(clip.video.device)
         return SourceFeatures(
             tokens=self._tokens(clip.video),
-            latents=_in_chunks(self._condition_mean, noisy),
+            latents=torch.cat([self._engine.condition_mean(frames) for frames in noisy.split(_ENCODE_FRAMES)]),
             extra=None if extra is None else extra.to(self._like),
             fps=clip.fps,
             augmentation=strength,
@@ -165,7 +166,7 @@ class Synthesizer:
 
     @property
     def _like(self) -> Tensor:
-        return self._networks.unet.stem.weight
+        return self._engine.like
 
     def _check_extra(self, extra: Tensor | None) -> None:
         wanted, given = self._traits.config.extra_condition_channels, 0 if extra is None else extra.shape[1]
@@ -185,14 +186,9 @@ class Synthesizer:
         return self._traits.motion_bucket(trajectory) if given is None else given
 
     def _tokens(self, video: Tensor) -> Tensor | None:
-        tower = self._networks.image_encoder
-        if tower is None:
-            return None
-        size = tower.config.image_size
-        return _in_chunks(lambda frames: tower(clip_pixels(frames, size).to(self._like)), video.to(self._like.device))
-
-    def _condition_mean(self, frames: Tensor) -> Tensor:
-        return self._networks.condition_encoder(frames.to(self._like)).mean
+        chunks = [self._engine.tokens(frames) for frames in video.split(_ENCODE_FRAMES)]
+        made = [each for each in chunks if each is not None]
+        return torch.cat(made) if made else None
 
     def _mount(self, clip: Clip) -> CameraMount | None:
         """Of a camera on a vehicle; where an orbit's source camera stands, the path says."""
@@ -209,24 +205,20 @@ class Synthesizer:
 
     def _denoise(self, job: "_Job") -> Denoised:
         config, options = self._traits.config, job.options
-        first, last = options.guidance or config.sampling.guidance
-        scale = guidance_scale(first, last, config.frames).to(self._like.device)
-        conditioning = self._condition(job, unconditional=(first, last) != (1.0, 1.0))
-        sigmas = edm_sigmas(config.sampling, options.steps or config.sampling.steps)
-        unet, head = self._networks.unet, self._networks.class_head
-        denoiser = Denoiser(unet, head, conditioning, sigmas, scale, config.prediction)
-        noise = job.noise(config.frames, shared=config.sampling.shared_noise).to(self._like.device)  # [S, T, C, h, w]
-        start = start_noise(noise, sigmas, len(job.trajectories))
-        latents = euler(denoiser, start, sigmas, progress=options.progress, cancel=options.cancel)
-        if not latents.isfinite().all():
+        schedule = Schedule.of(config, options)
+        given = self._condition(job, unconditional=schedule.branches == 2)
+        noise = job.noise(config.frames, shared=config.sampling.shared_noise)  # [S, T, C, h, w]
+        start = schedule.start(noise.to(self._like.device), len(job.trajectories))
+        sampled = self._engine.sample(start, given, schedule, options)
+        if not sampled.latents.isfinite().all():
             raise NonFiniteError(
                 f"{self._traits.name} produced NaN or Inf in the latents (precision {self._traits.precision}, seed "
                 f"{options.seed}); try --dtype float32, and look at the weights with `gcd-node weights inspect`"
             )
-        each, logits = (len(job.trajectories), options.samples), denoiser.class_logits
+        each, logits = (len(job.trajectories), options.samples), sampled.class_logits
         if logits is not None:
             logits = logits.unflatten(0, (*each, config.frames))
-        return Denoised(latents=latents.unflatten(0, each), class_logits=logits)
+        return Denoised(latents=sampled.latents.unflatten(0, each), class_logits=logits)
 
     def _condition(self, job: "_Job", *, unconditional: bool) -> Conditioning:
         """Rows are ordered view by view, sample by sample."""
@@ -235,22 +227,24 @@ class Synthesizer:
             micro_conditioning(job.features.fps, bucket, job.features.augmentation, width) for bucket in job.buckets
         ]
         per_frame = samples * job.features.frames
-        camera = self._networks.camera
-        cameras = None if camera is None else [camera(path).repeat(samples, 1) for path in job.trajectories]
+        told = [self._engine.camera(path) for path in job.trajectories]
+        cameras = [each.repeat(samples, 1) for each in told if each is not None]
         views = samples * len(job.trajectories)
         return Conditioning(
             vector=torch.cat([vector.expand(per_frame, -1) for vector in vectors]).to(self._like),
-            camera=None if cameras is None else torch.cat(cameras),
+            camera=torch.cat(cameras) if cameras else None,
             tokens=condition_tokens(job.features, views, unconditional=unconditional),
             latents=condition_latents(job.features, views, job.channels(), unconditional=unconditional),
             branches=2 if unconditional else 1,
         )
 
     def _decode(self, job: "_Job", denoised: Denoised) -> list[Pictures]:
-        mixes = self._networks.plane_mix is not None
+        mixes = self._traits.config.plane_mix is not None
         stacks = [job.layers(warps) if mixes else None for warps in job.warps]
-        pictures = decode(self._networks, denoised, stacks, self._traits.painted_classes)
-        if not all(view.pixels.isfinite().all() for view in pictures):
+        scale = self._traits.config.vae.scale
+        finish = Finish(painted=self._traits.painted_classes, whole_levels=job.options.whole_levels)
+        pictures = decode(self._engine, scale, denoised, stacks, finish)
+        if not all(view.finite for view in pictures):
             raise NonFiniteError(f"{self._traits.name} decoded to NaN or Inf; the weights are damaged")
         return pictures
 
@@ -297,7 +291,3 @@ class _Job:
     def _source(self, warps: PathWarps) -> Tensor:
         assert self.features.video is not None  # `_path_warps` looked
         return self.features.video.to(warps.device)
-
-
-def _in_chunks(network: Callable[[Tensor], Tensor], frames: Tensor) -> Tensor:
-    return torch.cat([network(chunk) for chunk in frames.split(_ENCODE_FRAMES)])

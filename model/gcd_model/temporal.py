@@ -123,9 +123,11 @@ class TemporalBlock(nn.Module):
         self.feed = FeedForward(channels)
 
     def forward(self, x: Tensor, cross: Tensor | None) -> Tensor:
-        """x: [B, L, T, C]. cross: [B, C]."""
+        """x: [B, T, L, C]. cross: [B, C]."""
         x = x + self.feed_first(self.norm_first(x))
-        x = x + self.attention(self.norm_attention(x).flatten(0, 1)).view_as(x)
+        by_pixel = self.norm_attention(x).transpose(1, 2).contiguous()  # [B, L, T, C]
+        mixed = self.attention(by_pixel.flatten(0, 1)).view_as(by_pixel)
+        x = x + mixed.transpose(1, 2)
         if cross is not None:
             x = x + cross[:, None, None]
         return x + self.feed(self.norm_feed(x))
@@ -166,6 +168,5 @@ class VideoTransformer(nn.Module):
         return x + self.proj_out(tokens).transpose(1, 2).unflatten(2, x.shape[-2:])
 
     def _across(self, tokens: Tensor, frames: int, cross: Tensor | None) -> Tensor:
-        across = tokens.unflatten(0, (-1, frames)).transpose(1, 2)  # [B, L, T, C]
-        across = self.temporal(across + self.positions.derived()[:frames], cross)
-        return self.share.blend(tokens, across.transpose(1, 2).flatten(0, 1))
+        across = tokens.unflatten(0, (-1, frames)) + self.positions.derived()[:frames, None]  # [B, T, L, C]
+        return self.share.blend(tokens, self.temporal(across, cross).flatten(0, 1))

@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gcd_model.config import UNetConfig
+from gcd_model.frugal import laid_out, rows_at_once
 from gcd_model.layers import Downsample, Layers, Upsample, embedding_mlp, sinusoid, zeroed
 from gcd_model.temporal import TemporalShare, VideoResBlock, VideoTransformer
 
@@ -27,6 +28,12 @@ class StageInputs:
     temporal_embedding: Tensor
     spatial_cross: Tensor | None
     temporal_cross: Tensor | None
+
+    def split(self, clips: int) -> Iterator["StageInputs"]:
+        """Each clip's own, in order."""
+        parts = (self.spatial_embedding, self.temporal_embedding, self.spatial_cross, self.temporal_cross)
+        chunks = [[None] * clips if part is None else part.chunk(clips) for part in parts]
+        return (StageInputs(*clip) for clip in zip(*chunks, strict=True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +113,13 @@ class Stage(nn.Module):
 
     def forward(self, x: Tensor, inputs: StageInputs, frames: int | None) -> Tensor:
         """x: [N, C, h, w] -> [N, C', h, w]. frames: None for unrelated frames."""
+        clips = 1 if frames is None else len(x) // frames
+        if clips == 1 or rows_at_once(x, x[0].numel()) >= len(x):
+            return self._together(x, inputs, frames)
+        parts = zip(x.chunk(clips), inputs.split(clips), strict=True)
+        return torch.cat([self._together(clip, its_own, frames) for clip, its_own in parts])
+
+    def _together(self, x: Tensor, inputs: StageInputs, frames: int | None) -> Tensor:
         x = self.res(x, frames, inputs.spatial_embedding, inputs.temporal_embedding)
         if self.attention is None:
             return x
@@ -210,14 +224,14 @@ class VideoUNet(nn.Module):
     ) -> Tensor:
         """What the last norm sees, [B*T, width, h, w]; `project` makes the network's output of it. See `forward`."""
         inputs_left, frames = iter(inputs), None if image_mode else self.frames
-        x = self.stem(torch.cat([latents, condition], dim=1))
+        x = laid_out(self.stem(torch.cat([latents, condition], dim=1)))
         skips = [x]
         for level in self.down:
             for stage in level.stages:
                 x = stage(x, next(inputs_left), frames)
                 skips.append(x)
             if level.down is not None:
-                x = level.down(x)
+                x = laid_out(level.down(x))
                 skips.append(x)
         for stage in self.middle:
             x = stage(x, next(inputs_left), frames)
@@ -225,12 +239,12 @@ class VideoUNet(nn.Module):
             for stage in level.stages:
                 x = stage(torch.cat([x, skips.pop()], dim=1), next(inputs_left), frames)
             if level.up is not None:
-                x = level.up(x)
+                x = laid_out(level.up(x))
         return x
 
     def project(self, features: Tensor) -> Tensor:
         """[B*T, width, h, w] -> [B*T, C, h, w]."""
-        return self.conv_out(F.silu(self.norm_out(features)))
+        return self.conv_out(F.silu(self.norm_out(features))).contiguous()
 
     def start_apart(self) -> None:
         """Make all transformers across frames the identity too: for learning from single frames first, then clips."""

@@ -135,7 +135,7 @@ def test_extra_condition_channels_follow_the_source_latents() -> None:
 
 def test_rows_and_followed_by_undo_each_other() -> None:
     features = _features(frames=5, extra=draw(5, 2, 2, 3, seed=1))
-    joined = features.rows(0, 2).followed_by(features.rows(2, 5))
+    joined = features.rows(0, 2).followed_by(features.rows(2, 3), features.rows(3, 5))
     for name in ("tokens", "latents", "extra"):
         assert torch.equal(getattr(joined, name), getattr(features, name))
     assert joined.frames == 5
@@ -147,7 +147,7 @@ def test_features_encoded_differently_are_not_joined(fps: float, augmentation: f
     first = _features()
     other = SourceFeatures(tokens=first.tokens, latents=first.latents, extra=None, fps=fps, augmentation=augmentation)
     with pytest.raises(ShapeError, match="encode them alike"):
-        first.followed_by(other)
+        first.followed_by(first, other)
 
 
 def test_condition_latents_are_the_posterior_mean_of_the_noised_frames_and_not_scaled() -> None:

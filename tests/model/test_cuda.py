@@ -1,18 +1,29 @@
 """What only a GPU can show."""
 
+import copy
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+
 import pytest
 import torch
-from small_models import TINY, random_clip, relative_error
+from small_models import TINY, TINY_DRIVING, random_clip, relative_error, tiny_driving, tiny_synthesizer
 
-from gcd_model.clip import RenderOptions
+from gcd_model.clip import RenderOptions, View
+from gcd_model.config import SVD_14, ModelConfig
+from gcd_model.cuda_engine import CudaEngine, CudaOptions
+from gcd_model.download import Download
+from gcd_model.errors import Cancelled
 from gcd_model.families import KUBRIC90
 from gcd_model.geometry import SphericalDelta
+from gcd_model.measuring.subject import still_clip
 from gcd_model.networks import random_networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
 
 pytestmark = [
     pytest.mark.gpu,
+    pytest.mark.timeout(900),  # the first use of a block compiles it
     pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
 ]
 
@@ -66,3 +77,145 @@ def test_a_full_device_is_our_own_error_and_leaves_the_device_usable() -> None:
     with pytest.raises(DeviceMemoryError):
         greedy()
     assert torch.ones(3, device="cuda").sum().item() == 3
+
+
+# --- the engine ----------------------------------------------------------------------------------------------------
+
+GRAPHS = CudaOptions(backend=None, decoder="float32")
+VARIANTS = {"graphs": GRAPHS, "compiled": CudaOptions(graphs=False, decoder="float32"), "both": CudaOptions()}
+
+
+@pytest.fixture
+def exact() -> Iterator[None]:
+    """Without TF32, so that differences are rounding alone."""
+    matmul, cudnn = torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32
+    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
+    yield
+    torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32 = matmul, cudnn
+
+
+def on_gpu(synthesizer: Synthesizer, options: CudaOptions | None) -> Synthesizer:
+    """The same weights on the GPU, behind the engine or, with None, behind plain torch."""
+    networks = copy.deepcopy(synthesizer.networks).cuda()
+    engine = None if options is None else CudaEngine(networks, options)
+    return Synthesizer(networks, replace(synthesizer.traits, device="cuda"), engine)
+
+
+def rendered(synthesizer: Synthesizer, options: RenderOptions, config: ModelConfig = TINY) -> list[View]:
+    traits = synthesizer.traits
+    steered = config.camera != "none"
+    paths = [traits.plan_view(SphericalDelta(azimuth_deg=a) if steered else None) for a in (30.0, -20.0)]
+    return synthesizer.render(synthesizer.encode(random_clip(config)), paths, options)
+
+
+@pytest.mark.usefixtures("exact")
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_engine_computes_what_plain_torch_computes(variant: str) -> None:
+    plain = tiny_synthesizer()
+    engine = on_gpu(plain, VARIANTS[variant])
+    for options in (
+        RenderOptions(steps=3, samples=2),
+        RenderOptions(steps=5, seed=3, samples=2, solver="dpmpp_2m", guidance=(1.0, 3.0)),
+        RenderOptions(steps=4, guidance=(1.0, 3.0), guidance_interval=(0.5, 100.0), whole_levels=True),
+    ):
+        for mine, other in zip(rendered(engine, options), rendered(plain, options), strict=True):
+            assert relative_error(mine.latents, other.latents) < 1e-4
+            assert relative_error(mine.samples.float(), other.samples.float()) < (
+                0.02 if options.whole_levels else 1e-3
+            )
+
+
+@pytest.mark.usefixtures("exact")
+def test_class_maps_are_those_of_plain_torch() -> None:
+    plain = tiny_driving()
+    engine = on_gpu(plain, VARIANTS["graphs"])
+    for seed in (0, 1):
+        options = RenderOptions(steps=2, seed=seed)
+        pair = (rendered(each, options, TINY_DRIVING)[0] for each in (engine, plain))
+        mine, other = pair
+        assert mine.classes is not None
+        assert other.classes is not None
+        assert (mine.classes == other.classes).float().mean() > 0.99
+
+
+def test_the_loop_neither_allocates_nor_waits_for_the_device() -> None:
+    engine = on_gpu(tiny_synthesizer(), VARIANTS["both"])
+    rendered(engine, RenderOptions(steps=3))
+    allocated: list[int] = []
+
+    def note(done: int, steps: int) -> None:
+        allocated.append(torch.cuda.memory_stats()["allocation.all.allocated"])
+        torch.cuda.set_sync_debug_mode("error" if done < steps else "default")
+
+    try:
+        rendered(engine, RenderOptions(steps=6, progress=note))
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert len(allocated) == 6
+    assert len(set(allocated)) == 1
+
+
+def test_a_second_window_records_and_compiles_nothing() -> None:
+    engine = on_gpu(tiny_synthesizer(), VARIANTS["both"])
+    rendered(engine, RenderOptions(steps=3))
+    from torch._dynamo.utils import counters
+
+    compiled, held = counters["stats"]["unique_graphs"], torch.cuda.memory_allocated()
+    rendered(engine, RenderOptions(steps=3, seed=2))
+    assert counters["stats"]["unique_graphs"] == compiled
+    assert torch.cuda.memory_allocated() == held
+
+
+def test_a_window_is_abandoned_after_the_step_in_which_the_wish_came() -> None:
+    engine, stop = on_gpu(tiny_synthesizer(), VARIANTS["graphs"]), threading.Event()
+
+    def note(done: int, _steps: int) -> None:
+        if done == 2:
+            stop.set()
+
+    with pytest.raises(Cancelled, match="before step 3 of 5"):
+        rendered(engine, RenderOptions(steps=5, progress=note, cancel=stop))
+    assert torch.cuda.current_stream().query()  # nothing is left to do
+    assert rendered(engine, RenderOptions(steps=5))[0].samples.isfinite().all()
+
+
+def test_a_download_holds_what_the_device_had_and_lies_in_pinned_memory() -> None:
+    source = torch.arange(1 << 20, device="cuda", dtype=torch.uint8)
+    download = Download(source)
+    expected = source.cpu()
+    del source
+    torch.zeros(1 << 20, device="cuda", dtype=torch.uint8)  # would take the memory that the copy is read from
+    assert download.result().is_pinned()
+    assert torch.equal(download.result(), expected)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_a_full_size_window_equals_plain_torch_within_bfloat16_and_ten_gigabytes() -> None:
+    networks = random_networks(SVD_14, seed=0)
+    traits = Traits(
+        name="random-full",
+        config=SVD_14,
+        family=KUBRIC90,
+        move_time=13,
+        sha256_12="0" * 12,
+        precision="bfloat16",
+        device="cuda",
+        trained=False,
+    )
+    for module in networks.children():
+        module.to("cuda", torch.bfloat16)
+    networks.decoder.float()
+    clip, path = still_clip(14, 256, 384, 12.0), traits.plan_view(SphericalDelta(azimuth_deg=30.0))
+    options = RenderOptions(steps=2)
+    plain = Synthesizer(networks, traits)
+    features = plain.encode(clip)
+    (other,) = plain.render(features, [path], options)
+    engine = Synthesizer(
+        networks, traits, CudaEngine(networks, CudaOptions(decoder="bfloat16"))
+    )  # in place: no more plain
+    torch.cuda.empty_cache()
+    torch.cuda.reset_peak_memory_stats()
+    (mine,) = engine.render(engine.encode(clip), [path], options)
+    assert relative_error(mine.latents, other.latents) < 0.05
+    assert torch.cuda.max_memory_allocated() < 10e9

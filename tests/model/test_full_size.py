@@ -1,4 +1,4 @@
-"""One full-size forward, ours against diffusers: the same numbers; both times and both peak memories printed."""
+"""One guided full-size step, ours against diffusers: the same numbers in less memory; both times are printed."""
 
 import json
 import os
@@ -28,7 +28,7 @@ def _run(task: str, folder: Path) -> str:
         env=os.environ | {"PYTHONPATH": path},
         capture_output=True,
         text=True,
-        timeout=900,
+        timeout=5400,
         check=False,
     )
     assert done.returncode == 0, done.stderr[-2000:]
@@ -36,11 +36,11 @@ def _run(task: str, folder: Path) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1800)
-def test_a_full_size_forward_equals_diffusers_and_both_costs_are_printed(
+@pytest.mark.timeout(10800)
+def test_a_guided_full_size_step_equals_diffusers_in_less_memory_and_both_costs_are_printed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """14 frames of 32x48 latents, float32, one branch, random weights; each side in a process of its own."""
+    """Two branches of 14 frames of 32x48 latents, float32, random weights; each side in a process of its own."""
     try:
         _run("write", tmp_path)
         costs = {side: json.loads(_run(side, _warmed(tmp_path)).splitlines()[-1]) for side in ("ours", "diffusers")}
@@ -56,4 +56,5 @@ def test_a_full_size_forward_equals_diffusers_and_both_costs_are_printed(
     assert results["ours"].abs().max() > 0.1
     assert error < 1e-4
     assert costs["ours"]["cpu_s"] > 0
-    assert costs["ours"]["peak_gb"] < 12
+    assert costs["ours"]["peak_gb"] <= 0.85 * costs["diffusers"]["peak_gb"]
+    assert costs["ours"]["private_gb"] <= 2.0  # so nothing copies the 6 GB of weights

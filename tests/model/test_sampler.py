@@ -2,6 +2,7 @@
 
 import math
 import threading
+from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
@@ -10,12 +11,19 @@ from small_models import draw
 from torch import Tensor
 from torch.testing import assert_close
 
+from gcd_model.clip import SOLVERS, SolverName
 from gcd_model.config import SamplingConfig
 from gcd_model.errors import Cancelled
 from gcd_model.noise import edm_sigmas, guidance_scale, preconditioning, unit_noise
-from gcd_model.sampler import euler, guided
+from gcd_model.sampler import guided, multistep_steps, sample, solver_steps
 
 PUBLISHED = SamplingConfig()
+
+
+def follow(
+    denoise: Callable[[Tensor, int], Tensor], start: Tensor, sigmas: Tensor, solver: SolverName = "euler"
+) -> Tensor:
+    return sample(denoise, start, solver_steps(solver, sigmas))
 
 
 def test_25_noise_levels_have_the_published_values() -> None:
@@ -95,7 +103,7 @@ def test_guidance_moves_each_frame_away_from_the_unconditional_prediction_by_its
 def test_euler_reaches_a_constant_prediction_exactly() -> None:
     target = draw(3).double()
     sigmas = edm_sigmas(PUBLISHED, 7)
-    assert_close(euler(lambda _x, _i: target, draw(3, seed=1).double() * 700, sigmas), target)
+    assert_close(follow(lambda _x, _i: target, draw(3, seed=1).double() * 700, sigmas), target)
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.3, 0.9])
@@ -105,26 +113,55 @@ def test_euler_follows_the_closed_form_for_a_denoiser_that_scales(slope: float) 
     factor = 1.0
     for sigma, following in pairwise(sigmas.tolist()):
         factor *= slope + (1 - slope) * following / sigma
-    assert_close(euler(lambda x, _i: slope * x, start, sigmas), start * factor)
+    assert_close(follow(lambda x, _i: slope * x, start, sigmas), start * factor)
 
 
-def test_euler_approaches_the_true_flow_of_a_gaussian_in_proportion_to_its_step() -> None:
+@pytest.mark.parametrize(("solver", "order", "bound"), [("euler", 1, 0.02), ("dpmpp_2m", 2, 0.0005)])
+def test_a_solver_approaches_the_true_flow_of_a_gaussian_with_its_order(
+    solver: SolverName, order: int, bound: float
+) -> None:
     spread = 2.0  # data ~ N(0, 2^2): D(x, s) = x * 4 / (4 + s^2), and x(s) grows with sqrt(4 + s^2)
     start = torch.tensor([1.0], dtype=torch.float64)
     exact = start * spread / math.sqrt(spread**2 + PUBLISHED.sigma_max**2)
 
     def error(steps: int) -> float:
         sigmas = edm_sigmas(PUBLISHED, steps)
-        final = euler(lambda x, i: x * spread**2 / (spread**2 + sigmas[i] ** 2), start, sigmas)
+        final = follow(lambda x, i: x * spread**2 / (spread**2 + sigmas[i] ** 2), start, sigmas, solver)
         return (final / exact - 1).abs().item()
 
-    assert error(400) < 0.02
-    assert error(200) / error(400) == pytest.approx(2.0, abs=0.1)
+    assert error(400) < bound
+    assert math.log2(error(400) / error(800)) == pytest.approx(order, abs=0.15)
+
+
+def test_the_multistep_solver_uses_the_prediction_of_half_way_where_it_is_a_line_over_the_logarithm() -> None:
+    levels = [9.0, 5.0, 2.0, 1.0, 0.3]
+
+    def line(log_sigma: float) -> float:
+        return 3.0 - 0.7 * log_sigma
+
+    steps = multistep_steps(levels)
+    for i in range(1, len(steps)):
+        earlier, now, after = levels[i - 1 : i + 2]
+        counted = steps[i].new * line(math.log(now)) + steps[i].before * line(math.log(earlier))
+        half_way = line((math.log(now) + math.log(after)) / 2)
+        assert counted == pytest.approx((1 - after / now) * half_way)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3, 25])
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_every_step_of_a_solver_weighs_its_terms_to_one_and_the_last_leaves_no_noise(
+    solver: SolverName, steps: int
+) -> None:
+    made = solver_steps(solver, edm_sigmas(PUBLISHED, steps))
+    assert [step.keep + step.new + step.before for step in made] == pytest.approx([1.0] * steps)
+    assert (made[-1].keep, made[-1].before) == (0.0, 0.0)
+    assert made[0].before == 0.0
 
 
 def test_progress_counts_every_step_once() -> None:
     seen: list[tuple[int, int]] = []
-    euler(lambda x, _i: x, draw(2), edm_sigmas(PUBLISHED, 4), progress=lambda done, total: seen.append((done, total)))
+    steps = solver_steps("euler", edm_sigmas(PUBLISHED, 4))
+    sample(lambda x, _i: x, draw(2), steps, progress=lambda done, total: seen.append((done, total)))
     assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
@@ -138,7 +175,7 @@ def test_a_cancelled_run_stops_before_the_next_network_evaluation() -> None:
         return x
 
     with pytest.raises(Cancelled, match="before step 3 of 5"):
-        euler(denoise, draw(2), edm_sigmas(PUBLISHED, 5), cancel=stop)
+        sample(denoise, draw(2), solver_steps("euler", edm_sigmas(PUBLISHED, 5)), cancel=stop)
     assert evaluations == [0, 1]
 
 

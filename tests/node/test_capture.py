@@ -6,12 +6,13 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
+from cameras import until
 from media import frames_at
 
-from gcd_node.capture import Newest, read
+from gcd_node.capture import Newest, WindowSlot, read
 from gcd_node.errors import SourceError, TooShortError
 from gcd_node.frame import Frame, SourceInfo
-from gcd_node.window import FrameWindow, WindowBuilder
+from gcd_node.window import Filling, FrameWindow, WindowBuilder
 
 GUARD_S = 5.0
 
@@ -52,7 +53,7 @@ def joined(thread: threading.Thread) -> None:
     assert not thread.is_alive(), "a thread hangs"
 
 
-def taken(slot: Newest[FrameWindow]) -> list[FrameWindow]:
+def taken(slot: WindowSlot) -> list[FrameWindow]:
     windows: list[FrameWindow] = []
     while (window := slot.take()) is not None:
         windows.append(window)
@@ -141,11 +142,60 @@ def test_nothing_is_lost_or_doubled_between_busy_threads() -> None:
     assert len(got) + slot.dropped == 3000
 
 
+def test_who_waits_works_meanwhile_until_nothing_is_left_to_do_and_again_when_nudged() -> None:
+    slot, left, done, got = Newest[int](), [2], [], []
+
+    def work() -> bool:
+        if not left[0]:
+            return False
+        left[0] -= 1
+        done.append(left[0])
+        return True
+
+    taker = started(lambda: got.append(slot.take(work)))
+    until(lambda: done == [1, 0])
+    left[0] = 1
+    slot.nudge()
+    until(lambda: done == [1, 0, 0])
+    slot.put(7)
+    joined(taker)
+    assert got == [7]
+
+
+def test_an_item_is_taken_before_anything_else_is_done() -> None:
+    slot, done = Newest[int](), []
+    slot.put(7)
+    assert slot.take(lambda: bool(done.append(1))) == 7
+    slot.finish()
+    assert slot.take(lambda: bool(done.append(1))) is None
+    assert done == []
+
+
+def test_a_nudge_while_there_is_work_under_way_is_not_lost() -> None:
+    slot, calls = Newest[int](), []
+
+    def work() -> bool:
+        calls.append(len(calls))
+        if len(calls) == 1:
+            slot.nudge()  # from another thread, just now
+        else:
+            slot.put(7)
+        return False
+
+    assert slot.take(work) == 7
+    assert calls == [0, 1]
+
+
+def test_what_goes_wrong_meanwhile_reaches_the_taker() -> None:
+    with pytest.raises(SourceError, match="meanwhile"):
+        Newest[int]().take(lambda: (_ for _ in ()).throw(SourceError("meanwhile")))
+
+
 # --- the reader --------------------------------------------------------------------------------------------------
 
 
 def test_a_patient_taker_gets_every_window() -> None:
-    slot = Newest[FrameWindow](lossless=True)
+    slot = WindowSlot(lossless=True)
     reader = started(lambda: read(ScriptedSource(ten_fps(20)), builder(), slot))
     windows = taken(slot)
     joined(reader)
@@ -153,7 +203,7 @@ def test_a_patient_taker_gets_every_window() -> None:
 
 
 def test_a_slow_taker_gets_the_newest_window_and_every_frame_was_read() -> None:
-    slot = Newest[FrameWindow]()
+    slot = WindowSlot()
     source = ScriptedSource(ten_fps(20))
     read(source, builder(), slot)
     windows = taken(slot)
@@ -162,20 +212,20 @@ def test_a_slow_taker_gets_the_newest_window_and_every_frame_was_read() -> None:
 
 
 def test_arrivals_are_stamped_by_the_given_clock() -> None:
-    slot = Newest[FrameWindow]()
+    slot = WindowSlot()
     ticks = iter(range(1000, 2000))
     read(ScriptedSource(ten_fps(4)), builder(), slot, clock_ns=lambda: next(ticks))
     assert [window.arrival_ns for window in taken(slot)] == [1003]
 
 
 def test_the_last_window_is_not_forgotten_at_the_end() -> None:
-    slot = Newest[FrameWindow]()
+    slot = WindowSlot()
     read(ScriptedSource(frames_at([0, 100, 200, 270])), WindowBuilder(frames=4, fps=10.0), slot)
     assert len(taken(slot)) == 1
 
 
 def test_a_lost_source_is_reported_after_its_last_window() -> None:
-    slot = Newest[FrameWindow](lossless=True)
+    slot = WindowSlot(lossless=True)
     source = ScriptedSource(ten_fps(6), failure=SourceError("camera unplugged"))
     reader = started(lambda: read(source, builder(), slot))
     assert slot.take() is not None
@@ -185,14 +235,14 @@ def test_a_lost_source_is_reported_after_its_last_window() -> None:
 
 
 def test_a_fault_in_the_source_is_not_swallowed() -> None:
-    slot = Newest[FrameWindow]()
+    slot = WindowSlot()
     read(ScriptedSource([], failure=ZeroDivisionError("bug")), builder(), slot)
     with pytest.raises(ZeroDivisionError, match="bug"):
         slot.take()
 
 
 def test_too_few_frames_are_an_error_that_counts_them() -> None:
-    slot = Newest[FrameWindow]()
+    slot = WindowSlot()
     read(ScriptedSource(ten_fps(3)), builder(), slot)
     with pytest.raises(TooShortError, match=r"TOO_SHORT n=3: script .* takes 4 in a row at 10 FPS") as caught:
         slot.take()
@@ -200,14 +250,14 @@ def test_too_few_frames_are_an_error_that_counts_them() -> None:
 
 
 def test_frames_with_too_many_holes_are_an_error_that_says_so() -> None:
-    slot = Newest[FrameWindow]()
+    slot = WindowSlot()
     read(ScriptedSource(frames_at(i * 250.0 for i in range(20))), builder(), slot)
     with pytest.raises(TooShortError, match=r"n=20: .* x WIN_GAP"):
         slot.take()
 
 
 def test_closing_slot_and_source_stops_the_reader_without_an_error() -> None:
-    slot = Newest[FrameWindow]()
+    slot = WindowSlot()
     source = ScriptedSource(ten_fps(2), stays=True)
     reader = started(lambda: read(source, builder(), slot))
     time.sleep(0.05)
@@ -218,7 +268,29 @@ def test_closing_slot_and_source_stops_the_reader_without_an_error() -> None:
 
 
 def test_windows_leave_the_reader_with_fitted_pictures() -> None:
-    slot = Newest[FrameWindow]()
+    slot = WindowSlot()
     fitting = WindowBuilder(frames=4, fps=10.0, source_fps=10.0, fit=lambda image: np.ascontiguousarray(image[:1]))
     read(ScriptedSource(ten_fps(4)), fitting, slot)
     assert [window.images.shape for window in taken(slot)] == [(4, 1, 4, 3)]
+
+
+def test_the_slot_shows_what_the_next_window_holds_so_far() -> None:
+    slot, shown = WindowSlot(), []
+    source, windows = ScriptedSource(ten_fps(9)), builder()
+
+    class Looking(WindowSlot):
+        def show(self, filling: Filling) -> None:
+            super().show(filling)
+            shown.append(filling.seqs)
+
+        def put(self, item: FrameWindow) -> bool:
+            done = super().put(item)
+            assert self.filling is None
+            return done
+
+    assert slot.filling is None
+    slot = Looking()
+    read(source, windows, slot)
+    assert shown == [(0,), (0, 1), (0, 1, 2), (), (4,), (4, 5), (4, 5, 6), (), (8,)]
+    assert slot.filling is not None
+    assert slot.filling.clip.shape == (1, 3, 2, 4)

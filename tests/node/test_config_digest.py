@@ -1,9 +1,13 @@
 """Configurations that render the same have the same name, however they are written."""
 
+from dataclasses import replace
+
+import msgspec
 import pytest
 from fakes import traits, warping_traits
 
-from gcd_model import Traits
+from gcd_model import RenderOptions, Traits, sampler_of
+from gcd_model.config import SamplingConfig
 from gcd_node.config import NodeConfig, parse_config
 from gcd_node.config_digest import config_digest
 
@@ -34,6 +38,9 @@ def digest(*changes: str, made: Traits = STEERED) -> str:
         (STEERED, f"model.move_time={STEERED.move_time}"),
         (STEERED, f"model.head_width={STEERED.config.unet.head_width}"),
         (STEERED, "model.family=kubric90"),
+        (STEERED, "model.quality=exact"),
+        (STEERED, "model.quality=fastest"),
+        (STEERED, "model.solver=euler"),
         (STEERED, "model.samples=1"),
         (STEERED, "model.seed=0"),
         (STEERED, "model.device=auto"),
@@ -59,6 +66,8 @@ def test_a_default_that_is_written_out_changes_nothing(made: Traits, written_out
     [
         (STEERED, "model.steps=3"),
         (STEERED, "model.guidance=[1.0, 3.0]"),
+        (STEERED, "model.guidance_interval=[0.5, 5.0]"),
+        (STEERED, "model.solver=dpmpp_2m"),
         (STEERED, "model.cond_aug=0.5"),
         (STEERED, "model.cond_aug=0.0"),
         (STEERED, "model.move_time=0"),
@@ -77,6 +86,14 @@ def test_a_default_that_is_written_out_changes_nothing(made: Traits, written_out
 )
 def test_what_changes_the_pixels_changes_the_name(made: Traits, change: str) -> None:
     assert digest(change, made=made) != digest(made=made)
+
+
+def test_a_quality_has_the_name_of_what_it_comes_to() -> None:
+    many = replace(STEERED, config=msgspec.structs.replace(STEERED.config, sampling=SamplingConfig()))
+    fast = sampler_of(many.config.sampling, RenderOptions(quality="fast"))
+    assert digest("model.quality=fast", made=many) != digest(made=many)
+    named = digest(f"model.steps={fast.steps}", f"model.solver={fast.solver}", made=many)
+    assert digest("model.quality=fast", made=many) == named
 
 
 @pytest.mark.parametrize(

@@ -200,6 +200,7 @@ WILD: list[dict[str, object]] = [
 
 def test_no_number_in_a_view_can_end_the_stream(tmp_path: Path) -> None:
     with Rig(tmp_path, lambda _: Endless(), config=LOCKSTEP) as rig:
+        rig.await_views(1)
         for wanted in WILD:
             reply = rig.ask("set_view", wanted, view="main")
             assert reply.code in (Code.OK, Code.OUT_OF_RANGE, Code.BAD_ARG)

@@ -485,3 +485,15 @@ def test_two_lockstep_runs_of_a_real_network_publish_identical_payloads() -> Non
         payloads.append([bytes(message.payload) for message in box.of("win")])
     assert payloads[0] == payloads[1]
     assert len(payloads[0]) == 2
+
+
+@pytest.mark.parametrize(
+    ("device", "samples", "wanted"), [("cuda:0", 1, True), ("cuda:0", 2, False), ("cpu", 1, False)]
+)
+def test_a_gpu_hands_over_whole_levels_unless_their_deviation_is_wanted(
+    device: str, samples: int, wanted: bool
+) -> None:
+    model = FakeSynthesizer(replace(traits(), device=device))
+    _, box = run(config(model=f"samples = {samples}"), FakeSource(14), model)
+    assert [options.whole_levels for _, options in model.asked] == [wanted]
+    assert len(box.of("win")) == 1

@@ -27,7 +27,8 @@ from gcd_node.errors import (
     TooShortError,
 )
 from gcd_node.frame import Frame
-from gcd_node.rendering.model_worker import WindowReport, window_seed
+from gcd_node.rendering.model_worker import WindowReport
+from gcd_node.rendering.seeds import window_seed
 from gcd_node.replay import pixel_file
 from gcd_node.replay.lockstep import lockstep_config, replay
 from gcd_node.replay.manifest import encode_manifest, parse_manifest

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from fakes import WIDTH, Box, FakeSource, FakeSynthesizer, made_node, orbiting_traits, traits, warping_traits
 
-from gcd_model import CameraMount, OptionError, Traits
+from gcd_model import CameraMount, OptionError, Traits, load_synthesizer
 from gcd_node.config import NodeConfig, SourcePose, load_config, parse_config
 from gcd_node.config_digest import config_digest
 from gcd_node.errors import ConfigError
@@ -148,8 +148,11 @@ def test_the_pose_of_every_launch_file_suits_its_model() -> None:
     for path in paths:
         settings = load_config(path)
         kind, _, name = settings.model.weights.partition(":")
-        family = name if kind == "random" else settings.model.family
-        require_usable(settings.source.pose, warping_traits() if family is None else traits(family))
+        if kind == "package":
+            require_usable(settings.source.pose, load_synthesizer(settings.model.weights, device="cpu").traits)
+        else:
+            family = name if kind == "random" else settings.model.family
+            require_usable(settings.source.pose, warping_traits() if family is None else traits(family))
 
 
 def test_a_pose_that_says_nothing_suits_every_model() -> None:

@@ -10,7 +10,7 @@ from media import frames_at
 from gcd_node.errors import ConfigError, SourceError
 from gcd_node.frame import Frame
 from gcd_node.optics.preprocess import to_clip_tensor
-from gcd_node.window import FrameWindow, WindowBuilder, choose_fps
+from gcd_node.window import Filling, FrameWindow, WindowBuilder, choose_fps
 
 
 def run(builder: WindowBuilder, frames: Sequence[Frame], *, flush: bool = True) -> list[FrameWindow]:
@@ -105,6 +105,38 @@ def test_the_clip_of_a_window_is_its_pictures_as_the_network_takes_them(stride: 
     for window in windows:
         assert window.images[:, 0, 0, 0].tolist() == list(window.seqs)
         np.testing.assert_array_equal(window.clip, to_clip_tensor(window.images))
+
+
+@pytest.mark.parametrize("stride", [1, 3, 4, 6])
+def test_what_a_window_holds_so_far_is_how_the_whole_one_will_begin(stride: int) -> None:
+    frames, builder = even(30, 10.0), WindowBuilder(frames=4, fps=10.0, stride=stride)
+    seen: list[tuple[Filling, np.ndarray]] = []
+    for frame in frames:
+        for window in builder.push(frame, frame.stamp_ns):
+            begun = [(filling, clip) for filling, clip in seen if filling.seqs == window.seqs[: len(filling.seqs)]]
+            assert {len(filling.seqs) for filling, _ in begun} >= {3}
+            for filling, clip in begun:
+                np.testing.assert_array_equal(clip, window.clip[: len(clip)])
+                assert (filling.fps, filling.epoch) == (window.fps, window.epoch)
+                assert filling.stamps_ns == window.stamps_ns[: len(clip)]
+        seen.append((builder.filling, builder.filling.clip.copy()))
+    for filling, clip in seen:
+        np.testing.assert_array_equal(filling.clip, clip)  # nothing of it has changed since
+
+
+def test_a_hole_and_a_restart_leave_what_was_shown_as_it_was() -> None:
+    frames, builder = even(30, 10.0), WindowBuilder(frames=4, fps=10.0)
+    run(builder, frames[:3], flush=False)
+    shown, before = builder.filling, builder.filling.clip.copy()
+    run(builder, frames[6:8], flush=False)
+    assert builder.filling.seqs == (6, 7)
+    np.testing.assert_array_equal(shown.clip, before)
+    shown, before = builder.filling, builder.filling.clip.copy()
+    builder.restart("SRC_LOST")
+    assert (builder.filling.seqs, builder.filling.epoch, len(builder.filling.clip)) == ((), 1, 0)
+    run(builder, frames[9:11], flush=False)
+    assert builder.filling.seqs == (9, 10)
+    np.testing.assert_array_equal(shown.clip, before)
 
 
 # --- a window ----------------------------------------------------------------------------------------------------

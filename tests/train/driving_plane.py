@@ -24,6 +24,7 @@ from gcd_model.geometry import (
     driving_trajectory,
     spherical_trajectory,
 )
+from gcd_train.baselines import BaselineSettings, Predictor, build, fit_statistics, usual_baselines
 from gcd_train.baselines.cameras import CameraPair, pixel_rays
 from gcd_train.datasets.paired import PairedClip
 from gcd_train.scenes.pair_world import DEPTH_UNIT_M, Orbit, World
@@ -191,3 +192,15 @@ def _strips(clip: PairedClip) -> dict[str, np.ndarray]:
         strips[f"{side}.classes"] = getattr(clip, f"{side}_classes")
         strips[f"{side}.instances"] = getattr(clip, f"{side}_instances")
     return {kind: np.ascontiguousarray(np.concatenate(frames)) for kind, frames in strips.items()}
+
+
+def without_learning(clips: PlaneClips, *, named: bool = True) -> tuple[Predictor, ...]:
+    """What is compared with models of pictures, built from the same clips. named: with their classes."""
+    settings = BaselineSettings(
+        frames=clips.frames,
+        height=clips.height,
+        width=clips.width,
+        classes=tuple(clips.classes) if named else (),
+        statistics=fit_statistics(clips),
+    )
+    return tuple(build(name, settings) for name in usual_baselines(settings) if not name.startswith("reproject"))

@@ -56,3 +56,14 @@ def mark_and_square(place: tuple[str, int]) -> int:
     time.sleep(0.5)
     Path(folder, f"{number}-{os.getpid()}-{time.time_ns()}").touch()
     return number * number
+
+
+def seat_after_a_death(place: tuple[str, int]) -> str:
+    """What the environment says; kills its process the first time it meets item 0."""
+    folder, number = place
+    first = Path(folder, "first")
+    if number == 0 and not first.exists():
+        first.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    time.sleep(0.3)  # so that every worker has some
+    return os.environ["SEAT"]

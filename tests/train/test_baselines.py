@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from driving_plane import STAGE_SOURCE, PlaneClips, plane_clip
+from driving_plane import STAGE_SOURCE, PlaneClips, plane_clip, without_learning
 from torch.testing import assert_close
 
 from gcd_model.config import PlaneWarpConfig
@@ -17,7 +17,6 @@ from gcd_train.baselines import (
     MajorityMap,
     MeanTarget,
     TargetStatistics,
-    all_baselines,
     fit_statistics,
     to_pictures,
 )
@@ -210,7 +209,7 @@ def test_statistics_of_no_clips_are_refused() -> None:
 
 def test_every_baseline_follows_one_protocol() -> None:
     clips = PlaneClips.make(2)
-    baselines = all_baselines(fit_statistics(clips), len(clips.classes))
+    baselines = without_learning(clips)
     names = [each.name for each in baselines]
     assert len(set(names)) == len(names) == 6
     assert [each.name for each in baselines if each.privileged] == names[-2:]
@@ -263,7 +262,7 @@ def test_an_orbit_whose_beginning_nobody_knows_is_refused() -> None:
 
 def test_without_an_ontology_there_is_no_majority_map_and_no_class_map() -> None:
     clips = PlaneClips.orbits([turned(30.0), turned(-60.0)])
-    baselines = all_baselines(fit_statistics(clips), 0)
+    baselines = without_learning(clips, named=False)
     assert [each.name for each in baselines if "majority" in each.name] == []
     assert len(baselines) == 5
     seen = source_side(clips, 1, clips[1], None)

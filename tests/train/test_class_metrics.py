@@ -13,6 +13,8 @@ from gcd_train.metrics import (
     majority_classes,
     mean_iou,
     pixel_accuracy,
+    void_ids,
+    without_classes,
 )
 
 
@@ -24,9 +26,10 @@ def labels(seed: int) -> torch.Tensor:
 def test_confusions_of_frames_and_of_regions_add_up_to_the_whole() -> None:
     said, true, mask = labels(0), labels(1), labels(2) < 2
     whole = frame_confusions(said, true, 4)
-    assert whole.sum(dim=0).equal(confusion_matrix(said, true, 4))
+    assert whole[:, :, :4].sum(dim=0).equal(confusion_matrix(said, true, 4))
+    assert not whole[:, :, 4].any()
     assert (frame_confusions(said, true, 4, mask) + frame_confusions(said, true, 4, ~mask)).equal(whole)
-    assert whole[1].equal(confusion_matrix(said[1], true[1], 4))
+    assert whole[1, :, :4].equal(confusion_matrix(said[1], true[1], 4))
 
 
 def test_a_map_has_iou_one_with_itself_whatever_classes_are_asked_for() -> None:
@@ -77,6 +80,29 @@ def test_pixels_without_a_class_are_not_counted() -> None:
     assert found.sum(dim=(1, 2)).tolist() == [0, 48, 48]
 
 
+def test_predictions_of_no_class_are_wrong_and_nobodys() -> None:
+    true = torch.tensor([[[0, 0, 1, 1]]], dtype=torch.uint8)
+    said = torch.tensor([[[0, NO_CLASS, 1, NO_CLASS]]], dtype=torch.uint8)
+    found = frame_confusions(said, true, 2)
+    assert found.tolist() == [[[1, 0, 1], [0, 1, 1]]]
+    assert class_iou(found[0]).tolist() == [0.5, 0.5]
+    assert pixel_accuracy(found[0]) == 0.5
+
+
+def test_void_is_known_by_its_name_whatever_the_case() -> None:
+    assert void_ids(["Road", "Void", "Car", "unlabelled", "UNLABELED "]) == (1, 3, 4)
+    assert void_ids(["Road", "Avoided"]) == ()
+    assert void_ids(["Void"] * 256) == ()
+
+
+def test_a_map_without_void_has_no_class_there_and_the_others_stay() -> None:
+    assert without_classes(labels(0), ()).equal(labels(0))
+    made = without_classes(labels(0), (1, 3))
+    assert made.dtype == torch.uint8
+    assert ((made == NO_CLASS) == (labels(0) % 2 == 1)).all()
+    assert made[labels(0) % 2 == 0].equal(labels(0)[labels(0) % 2 == 0])
+
+
 def test_of_256_classes_the_last_is_one_too() -> None:
     true = torch.full((1, 2, 2), 255, dtype=torch.uint8)
     assert frame_confusions(true, true, 256)[0, 255, 255] == 4
@@ -92,13 +118,13 @@ def test_unknown_ids_of_frames_are_refused() -> None:
 def test_the_commonest_classes_are_those_of_the_targets() -> None:
     confusion = torch.tensor([[5, 0, 0, 0], [0, 5, 4, 0], [0, 0, 5, 0], [90, 0, 0, 0]])
     confusion[3] = torch.tensor([0, 0, 0, 0])  # never there
-    assert commonest_classes(confusion, 10) == (1, 0, 2)
-    assert commonest_classes(confusion, 2) == (1, 0)
+    assert commonest_classes(confusion.sum(dim=1), 10) == (1, 0, 2)
+    assert commonest_classes(confusion.sum(dim=1), 2) == (1, 0)
 
 
 def test_mean_iou_over_the_commonest_classes_leaves_the_others_out() -> None:
     confusion = torch.tensor([[8, 2, 0], [0, 6, 0], [0, 1, 0]])
-    assert mean_iou(confusion, commonest_classes(confusion, 2)) == pytest.approx((8 / 10 + 6 / 9) / 2)
+    assert mean_iou(confusion, commonest_classes(confusion.sum(dim=1), 2)) == pytest.approx((8 / 10 + 6 / 9) / 2)
     assert mean_iou(confusion) == pytest.approx((8 / 10 + 6 / 9 + 0) / 3)
     assert math.isnan(mean_iou(confusion, ()))
 

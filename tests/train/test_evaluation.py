@@ -267,6 +267,17 @@ def test_the_same_weights_are_measured_with_other_steps_too() -> None:
     assert synthesizer.steps == [None, 1, 4]
 
 
+def test_a_row_says_how_it_is_sampled_and_the_model_is_asked_so() -> None:
+    clips = PlaneClips.make(1)
+    synthesizer = fake(clips)
+    sampled = RenderOptions(
+        quality="fast", steps=4, solver="dpmpp_2m", guidance=(1.0, 2.5), guidance_interval=(0.5, 20.0)
+    )
+    (found,) = found_by([SynthesizedViews.of(synthesizer, clips, sampled)], clips)
+    assert found.name == "fake-small (fast, 4 steps, dpmpp_2m, guidance 1 to 2.5, guided from 0.5 to 20)"
+    assert synthesizer.options == [sampled]
+
+
 def test_a_declared_mount_reaches_the_clip_the_path_and_the_baselines() -> None:
     clips = PlaneClips.make(1)
     synthesizer, mount = fake(clips), CameraMount(height_m=1.8)

@@ -11,12 +11,25 @@ from driving_plane import PlaneClips
 from made_records import note, record
 from typer.testing import CliRunner
 
-from gcd_train.baselines import CopySource, Prediction, Predictor, SavedFrames, SourceClip, to_pictures
+from gcd_train.baselines import (
+    BaselineSettings,
+    CopySource,
+    Prediction,
+    Predictor,
+    SavedFrames,
+    SourceClip,
+    build,
+    fit_statistics,
+    to_pictures,
+)
 from gcd_train.cli.main import app
 from gcd_train.datasets.paired import PairedClips
 from gcd_train.errors import DataError, RunError
 from gcd_train.evaluation import ClipWork, HeldOutClip, PairedSet, RunKeeper, folder_name, measure_all, read_run
+from gcd_train.evaluation.gpu_seats import gpu_seats
+from gcd_train.evaluation.kept_frames import png
 from gcd_train.evaluation.paired_set import chosen, identity_of
+from gcd_train.evaluation.run import predicted_and_measured
 from gcd_train.evaluation.spread import GIVE_UP_AFTER, Account
 
 
@@ -167,6 +180,15 @@ def written(folder: Path, count: int, first_seed: int = 0) -> PairedClips:
     return PairedClips.open(PlaneClips.make(count).write(folder, first_seed))
 
 
+def test_workers_take_gpus_in_turn_unless_one_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    each = [{"CUDA_VISIBLE_DEVICES": "0"}, {"CUDA_VISIBLE_DEVICES": "1"}, {"CUDA_VISIBLE_DEVICES": "2"}]
+    assert list(gpu_seats("auto", 3)) == list(gpu_seats("cuda", 3)) == each
+    assert gpu_seats("cpu", 3) == gpu_seats("cuda:1", 3) == gpu_seats("auto", 1) == gpu_seats("auto", 0) == ()
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5, GPU-3a")
+    assert [seat["CUDA_VISIBLE_DEVICES"] for seat in gpu_seats("auto", 2)] == ["5", "GPU-3a"]
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(300)  # each process imports torch
 def test_processes_find_what_one_finds(tmp_path: Path) -> None:
@@ -249,15 +271,88 @@ def test_the_command_measures_and_goes_on(tmp_path: Path) -> None:
     assert scores["saved"] == scores["copy_source"]
 
 
+def test_what_is_wrong_is_said_before_training_clips_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    PlaneClips.make(1).write(tmp_path / "data")
+    PlaneClips.make(2).write(tmp_path / "train", first_seed=5)
+    means = ["--methods", "mean_target", "--train", str(tmp_path / "train")]
+    code, said = evaluated(tmp_path, *means)
+    assert code == 0, said
+
+    def unwanted(*_: object, **__: object) -> None:
+        pytest.fail("the means were worked out")
+
+    monkeypatch.setattr("gcd_train.evaluation.plan.fit_statistics", unwanted)
+    for options, words in (
+        (["--lpips", str(tmp_path / "nowhere")], "nowhere"),
+        (["--predictions", f"other={tmp_path / 'nowhere'}"], "is no folder"),
+        (["--seed", "4"], "seed was 0, is 4"),
+    ):
+        code, said = evaluated(tmp_path, *means, *options)
+        assert (code != 0, words in said) == (True, True), said
+
+
+def test_means_are_those_of_the_training_clips(tmp_path: Path) -> None:
+    held_out = PlaneClips.make(1).write(tmp_path / "data")
+    training = PlaneClips.make(2).write(tmp_path / "train", first_seed=5)
+    code, said = evaluated(tmp_path, "--methods", "mean_target", "--train", str(training))
+    assert code == 0, said
+    mean = build("mean_target", settings_of(PairedClips.open(training)))
+    clip = PairedSet.of(PairedClips.open(held_out))
+    _, wanted = predicted_and_measured(mean, clip.clip(clip.keys[0]), classes=clip.classes)
+    (record,) = read_run(tmp_path / "run")[1]
+    assert record.regions == wanted.regions
+
+
+def settings_of(training: PairedClips) -> BaselineSettings:
+    return BaselineSettings(
+        frames=training.frames,
+        height=training.height,
+        width=training.width,
+        classes=tuple(training.classes),
+        statistics=fit_statistics(training),
+    )
+
+
+def test_what_a_hexplane_learns_can_be_said_and_is_kept(tmp_path: Path) -> None:
+    PlaneClips.make(1).write(tmp_path / "data")
+    few = ["--methods", "hexplane_1", "--hexplane-updates", "2", "--hexplane-rays", "16", "--limit", "1"]
+    code, said = evaluated(tmp_path, *few)
+    assert code == 0, said
+    told, (record,) = read_run(tmp_path / "run")
+    assert (told.methods["hexplane_1"]["updates"], told.methods["hexplane_1"]["rays"]) == ("2", "16")
+    assert record.regions["all"].psnr_db is not None
+    code, said = evaluated(tmp_path, *few, "--hexplane-rays", "17")
+    assert (code != 0, "rays of hexplane_1 was 16, is 17" in said) == (True, True), said
+
+
+def test_frames_of_a_method_that_was_given_more_are_starred(tmp_path: Path) -> None:
+    PlaneClips.make(1).write(tmp_path / "data")
+    clip = PairedSet.of(PairedClips.open([tmp_path / "data"]))
+    (key,) = clip.keys
+    for name in ("a", "b"):
+        RunKeeper(tmp_path).views(name, key).mkdir(parents=True)
+        for number, frame in enumerate(clip.clip(key).target):
+            (RunKeeper(tmp_path).views(name, key) / f"{number:04d}.png").write_bytes(png(frame))
+    frames = [word for name in "ab" for word in ("--predictions", f"{name}={tmp_path / 'views' / name}")]
+    code, said = evaluated(tmp_path, "--no-baselines", *frames, "--privileged", "b")
+    assert code == 0, said
+    assert ("| a |" in said, "| b * |" in said) == (True, True), said
+    assert [(each.method, each.privileged) for each in read_run(tmp_path / "run")[1]] == [("a", False), ("b", True)]
+    code, said = evaluated(tmp_path, "--no-baselines", *frames)
+    assert (code != 0, "privileged of b was yes, is not told" in said) == (True, True), said
+
+
 @pytest.mark.parametrize(
     ("options", "code", "words"),
     [
         (["--methods", "copy_sauce"], 78, "did you mean copy_source"),
         (["--methods", "copy_source", "--controls", "list.json"], 78, "these are pairs"),
         (["--methods", "copy_source", "--split", "driving-tset"], 78, "did you mean driving-test"),
-        (["--methods", "copy_source", "--split", "drop-test"], 66, "is of the split"),
+        (["--methods", "copy_source", "--split", "drop-test"], 66, "the world drop, but these pairs are of driving"),
+        (["--methods", "copy_source", "--split", "driving-test"], 66, "is of the split"),
         (["--no-baselines"], 78, "there is nothing to measure"),
         (["--no-baselines", "--predictions", "frames"], 78, "NAME=FOLDER"),
+        (["--methods", "copy_source", "--privileged", "mine"], 78, "got 'mine'; there are none"),
         ([], 78, "baselines want training clips"),
     ],
 )

@@ -152,6 +152,14 @@ def test_every_class_has_a_place_even_if_nobody_saw_it() -> None:
     assert found.accuracy == 1.0
 
 
+def test_what_is_said_to_be_of_no_class_is_wrong_and_makes_no_class() -> None:
+    clip = record(regions={"all": region(counts=[(0, 0, 6), (0, 255, 2), (1, 1, 4)])}, grid=[(0, 255, 3), (0, 0, 1)])
+    found = figures([clip], classes=2)
+    assert found.class_iou_full == pytest.approx((6 / 8, 1.0))
+    assert (found.class_iou[0], found.accuracy) == (0.25, 0.25)
+    assert class_counts([clip]).common == (0, 1)
+
+
 def test_the_ten_commonest_classes_are_those_of_all_targets_in_every_region() -> None:
     counts = [(label, label, 100 - label) for label in range(12)]
     rare = [(11, 0, 50)]

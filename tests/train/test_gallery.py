@@ -1,5 +1,6 @@
 """Real videos: which frames become windows, what is shown of them, and what is said of bad ones."""
 
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -36,7 +37,7 @@ from gcd_train.gallery.real_video import fitted, kept_share
 from gcd_train.gallery.viewed import mounted, paths
 
 T, H, W = 4, 32, 64
-REAL = Path(__file__).parents[2].parent / "shared" / "real"
+REAL = Path(os.environ.get("GCD_REAL_VIDEOS", "no folder of videos"))
 
 
 def traits(family: str = "kubric90") -> Traits:
@@ -308,7 +309,7 @@ def test_what_cannot_be_shown_is_one_line(tmp_path: Path, weights: Path, more: l
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not REAL.is_dir(), reason="the real videos are not here")
+@pytest.mark.skipif(not REAL.is_dir(), reason="needs a folder of real videos, named in GCD_REAL_VIDEOS")
 def test_real_videos_are_shown_by_the_packaged_model(tmp_path: Path) -> None:
     out = tmp_path / "out"
     code, said = run(REAL, "--weights", "package:driving-small", "--windows", 1, "--out", out)

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
-from mapped_work import always_killed, killed_once, square, unsendable
+from mapped_work import always_killed, killed_once, seat_after_a_death, square, unsendable
 
 from gcd_train.errors import DataError, RunError
 from gcd_train.map_items import Outcome, map_items
@@ -47,6 +47,15 @@ def test_an_item_that_kills_every_worker_is_given_up() -> None:
     assert {item: outcome.value for item, outcome in outcomes.items()} == {0: 0, 1: 1, 2: None, 3: 9}
     assert "killed 2 times (exit code -9)" in (outcomes[2].error or "")
     assert outcomes[2].kind == "WorkerLost"
+
+
+def test_workers_take_environments_in_turn_and_a_new_one_has_that_of_the_killed(tmp_path: Path) -> None:
+    items = [(str(tmp_path), number) for number in range(6)]
+    environments = [{"SEAT": "a"}, {"SEAT": "b"}]
+    outcomes = list(map_items(seat_after_a_death, items, workers=2, environments=environments))
+    assert sorted(outcome.item for outcome in outcomes) == items
+    assert {outcome.unwrap() for outcome in outcomes} == {"a", "b"}
+    assert "SEAT" not in os.environ
 
 
 def test_a_result_that_cannot_travel_is_an_error() -> None:

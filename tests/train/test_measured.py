@@ -1,3 +1,4 @@
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -9,12 +10,16 @@ from driving_plane import PlaneClips
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
+from gcd_model.config import SemanticClass
 from gcd_model.errors import NonFiniteError, ShapeError
 from gcd_model.geometry import CameraMount
-from gcd_train.baselines import CameraPair, Prediction, SourceClip, to_pictures
+from gcd_train.baselines import CameraPair, CopySource, Prediction, SourceClip, to_pictures
+from gcd_train.evaluation import figures
+from gcd_train.evaluation.class_counts import class_counts
 from gcd_train.evaluation.clips import HeldOutClip
 from gcd_train.evaluation.measured import measure
 from gcd_train.evaluation.record import ClipRecord, Counted, RegionRecord
+from gcd_train.evaluation.run import predicted_and_measured
 from gcd_train.metrics import NO_CLASS, Lpips, confusion_matrix, masked_psnr, masked_ssim, psnr, ssim
 
 FRAMES, HEIGHT, WIDTH, CLASSES = 4, 32, 48, 14
@@ -55,12 +60,8 @@ def drawn(clip: HeldOutClip, draws: int) -> Prediction:
     return replace(noisy(clip, 0), more=tuple(noisy(clip, seed) for seed in range(1, draws)))
 
 
-def record_of(
-    clip: HeldOutClip, prediction: Prediction, *, lpips: Lpips | None = None, whole: bool = True
-) -> ClipRecord:
-    return measure(
-        clip, prediction, method="noisy", privileged=False, seconds=2.5, classes=CLASSES, lpips=lpips, whole=whole
-    )
+def record_of(clip: HeldOutClip, prediction: Prediction, *, lpips: Lpips | None = None) -> ClipRecord:
+    return measure(clip, prediction, method="noisy", privileged=False, seconds=2.5, classes=CLASSES, lpips=lpips)
 
 
 def matrix(counted: Sequence[Counted]) -> Tensor:
@@ -166,10 +167,9 @@ def test_diversity_needs_two_draws() -> None:
     assert min(record_of(clip, drawn(clip, 2)).regions["occluded"].diversity) > 0.02
 
 
-def test_regions_are_left_out_where_nobody_knows_them_or_asks_for_them() -> None:
-    assert set(record_of(held_out(visible=False), noisy(held_out(), 0)).regions) == {"all"}
-    clip = held_out()
-    short, long = record_of(clip, noisy(clip, 0), whole=False), record_of(clip, noisy(clip, 0))
+def test_regions_are_left_out_where_nobody_knows_them() -> None:
+    clip, unseen = held_out(), held_out(visible=False)
+    short, long = record_of(unseen, noisy(clip, 0)), record_of(clip, noisy(clip, 0))
     assert short == msgspec.structs.replace(long, regions={"all": long.regions["all"]})
 
 
@@ -201,6 +201,47 @@ def test_target_pixels_without_a_class_count_nowhere() -> None:
     cells = [sum(count for _, _, count in frame) for frame in record.grid_confusion]
     assert pixels == [(HEIGHT - 10) * WIDTH] * FRAMES
     assert cells == [(HEIGHT - 10) // 2 * WIDTH // 2] * FRAMES
+
+
+def test_void_is_not_counted_where_it_is_true_and_wrong_where_it_is_said() -> None:
+    clip = held_out()
+    true = torch.from_numpy(clip.target_classes.copy())
+    void, road = int(true[0, 0, 0]), int(true[0, -1, WIDTH // 2])
+    said = true.clone()
+    said[:, -2:] = void  # on the ground, the last row of the class grid
+    record = measure(
+        clip,
+        Prediction(classes=said),
+        method="noisy",
+        privileged=False,
+        seconds=0.0,
+        classes=CLASSES,
+        lpips=None,
+        void=(void,),
+    )
+    for counted, rows, shape in (
+        (record.regions["all"].confusion, 2, true[0].shape),
+        (record.grid_confusion, 1, (HEIGHT // 2, WIDTH // 2)),
+    ):
+        assert void not in {label for frame in counted for entry in frame for label in entry[:2]}
+        wrong = [sum(count for _, label, count in frame if label == NO_CLASS) for frame in counted]
+        assert wrong == [rows * shape[1]] * FRAMES
+        assert road in {entry[0] for frame in counted for entry in frame if entry[1] == NO_CLASS}
+    found = figures([record], classes=CLASSES)
+    assert math.isnan(found.class_iou_full[void])
+    assert void not in class_counts([record], CLASSES).common
+    assert found.miou_full < 1.0
+
+
+def test_a_method_on_a_set_with_void_is_measured_without_it() -> None:
+    clip = held_out()
+    labels = np.full_like(clip.target_classes, 1)
+    labels[:, :8] = 2
+    names = [SemanticClass(name=name, colour=(label, 0, 0)) for label, name in enumerate(("Road", "Car", "Void"))]
+    known = replace(clip, target_classes=labels, seen=replace(clip.seen, source_classes=labels))
+    _, record = predicted_and_measured(CopySource(), known, classes=names)
+    assert record.regions["all"].confusion == (((1, 1, (HEIGHT - 8) * WIDTH),),) * FRAMES
+    assert record.grid_confusion == (((1, 1, (HEIGHT - 8) * WIDTH // 4),),) * FRAMES
 
 
 def test_an_odd_row_does_not_stop_the_class_grid() -> None:

@@ -7,7 +7,7 @@ from headless import needs_egl
 from typer.testing import CliRunner
 
 from gcd_model import load_synthesizer
-from gcd_train.baselines import all_baselines, fit_statistics
+from gcd_train.baselines import BaselineSettings, build, fit_statistics
 from gcd_train.cli.main import app
 from gcd_train.datasets.paired import PairedClips
 from gcd_train.evaluation import Evaluation, PairedSet, SynthesizedViews, evaluate
@@ -27,8 +27,14 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Evaluation]:
     folder = tmp_path_factory.mktemp("scenes")
     clips, training = made(folder / "held-out", 1_000_000, 4), made(folder / "train", 0, 4)
     model = SynthesizedViews.of(load_synthesizer("package:driving-small", device="cpu"), clips)
-    baselines = all_baselines(fit_statistics(training), len(clips.classes))
-    compared = [each for each in baselines if each.name in ("depth_reprojection", "majority_map")]
+    settings = BaselineSettings(
+        frames=clips.frames,
+        height=clips.height,
+        width=clips.width,
+        classes=tuple(clips.classes),
+        statistics=fit_statistics(training),
+    )
+    compared = [build(name, settings) for name in ("depth_reprojection", "majority_map")]
     return {each.name: each for each in evaluate([model, *compared], PairedSet.of(clips))}
 
 

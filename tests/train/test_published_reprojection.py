@@ -21,12 +21,14 @@ from gcd_train.baselines import (
     SourceClip,
     baseline_names,
     build,
+    described,
     fit_statistics,
     to_pictures,
     usual_baselines,
 )
 from gcd_train.baselines.published_reprojection import source_views
 from gcd_train.errors import DataError, RecipeError
+from gcd_train.metrics import NO_CLASS
 from gcd_train.pointcloud import visibility
 from gcd_train.scene_view import SceneView
 
@@ -93,21 +95,31 @@ def test_on_a_plane_it_agrees_with_the_picture_drawn_by_rays_and_is_black_elsewh
     assert not made.permute(0, 2, 3, 1)[~there].any()
 
 
-def test_classes_are_read_back_from_the_nearest_colour_and_holes_are_the_darkest_class() -> None:
+def test_classes_are_read_back_from_the_nearest_colour_and_holes_are_of_no_class() -> None:
     made, target = classes(), torch.from_numpy(CLIP.target_classes)
     there = shown(picture())
     near = torch.from_numpy((CLIP.target_depth > 0) & (CLIP.target_depth < 15))
     assert (made == target)[there & near].float().mean() > 0.9
-    darkest = min(range(len(CLASSES)), key=lambda label: sum(channel**2 for channel in CLASSES[label].colour))
-    deep = torch.nn.functional.max_pool2d(there.float()[:, None], 5, 1, 2)[:, 0] == 0  # away from what is blurred
-    assert deep.any()
-    assert (made[deep] == darkest).all()
+    assert (~there).any()
+    assert (made[~there] == NO_CLASS).all()
+    assert (made[there] == NO_CLASS).float().mean() < 0.05  # edges that points cover to less than half
 
 
-def test_with_void_among_the_classes_holes_are_void() -> None:
-    void = (*CLASSES, SemanticClass(name="void", colour=(0, 0, 0)))
-    there = shown(picture())
-    assert (classes(kinds=void)[~there] == len(CLASSES)).all()
+@pytest.mark.parametrize("published", [False, True])
+def test_no_colour_of_a_class_makes_a_hole_match(published: bool) -> None:
+    black = tuple(SemanticClass(name=each.name, colour=(0, 0, label)) for label, each in enumerate(CLASSES))
+    holes = []
+    for kinds in (black, CLASSES):
+        made = ReprojectSemd(classes=kinds, published=published).predict(SEEN).classes
+        assert made is not None
+        holes.append(made == NO_CLASS)
+    assert holes[0].any()
+    assert torch.equal(*holes)
+
+
+def test_edges_of_holes_are_not_read_as_darker_classes() -> None:
+    bright = (*CLASSES, SemanticClass(name="night", colour=(40, 40, 40)))
+    assert not (classes(kinds=bright) == len(CLASSES)).any()
 
 
 def test_points_of_the_data_sets_own_views_are_drawn_instead_where_there_are_some() -> None:
@@ -166,6 +178,20 @@ def test_a_name_that_is_none_gets_the_nearest_one() -> None:
         build("reproject_rgb", SETTINGS)
 
 
+def test_a_run_is_told_where_holes_of_class_maps_are_of_no_class() -> None:
+    filled = replace(SETTINGS, statistics=fit_statistics(PlaneClips.make(1)))
+    names = ("copy_source", "ground_homography", "depth_reprojection", "reproject_semd")
+    told = {name: [described(name, each).get("holes") for each in (SETTINGS, filled)] for name in names}
+    nothing = "of no class"
+    assert told == {
+        "copy_source": [None, None],
+        "ground_homography": [nothing, None],
+        "depth_reprojection": [nothing, None],
+        "reproject_semd": [nothing, nothing],
+    }
+    assert described("ground_homography", replace(SETTINGS, classes=())) == {}
+
+
 @pytest.mark.parametrize("name", ["mean_target", "majority_map", "depth_reprojection_on_mean"])
 def test_means_want_training_clips(name: str) -> None:
     with pytest.raises(RecipeError, match=f"{name} wants training clips .* give --train"):
@@ -184,6 +210,7 @@ def test_without_training_clips_holes_are_black_and_the_others_are_offered() -> 
     assert made.video is not None
     assert made.classes is not None
     assert not made.video[:, :, 0].any()  # the horizon lies lower
+    assert (made.classes[:, 0] == NO_CLASS).all()
 
 
 def test_where_targets_are_class_maps_only_class_maps_count() -> None:

@@ -7,7 +7,7 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-from driving_plane import PlaneClips
+from driving_plane import PlaneClips, without_learning
 from typer.testing import CliRunner
 
 from gcd_model.checkpoints import save_weights
@@ -15,7 +15,7 @@ from gcd_model.config import DRIVING_SMALL
 from gcd_model.geometry import SphericalDelta
 from gcd_model.networks import random_networks
 from gcd_model.own_format import Card
-from gcd_train.baselines import CopySource, MajorityMap, all_baselines, fit_statistics
+from gcd_train.baselines import CopySource, MajorityMap, fit_statistics
 from gcd_train.cli.main import app
 from gcd_train.errors import RunError
 from gcd_train.evaluation import (
@@ -56,7 +56,7 @@ def conditions(weights: str | None = None) -> Conditions:
 @pytest.fixture(scope="module")
 def report() -> Report:
     clips = PlaneClips.make(2)
-    found = evaluate(all_baselines(fit_statistics(clips), len(clips.classes)), as_set(clips))
+    found = evaluate(without_learning(clips), as_set(clips))
     return Report(conditions=conditions(), classes=tuple(c.name for c in clips.classes), model=(), baselines=found)
 
 
@@ -107,7 +107,7 @@ def test_a_models_clips_are_named_and_its_steps_compared(report: Report) -> None
 
 def test_what_nobody_has_is_left_out() -> None:
     clips = PlaneClips.orbits([SphericalDelta(azimuth_deg=40.0, radius_m=-1.0)])
-    found = evaluate(all_baselines(fit_statistics(clips), 0), as_set(clips))
+    found = evaluate(without_learning(clips, named=False), as_set(clips))
     shot = Shot(world="drop", scene=4, clip="00000013", change=(40.0, 0.0, -1.0))
     orbit = msgspec.structs.replace(
         conditions("copy"), camera="spherical", shots=(shot,), true_mount=None, declared_mount=None
@@ -194,11 +194,9 @@ def test_clips_from_a_folder_measure_as_they_do_in_memory(tmp_path: Path) -> Non
     code, output = run("--data", held_out, "--train", training, "--out", tmp_path / "out")
     assert code == 0, output
     read = json.loads((tmp_path / "out" / "evaluation.json").read_text())
-    expected = [
-        each.total.psnr_db for each in evaluate(all_baselines(fit_statistics(clips), len(clips.classes)), as_set(clips))
-    ]
+    expected = [each.total.psnr_db for each in evaluate(without_learning(clips), as_set(clips))]
     found = {each["name"]: each["total"]["psnr_db"] or np.nan for each in read["baselines"]}
-    names = [each.name for each in all_baselines(fit_statistics(clips), len(clips.classes))]
+    names = [each.name for each in without_learning(clips)]
     assert [found[name] for name in names] == pytest.approx(expected, abs=0.02, nan_ok=True)  # depth in 1/256 m
 
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from made_records import FRAMES, note, record, region
@@ -173,6 +174,40 @@ def test_pixels_that_nobody_knows_are_unknown_in_a_table_of_the_paper() -> None:
     (row,) = [row for row in main.rows if row.method]
     assert [str(cell) for cell in row.cells[3:]] == ["unknown", "unknown"]
     assert "Unknown" in main.notes[1]
+
+
+def test_a_released_run_also_has_its_own_figures_over_all_frames(tmp_path: Path) -> None:
+    for protocol in ("released", "paper"):
+        keeper = RunKeeper(tmp_path / protocol)
+        keeper.begin(note(methods={"gradual-90": WEIGHTS, "b": {}}, kind="kubric", protocol=protocol))
+        for each in (*records("gradual-90"), *records("b")):
+            first = {"all": region((99.0, *(each.regions["all"].psnr_db or ((),))[0][1:]))}
+            keeper.keep(msgspec.structs.replace(each, regions={**each.regions, **first}))
+    choices = Choices(drawn=False, worst=0)
+    text = make_report([tmp_path / "released"], tmp_path / "out", choices).read_text()
+    assert f"all {FRAMES} frames" in text
+    assert text.index("all_frames.csv") < text.index("table1.csv")
+    every, table1 = (
+        next(
+            row
+            for row in lines((tmp_path / "out" / "tables" / f"{name}.csv").read_text())
+            if "gradual" in row["method"]
+        )
+        for name in ("all_frames", "table1")
+    )
+    assert float(every["PSNR all"]) == pytest.approx((99.0 + 3 * float(table1["PSNR all"])) / 4, rel=1e-5)
+    compared = {row["frames"] for row in lines((tmp_path / "out" / "tables" / "differences.csv").read_text())}
+    assert compared == {"all", "2-last", "last"}
+    make_report([tmp_path / "paper"], tmp_path / "other", choices)
+    assert not (tmp_path / "other" / "tables" / "all_frames.csv").exists()
+
+
+def test_a_table_with_regions_says_that_lpips_has_none() -> None:
+    main, last = main_tables(measured(records("a")))
+    assert any("LPIPS is over all pixels alone" in line for line in main.notes)
+    assert "LPIPS is over all pixels alone" in to_markdown(last)
+    whole = main_tables(measured(records("a", occluded=None)))[0]
+    assert not any("LPIPS" in line for line in whole.notes)
 
 
 @pytest.mark.parametrize(

@@ -2,9 +2,11 @@
 
 import json
 import pickle
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from tiny_scenes4d import draw, kubric_poses, write_driving, write_kubric
@@ -17,9 +19,12 @@ from gcd_train.datasets.public_splits import public_split, public_split_names
 from gcd_train.datasets.trajectories import OrbitSampling
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation import EvaluationSet, read_run
-from gcd_train.evaluation.opening import Choice, SceneCuts, data_kind, open_scenes, usual_samples
+from gcd_train.evaluation.choosing import Choice
+from gcd_train.evaluation.fingerprint import fingerprint
+from gcd_train.evaluation.opening import SceneCuts, data_kind, open_scenes, usual_samples
 from gcd_train.evaluation.protocols import PAPER_SOURCE, RELEASED_SOURCE, DrawnControls, FrameBounds, ReleasedControl
 from gcd_train.evaluation.scene_set import far_apart
+from gcd_train.layouts.manifest import MANIFEST, SceneManifest
 from gcd_train.pointcloud import visibility
 
 VIEWS = tuple(f"view{number}" for number in range(4))
@@ -153,6 +158,39 @@ def test_lists_and_splits_choose_scenes(kubric: Path, tmp_path: Path) -> None:
         opened(kubric, KUBRIC, split="kubric4d-test", listed=listed)
 
 
+@pytest.mark.parametrize("scenes", ["kubric", "driving"])
+def test_a_public_split_of_another_world_is_refused(scenes: str, request: pytest.FixtureRequest) -> None:
+    root = request.getfixturevalue(scenes)
+    said = "the world drop, but .* is of kubric4d" if scenes == "kubric" else "the world drop, but .* parallel_domain4d"
+    with pytest.raises(DataError, match=f"--split drop-test is for {said}; give another"):
+        opened(root, KUBRIC if scenes == "kubric" else DRIVING, split="drop-test")
+
+
+def test_a_scene_of_ours_is_of_the_world_that_its_manifest_says(tmp_path: Path) -> None:
+    write_kubric(tmp_path, 1_000_000, frames=4)
+    manifest = SceneManifest(
+        layout="kubric4d",
+        world="tabletop",
+        seed=1_000_000,
+        version="0",
+        edition=1,
+        frames=4,
+        fps=24.0,
+        width=48,
+        height=32,
+        oversample=1,
+        compact=False,
+        hfov_deg=53.1,
+        cameras=VIEWS,
+        files={},
+    )
+    (tmp_path / "scn1000000" / MANIFEST).write_bytes(msgspec.json.encode(manifest))
+    assert len(opened(tmp_path, KUBRIC, split="tabletop-test").keys) == 4
+    for split in ("drop-test", "driving-test"):
+        with pytest.raises(DataError, match=f"{split} is for .*scn1000000 is of tabletop"):
+            opened(tmp_path, KUBRIC, split=split)
+
+
 def test_a_split_file_of_parallel_domain_names_its_part(driving: Path, tmp_path: Path) -> None:
     file = tmp_path / "split.json"
     file.write_text(json.dumps({"train": ["a/scene_000005"], "val": [], "test": ["scene_000006"]}))
@@ -168,6 +206,35 @@ def test_the_identity_follows_scenes_and_cuts(kubric: Path) -> None:
     assert (
         len({first, opened(kubric, KUBRIC, limit=1).identity, *(opened(kubric, each).identity for each in others)}) == 5
     )
+
+
+def test_the_identity_follows_the_files_and_neither_their_place_nor_their_times(kubric: Path, tmp_path: Path) -> None:
+    first, copy = opened(kubric, KUBRIC).identity, tmp_path / "copy"
+    shutil.copytree(kubric, copy)  # with times of its own
+    assert opened(copy, KUBRIC).identity == first
+    (picture,) = copy.glob("scn02900/frames_p0_v0/rgba_00000.png")
+    whole = picture.read_bytes()
+    picture.write_bytes(whole + b"0")
+    assert opened(copy, KUBRIC).identity != first
+    picture.write_bytes(whole)
+    assert opened(copy, KUBRIC).identity == first
+    told = next(copy.glob("scn02900/*.json"))
+    told.write_bytes(told.read_bytes().replace(b"0", b"1", 1))  # of the same size
+    assert opened(copy, KUBRIC).identity != first
+
+
+def test_what_begins_with_a_dot_is_no_part_of_a_scene_and_a_missing_one_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text("{}")
+    bare = fingerprint(tmp_path)
+    (tmp_path / ".DS_Store").write_text("where icons lie")
+    (tmp_path / ".cache").mkdir()
+    (tmp_path / ".cache" / "thumb.png").write_text("small")
+    assert fingerprint(tmp_path) == bare
+    (tmp_path / "b").mkdir()
+    (tmp_path / "a.json").rename(tmp_path / "b" / "a.json")
+    assert fingerprint(tmp_path) != bare
+    with pytest.raises(DataError, match="nowhere cannot be read"):
+        fingerprint(tmp_path / "nowhere")
 
 
 def test_public_splits_of_a_world_share_no_scene() -> None:

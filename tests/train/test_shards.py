@@ -18,6 +18,7 @@ from gcd_train.cli.main import app
 from gcd_train.datasets.paired import PairedClips, require_apart
 from gcd_train.errors import DataError
 from gcd_train.scenes.driving import driving_scene
+from gcd_train.scenes.film import filmed
 from gcd_train.scenes.pair_world import World, read_world
 from gcd_train.scenes.renderer import Renderer
 from gcd_train.scenes.writer import generate, shard_path, write_shard
@@ -139,6 +140,14 @@ def test_a_film_holds_the_source_view_of_a_longer_drive(tmp_path: Path) -> None:
     assert np.abs(pictures[19][..., ::-1].astype(int) - drawn[19].rgb).mean() < 12
 
 
+def test_a_film_of_no_world_is_refused(tmp_path: Path) -> None:
+    out = tmp_path / "film.mp4"
+    made = CliRunner().invoke(app, ["generate", "film", "--out", str(out), "--world", "moon"])
+    assert made.exit_code == 78
+    assert "no world 'moon'" in made.output
+    assert not out.exists()
+
+
 def test_a_mount_that_is_no_number_is_refused(tmp_path: Path) -> None:
     made = CliRunner().invoke(app, ["generate", "driving", "--out", str(tmp_path), "--mount-height", "nan"])
     assert made.exit_code == 78
@@ -146,15 +155,20 @@ def test_a_mount_that_is_no_number_is_refused(tmp_path: Path) -> None:
 
 
 @needs_egl
-def test_the_packaged_drive_is_the_film_of_its_seed() -> None:
-    video = cv2.VideoCapture(str(Path(__file__).parents[2] / "gcd_node" / "assets" / "drive.mp4"))
+@pytest.mark.parametrize(
+    ("name", "world", "seed", "width", "height"),
+    [("drive", "driving", 2_000_021, 432, 288), ("workbench", "tabletop", 2_000_004, 288, 192)],
+)
+def test_a_packaged_video_is_the_film_of_its_seed(name: str, world: str, seed: int, width: int, height: int) -> None:
+    video = cv2.VideoCapture(str(Path(__file__).parents[2] / "gcd_node" / "assets" / f"{name}.mp4"))
     shown = [video.read()[1] for _ in range(42)]
-    scene = driving_scene(2_000_021, frames=42)
+    scene, camera, rate_hz = filmed(world, seed, 42)
     ends = [0, 41]
-    cameras = {"source": scene.cameras["source"][ends]}
-    with Renderer(432, 288) as renderer:
-        drawn = renderer.render(replace(scene, poses=scene.poses[ends], focus=scene.focus[ends], cameras=cameras))
-    for view, frame in zip(drawn["source"], ends, strict=True):
+    cut = replace(scene, poses=scene.poses[ends], focus=scene.focus[ends])
+    with Renderer(width, height) as renderer:
+        drawn = [view for _, _, view in renderer.views(cut, {"source": camera[ends]})]
+    assert (video.get(cv2.CAP_PROP_FPS), len(drawn)) == (rate_hz, 2)
+    for view, frame in zip(drawn, ends, strict=True):
         error = np.mean((shown[frame][..., ::-1].astype(float) - view.rgb) ** 2)
         assert 10 * np.log10(255**2 / error) > 22
 

@@ -20,7 +20,7 @@ from gcd_train.engine.trained import Mark, Trained
 from gcd_train.errors import Interrupted
 from gcd_train.monitor.finite import FiniteGuard
 from gcd_train.monitor.memory import peak_memory_gb
-from gcd_train.recipe import Budget, EmaRecipe, LogRecipe, OptimiserRecipe, StageName
+from gcd_train.recipe import AnyStageName, Budget, EmaRecipe, LogRecipe, OptimiserRecipe
 from gcd_train.run_folder import RunFolder
 from gcd_train.schedule import ParameterGroup
 from gcd_train.stop import StopSignal
@@ -87,7 +87,7 @@ class LoopOptions:
     """How a stage runs. identity: see StageState. frames_per_clip: for the log. parts: batches
     whose gradients make one update, shared by the engine's processes. clock: seconds, for tests."""
 
-    stage: StageName
+    stage: AnyStageName
     identity: str
     budget: Budget
     optimiser: OptimiserRecipe

@@ -9,7 +9,7 @@ import os
 import signal
 import traceback
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -53,6 +53,7 @@ def map_items(
     ray_address: str | None = None,
     retries: int = 2,
     gpus: float = 0.0,
+    environments: Sequence[Mapping[str, str]] = (),
 ) -> Iterator[Outcome[Item, Value]]:
     """Outcomes in the order in which they are finished. Items are taken as workers come free.
 
@@ -67,6 +68,8 @@ def map_items(
         retries: how often an item is given to another worker after one was killed.
         gpus: GPUs, or share of one, that an item is given on a cluster that has any: Ray hides them from what asks for
             none.
+        environments: variables that processes of this machine are given before they work, in turn: worker k has the
+            k-th, and who takes the place of a killed one has that one's. Empty for nothing.
     Raises:
         RunError: there is no such cluster, or the extra `cluster` is not installed.
     """
@@ -76,7 +79,7 @@ def map_items(
         return map_on_ray(function, items, address=ray_address, retries=retries, gpus=gpus)
     if workers == 1:
         return (done(function, item) for item in items)
-    return _Pool(function, workers, retries).run(iter(items))
+    return _Pool(function, workers, retries, environments).run(iter(items))
 
 
 def done(function: Callable[[Item], Value], item: Item) -> Outcome[Item, Value]:
@@ -107,6 +110,7 @@ def _told(error: Exception) -> str:
 class _Worker:
     process: BaseProcess
     pipe: Connection
+    seat: int
     attempt: "_Attempt | None" = None
 
 
@@ -119,8 +123,11 @@ class _Attempt:
 class _Pool:
     """Processes with a pipe each, so that it is known which item a killed one had."""
 
-    def __init__(self, function: Callable[[Any], Any], workers: int, retries: int) -> None:
+    def __init__(
+        self, function: Callable[[Any], Any], workers: int, retries: int, environments: Sequence[Mapping[str, str]]
+    ) -> None:
         self._function, self._size, self._retries = function, workers, retries
+        self._environments = environments or ({},)
         self._workers: list[_Worker] = []
         self._again: deque[_Attempt] = deque()
 
@@ -176,10 +183,12 @@ class _Pool:
     def _start(self) -> _Worker:
         context = get_context("spawn")  # a fork would share OpenGL's and torch's state
         ours, theirs = context.Pipe()
-        process = context.Process(target=_serve, args=(theirs,), daemon=True)
+        seat = min(set(range(self._size)) - {worker.seat for worker in self._workers})
+        environment = dict(self._environments[seat % len(self._environments)])
+        process = context.Process(target=_serve, args=(theirs, environment), daemon=True)
         process.start()
         theirs.close()
-        worker = _Worker(process, ours)
+        worker = _Worker(process, ours, seat)
         self._workers.append(worker)
         with suppress(OSError):  # it is gone already: the item's turn will tell
             ours.send(self._function)
@@ -203,8 +212,9 @@ def _next_attempt(items: Iterator[Any]) -> _Attempt | None:
     return None
 
 
-def _serve(pipe: Connection) -> None:
+def _serve(pipe: Connection, environment: Mapping[str, str]) -> None:
     """A worker's life: the function first, then items until the pipe is closed."""
+    os.environ.update(environment)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process of a terminal: the parent decides
     signal.signal(signal.SIGTERM, _leave)
     one_thread_each()

@@ -15,7 +15,7 @@ from gcd_train.checkpoint import require_identity
 from gcd_train.engine.states import newest_weights
 from gcd_train.errors import RecipeError, RunError
 from gcd_train.lora import plain_weights
-from gcd_train.recipe import ComputeRecipe, ModelRecipe, Recipe, StageName, UNetChanges, UNetRecipe, VAEChanges
+from gcd_train.recipe import AnyStageName, ComputeRecipe, ModelRecipe, Recipe, UNetChanges, UNetRecipe, VAEChanges
 from gcd_train.run_folder import RunFolder
 
 _BASES: dict[str, ModelConfig] = {
@@ -26,9 +26,12 @@ _BASES: dict[str, ModelConfig] = {
     "svd-14": SVD_14,
     "small": SMALL,
 }
-_PREFIXES: dict[StageName, tuple[str, ...]] = {
+_DENOISER = ("unet.", "class_head.", "camera.")
+_PREFIXES: dict[AnyStageName, tuple[str, ...]] = {
     "vae": ("target_encoder.", "decoder."),
-    "unet": ("unet.", "class_head.", "camera."),
+    "unet": _DENOISER,
+    "paired": _DENOISER,
+    "matching": _DENOISER,
     "decoder": ("plane_mix.",),
 }
 
@@ -136,7 +139,7 @@ def to_channels_last(module: nn.Module) -> None:
             parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
 
 
-def fill(networks: Networks, folder: RunFolder, stage: StageName, identity: str) -> int:
+def fill(networks: Networks, folder: RunFolder, stage: AnyStageName, identity: str) -> int:
     """Copy what a stage trained into networks, averaged where it averages; returns the updates it took so far.
 
     identity: what its state must belong to. Weights that take no gradient need not be there. Raises RunError if it has

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gcd_train.errors import RunError
 from gcd_train.monitor.board import Board
-from gcd_train.recipe import StageName
+from gcd_train.recipe import AnyStageName
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,20 +20,20 @@ class RunFolder:
     path: Path
     board: Board | None = None
 
-    def stage(self, name: StageName) -> Path:
+    def stage(self, name: AnyStageName) -> Path:
         """The folder of a stage."""
         return self.path / name
 
-    def state(self, name: StageName) -> Path:
+    def state(self, name: AnyStageName) -> Path:
         """A training stage's state."""
         return self.stage(name) / "state.pt"
 
-    def sample(self, name: StageName, updates: int) -> Path:
+    def sample(self, name: AnyStageName, updates: int) -> Path:
         """A sample picture after so many updates."""
         return self.stage(name) / "samples" / f"{updates:07d}.png"
 
     def record(
-        self, stage: StageName, kind: str, values: dict[str, float | int | str], picture: Path | None = None
+        self, stage: AnyStageName, kind: str, values: dict[str, float | int | str], picture: Path | None = None
     ) -> None:
         """Append one line to metrics.jsonl: stage, kind, time of day, then the values. Raises RunError.
 

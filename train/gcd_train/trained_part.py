@@ -25,7 +25,7 @@ def let_train(networks: Networks, recipe: ModelRecipe, seed: int) -> None:
         parameter.requires_grad_(is_trained(name, recipe))
 
 
-def halve_frozen(networks: Networks) -> None:
+def halve_frozen(networks: nn.Module) -> None:
     """Keep what takes no gradients in bfloat16, in place; published weights that cannot matter stay as they are."""
     for name, parameter in networks.named_parameters():
         if not parameter.requires_grad and _DORMANT not in name:

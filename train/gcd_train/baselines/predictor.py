@@ -47,8 +47,8 @@ class SourceClip:
 class Prediction:
     """A view as it is measured.
 
-    video: float32 [T, 3, H, W] in [0, 1], or None. classes: uint8 [T, H, W], or None. more: further draws of the same
-    view, of methods that draw.
+    video: float32 [T, 3, H, W] in [0, 1], or None. classes: uint8 [T, H, W], 255 for no class, or None. more: further
+    draws of the same view, of methods that draw.
     """
 
     video: Tensor | None = None

@@ -16,6 +16,7 @@ from gcd_model.config import SemanticClass
 from gcd_train.baselines.predictor import Prediction, SourceClip
 from gcd_train.datasets.clip_source import Bytes
 from gcd_train.errors import DataError
+from gcd_train.metrics import NO_CLASS
 from gcd_train.pointcloud import SplatOptions, published_tensor
 from gcd_train.scene_view import SceneView
 
@@ -23,6 +24,8 @@ REPROJECT_RGBD = "reproject_rgbd"
 REPROJECT_SEMD = "reproject_semd"
 
 _KERNEL, _SIGMA = 3, 0.75
+_WHITE = 255
+_HOLE = 0.5  # share of a pixel below which it counts as a hole
 _SKY_M = 1e4  # what a source depth of 0 stands for; where points are so far apart, how far does not show
 
 
@@ -47,10 +50,12 @@ class ReprojectRgbd:
 class ReprojectSemd:
     """The source's class map in colours, drawn where its depth puts them, and read back: the nearest colour's class.
 
-    Holes are black, and so of the class whose colour is nearest to black: void, where the set has it.
+    A pixel of which points cover less than half is a hole, and of no class: wrong, whatever the target shows. Colours
+    are read as if points covered the whole pixel, so that edges of holes are not darker than what is there.
 
     classes: by id. published: see `ReprojectRgbd`.
-    Source: Van Hoorick et al. 2024 (GCD), section 5, "Reproject Sem-D". How colours are read back is not published.
+    Source: Van Hoorick et al. 2024 (GCD), section 5, "Reproject Sem-D". How colours are read back, and what holes count
+    as, is not published.
     """
 
     classes: tuple[SemanticClass, ...]
@@ -62,8 +67,11 @@ class ReprojectSemd:
         """See Predictor. A class map alone. Raises DataError for a clip without classes."""
         views = source_views(clip)
         colours = palette(self.classes).numpy()
-        painted = [colours[_ids(view, len(self.classes), clip.key)] for view in views]
-        return Prediction(classes=nearest_classes(_drawn(clip, views, painted, self.published), self.classes))
+        painted = [_with_cover(colours[_ids(view, len(self.classes), clip.key)]) for view in views]
+        drawn = _drawn(clip, views, painted, self.published)
+        cover = drawn[:, 3:4]
+        read = nearest_classes(drawn[:, :3] / cover.clamp(min=_HOLE), self.classes)
+        return Prediction(classes=torch.where(cover[:, 0] < _HOLE, NO_CLASS, read))
 
 
 def source_views(clip: SourceClip) -> Sequence[SceneView]:
@@ -89,7 +97,10 @@ def source_views(clip: SourceClip) -> Sequence[SceneView]:
 
 
 def _drawn(clip: SourceClip, views: Sequence[SceneView], values: Sequence[Bytes] | None, published: bool) -> Tensor:
-    """What the target camera sees of them, float32 [T, 3, H, W] in [0, 1]. values: shown instead of the colours."""
+    """What the target camera sees of them, float32 [T, C, H, W] in [0, 1].
+
+    values: uint8 [H, W, C] for each, shown instead of the colours.
+    """
     lens, poses = clip.cameras.target, clip.cameras.source_from_target.numpy()
     options = replace(SplatOptions(), published=published)
     frames = [
@@ -107,6 +118,11 @@ def _drawn(clip: SourceClip, views: Sequence[SceneView], values: Sequence[Bytes]
         for t, (view, pose) in enumerate(zip(views, poses, strict=True))
     ]
     return torch.stack(frames).permute(0, 3, 1, 2)
+
+
+def _with_cover(painted: Bytes) -> Bytes:
+    """A picture uint8 [H, W, 3] before a white one: what is drawn of that says how much of a pixel points cover."""
+    return np.concatenate([painted, np.full_like(painted, _WHITE)], axis=-1)
 
 
 def _ids(view: SceneView, count: int, key: str) -> Bytes:

@@ -8,7 +8,6 @@ from typing import TypeAlias
 
 import torch
 
-from gcd_model.class_head import nearest_classes
 from gcd_model.config import SemanticClass
 from gcd_train.baselines.copy_source import CopySource
 from gcd_train.baselines.depth_reprojection import DepthReprojection
@@ -22,6 +21,7 @@ from gcd_train.baselines.target_statistics import TargetStatistics
 from gcd_train.baselines.vanilla_svd import VANILLA_SVD, VanillaSVD, weights_named
 from gcd_train.errors import RecipeError
 from gcd_train.hexplane import HexPlaneSettings
+from gcd_train.metrics import NO_CLASS
 
 DEPTH_ON_MEAN = "depth_reprojection_on_mean"
 """Depth reprojection with holes as in the mean target and the majority map."""
@@ -59,11 +59,12 @@ class BaselineSettings:
 
     @property
     def fill(self) -> TargetStatistics:
-        """What stands in holes: means over training targets, or black and the class nearest to it."""
+        """What stands in holes: means over training targets, or black and no class."""
         if self.statistics is not None:
             return self.statistics
         black = torch.zeros(self.frames, 3, self.height, self.width)
-        return TargetStatistics(mean=black, majority=nearest_classes(black, self.classes) if self.classes else None)
+        nothing = torch.full((self.frames, self.height, self.width), NO_CLASS, dtype=torch.uint8)
+        return TargetStatistics(mean=black, majority=nothing if self.classes else None)
 
 
 Builder: TypeAlias = Callable[[BaselineSettings], Predictor]
@@ -117,13 +118,14 @@ def build(name: str, settings: BaselineSettings) -> Predictor:
 def described(name: str, settings: BaselineSettings) -> dict[str, str]:
     """What a baseline is beyond its name and the draws, for the record of a run.
 
-    Vanilla SVD's weights, and what a HexPlane learns; nothing for the others. Raises CheckpointError.
+    Vanilla SVD's weights, what a HexPlane learns, and what holes in class maps count as. Raises CheckpointError.
     """
     if name == VANILLA_SVD and settings.svd is not None:
         return {"weights": weights_named(settings.svd)}
     if _HEXPLANE.fullmatch(name):
         return {key: str(value) for key, value in asdict(settings.hexplane).items()}
-    return {}
+    filled = settings.statistics is not None and name != REPROJECT_SEMD
+    return {"holes": "of no class"} if settings.classes and name in _WITH_HOLES and not filled else {}
 
 
 def usual_baselines(settings: BaselineSettings) -> tuple[str, ...]:
@@ -136,26 +138,6 @@ def usual_baselines(settings: BaselineSettings) -> tuple[str, ...]:
     if settings.painted:
         wanted -= set(_PICTURES_ALONE)
     return tuple(name for name in _BUILDERS if name in wanted)
-
-
-def all_baselines(statistics: TargetStatistics, classes: int) -> tuple[Predictor, ...]:
-    """Those that need nothing but training targets; each finds the cameras in the clip.
-
-    Args:
-        statistics: of the training targets. classes: how many there are, 0 without an ontology.
-    Returns:
-        Copy, mean target, majority map (with an ontology), ground homography with holes as in the mean target, depth
-        reprojection with holes in one colour, and the same with holes as in the mean target.
-    """
-    of_classes = () if statistics.majority is None else (MajorityMap(majority=statistics.majority),)
-    return (
-        CopySource(),
-        MeanTarget(statistics=statistics),
-        *of_classes,
-        GroundHomography(fill=statistics),
-        DepthReprojection(fill=statistics.constant, classes=classes),
-        DepthReprojection(fill=statistics, classes=classes, name=DEPTH_ON_MEAN),
-    )
 
 
 def _mean_target(settings: BaselineSettings) -> Predictor:
@@ -208,4 +190,5 @@ _BUILDERS: Mapping[str, Builder] = {
     REPROJECT_SEMD: _reproject_semd,
     VANILLA_SVD: _vanilla_svd,
 }
+_WITH_HOLES = ("ground_homography", "depth_reprojection", REPROJECT_SEMD)
 _PICTURES_ALONE = ("mean_target", REPROJECT_RGBD, VANILLA_SVD)

@@ -30,11 +30,11 @@ class SavedFrames:
     privileged: bool = False
 
     @classmethod
-    def open(cls, name: str, folder: Path, *, painted: Sequence[SemanticClass] = ()) -> Self:
+    def open(cls, name: str, folder: Path, *, painted: Sequence[SemanticClass] = (), privileged: bool = False) -> Self:
         """Raises DataError if there is no such folder."""
         if not folder.is_dir():
             raise DataError(f"the frames of {name} should lie in {folder}, which is no folder; give NAME=FOLDER")
-        return cls(name=name, folder=folder, painted=tuple(painted))
+        return cls(name=name, folder=folder, painted=tuple(painted), privileged=privileged)
 
     def predict(self, clip: SourceClip) -> Prediction:
         """See Predictor; each sample that was saved is a draw.

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gcd_train.bench_data import BenchDataOptions, DataReport, Figure, bench_data
+from gcd_train.cli.bench_sampler import sampler_command
 from gcd_train.cli.errors import errors_shown
 
 if TYPE_CHECKING:
@@ -23,6 +24,9 @@ app = typer.Typer(no_args_is_help=True, help="Measure on this machine.")
 @app.callback()
 def about() -> None:
     """Keep `bench` a command with sub-commands."""
+
+
+app.command("sampler")(sampler_command)
 
 
 @app.command()

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from gcd_model import Synthesizer
     from gcd_train.baselines import Predictor
     from gcd_train.evaluation.calibration import Distances
+    from gcd_train.evaluation.choosing import Choice
     from gcd_train.evaluation.clips import EvaluationSet
-    from gcd_train.evaluation.opening import Choice
 
 _LOG = Console(stderr=True, highlight=False)
 
@@ -41,7 +41,7 @@ def calibrate_command(
         from gcd_model import RenderOptions, convert_weights, load_synthesizer
         from gcd_train.evaluation.calibration import calibrate
         from gcd_train.evaluation.calibration_report import CalibrationNote, write_calibration
-        from gcd_train.evaluation.opening import Choice
+        from gcd_train.evaluation.choosing import Choice
         from gcd_train.evaluation.synthesized import SynthesizedViews
         from gcd_train.show.matplotlib_door import require_matplotlib
 

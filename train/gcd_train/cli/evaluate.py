@@ -3,26 +3,32 @@
 import shlex
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
+import torch
 import typer
 from rich.console import Console
 from typer import Option
 
-from gcd_model import RenderOptions
+from gcd_model import Quality, RenderOptions, SolverName
 from gcd_train.cli.errors import errors_shown
 from gcd_train.cli.progress_bar import progress_bar
 from gcd_train.evaluation import ClipWork, RunKeeper, measure_all
 from gcd_train.evaluation.asked import Asked, Candidate, Looks, Rivals, SceneWishes, declared_mount
+from gcd_train.evaluation.choosing import Choice
+from gcd_train.evaluation.gpu_seats import gpu_seats
 from gcd_train.evaluation.kept_frames import KeptViews
-from gcd_train.evaluation.opening import Choice, usual_samples
+from gcd_train.evaluation.opening import usual_samples
 from gcd_train.evaluation.outcome import write_outcome
 from gcd_train.evaluation.plan import note_of, planned
 from gcd_train.evaluation.protocols import FrameBounds
 from gcd_train.evaluation.spread import Account
+from gcd_train.hexplane import HexPlaneSettings
 
 _LOG = Console(stderr=True, highlight=False)
+_FIELD = HexPlaneSettings()
 
 Folders = Annotated[list[Path], Option(help="Folder of pairs (several may be given), or one of whole scenes.")]
 Out = Annotated[Path, Option(help="Folder of the run: run.json, records, tables; one that is there is gone on with.")]
@@ -30,11 +36,17 @@ WeightsPath = Annotated[str | None, Option(help="package:NAME or a path; without
 Steps = Annotated[list[int] | None, Option(min=1, help="Also with so many steps of the sampler; may be repeated.")]
 Samples = Annotated[int | None, Option(min=1, help="Draws of each view; by default 1 of pairs, else by the protocol.")]
 Guidance = Annotated[tuple[float, float] | None, Option(help="Of the first and the last frame; by default as shipped.")]
+QualityChoice = Annotated[Quality, Option(help="As the weights ship, or in fewer steps where they take many.")]
+Solver = Annotated[SolverName | None, Option(help="Euler steps as published, or of second order.")]
+Interval = Annotated[tuple[float, float] | None, Option(help="Noise levels guidance applies at; by default all.")]
 Train = Annotated[list[Path] | None, Option(help="Folder of training pairs: mean target, majority map.")]
 Baselines = Annotated[bool, Option(help="Also measure what has to be beaten; of pairs that needs --train.")]
 Methods = Annotated[list[str] | None, Option(help="These baselines, with commas between; by default the usual ones.")]
 Svd = Annotated[str | None, Option(help="Weights for vanilla_svd: svd.safetensors.")]
 Predictions = Annotated[list[str] | None, Option(help="NAME=FOLDER with frames of another method; may be repeated.")]
+Privileged = Annotated[list[str] | None, Option(help="NAME of --predictions that was given depth or other views: *.")]
+HexPlaneUpdates = Annotated[int, Option("--hexplane-updates", min=1, help="hexplane_K: steps of learning a clip.")]
+HexPlaneRays = Annotated[int, Option("--hexplane-rays", min=1, help="hexplane_K: rays in each of these steps.")]
 LpipsWeights = Annotated[Path | None, Option("--lpips", help="Folder with LPIPS weights; without, no such figure.")]
 ProtocolName = Annotated[Literal["paper", "released"], Option(help="How clips are cut from whole scenes.")]
 Controls = Annotated[Path | None, Option(help="Scenes: control list, JSON.")]
@@ -53,7 +65,7 @@ TrainLimit = Annotated[int, Option(min=1, help="At most so many training clips f
 Height = Annotated[float | None, Option(help="Driving pairs: mount declared, height in metres; by default as trained.")]
 Tilt = Annotated[float | None, Option(help="Driving pairs: mount declared, degrees down; by default as trained.")]
 Views = Annotated[Literal["none", "last", "all"], Option(help="Frames to keep as PNG, for galleries.")]
-Workers = Annotated[int, Option(min=1, help="Processes.")]
+Workers = Annotated[int, Option(min=1, help="Processes; where there are several GPUs they take them in turn.")]
 Ray = Annotated[str | None, Option("--ray", help="Run on this Ray cluster (auto, HOST:PORT; extra `cluster`).")]
 Seed = Annotated[int, Option(min=0, help="Of drawn clips and of all noise.")]
 SheetClips = Annotated[int, Option(min=0, help="Clips on the contact sheet; 0 for none.")]
@@ -68,11 +80,17 @@ def evaluate_command(
     steps: Steps = None,
     samples: Samples = None,
     guidance: Guidance = None,
+    quality: QualityChoice = "exact",
+    solver: Solver = None,
+    guidance_interval: Interval = None,
     train: Train = None,
     baselines: Baselines = True,
     methods: Methods = None,
     svd: Svd = None,
     predictions: Predictions = None,
+    privileged: Privileged = None,
+    updates: HexPlaneUpdates = _FIELD.updates,
+    rays: HexPlaneRays = _FIELD.rays,
     lpips: LpipsWeights = None,
     protocol: ProtocolName = "paper",
     controls: Controls = None,
@@ -101,16 +119,15 @@ def evaluate_command(
     """Measure weights, baselines and others' frames on held-out clips, and say what is reached."""
     with errors_shown():
         choice = Choice(split=split, listed=listed, limit=limit)
-        looks = Looks(angles=angles, path=path, modality=modality)
+        looks, field = Looks(angles=angles, path=path, modality=modality), HexPlaneSettings(updates=updates, rays=rays)
         bounds, mount = FrameBounds(start=frame_start, skip=frame_skip), declared_mount(declared_height, declared_tilt)
         cut = SceneWishes(
             looks=looks, bounds=bounds, controls=controls, clips=trajectories, exact=exact, cameras=camera or None
         )
-        rivals = Rivals(
-            usual=baselines, names=methods, train=train, train_limit=train_limit, svd=svd, predictions=predictions
-        )
-        draws = usual_samples(data, protocol) if samples is None else samples
-        sampling = RenderOptions(samples=draws, guidance=guidance, seed=seed)
+        known = Rivals(usual=baselines, names=methods, train=train, train_limit=train_limit, svd=svd)
+        rivals = replace(known, predictions=predictions, privileged=privileged, hexplane=field)
+        sampler = RenderOptions(quality=quality, solver=solver, guidance=guidance, guidance_interval=guidance_interval)
+        sampling = replace(sampler, samples=samples or usual_samples(data, protocol), seed=seed)
         tested = Candidate(weights=weights, device=device, dtype=dtype, steps=steps, sampling=sampling)
         asked = Asked(
             data=data, protocol=protocol, choice=choice, cut=cut, mount=mount, tested=tested, rivals=rivals, lpips=lpips
@@ -120,11 +137,11 @@ def evaluate_command(
 
 def _evaluate(asked: Asked, out: Path, *, views: KeptViews, workers: int, ray: str | None, sheet_clips: int) -> None:
     out.mkdir(parents=True, exist_ok=True)  # to know at once
-    plan = planned(asked, progress_bar)
+    plan = planned(asked)
     for line in plan.opened.notes:
         _say(line)
-    keeper = RunKeeper(out)
-    keeper.begin(note_of(plan, _command_line()))
+    RunKeeper(out).begin(note_of(plan, _command_line()))
+    plan = plan.with_means(progress_bar)
     work = ClipWork(
         folder=out.resolve(),
         clips=plan.clips,
@@ -146,9 +163,11 @@ def _evaluate(asked: Asked, out: Path, *, views: KeptViews, workers: int, ray: s
 def _measured(work: ClipWork, workers: int, ray: str | None, device: str) -> Account:
     if workers > 1 or ray is not None:
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that no worker is left behind
-    account = Account(clips=len(work.clips.keys))
+    account, seats = Account(clips=len(work.clips.keys)), gpu_seats(device, torch.cuda.device_count())
     with progress_bar("clips", len(work.clips.keys)) as show:
-        for account in measure_all(work, workers=workers, ray_address=ray, gpus=float(device != "cpu")):
+        for account in measure_all(
+            work, workers=workers, ray_address=ray, gpus=float(device != "cpu"), environments=seats
+        ):
             show(account.done)
     return account
 

@@ -160,13 +160,14 @@ def driving(
 def film(
     out: Annotated[Path, typer.Option(help="An .mp4 file.")],
     seed: Annotated[int, typer.Option(min=0, help="Scene; those from 2000000 on are in no data set.")] = 2_000_021,
-    frames: Annotated[int, typer.Option(min=2, help="Time steps at 10 Hz.")] = 42,
+    world: Annotated[str, typer.Option(help="driving (10 Hz), drop or tabletop (12 Hz).")] = "driving",
+    frames: Annotated[int, typer.Option(min=2, help="Time steps.")] = 42,
     width: Annotated[int, typer.Option(min=16, help="Pixels.")] = 432,
     height: Annotated[int, typer.Option(min=16, help="Pixels.")] = 288,
 ) -> None:
-    """One longer drive as a video, seen from the forward camera; the packaged drive was made so."""
+    """One longer scene as a video, seen from its source camera; the packaged videos were made so."""
     with errors_shown():
-        write_film(out, seed, frames=frames, width=width, height=height)
+        write_film(out, seed, world=world, frames=frames, width=width, height=height)
 
 
 def _wants_pairs(pairs: bool, clips: int | None, scenes: int | None, compact: bool) -> bool:

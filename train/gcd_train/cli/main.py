@@ -11,6 +11,7 @@ from gcd_model import DRIVING_SMALL, FAMILIES, SMALL, SVD_14, Family, ModelConfi
 from gcd_train.cli import bench, generate, lerobot, lora
 from gcd_train.cli.cache import cache
 from gcd_train.cli.calibrate import calibrate_command
+from gcd_train.cli.distill import distill
 from gcd_train.cli.evaluate import evaluate_command
 from gcd_train.cli.findings import findings_command
 from gcd_train.cli.gallery import gallery_command
@@ -32,6 +33,7 @@ app.add_typer(lerobot.app, name="export")
 app.add_typer(lora.app, name="lora")
 app.command()(cache)
 app.command("calibrate")(calibrate_command)
+app.command()(distill)
 app.command("evaluate")(evaluate_command)
 app.command("findings")(findings_command)
 app.command("gallery")(gallery_command)

@@ -7,8 +7,9 @@ from typing import Literal
 
 from gcd_model import RenderOptions
 from gcd_model.geometry import CameraMount
-from gcd_train.evaluation.opening import Choice
+from gcd_train.evaluation.choosing import Choice
 from gcd_train.evaluation.protocols import AS_PLANNED, FrameBounds, ProtocolName
+from gcd_train.hexplane import HexPlaneSettings
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -41,6 +42,7 @@ class Rivals:
 
     usual: baselines too. names: these, each name or several with commas between; None for the usual ones. train: pairs
     for means, at most `train_limit`. svd: weights for vanilla SVD. predictions: NAME=FOLDER of others' frames.
+    privileged: names of those of them that were given more than the source video. hexplane: what it learns of a clip.
     """
 
     usual: bool = True
@@ -49,13 +51,15 @@ class Rivals:
     train_limit: int = 1000
     svd: str | None = None
     predictions: Sequence[str] | None = None
+    privileged: Sequence[str] | None = None
+    hexplane: HexPlaneSettings = HexPlaneSettings()  # noqa: RUF009  it is frozen
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Candidate:
     """What is put to the test. weights: by name or path, None for rivals alone.
 
-    They are measured with the shipped steps and with each of `steps`. sampling: samples, guidance and seed. device,
+    They are measured with the shipped steps and with each of `steps`. sampling: all the rest. device,
     dtype: see `load_synthesizer`.
     """
 

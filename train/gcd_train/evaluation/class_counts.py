@@ -4,9 +4,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from gcd_train.evaluation.record import REGIONS, ClipRecord, Counted, Region
+from gcd_train.metrics import NO_CLASS, commonest_classes
 
 COMMON_CLASSES = 10
 """Classes that the paper's mIoU is a mean over: the commonest of the evaluated targets."""
@@ -44,9 +46,8 @@ def class_counts(records: Sequence[ClipRecord], classes: int = 0) -> ClassCounts
 
 def _commonest(counts: Array) -> tuple[int, ...]:
     """Ids of the classes with most pixels in the targets of all frames, rising; ties go to the lower id."""
-    true = counts[:, :, 2].sum(axis=(0, 1))
-    order = np.argsort(-true, kind="stable")[:COMMON_CLASSES]
-    return tuple(sorted(int(label) for label in order if true[label] > 0))
+    true = torch.from_numpy(counts[:, :, 2].sum(axis=(0, 1)))
+    return tuple(sorted(commonest_classes(true, COMMON_CLASSES)))
 
 
 def _confusion(record: ClipRecord, name: Region) -> Sequence[Counted] | None:
@@ -69,12 +70,14 @@ def _count(frame: Array, counted: Counted) -> None:
     if not counted:
         return
     true, predicted, pixels = np.array(counted).T
+    known = predicted < frame.shape[1]  # the others are of no class: wrong, and nobody's
     np.add.at(frame[0], true, pixels * (true == predicted))
-    np.add.at(frame[1], predicted, pixels)
+    np.add.at(frame[1], predicted[known], pixels[known])
     np.add.at(frame[2], true, pixels)
 
 
 def _highest(record: ClipRecord) -> int:
     """The highest class id that a record names; -1 for none."""
     every = [record.grid_confusion or (), *(region.confusion or () for region in record.regions.values())]
-    return max((max(entry[:2]) for frames in every for frame in frames for entry in frame), default=-1)
+    ids = (label for frames in every for frame in frames for entry in frame for label in entry[:2])
+    return max((label for label in ids if label != NO_CLASS), default=-1)

@@ -34,27 +34,35 @@ class HeldOutClip:
     change: tuple[float, float, float] | None = None
 
 
-class EvaluationSet(Protocol):
-    """Clips by key, the same whenever they are asked for, in any process.
+class ClipFacts(Protocol):
+    """What a model has to fit.
 
-    camera: "none" for the one path of driving, "spherical" for a path of each clip's own. identity: digest of what the
-    clips are read from and how they were drawn.
+    camera: "none" for the one path of driving, "spherical" for a path of each clip's own. frames, height, width: T, H
+    and W of each clip.
     """
 
-    @property
-    def keys(self) -> Sequence[str]: ...
-    @property
-    def kind(self) -> SetKind: ...
-    @property
-    def camera(self) -> CameraControl: ...
-    @property
-    def classes(self) -> Sequence[SemanticClass]: ...
     @property
     def frames(self) -> int: ...
     @property
     def height(self) -> int: ...
     @property
     def width(self) -> int: ...
+    @property
+    def camera(self) -> CameraControl: ...
+    @property
+    def classes(self) -> Sequence[SemanticClass]: ...
+
+
+class EvaluationSet(ClipFacts, Protocol):
+    """Clips by key, the same whenever they are asked for, in any process.
+
+    identity: digest of what the clips are read from and how they were drawn.
+    """
+
+    @property
+    def keys(self) -> Sequence[str]: ...
+    @property
+    def kind(self) -> SetKind: ...
     @property
     def fps(self) -> float: ...
     @property

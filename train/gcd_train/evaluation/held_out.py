@@ -3,19 +3,19 @@
 from collections.abc import Sequence
 from typing import Protocol
 
-from gcd_model.config import CameraControl, SemanticClass
+from gcd_model.config import SemanticClass
 from gcd_model.geometry import CameraMount, Trajectory
 from gcd_train.baselines import CameraPair, SourceClip
 from gcd_train.datasets.clip_source import ClipSource
 from gcd_train.datasets.paired import PairedClip
 from gcd_train.errors import DataError
+from gcd_train.evaluation.clips import ClipFacts
 
 
-class HeldOutClips(ClipSource, Protocol):
+class HeldOutClips(ClipSource, ClipFacts, Protocol):
     """Clips to be measured on; `PairedClips` is one.
 
-    camera: "none" for the one path of driving, "spherical" for a path of each clip's own.
-    frames, height, width: T, H and W of each clip. hfov_deg: across the pictures, of orbits both cameras' own.
+    hfov_deg: across the pictures, of orbits both cameras' own.
     scene: world and seed of the scene that a clip was cut from. trajectory: of a clip, from source to target.
     name: of a clip in its world, its number in digits.
     """
@@ -25,15 +25,7 @@ class HeldOutClips(ClipSource, Protocol):
     def trajectory(self, number: int, /) -> Trajectory: ...
     def name(self, number: int, /) -> str: ...
     @property
-    def camera(self) -> CameraControl: ...
-    @property
     def mount(self) -> CameraMount | None: ...
-    @property
-    def frames(self) -> int: ...
-    @property
-    def height(self) -> int: ...
-    @property
-    def width(self) -> int: ...
     @property
     def hfov_deg(self) -> float: ...
 

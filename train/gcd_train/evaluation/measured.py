@@ -1,6 +1,7 @@
 """One method's view of one clip against its target, as the record that all tables are made from."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -24,23 +25,25 @@ def measure(
     seconds: float,
     classes: int,
     lpips: metrics.Lpips | None,
-    whole: bool = True,
+    void: Sequence[int] = (),
 ) -> ClipRecord:
     """All figures of one view, of every frame from the first on.
 
+    Visible and occluded pixels are measured apart, too, where it is known which those are.
+
     Args:
         seconds: that the method took. classes: how many there are, 0 for none. lpips: None where no weights were given.
-        whole: whether visible and occluded pixels are measured apart, too, where it is known which those are. Occluded
-            is what is not visible.
+        void: ids among them that stand for no class, see `void_ids`: not counted where they are true, wrong where they
+            are said.
     Raises:
         ShapeError: a view is of another size or length than its target, a class id is unknown, or the draws of one
             prediction do not all show the same kinds of things.
         NonFiniteError: a view holds values that are no numbers.
     """
     target, draws = to_pictures(clip.target), _pictures(prediction, f"{method} on {clip.key}")
-    painted = _Painted.of(clip, prediction, classes)
+    painted = _Painted.of(clip, prediction, classes, void)
     shown = None if draws is None else _Shown.of(draws, target)
-    masks = _masks(clip, whole=whole)
+    masks = _masks(clip)
     return ClipRecord(
         method=method,
         privileged=privileged,
@@ -108,15 +111,17 @@ class _Painted:
     classes: int
 
     @classmethod
-    def of(cls, clip: HeldOutClip, prediction: Prediction, classes: int) -> "_Painted | None":
+    def of(cls, clip: HeldOutClip, prediction: Prediction, classes: int, void: Sequence[int]) -> "_Painted | None":
         said = _alike([draw.classes for draw in prediction.draws], "class maps")
         true = to_labels(clip.target_classes)
         if said is None or true is None or not classes:
             return None
-        return cls(said=said.cpu(), true=true, classes=classes)
+        return cls(
+            said=metrics.without_classes(said.cpu(), void), true=metrics.without_classes(true, void), classes=classes
+        )
 
     def confusion(self, mask: Tensor | None) -> Tensor:
-        """Of each frame, all draws together: int64 [T, K, K]."""
+        """Of each frame, all draws together: int64 [T, K, K + 1], last what is said to be of no class."""
         each = [metrics.frame_confusions(said, self.true, self.classes, mask) for said in self.said]
         return torch.stack(each).sum(dim=0)
 
@@ -151,8 +156,9 @@ def _within(values: Tensor, mask: Tensor | None) -> Frames:
     return _frames(values.mean(dim=(1, 2)) if mask is None else metrics.masked_mean(values, mask))
 
 
-def _masks(clip: HeldOutClip, *, whole: bool) -> dict[Region, Tensor | None]:
-    if clip.visible is None or not whole:
+def _masks(clip: HeldOutClip) -> dict[Region, Tensor | None]:
+    """Occluded is what is not visible."""
+    if clip.visible is None:
         return {"all": None}
     visible = torch.from_numpy(clip.visible.copy())
     return {"all": None, "visible": visible, "occluded": ~visible}
@@ -178,14 +184,17 @@ def _alike(draws: list[Tensor | None], what: str) -> Tensor | None:
 
 
 def _counted(confusions: Tensor) -> tuple[Counted, ...]:
-    """What occurs in each frame's matrix, [T, K, K]."""
+    """What occurs in each frame's matrix, [T, K, K + 1]."""
     return tuple(_occurring(each) for each in confusions)
 
 
 def _occurring(confusion: Tensor) -> Counted:
     places = confusion.nonzero()
     pixels = confusion[places[:, 0], places[:, 1]]
-    return tuple((true, said, count) for (true, said), count in zip(places.tolist(), pixels.tolist(), strict=True))
+    return tuple(
+        (true, said if said < len(confusion) else metrics.NO_CLASS, count)
+        for (true, said), count in zip(places.tolist(), pixels.tolist(), strict=True)
+    )
 
 
 def _rows(values: Tensor) -> tuple[Frames, ...]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 
-from gcd_model import RenderOptions, Synthesizer, load_synthesizer
+from gcd_model import RenderOptions, Synthesizer, load_synthesizer, sampler_of
 from gcd_model.config import CameraControl, SemanticClass
 from gcd_train.baselines import (
     VANILLA_SVD,
@@ -72,7 +72,7 @@ def of_weights(weights: Weights, clips: ClipFacts, options: RenderOptions, steps
     """The weights as they ship, then with each other number of steps.
 
     Args:
-        options: guidance, samples and seed count. steps: the shipped number is passed over.
+        options: all but the steps. steps: the shipped number is passed over.
     Raises:
         DataError: the weights do not fit the clips. CheckpointError: they cannot be opened.
     """
@@ -105,15 +105,27 @@ def of_baselines(names: Sequence[str] | None, settings: BaselineSettings, traine
     )
 
 
-def of_saved_frames(named: Sequence[str], painted: Sequence[SemanticClass]) -> tuple[Method, ...]:
+def of_saved_frames(
+    named: Sequence[str], painted: Sequence[SemanticClass], *, privileged: Sequence[str] = ()
+) -> tuple[Method, ...]:
     """Methods whose frames lie in folders.
 
     Args:
-        named: `NAME=FOLDER` each. painted: the classes in whose colours they are; empty for photographs.
+        named: `NAME=FOLDER` each. painted: the classes in whose colours they are; empty for photographs. privileged:
+            names of those that were given more than the source video.
     Raises:
-        RecipeError: one has no name or no folder. DataError: there is no such folder.
+        RecipeError: one has no name or no folder, or a privileged one is none of them. DataError: there is no such
+            folder.
     """
-    return tuple(_of_saved_frames(each, tuple(painted)) for each in named)
+    methods = tuple(_of_saved_frames(each, tuple(painted), privileged) for each in named)
+    names = [method.name for method in methods]
+    unknown = [name for name in privileged if name not in names]
+    if unknown:
+        raise RecipeError(
+            f"--privileged wants the name of a method of --predictions, got {unknown[0]!r}; "
+            f"there are {', '.join(names) or 'none'}"
+        )
+    return methods
 
 
 def require_names_apart(methods: Sequence[Method]) -> None:
@@ -129,17 +141,19 @@ def require_names_apart(methods: Sequence[Method]) -> None:
 def _of_weights(weights: Weights, clips: ClipFacts, options: RenderOptions) -> Method:
     made = SynthesizedViews.of(weights.open(), clips, options)
     traits = made.synthesizer.traits
-    sampling = traits.config.sampling
-    guidance = options.guidance or sampling.guidance
+    used = sampler_of(traits.config.sampling, options)
     told = {
         "weights": traits.sha256_12,
         "family": "unknown" if traits.family is None else traits.family.name,
-        "steps": str(options.steps or sampling.steps),
-        "guidance": f"{guidance[0]:g} to {guidance[1]:g}",
+        "steps": str(used.steps),
+        "guidance": "{:g} to {:g}".format(*used.guidance),
         "samples": str(options.samples),
         "seed": str(options.seed),
         "precision": traits.precision,
     }
+    told |= {} if used.solver == "euler" else {"solver": used.solver}  # left out, earlier runs can be gone on with
+    if used.guidance_interval is not None:
+        told["guided from"] = "{:g} to {:g}".format(*used.guidance_interval)
     return Method(name=made.name, make=partial(_synthesized, weights, Form.of(clips), options), told=told)
 
 
@@ -152,14 +166,15 @@ def _opened(weights: Weights) -> Synthesizer:
     return load_synthesizer(weights.path, device=weights.device, dtype=weights.dtype)
 
 
-def _of_saved_frames(named: str, painted: tuple[SemanticClass, ...]) -> Method:
+def _of_saved_frames(named: str, painted: tuple[SemanticClass, ...], privileged: Sequence[str]) -> Method:
     name, separator, folder = named.partition("=")
     if not (name and separator and folder):
         raise RecipeError(f"frames of another method are given as NAME=FOLDER, got {named!r}")
     place = Path(folder).resolve()
     SavedFrames.open(name, place)  # to refuse at once
-    told = {"frames in": folder, "digest": _listing(place)}
-    return Method(name=name, make=partial(SavedFrames.open, name, place, painted=painted), told=told)
+    more = name in privileged
+    told = {"frames in": folder, "digest": _listing(place)} | ({"privileged": "yes"} if more else {})
+    return Method(name=name, make=partial(SavedFrames.open, name, place, painted=painted, privileged=more), told=told)
 
 
 def _listing(folder: Path) -> str:

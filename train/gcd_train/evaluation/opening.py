@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, TypeAlias, get_args
+from typing import Literal, TypeAlias
 
 import msgspec
 
@@ -14,13 +14,13 @@ from gcd_train.datasets.controls import read_controls
 from gcd_train.datasets.kubric4d import Kubric4D
 from gcd_train.datasets.paired import PairedClips
 from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
-from gcd_train.datasets.public_splits import PublicSplit, public_split
 from gcd_train.datasets.skips import Skips
-from gcd_train.datasets.splits import Part, present, read_scene_list, read_split
 from gcd_train.datasets.trajectories import DrivingSampling, OrbitSampling, Sampling
 from gcd_train.datasets.view_pairs import ViewPairs
 from gcd_train.errors import DataError, RecipeError
+from gcd_train.evaluation.choosing import Choice, pairs_of_split, wanted_scenes
 from gcd_train.evaluation.clips import EvaluationSet
+from gcd_train.evaluation.fingerprint import fingerprint
 from gcd_train.evaluation.paired_set import PairedSet, chosen
 from gcd_train.evaluation.protocols import (
     AS_PLANNED,
@@ -35,25 +35,11 @@ from gcd_train.evaluation.protocols import (
 )
 from gcd_train.evaluation.scene_set import SceneSet
 from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
-from gcd_train.layouts.manifest import MANIFEST
 
 DataKind: TypeAlias = Literal["pairs", "kubric4d", "parallel_domain4d"]
 """What a folder holds."""
 
-_PARTS: dict[str, Part] = {part: part for part in get_args(Part)}
 _DIGITS = 12
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Choice:
-    """Which scenes of a folder. split: a public one's name, or a split file with `:train`, `:val` or `:test` after it.
-
-    listed: a file with a scene a line. limit: only the first so many.
-    """
-
-    split: str | None = None
-    listed: Path | None = None
-    limit: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -117,7 +103,8 @@ def open_pairs(folders: Sequence[Path], choice: Choice, mount: CameraMount | Non
     Args:
         mount: what everybody is told of the source camera of driving clips; None for the usual one.
     Raises:
-        DataError: see `PairedClips.open`. RecipeError: a list, no such split, or a mount where there is no vehicle.
+        DataError: see `PairedClips.open`; or the split is of another world. RecipeError: a list, no such split, or a
+            mount where there is no vehicle.
     """
     if choice.listed is not None:
         raise RecipeError("--list names whole scenes, and these are pairs; give --split NAME, or leave it out")
@@ -125,9 +112,7 @@ def open_pairs(folders: Sequence[Path], choice: Choice, mount: CameraMount | Non
     scenes = [clips.scene(number) for number in range(len(clips))]
     wanted = None
     if choice.split is not None:
-        split = public_split(choice.split)
-        wanted = {(world, seed) for world, seed in scenes if world == split.world and seed in split}
-        _note_missing(split, {seed for _, seed in wanted}, notes)
+        wanted = pairs_of_split(choice.split, scenes, notes)
     return Opened(
         clips=PairedSet.of(chosen(clips, scenes=wanted, limit=choice.limit), declared=_declared(mount, clips)),
         notes=tuple(notes.lines()),
@@ -145,7 +130,7 @@ def open_scenes(folder: Path, choice: Choice, cuts: SceneCuts) -> Opened:
     orbits, notes = data_kind([folder]) == "kubric4d", Skips()
     whole = _kubric(folder, cuts) if orbits else _driving(folder, cuts)
     controls = _controls(cuts, orbits=orbits)
-    scenes = _wanted(whole.scenes, choice, notes)
+    scenes = wanted_scenes(folder, whole.scenes, choice, notes)
     scenes = _controlled(scenes, controls, cuts, notes)[: choice.limit]
     data = whole.only(scenes)
     pairs = ViewPairs(
@@ -201,34 +186,6 @@ def _names(folder: Path) -> list[str]:
         raise DataError(f"{folder} cannot be read ({error}); give a folder with pairs or with scenes") from error
 
 
-def _note_missing(split: PublicSplit, there: set[int], notes: Skips) -> None:
-    """A part that is open-ended in practice, as `train`, is not missed."""
-    if there and len(there) < len(split) and not split.name.endswith("-train"):
-        notes.add(split.name, "--data", f"has {len(there)} of its {len(split)} scenes")
-
-
-def _wanted(there: Sequence[str], choice: Choice, notes: Skips) -> tuple[str, ...]:
-    if choice.listed is not None and choice.split is not None:
-        raise RecipeError("give --list or --split, not both")
-    if choice.listed is not None:
-        return present(read_scene_list(choice.listed, notes).scenes, there, notes, choice.listed)
-    if choice.split is None:
-        return tuple(there)
-    place, _, part = choice.split.rpartition(":")
-    file = Path(place if part in _PARTS and place else choice.split)
-    if file.is_file():
-        return present(read_split(file, _PARTS.get(part, "test")), there, notes, file)
-    split = public_split(choice.split)
-    scenes = tuple(scene for scene in there if _seed(scene) in split)
-    _note_missing(split, {_seed(scene) for scene in scenes}, notes)
-    return scenes
-
-
-def _seed(scene: str) -> int:
-    number = kubric4d_names.scene_number(scene)
-    return (parallel_domain4d_names.scene_number(scene) or 0) if number is None else number
-
-
 def _controlled(scenes: Sequence[str], controls: ClipControls, cuts: SceneCuts, notes: Skips) -> tuple[str, ...]:
     """Those of which there are clips; the others are counted."""
     for scene in scenes:
@@ -277,11 +234,10 @@ def _sampling(cuts: SceneCuts, *, orbits: bool) -> Sampling:
 
 
 def _identity(folder: Path, scenes: Sequence[str], cuts: SceneCuts) -> str:
-    """Of the scenes by name, what ours say of their files, and how clips are cut."""
+    """Of the scenes by name and files, and how clips are cut."""
     digest = hashlib.sha256(msgspec.json.encode(replace(cuts, controls=None), order="sorted"))
     if cuts.controls is not None:
         digest.update(cuts.controls.read_bytes())
     for scene in scenes:
-        manifest = folder / scene / MANIFEST
-        digest.update(scene.encode() + (manifest.read_bytes() if manifest.is_file() else b""))
+        digest.update(scene.encode() + fingerprint(folder / scene))
     return digest.hexdigest()[:_DIGITS]

@@ -3,7 +3,7 @@
 import platform
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TypeAlias
@@ -40,28 +40,35 @@ _NEAR_DEG = 90.0
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Training:
-    """Pairs whose means stand in for what nobody saw. identity: of the clips. count: how many."""
+    """Pairs whose means stand in for what nobody saw. identity: of the clips."""
 
-    statistics: TargetStatistics
+    clips: PairedClips
     identity: str
-    count: int
+
+    @property
+    def count(self) -> int:
+        """How many clips."""
+        return len(self.clips)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Plan:
     """What is to be done.
 
-    models, rivals: methods, in the order of the table. model: what is known of the weights, None without. painted:
-    targets are class maps in colours.
+    models, baselines, saved: methods, in the order of the table; baselines that want means cannot be used before
+    `with_means`. model: what is known of the weights, None without. painted: targets are class maps in colours. lpips:
+    digest of its weights, None without.
     """
 
     asked: Asked
     opened: Opened
     models: tuple[Method, ...]
-    rivals: tuple[Method, ...]
+    baselines: tuple[Method, ...]
+    saved: tuple[Method, ...]
     model: Traits | None
     training: Training | None
     painted: bool
+    lpips: str | None
 
     @property
     def clips(self) -> EvaluationSet:
@@ -69,20 +76,38 @@ class Plan:
         return self.opened.clips
 
     @property
+    def rivals(self) -> tuple[Method, ...]:
+        """What the weights are measured against."""
+        return self.baselines + self.saved
+
+    @property
     def methods(self) -> tuple[Method, ...]:
         """All, the weights first."""
         return self.models + self.rivals
 
+    def with_means(self, bar: ProgressBar) -> "Plan":
+        """With the means of the training clips, all of which are read for it; the same plan where there are none.
 
-def planned(asked: Asked, bar: ProgressBar) -> Plan:
-    """Open the data and the weights, and choose the methods.
+        Raises: DataError if one cannot be read.
+        """
+        if self.training is None:
+            return self
+        clips = self.training.clips
+        with bar("training clips", len(clips)) as show:
+            statistics = fit_statistics(clips, progress=lambda done, _: show(done))
+        made = _baselines(self.asked, self.clips, self.training, statistics, painted=self.painted)
+        return replace(self, baselines=made)
+
+
+def planned(asked: Asked) -> Plan:
+    """Open the data and the weights, and choose the methods: all that is quick, so that faults are told at once.
 
     Raises:
         DataError: data or frames are missing, or do not fit together. RecipeError: options contradict each other, or
             there is nothing to measure. CheckpointError: weights cannot be opened.
     """
-    kind = data_kind(asked.data)
-    if kind == "pairs":
+    lpips = None if asked.lpips is None else Lpips.open(asked.lpips).identity
+    if data_kind(asked.data) == "pairs":
         _require_pairs_options(asked)
         opened, model = open_pairs(asked.data, asked.choice, asked.mount), _model(asked)
         painted = False
@@ -90,25 +115,39 @@ def planned(asked: Asked, bar: ProgressBar) -> Plan:
         model = _model(asked)
         cuts = _cuts(asked, model)
         opened, painted = open_scenes(asked.data[0], asked.choice, cuts), cuts.semantic
-    training = _training(asked, opened.clips, bar)
+    training = _training(asked, opened.clips)
     models = (
         ()
         if model is None
         else of_weights(_weights(asked), opened.clips, asked.tested.sampling, asked.tested.steps or ())
     )
-    rivals = _rivals(asked, opened.clips, training, painted=painted)
-    if not (models or rivals):
+    standing_in = None if training is None else _nothing_yet(opened.clips)
+    baselines = _baselines(asked, opened.clips, training, standing_in, painted=painted)
+    saved = of_saved_frames(
+        asked.rivals.predictions or (),
+        opened.clips.classes if painted else (),
+        privileged=asked.rivals.privileged or (),
+    )
+    if not (models or baselines or saved):
         raise RecipeError("there is nothing to measure: give --weights, or leave out --no-baselines")
-    require_names_apart([*models, *rivals])
+    require_names_apart([*models, *baselines, *saved])
     return Plan(
-        asked=asked, opened=opened, models=models, rivals=rivals, model=model, training=training, painted=painted
+        asked=asked,
+        opened=opened,
+        models=models,
+        baselines=baselines,
+        saved=saved,
+        model=model,
+        training=training,
+        painted=painted,
+        lpips=lpips,
     )
 
 
 def note_of(plan: Plan, command: str) -> RunNote:
-    """What the run says of itself. command: the line that began it. Raises DataError for unusable LPIPS weights."""
+    """What the run says of itself. command: the line that began it."""
     clips, asked = plan.clips, plan.asked
-    lpips = {} if asked.lpips is None else {"lpips": Lpips.open(asked.lpips).identity}
+    lpips = {} if plan.lpips is None else {"lpips": plan.lpips}
     return RunNote(
         command=command,
         made=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -177,7 +216,7 @@ def _cuts(asked: Asked, model: Traits | None) -> SceneCuts:
     )
 
 
-def _training(asked: Asked, clips: EvaluationSet, bar: ProgressBar) -> Training | None:
+def _training(asked: Asked, clips: EvaluationSet) -> Training | None:
     """Raises DataError where the training clips are no measure for the held-out ones."""
     told = asked.rivals
     if not told.usual or not told.train:
@@ -188,34 +227,47 @@ def _training(asked: Asked, clips: EvaluationSet, bar: ProgressBar) -> Training 
     require_same_kind(training, clips.clips)
     if isinstance(clips.clips, PairedClips):
         require_apart(training, clips.clips)
-    with bar("training clips", len(training)) as show:
-        statistics = fit_statistics(training, progress=lambda done, _: show(done))
-    return Training(statistics=statistics, identity=identity_of(training), count=len(training))
+    return Training(clips=training, identity=identity_of(training))
 
 
-def _rivals(asked: Asked, clips: EvaluationSet, training: Training | None, *, painted: bool) -> tuple[Method, ...]:
+def _nothing_yet(clips: EvaluationSet) -> TargetStatistics:
+    """What stands where means will be, in their shapes."""
+    frame = (clips.height, clips.width)
+    majority = torch.zeros(clips.frames, *frame, dtype=torch.uint8) if clips.classes else None
+    return TargetStatistics(mean=torch.zeros(clips.frames, 3, *frame), majority=majority)
+
+
+def _baselines(
+    asked: Asked,
+    clips: EvaluationSet,
+    training: Training | None,
+    statistics: TargetStatistics | None,
+    *,
+    painted: bool,
+) -> tuple[Method, ...]:
+    """Those that are wanted. statistics: of the training clips. Raises RecipeError as `of_baselines`."""
     told = asked.rivals
+    if not told.usual:
+        return ()
     settings = BaselineSettings(
         frames=clips.frames,
         height=clips.height,
         width=clips.width,
         classes=tuple(clips.classes),
         painted=painted,
-        statistics=None if training is None else training.statistics,
+        statistics=statistics,
         svd=told.svd,
         device=asked.tested.device,
         dtype=asked.tested.dtype,
         samples=asked.tested.sampling.samples,
         seed=asked.tested.sampling.seed,
         published=asked.protocol == "released",
+        hexplane=told.hexplane,
     )
-    saved = of_saved_frames(told.predictions or (), clips.classes if painted else ())
-    if not told.usual:
-        return saved
     names = None if told.names is None else [name.strip() for name in ",".join(told.names).split(",") if name.strip()]
     if names is None and training is None and isinstance(clips, PairedSet):
         raise RecipeError(
             "baselines want training clips for their means: give --train FOLDER, name some that need none with "
             "--methods, or --no-baselines"
         )
-    return of_baselines(names, settings, "nothing" if training is None else training.identity) + saved
+    return of_baselines(names, settings, "nothing" if training is None else training.identity)

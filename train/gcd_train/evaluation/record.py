@@ -13,7 +13,7 @@ Frames: TypeAlias = tuple[float | None, ...]
 """A value of each frame, from the first; None where there is no pixel to measure."""
 
 Counted: TypeAlias = tuple[tuple[int, int, int], ...]
-"""Pixels of one frame as (true class, predicted class, how many), only what occurs."""
+"""Pixels of one frame as (true class, predicted class, how many), only what occurs; predicted 255 is no class."""
 
 
 class RegionRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 
+from gcd_model.config import SemanticClass
 from gcd_train.baselines import Prediction, Predictor
 from gcd_train.errors import DataError
 from gcd_train.evaluation.clips import EvaluationSet, HeldOutClip
@@ -10,16 +11,16 @@ from gcd_train.evaluation.figures import Evaluation, summed_up
 from gcd_train.evaluation.measured import measure
 from gcd_train.evaluation.record import ClipRecord
 from gcd_train.evaluation.tallies import FIRST_MEASURED, MAIN, Selection
-from gcd_train.metrics import Lpips
+from gcd_train.metrics import Lpips, void_ids
 
 
 def predicted_and_measured(
-    predictor: Predictor, clip: HeldOutClip, *, classes: int, lpips: Lpips | None = None
+    predictor: Predictor, clip: HeldOutClip, *, classes: Sequence[SemanticClass], lpips: Lpips | None = None
 ) -> tuple[Prediction, ClipRecord]:
     """What a method makes of a clip, and the record of that.
 
     Args:
-        classes: how many there are, 0 for none. lpips: None for no such figure.
+        classes: the ontology, empty for none. lpips: None for no such figure.
     Raises: what the method raises; ShapeError, NonFiniteError: see `measure`.
     """
     start = time.perf_counter()
@@ -31,7 +32,8 @@ def predicted_and_measured(
         method=predictor.name,
         privileged=predictor.privileged,
         seconds=seconds,
-        classes=classes,
+        classes=len(classes),
+        void=void_ids([each.name for each in classes]),
         lpips=lpips,
     )
     return prediction, record
@@ -56,7 +58,7 @@ def evaluate(
     for done, key in enumerate(clips.keys, start=1):
         clip = clips.clip(key)
         for rows, predictor in zip(records, predictors, strict=True):
-            rows.append(predicted_and_measured(predictor, clip, classes=len(clips.classes))[1])
+            rows.append(predicted_and_measured(predictor, clip, classes=clips.classes)[1])
         if progress is not None:
             progress(done, len(clips.keys))
     return tuple(summed_up(rows, selection, classes=len(clips.classes)) for rows in records)

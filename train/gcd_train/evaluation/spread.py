@@ -1,7 +1,7 @@
 """An evaluation over processes of this machine or a Ray cluster: clip by clip, what is there already is kept."""
 
 import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -83,7 +83,7 @@ class ClipWork:
     def _keep(self, predictor: Predictor, clip: HeldOutClip) -> None:
         """The record is written last: what has one is whole."""
         lpips = None if self.lpips is None else _opened_lpips(self.lpips)
-        prediction, record = predicted_and_measured(predictor, clip, classes=len(self.clips.classes), lpips=lpips)
+        prediction, record = predicted_and_measured(predictor, clip, classes=self.clips.classes, lpips=lpips)
         keeper = RunKeeper(self.folder)
         write_views(keeper.views(record.method, record.key), clip, prediction, self.views, self.clips.classes)
         keeper.keep(record)
@@ -140,12 +140,17 @@ class Account:
 
 
 def measure_all(
-    work: ClipWork, *, workers: int = 1, ray_address: str | None = None, gpus: float = 0.0
+    work: ClipWork,
+    *,
+    workers: int = 1,
+    ray_address: str | None = None,
+    gpus: float = 0.0,
+    environments: Sequence[Mapping[str, str]] = (),
 ) -> Iterator[Account]:
     """Measure every method on every clip that has no record of it; gives the account after every clip, the same object.
 
     Args:
-        workers, ray_address, gpus: see `map_items`.
+        workers, ray_address, gpus, environments: see `map_items`.
     Raises:
         DataError: there is nothing to measure. RunError: nothing can be written, or as `map_items`.
     """
@@ -155,7 +160,9 @@ def measure_all(
     items = _missing(work)
     account = Account(clips=len(work.clips.keys), there=len(work.clips.keys) - len(items))
     yield account
-    for outcome in map_items(work, items, workers=workers, ray_address=ray_address, gpus=gpus):
+    for outcome in map_items(
+        work, items, workers=workers, ray_address=ray_address, gpus=gpus, environments=environments
+    ):
         account.add(outcome)
         yield account
         if account.gave_up:

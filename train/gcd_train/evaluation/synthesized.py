@@ -1,53 +1,35 @@
 """A model as it is shipped, as one of the methods that are measured."""
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol, Self
+from typing import Self
 
 from torch import Tensor
 
-from gcd_model import Clip, RenderOptions, Trajectory, ViewSynthesizer
+from gcd_model import Clip, RenderOptions, Trajectory, View, ViewSynthesizer
 from gcd_model.class_head import nearest_classes
-from gcd_model.config import CameraControl, SemanticClass
+from gcd_model.config import SemanticClass
 from gcd_model.geometry import CameraMount
 from gcd_train.baselines import CameraPair, Prediction, SourceClip
 from gcd_train.datasets.clip_source import to_network
 from gcd_train.errors import DataError
+from gcd_train.evaluation.clips import ClipFacts
 from gcd_train.evaluation.held_out import names_of
 
 _SAME_PATH_M = 1e-3
 """Largest difference between the entries of two poses that count as one; more is another path."""
 
 
-class ClipFacts(Protocol):
-    """What a model has to fit: of an `EvaluationSet`, or of pairs."""
-
-    @property
-    def frames(self) -> int: ...
-    @property
-    def height(self) -> int: ...
-    @property
-    def width(self) -> int: ...
-    @property
-    def camera(self) -> CameraControl: ...
-    @property
-    def classes(self) -> Sequence[SemanticClass]: ...
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SynthesizedViews:
     """A model with its own sampler settings, on its fixed view or on each clip's path.
 
-    steps, guidance (of the first and the last frame): instead of those the weights ship with. samples: draws of each
-    view. seed: of their noise, the same for every clip, as in a live node. painted: classes that its colours are read
-    by, where it paints class maps and its file does not say which.
+    options: instead of what the weights ship with. The noise of their seed is the same for every clip, as in a live
+    node. painted: classes that its colours are read by, where it paints class maps and its file does not say which.
     """
 
     synthesizer: ViewSynthesizer
-    steps: int | None = None
-    guidance: tuple[float, float] | None = None
-    samples: int = 1
-    seed: int = 0
+    options: RenderOptions = RenderOptions()  # noqa: RUF009  it is frozen
     painted: tuple[SemanticClass, ...] = ()
     privileged: bool = False
 
@@ -55,17 +37,10 @@ class SynthesizedViews:
     def of(cls, synthesizer: ViewSynthesizer, clips: ClipFacts, options: RenderOptions | None = None) -> Self:
         """A model that is measured on these clips.
 
-        options: steps, guidance, samples and seed count. Raises DataError where model and clips do not fit together.
+        Raises DataError where model and clips do not fit together.
         """
         _require_fit(synthesizer, clips)
-        options = RenderOptions() if options is None else options
-        made = cls(
-            synthesizer=synthesizer,
-            steps=options.steps,
-            guidance=options.guidance,
-            samples=options.samples,
-            seed=options.seed,
-        )
+        made = cls(synthesizer=synthesizer, options=RenderOptions() if options is None else options)
         if not made.paints_classes or synthesizer.traits.classes:
             return made
         if not clips.classes:
@@ -77,10 +52,9 @@ class SynthesizedViews:
 
     @property
     def name(self) -> str:
-        """The weights' name, with the steps and the guidance if they are not the shipped ones."""
-        told = [] if self.steps is None else [f"{self.steps} step{'' if self.steps == 1 else 's'}"]
-        told += [] if self.guidance is None else [f"guidance {self.guidance[0]:g} to {self.guidance[1]:g}"]
-        return self.synthesizer.traits.name + (f" ({', '.join(told)})" if told else "")
+        """The weights' name, with what is not as shipped of how they are sampled."""
+        told = told_of(self.options)
+        return self.synthesizer.traits.name + (f" ({told})" if told else "")
 
     @property
     def paints_classes(self) -> bool:
@@ -90,12 +64,19 @@ class SynthesizedViews:
 
     def predict(self, clip: SourceClip) -> Prediction:
         """See Predictor. Raises DataError where the clip's path is not one that the model was trained on."""
-        traits = self.synthesizer.traits
-        mount = clip.cameras.mount
-        declared = None if mount == (traits.mount or CameraMount()) else mount
-        features = self.synthesizer.encode(Clip(video=to_network(clip.source), fps=clip.fps, mount=declared))
-        (view,) = self.synthesizer.render(features, [self._path(clip.cameras, declared)], self._options())
-        classes = [None] * self.samples if view.classes is None else list(view.classes)
+        return self.shown(self.drawer(clip)(self.options))
+
+    def drawer(self, clip: SourceClip) -> Callable[[RenderOptions], View]:
+        """Draws the clip's view, encoded once, with any options. Raises DataError as `predict`."""
+        synthesizer, mount = self.synthesizer, clip.cameras.mount
+        declared = None if mount == (synthesizer.traits.mount or CameraMount()) else mount
+        path = self._path(clip.cameras, declared)
+        features = synthesizer.encode(Clip(video=to_network(clip.source), fps=clip.fps, mount=declared))
+        return lambda options: synthesizer.render(features, [path], options)[0]
+
+    def shown(self, view: View) -> Prediction:
+        """A view as it is measured, all its draws."""
+        classes = [None] * len(view.samples) if view.classes is None else list(view.classes)
         first, *more = (self._draw(*each) for each in zip(view.samples, classes, strict=True))
         return replace(first, more=tuple(more))
 
@@ -103,9 +84,6 @@ class SynthesizedViews:
         if self.painted:
             return Prediction(classes=nearest_classes(video, self.painted))
         return Prediction(video=None if self.paints_classes else video, classes=classes)
-
-    def _options(self) -> RenderOptions:
-        return RenderOptions(steps=self.steps, guidance=self.guidance, samples=self.samples, seed=self.seed)
 
     def _path(self, cameras: CameraPair, declared: CameraMount | None) -> Trajectory:
         traits, asked = self.synthesizer.traits, cameras.trajectory
@@ -122,6 +100,16 @@ class SynthesizedViews:
                 f"arrive in frame {asked.at_goal.index(True)}); evaluate it on clips like those of its training"
             )
         return planned
+
+
+def told_of(options: RenderOptions) -> str:
+    """What options say of sampling, in few words; empty where all is as shipped."""
+    told = [] if options.quality == "exact" else [options.quality]
+    told += [] if options.steps is None else [f"{options.steps} step{'' if options.steps == 1 else 's'}"]
+    told += [] if options.solver is None else [options.solver]
+    told += [] if options.guidance is None else ["guidance {:g} to {:g}".format(*options.guidance)]
+    told += [] if options.guidance_interval is None else ["guided from {:g} to {:g}".format(*options.guidance_interval)]
+    return ", ".join(told)
 
 
 def _require_fit(synthesizer: ViewSynthesizer, clips: ClipFacts) -> None:

@@ -26,9 +26,9 @@ class HexPlaneSettings:
     features: int = 16
     hidden: int = 64
     sides: tuple[int, ...] = (24, 48, 96)
-    plane_rate: float = 0.02
-    head_rate: float = 0.004
-    smoothness: float = 0.3
+    plane_rate: float = 0.06
+    head_rate: float = 0.01
+    smoothness: float = 0.03
     picture_width: int = 192
 
     def __post_init__(self) -> None:

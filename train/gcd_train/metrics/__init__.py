@@ -13,6 +13,8 @@ from gcd_train.metrics.classes import (
     majority_classes,
     mean_iou,
     pixel_accuracy,
+    void_ids,
+    without_classes,
 )
 from gcd_train.metrics.lpips import Lpips
 from gcd_train.metrics.pictures import (
@@ -46,5 +48,7 @@ __all__ = [
     "psnr",
     "ssim",
     "ssim_map",
+    "void_ids",
     "window_mask",
+    "without_classes",
 ]

@@ -10,7 +10,26 @@ from gcd_model.errors import ShapeError
 from gcd_train.metrics.shapes import require_mask, require_same_shape
 
 NO_CLASS = 255
-"""Id of target pixels that belong to no class, unless an ontology has 256."""
+"""Id of pixels that belong to no class, unless an ontology has 256: not counted in targets, wrong in predictions."""
+
+_VOID_NAMES = frozenset({"void", "unlabelled", "unlabeled"})
+
+
+def void_ids(names: Sequence[str]) -> tuple[int, ...]:
+    """Ids of the entries of an ontology that stand for no class: "Void", "unlabelled", whatever the case.
+
+    None of an ontology with 256 entries, which leaves no id for what has no class.
+    """
+    if len(names) > NO_CLASS:
+        return ()
+    return tuple(label for label, name in enumerate(names) if name.strip().lower() in _VOID_NAMES)
+
+
+def without_classes(labels: Tensor, void: Sequence[int]) -> Tensor:
+    """A class map, uint8 of any shape, with `NO_CLASS` where an id of `void` stood."""
+    if not void:
+        return labels
+    return labels.masked_fill(torch.isin(labels, torch.tensor(void, dtype=labels.dtype)), NO_CLASS)
 
 
 def majority_classes(classes: Tensor, height: int, width: int, count: int) -> Tensor:
@@ -45,39 +64,44 @@ def confusion_matrix(predicted: Tensor, target: Tensor, count: int) -> Tensor:
 
 
 def frame_confusions(predicted: Tensor, target: Tensor, count: int, mask: Tensor | None = None) -> Tensor:
-    """`confusion_matrix` of each frame, without pixels whose target has no class: int64 [T, count, count].
+    """`confusion_matrix` of each frame, without pixels whose target has no class: int64 [T, count, count + 1].
+
+    The last column holds pixels whose prediction has no class: they are wrong, and taken for none of the others.
 
     Args:
         predicted, target: uint8 [T, H, W]. mask: bool [T, H, W], the pixels that count; None for all.
     Raises:
-        ShapeError: shapes differ, or an id is `count` or more; of targets, `NO_CLASS` is none such.
+        ShapeError: shapes differ, or an id other than `NO_CLASS` is `count` or more.
     """
     require_same_shape(predicted, target)
-    counted = target != NO_CLASS if count <= NO_CLASS else torch.ones_like(target, dtype=torch.bool)
+    counted = _of_a_class(target, count)
     if mask is not None:
         require_mask(mask, *target.shape)
         counted = counted & mask
     said, true = predicted[counted], target[counted]
-    _require_known(said, true, count)
-    frames = len(target)
+    known = _of_a_class(said, count)
+    _require_known(said[known], true, count)
+    frames, columns = len(target), count + 1
     frame = torch.arange(frames).view(-1, 1, 1).expand(target.shape)[counted]
-    cells = (frame * count + true.long()) * count + said.long()
-    return torch.bincount(cells, minlength=frames * count * count).view(frames, count, count)
+    cells = (frame * count + true.long()) * columns + torch.where(known, said.long(), count)
+    return torch.bincount(cells, minlength=frames * count * columns).view(frames, count, columns)
 
 
 def class_iou(confusion: Tensor) -> Tensor:
-    """Intersection over union of each class, float64 [K]; NaN for one that is neither predicted nor there."""
+    """Intersection over union of each class, float64 [K]; NaN for one that is neither predicted nor there.
+
+    confusion: [K, K], or [K, K + 1] with a last column for predictions of no class.
+    """
     both = confusion.diagonal().double()
-    return both / (confusion.sum(dim=0) + confusion.sum(dim=1) - both)
+    return both / (confusion.sum(dim=0)[: len(confusion)] + confusion.sum(dim=1) - both)
 
 
-def commonest_classes(confusion: Tensor, count: int) -> tuple[int, ...]:
+def commonest_classes(pixels: Tensor, count: int) -> tuple[int, ...]:
     """Ids of the classes with most target pixels, most first, the lower id of two as common; absent ones never.
 
     Args:
-        confusion: of all evaluated targets together. count: how many at most.
+        pixels: [K], of all evaluated targets together. count: how many at most.
     """
-    pixels = confusion.sum(dim=1)
     order = pixels.argsort(descending=True, stable=True)[:count]
     return tuple(label for label in order.tolist() if pixels[label] > 0)
 
@@ -98,6 +122,11 @@ def pixel_accuracy(confusion: Tensor) -> float:
     return float(confusion.diagonal().sum().double() / confusion.sum())
 
 
+def _of_a_class(labels: Tensor, count: int) -> Tensor:
+    """Where ids are those of a class, or of none that is known."""
+    return labels != NO_CLASS if count <= NO_CLASS else torch.ones_like(labels, dtype=torch.bool)
+
+
 def _require_known(predicted: Tensor, target: Tensor, count: int) -> None:
-    if predicted.numel() and int(torch.maximum(predicted.max(), target.max())) >= count:
+    if any(labels.numel() and int(labels.max()) >= count for labels in (predicted, target)):
         raise ShapeError(f"class ids must be below {count}; are the two ontologies the same?")

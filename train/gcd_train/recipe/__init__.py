@@ -10,11 +10,21 @@ from gcd_train.recipe.optimiser import EmaRecipe, OptimiserRecipe
 from gcd_train.recipe.schema import Recipe
 from gcd_train.recipe.small_stages import DecoderRecipe, LatentsRecipe, VAERecipe
 from gcd_train.recipe.unet import ClassWeightsName, FocalBlendName, LossRecipe, NoiseRecipe, UNetRecipe
-from gcd_train.recipe.values import Budget, Count, NotNegative, Positive, Share, StageName
+from gcd_train.recipe.values import (
+    AnyStageName,
+    Budget,
+    Count,
+    DistillStageName,
+    NotNegative,
+    Positive,
+    Share,
+    StageName,
+)
 from gcd_train.recipe.writing import to_toml
 
 __all__ = [
     "PACKAGED",
+    "AnyStageName",
     "Budget",
     "ClassWeightsName",
     "ComputeRecipe",
@@ -23,6 +33,7 @@ __all__ = [
     "DataRecipe",
     "DataTask",
     "DecoderRecipe",
+    "DistillStageName",
     "EmaRecipe",
     "ExportRecipe",
     "FocalBlendName",

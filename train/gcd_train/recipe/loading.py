@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import msgspec
 
@@ -21,6 +22,7 @@ from gcd_train.recipe.merging import (
 )
 from gcd_train.recipe.schema import Recipe
 
+Kind = TypeVar("Kind", bound=msgspec.Struct)
 _KEYS = (*Recipe.__struct_fields__, BASE, WITHOUT, SMALL)
 
 
@@ -41,6 +43,14 @@ def load_recipe(source: str | Path, *, small: bool = False, changes: Sequence[st
 def parse_recipe(text: bytes, name: str) -> Recipe:
     """Read a recipe file's content, without a base; `name` is for the message. Raises RecipeError as `load_recipe`."""
     return _recipe(MergedTable(parsed(text, name), (name,)), small=False, changes=())
+
+
+def checked_recipe(table: Table, place: str, kind: type[Kind], changes: Sequence[str] = ()) -> Kind:
+    """A table as a recipe of some kind, changed for this run; `place` is for the message. Raises RecipeError."""
+    try:
+        return msgspec.convert(_changed(table, changes), kind)
+    except msgspec.ValidationError as error:
+        raise RecipeError(f"{place}: {explain_settings_error(str(error), kind)}") from error
 
 
 def _recipe(read: MergedTable, *, small: bool, changes: Sequence[str]) -> Recipe:
@@ -75,10 +85,7 @@ def _changed(table: Table, changes: Sequence[str]) -> Table:
 
 
 def _checked(table: Table, place: str) -> Recipe:
-    try:
-        return msgspec.convert(table, Recipe)
-    except msgspec.ValidationError as error:
-        raise RecipeError(f"{place}: {explain_settings_error(str(error), Recipe)}") from error
+    return checked_recipe(table, place, Recipe)
 
 
 def _change(change: str) -> Table:

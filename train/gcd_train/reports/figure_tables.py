@@ -12,6 +12,7 @@ from gcd_train.reports.paper import CLASS_COLUMNS, PICTURE_COLUMNS, Column, Pape
 from gcd_train.reports.table import NO_WEIGHTS, NOT_RUN, NOTHING, Cell, Row, Table, csv_text
 
 _SPANS: tuple[Span, ...] = ("2-last", "last", "all")
+_OWN_NAMES: dict[Span, str] = {"2-last": "main", "last": "last_frame", "all": "all_frames"}
 _BRACKETS = "In brackets: 95 % interval, bootstrap over scenes. * is given more than the source video."
 
 
@@ -54,13 +55,13 @@ def main_tables(measured: Measured, spans: Sequence[Span] = ("2-last", "last")) 
     """The paper's tables for clips of its sets, tables of the same columns under their own title for others.
 
     Args:
-        spans: only tables over these frames.
+        spans: only tables over these frames. The paper has none over all frames, so that one is always our own.
     """
-    wanted = tables_for(measured.of.note)
-    if wanted:
-        return tuple(_paper_table(measured, each) for each in wanted if each.frames in spans)
-    columns = _columns(measured.of)
-    return tuple(_own_table(measured, columns, frames) for frames in spans)
+    columns, papers = _columns(measured.of), {each.frames: each for each in tables_for(measured.of.note)}
+    return tuple(
+        _paper_table(measured, papers[frames]) if frames in papers else _own_table(measured, columns, frames)
+        for frames in spans
+    )
 
 
 def all_figures(measured: Measured) -> str:
@@ -85,10 +86,10 @@ def _columns(of: EvaluatedSet) -> tuple[Column, ...]:
 
 
 def _own_table(measured: Measured, columns: Sequence[Column], frames: Span) -> Table:
-    told = _frames_told(measured, frames)
+    told = frames_told(measured.of, frames)
     rows = [_measured_row(measured, method, columns, frames, PaperRow(label="")) for method in measured.of.methods]
     return Table(
-        name="main" if frames == "2-last" else "last_frame",
+        name=_OWN_NAMES[frames],
         title=f"{measured.of.title}: {told}",
         headings=tuple(column.heading for column in columns),
         rows=tuple(rows),
@@ -154,13 +155,16 @@ def _unknown_region(of: EvaluatedSet, region: Region) -> bool:
     return region not in of.regions
 
 
-def _frames_told(measured: Measured, frames: Span) -> str:
-    return "last frame" if frames == "last" else f"frames 2-{measured.of.note.frames}"
+def frames_told(of: EvaluatedSet, frames: Span) -> str:
+    """Which frames a table is over, in words."""
+    return {"2-last": f"frames 2-{of.note.frames}", "last": "last frame", "all": f"all {of.note.frames} frames"}[frames]
 
 
 def _notes(measured: Measured, columns: Sequence[Column], frames: Span) -> tuple[str, ...]:
-    of, told = measured.of, _frames_told(measured, frames)
+    of, told = measured.of, frames_told(measured.of, frames)
     notes = [f"{told[0].upper()}{told[1:]} of {len(of.keys)} clips of {of.scenes} scenes. {_BRACKETS}"]
     if any(_unknown_region(of, column.region) for column in columns):
         notes.append("Unknown: nobody knows which pixels of these clips the source camera saw.")
+    if any(column.figure == "lpips" for column in columns) and len(of.regions) > 1:
+        notes.append("LPIPS is over all pixels alone: its network sees patches, which no region cuts out.")
     return tuple(notes)

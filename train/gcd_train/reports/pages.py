@@ -12,7 +12,7 @@ from gcd_train.reports import comparison, failures
 from gcd_train.reports.comparison import Difference
 from gcd_train.reports.curves import all_plots, curves_csv
 from gcd_train.reports.drawing import draw
-from gcd_train.reports.figure_tables import Measured, all_figures, main_tables
+from gcd_train.reports.figure_tables import Measured, all_figures, frames_told, main_tables
 from gcd_train.reports.galleries import shown_clips, strips, write_sheet, write_video
 from gcd_train.reports.material import EvaluatedSet, Method, Run, gather, on_the_same_goals
 from gcd_train.reports.paper import is_model
@@ -23,6 +23,8 @@ FEWEST_SCENES = 10
 """With fewer a report warns: the bootstrap knows no more scenes than it is given."""
 
 _SPANS: tuple[Span, ...] = ("2-last", "last")
+_RELEASED_SPANS: tuple[Span, ...] = ("all", *_SPANS)
+"""The released script's figures are over all frames, so they come first where a run used it."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -124,12 +126,17 @@ class _Writer:
     place: str
     choices: Choices
 
+    @property
+    def spans(self) -> tuple[Span, ...]:
+        """Frames that tables are over."""
+        return _RELEASED_SPANS if self.of.note.protocol == "released" else _SPANS
+
     def sections(self) -> Iterator[str]:
         measured = Measured(of=self.of, seed=self.choices.seed, rows=self.choices.rows)
         first = leads(self.of, self.choices)
         yield f"## {self.of.title}\n"
         yield from self._tables(measured)
-        yield from self._differences(measured, first, _SPANS)
+        yield from self._differences(measured, first, self.spans)
         yield from self._plots(measured)
         yield from self._gallery()
         yield from self._failures(measured, first)
@@ -148,7 +155,7 @@ class _Writer:
             yield f"{to_markdown(table)}\n{self._link(f'tables/{table.name}.csv')}\n"
 
     def _tables(self, measured: Measured) -> Iterator[str]:
-        yield from self._main_tables(measured, _SPANS)
+        yield from self._main_tables(measured, self.spans)
         self._write("tables/figures.csv", all_figures(measured))
         self._write("tables/clips.csv", failures.clips_csv(measured))
         yield (
@@ -159,7 +166,7 @@ class _Writer:
     def _differences(self, measured: Measured, first: Sequence[Method], spans: Sequence[Span]) -> Iterator[str]:
         every: list[Difference] = []
         for frames in spans:
-            told = "last frame" if frames == "last" else f"frames 2-{self.of.note.frames}"
+            told = frames_told(self.of, frames)
             for lead in first:
                 found = comparison.differences(measured, lead, frames)
                 every += found

@@ -7,12 +7,13 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from gcd_model.clip import RenderOptions
 from gcd_model.conditioning import Conditioning
-from gcd_model.denoiser import Denoiser, start_noise
+from gcd_model.denoiser import Denoiser, TorchBackbone
 from gcd_model.networks import Networks
-from gcd_model.noise import edm_sigmas, guidance_scale
 from gcd_model.plane_mix import PlaneMix
-from gcd_model.sampler import euler
+from gcd_model.sampler import sample
+from gcd_model.schedule import Schedule
 from gcd_model.vae import TemporalDecoder
 from gcd_train.batches import EncodedBatches
 from gcd_train.clip_warps import ClipWarps
@@ -72,13 +73,12 @@ class Predictor:
             latents=self._batches.condition(rows),
             branches=1,
         )
-        sigmas = edm_sigmas(config.sampling, config.sampling.steps)
-        guidance = guidance_scale(1.0, 1.0, frames).to(device)
-        denoiser = Denoiser(networks.unet, networks.class_head, given, sigmas, guidance, config.prediction)
+        schedule = Schedule.of(config, RenderOptions(guidance=(1.0, 1.0)))
+        denoiser = Denoiser(TorchBackbone(networks.unet, networks.class_head), given, schedule)
         draws = Draws(self._seed, "predictions", number, device)
         noise = draws.normal(1 if config.sampling.shared_noise else frames, *rows.target.shape[1:])
-        start = start_noise(noise.expand(rows.target.shape)[None], sigmas, 1)
-        latents = euler(denoiser, start, sigmas)[0].float()
+        start = schedule.start(noise.expand(rows.target.shape)[None], 1)
+        latents = sample(denoiser, start, schedule.steps)[0].float()
         decoded = networks.decoder(self._precision.frames(latents / config.vae.scale), frames)
         return Predicted(latents, decoded, denoiser.class_logits)
 

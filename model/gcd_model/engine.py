@@ -1,0 +1,117 @@
+"""What computes the networks of a checkpoint, behind one interface: plain torch here, faster ones beside it."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from torch import Tensor
+
+from gcd_model.clip import RenderOptions
+from gcd_model.conditioning import Conditioning
+from gcd_model.denoiser import Denoiser, TorchBackbone
+from gcd_model.geometry import Trajectory
+from gcd_model.image_encoder import clip_pixels
+from gcd_model.networks import Networks
+from gcd_model.sampler import sample
+from gcd_model.schedule import Schedule
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Sampled:
+    """What sampling gave K views.
+
+    latents: float32 [K, T, C, h, w]. class_logits: float32 [K*T, classes, h', w'] or None.
+    """
+
+    latents: Tensor
+    class_logits: Tensor | None
+
+
+class Engine(Protocol):
+    """Computes networks; what they are given and what becomes of it is the synthesizer's.
+
+    Tensors may come from any device and are float32 unless `like` says otherwise; results lie where `like` does.
+    """
+
+    @property
+    def like(self) -> Tensor:
+        """A tensor of the device and precision that conditioning is wanted in."""
+        ...
+
+    def tokens(self, frames: Tensor) -> Tensor | None:
+        """Image tokens of frames [N, 3, H, W] in [-1, 1]: [N, D]; None without an image tower."""
+        ...
+
+    def condition_mean(self, frames: Tensor) -> Tensor:
+        """Unscaled latents of frames [N, 3, H, W] in [-1, 1]: [N, C, h, w]."""
+        ...
+
+    def camera(self, path: Trajectory) -> Tensor | None:
+        """What the U-Net is told of a camera path, [T, W]; None for a model without camera control."""
+        ...
+
+    def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Sampled:
+        """From noise [K, T, C, h, w] to clean latents; reports to `options.progress`, stops for `options.cancel`.
+
+        Raises Cancelled.
+        """
+        ...
+
+    def decode(self, latents: Tensor) -> Tensor:
+        """Unscaled latents of one clip [T, C, h, w] -> pictures float32 [T, 3, H, W], about [-1, 1]."""
+        ...
+
+    def mix(
+        self, decoded: Tensor, warped: Tensor, valid: Tensor, latents: Tensor, logits: Tensor | None
+    ) -> tuple[Tensor, Tensor | None]:
+        """Pictures and class logits with pixels of the warped source in them, see `PlaneMix`."""
+        ...
+
+
+class TorchEngine:
+    """The networks as torch runs them."""
+
+    def __init__(self, networks: Networks) -> None:
+        self._networks = networks
+        self._backbone = TorchBackbone(networks.unet, networks.class_head)
+
+    @property
+    def like(self) -> Tensor:
+        """See Engine."""
+        return self._networks.unet.stem.weight
+
+    def tokens(self, frames: Tensor) -> Tensor | None:
+        """See Engine."""
+        tower = self._networks.image_encoder
+        if tower is None:
+            return None
+        return tower(clip_pixels(frames.to(self.like.device), tower.config.image_size).to(self.like))
+
+    def condition_mean(self, frames: Tensor) -> Tensor:
+        """See Engine."""
+        return self._networks.condition_encoder(frames.to(self.like)).mean
+
+    def camera(self, path: Trajectory) -> Tensor | None:
+        """See Engine."""
+        embedder = self._networks.camera
+        return None if embedder is None else embedder(path)
+
+    def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Sampled:
+        """See Engine."""
+        denoiser = Denoiser(self._backbone, given, schedule)
+        latents = sample(
+            denoiser, start.to(self.like.device), schedule.steps, progress=options.progress, cancel=options.cancel
+        )
+        return Sampled(latents=latents, class_logits=denoiser.class_logits)
+
+    def decode(self, latents: Tensor) -> Tensor:
+        """See Engine."""
+        decoder = self._networks.decoder
+        return decoder(latents.to(decoder.stem.weight), len(latents))
+
+    def mix(
+        self, decoded: Tensor, warped: Tensor, valid: Tensor, latents: Tensor, logits: Tensor | None
+    ) -> tuple[Tensor, Tensor | None]:
+        """See Engine."""
+        mix = self._networks.plane_mix
+        assert mix is not None, "only models with a plane mix have warps to mix in"
+        return mix(decoded, warped, valid, latents.to(decoded), logits)

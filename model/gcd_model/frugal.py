@@ -1,0 +1,34 @@
+"""How a CPU is served best: working sets that fit its caches and the memory it has at hand.
+
+A buffer above 32 MB is fetched from the system afresh each time, page by page; writing it then costs more than what
+is computed for it. Smaller ones are used again. None of this changes what is computed.
+"""
+
+import torch
+from torch import Tensor
+
+REUSED_FLOATS = 7 * 2**20
+"""The largest buffer that is used again instead of being fetched anew, in float32 values."""
+
+
+def frugal(x: Tensor) -> bool:
+    """Whether to work in pieces: on a CPU, without gradient, and while nobody records a graph of the network."""
+    return x.device.type == "cpu" and not torch.is_grad_enabled() and not torch.compiler.is_compiling()
+
+
+def rows_at_once(x: Tensor, floats_per_row: int) -> int:
+    """How many rows of x to compute at once, if each needs a buffer of `floats_per_row`: all of them or a few."""
+    return max(1, REUSED_FLOATS // floats_per_row) if frugal(x) else len(x)
+
+
+def laid_out(x: Tensor) -> Tensor:
+    """x: [N, C, H, W], in the order of memory in which a CPU convolves it fastest; elsewhere as it is.
+
+    Channels last is faster, and makes tokens of pixels without a copy, but re-orders the 9 C^2 weights in each
+    call: it pays where there are many more pixels than channels.
+    """
+    if not frugal(x):
+        return x
+    pixels = x.numel() // x.shape[1]
+    last = pixels >= 4 * x.shape[1]
+    return x.contiguous(memory_format=torch.channels_last if last else torch.contiguous_format)

@@ -1,0 +1,188 @@
+"""A whole denoising step on memory that stays where it is, so that it can be recorded once and replayed.
+
+What differs between steps (noise level, solver, embeddings) is copied into that memory from tables that lie on the
+device before the first step; the host waits for nothing and allocates nothing in between.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gcd_model.conditioning import Conditioning
+from gcd_model.cuda_graphs import Recorder, Replay
+from gcd_model.denoiser import Backbone
+from gcd_model.noise import preconditioning
+from gcd_model.sampler import guided
+from gcd_model.schedule import Schedule
+from gcd_model.unet import StageInputs, StagePlan, UNetPlan
+
+Update = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+"""`solved`, as it is or compiled."""
+
+
+@dataclass(frozen=True, slots=True)
+class StepKind:
+    """Steps of one kind do the same work. guided: with the unconditional branch. classes: with class logits."""
+
+    guided: bool
+    classes: bool
+
+
+def step_kinds(schedule: Schedule, *, has_classes: bool) -> tuple[StepKind, ...]:
+    """The kind of each step. has_classes: the model has a class head, which looks at the last step."""
+    last = len(schedule.steps) - 1
+    return tuple(StepKind(wide, has_classes and i == last) for i, wide in enumerate(schedule.guided))
+
+
+def step_numbers(schedule: Schedule) -> Tensor:
+    """What a step multiplies with, float64 [S, 6]: c_in, c_out, c_skip, keep, rest, before.
+
+    keep, rest and before are the solver's: x <- D + keep * (x - D) + rest * D + before * (D of the step before).
+    """
+    levels = preconditioning(schedule.sigmas[:-1], schedule.prediction)
+    solver = [[step.keep, step.new + step.keep - 1.0, step.before] for step in schedule.steps]
+    made = torch.stack([levels.c_in, levels.c_out, levels.c_skip], dim=1)
+    return torch.cat([made, torch.tensor(solver, dtype=torch.float64)], dim=1)
+
+
+def solved(x: Tensor, before: Tensor, raw: Tensor, numbers: Tensor, guidance: Tensor) -> tuple[Tensor, Tensor]:
+    """What follows the network in a step: preconditioning, guidance, solver.
+
+    Args:
+        x, before: [K, T, C, h, w], float32. raw: [R, K, T, C, h, w], what the network said, R = 2 with guidance.
+        numbers: [6], one row of `step_numbers`. guidance: [T].
+    Returns:
+        The next x, and D of this step.
+    """
+    _, c_out, c_skip, keep, rest, early = numbers.unbind()
+    both = c_skip * x + c_out * raw
+    denoised = guided(both[0], both[1], guidance) if len(both) == 2 else both[0]
+    return torch.lerp(denoised, x, keep) + rest * denoised + early * before, denoised
+
+
+class PlanMemory:
+    """What the stages of the U-Net are given, in memory that stays where it is."""
+
+    def __init__(self, plan: UNetPlan) -> None:
+        """plan: any one of this batch's shape."""
+        self._table = _packed(plan)  # [S, all embeddings]
+        self._row = self._table[0].clone()
+        self._stages = plan.stages
+        self._crosses = [tuple(None if each is None else each.clone() for each in _crosses(s)) for s in plan.stages]
+
+    def load(self, plan: UNetPlan) -> None:
+        """From now on this plan, of the same shape but for its number of steps, counts."""
+        self._table = _packed(plan)
+        for kept, stage in zip(self._crosses, plan.stages, strict=True):
+            for memory, cross in zip(kept, _crosses(stage), strict=True):
+                if memory is not None and cross is not None:
+                    memory.copy_(cross)
+
+    def seek(self, step: int) -> None:
+        """The embeddings of this step."""
+        self._row.copy_(self._table[step])
+
+    def inputs(self, branches: int, given: int) -> tuple[StageInputs, ...]:
+        """Of as many branches as a step computes. given: those there are; the conditional one comes last."""
+        embeddings = iter(self._row.split([each.shape[1:].numel() for stage in self._stages for each in _both(stage)]))
+        return tuple(
+            StageInputs(
+                next(embeddings).view(stage.spatial_embedding.shape[1:]).repeat(branches, 1),
+                next(embeddings).view(stage.temporal_embedding.shape[1:]).repeat(branches, 1),
+                *(None if cross is None else _last(cross, branches, given) for cross in crosses),
+            )
+            for stage, crosses in zip(self._stages, self._crosses, strict=True)
+        )
+
+
+def _both(stage: StagePlan) -> tuple[Tensor, Tensor]:
+    return stage.spatial_embedding, stage.temporal_embedding
+
+
+def _crosses(stage: StagePlan) -> tuple[Tensor | None, Tensor | None]:
+    return stage.spatial_cross, stage.temporal_cross
+
+
+def _packed(plan: UNetPlan) -> Tensor:
+    """All embeddings of a step one after the other, [S, numbers]: one copy brings them all."""
+    return torch.cat([each.flatten(1) for stage in plan.stages for each in _both(stage)], dim=1)
+
+
+def _last(rows: Tensor, branches: int, given: int) -> Tensor:
+    """Of rows of `given` branches those of the last `branches`."""
+    return rows[len(rows) // given * (given - branches) :]
+
+
+class StepMemory:
+    """All that a step reads and writes, for batches of one shape, and the steps recorded on it."""
+
+    def __init__(
+        self, backbone: Backbone, update: Update, start: Tensor, given: Conditioning, schedule: Schedule
+    ) -> None:
+        self._backbone, self._update, self._branches = backbone, update, given.branches
+        self._x, self._before = torch.empty_like(start), torch.empty_like(start)
+        self._condition = torch.empty_like(given.latents)
+        self._guidance = start.new_empty(len(schedule.guidance))
+        self._table = start.new_empty(0)
+        self._numbers = start.new_empty(step_numbers(schedule).shape[1])
+        self._plan: PlanMemory | None = None
+        self._logits: Tensor | None = None
+        self._replays: dict[StepKind, Replay] = {}
+
+    def begin(self, start: Tensor, given: Conditioning, schedule: Schedule) -> None:
+        """Load a batch."""
+        labels = preconditioning(schedule.sigmas[:-1], schedule.prediction).c_noise.float()
+        plan = self._backbone.plan(labels, given)
+        if self._plan is None:
+            self._plan = PlanMemory(plan)
+        self._plan.load(plan)
+        self._table = step_numbers(schedule).to(self._x)
+        self._x.copy_(start)
+        self._before.copy_(start)
+        self._condition.copy_(given.latents)
+        self._guidance.copy_(schedule.guidance)
+
+    def record(self, kinds: set[StepKind], recorder: Recorder) -> bool:
+        """Record what is missing; then a batch that was loaded must be loaded again. Whether anything was."""
+        missing = [kind for kind in kinds if kind not in self._replays]
+        for kind in missing:
+            self.seek(0)
+            self._replays[kind] = recorder.record(lambda kind=kind: self._advance(kind))
+        return bool(missing)
+
+    def seek(self, step: int) -> None:
+        """Bring what this step needs."""
+        assert self._plan is not None, "begin() comes first"
+        self._numbers.copy_(self._table[step])
+        self._plan.seek(step)
+
+    def advance(self, kind: StepKind) -> None:
+        """Do the step."""
+        self._replays[kind]()
+
+    def result(self) -> tuple[Tensor, Tensor | None]:
+        """Latents and class logits, copies."""
+        return self._x.clone(), None if self._logits is None else self._logits.clone()
+
+    def _advance(self, kind: StepKind) -> None:
+        branches = 2 if kind.guided else 1
+        raw = self._network(kind, branches).unflatten(0, (branches, *self._x.shape[:2]))
+        after, denoised = self._update(self._x, self._before, raw, self._numbers, self._guidance)
+        self._x.copy_(after)
+        self._before.copy_(denoised)
+
+    def _network(self, kind: StepKind, branches: int) -> Tensor:
+        assert self._plan is not None, "begin() comes first"
+        rows = (self._x * self._numbers[0]).flatten(0, 1).repeat(branches, 1, 1, 1)
+        condition = _last(self._condition, branches, self._branches)
+        inputs = self._plan.inputs(branches, self._branches)
+        if not kind.classes:
+            return self._backbone.predict(rows, condition, inputs)
+        raw, logits = self._backbone.predict_classes(rows, condition, inputs, branches)
+        assert logits is not None, "only models with a class head have such steps"
+        if self._logits is None:
+            self._logits = torch.empty_like(logits)
+        self._logits.copy_(logits)
+        return raw

@@ -1,0 +1,300 @@
+"""The engine for GPUs on a CPU: the same numbers as plain torch, recorded or not, whatever is replayed."""
+
+import threading
+from collections.abc import Generator
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from small_models import TINY, TINY_DRIVING, random_clip, relative_error, tiny_driving, tiny_synthesizer
+from tape import HostAskedError, TapeRecorder
+
+from gcd_model.clip import Clip, RenderOptions, View
+from gcd_model.compiled_regions import cache_folder, keep_compiled, regions, twin
+from gcd_model.config import ModelConfig
+from gcd_model.cuda_engine import CudaEngine, CudaOptions
+from gcd_model.cuda_graphs import CudaGraphs, Recent, RecordedCall, Recorder, Replay, Unrecorded
+from gcd_model.errors import Cancelled, DeviceMemoryError, NonFiniteError, OptionError
+from gcd_model.fused_step import step_numbers
+from gcd_model.geometry import SphericalDelta, Trajectory
+from gcd_model.loading import load_synthesizer
+from gcd_model.schedule import Schedule
+from gcd_model.synthesizer import Synthesizer
+
+PLAIN = CudaOptions(backend=None, channels_last=False, decoder="float32")
+
+
+def with_engine(
+    synthesizer: Synthesizer, recorder: Recorder | None = None, options: CudaOptions = PLAIN
+) -> Synthesizer:
+    """The same checkpoint behind the engine."""
+    engine = CudaEngine(twin(synthesizer.networks), options, recorder)
+    return Synthesizer(synthesizer.networks, synthesizer.traits, engine)
+
+
+def views_of(synthesizer: Synthesizer, options: RenderOptions, clip: Clip, azimuths: tuple[float, ...]) -> list[View]:
+    return synthesizer.render(synthesizer.encode(clip), orbits(synthesizer, azimuths), options)
+
+
+def orbits(synthesizer: Synthesizer, azimuths: tuple[float, ...]) -> list[Trajectory]:
+    return [synthesizer.traits.plan_view(SphericalDelta(azimuth_deg=azimuth)) for azimuth in azimuths]
+
+
+@pytest.fixture(scope="module")
+def plain() -> Synthesizer:
+    return tiny_synthesizer()
+
+
+def test_euler_steps_of_several_views_and_samples_are_plain_torch_bit_for_bit(plain: Synthesizer) -> None:
+    options = RenderOptions(steps=2, samples=2, guidance=(1.0, 2.5))
+    ours, theirs = (views_of(s, options, random_clip(), (30.0, -20.0)) for s in (with_engine(plain), plain))
+    for mine, other in zip(ours, theirs, strict=True):
+        assert torch.equal(mine.latents, other.latents)
+        assert torch.equal(mine.samples, other.samples)
+
+
+def test_multistep_with_guidance_in_an_interval_and_convolutions_laid_out_anew_is_plain_torch(
+    plain: Synthesizer,
+) -> None:
+    options = RenderOptions(steps=3, solver="dpmpp_2m", guidance=(1.0, 3.0), guidance_interval=(0.5, 100.0))
+    engine = with_engine(plain, options=replace(PLAIN, channels_last=True))
+    assert set(Schedule.of(TINY, options).guided) == {True, False}
+    (mine,), (other,) = (views_of(s, options, random_clip(), (30.0,)) for s in (engine, plain))
+    assert relative_error(mine.latents, other.latents) < 1e-5
+    assert relative_error(mine.samples, other.samples) < 1e-5
+
+
+def test_class_maps_and_warps_of_a_driving_model_are_plain_torch() -> None:
+    plain = tiny_driving()
+    tape = TapeRecorder()
+    engine = with_engine(plain, tape)
+    for steps, seed in ((2, 0), (2, 1)):
+        options = RenderOptions(steps=steps, seed=seed)
+        clip = random_clip(TINY_DRIVING, seed=seed)
+        mine, other = (s.render(s.encode(clip), [s.traits.plan_view()], options)[0] for s in (engine, plain))
+        assert torch.equal(mine.latents, other.latents)
+        assert torch.equal(mine.samples, other.samples)
+        assert mine.classes is not None
+        assert other.classes is not None
+        assert torch.equal(mine.classes, other.classes)
+    assert tape.recorded == 5  # the encoder for two frames and for one, a step, the last one with classes, the decoder
+
+
+def test_what_was_recorded_serves_other_clips_paths_steps_solvers_and_guidance(plain: Synthesizer) -> None:
+    """Nothing of the first window may be left in the second: Python numbers do not survive a recording."""
+    tape = TapeRecorder()
+    engine = with_engine(plain, tape)
+    views_of(engine, RenderOptions(steps=2), random_clip(), (30.0,))
+    recorded = tape.recorded
+    assert recorded == 6  # the tower and the encoder for two frames and for one, a step, the decoder
+    others = (
+        RenderOptions(steps=1, seed=3, guidance=(1.0, 4.0), motion_bucket=17.0),
+        RenderOptions(steps=3, seed=4, solver="dpmpp_2m", guidance=(2.0, 1.0)),
+    )
+    for seed, options in enumerate(others, start=1):
+        clip = Clip(video=random_clip(seed=seed).video, fps=7.0)
+        pairs = zip(*(views_of(s, options, clip, (-70.0,)) for s in (engine, plain)), strict=True)
+        for mine, other in pairs:
+            assert relative_error(mine.latents, other.latents) < 1e-5
+            assert relative_error(mine.samples, other.samples) < 1e-5
+    assert tape.recorded == recorded
+
+
+def test_guided_and_plain_steps_and_each_batch_size_are_recorded_once(plain: Synthesizer) -> None:
+    tape = TapeRecorder()
+    engine = with_engine(plain, tape)
+    features = engine.encode(random_clip())
+    before = tape.recorded
+    interval = RenderOptions(steps=2, guidance=(1.0, 3.0), guidance_interval=(0.0, 100.0))
+    for _ in range(2):
+        engine.render(features, orbits(engine, (30.0,)), interval)
+    assert tape.recorded - before == 3  # two kinds of step, one decoder
+    engine.render(features, orbits(engine, (30.0, 10.0)), interval)
+    assert tape.recorded - before == 5
+
+
+def test_a_recording_that_looks_into_a_tensor_is_found_out() -> None:
+    """What the tests above rest on."""
+    for peek in (lambda x: x.sum().item(), lambda x: x + torch.tensor([1.0])):
+        with pytest.raises(HostAskedError):
+            RecordedCall(lambda x, peek=peek: x * peek(x), TapeRecorder())(torch.ones(3))
+
+
+def test_a_recorded_call_gives_its_caller_a_copy() -> None:
+    call = RecordedCall(lambda x: x * 2, TapeRecorder())
+    first = call(torch.ones(3))
+    assert call(torch.full((3,), 5.0)).tolist() == [10.0] * 3
+    assert first.tolist() == [2.0] * 3
+
+
+def test_a_window_is_abandoned_between_two_steps_and_the_next_one_is_whole(plain: Synthesizer) -> None:
+    engine, stop = with_engine(plain), threading.Event()
+    features, path = engine.encode(random_clip()), orbits(engine, (30.0,))
+    told: list[tuple[int, int]] = []
+
+    def note(done: int, steps: int) -> None:
+        told.append((done, steps))
+        if done == 1:
+            stop.set()
+
+    with pytest.raises(Cancelled, match="before step 2 of 2"):
+        engine.render(features, path, RenderOptions(steps=2, progress=note, cancel=stop))
+    assert told == [(1, 2)]
+    stop.clear()
+    options = RenderOptions(steps=2, cancel=stop)
+    mine, other = (s.render(features, path, options)[0] for s in (engine, plain))
+    assert torch.equal(mine.latents, other.latents)
+
+
+class Full(Unrecorded):
+    """A device that is full when the fifth piece of work, a step, is recorded."""
+
+    def __init__(self) -> None:
+        self.recorded, self.forgotten = 0, 0
+
+    def record(self, work: Replay) -> Replay:
+        self.recorded += 1
+        if self.recorded == 5:
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+        return super().record(work)
+
+    def forget(self) -> None:
+        self.forgotten += 1
+
+
+def test_a_full_device_drops_what_was_recorded_and_the_next_window_starts_anew(plain: Synthesizer) -> None:
+    full = Full()
+    engine = with_engine(plain, full)
+    features, path, options = engine.encode(random_clip()), orbits(engine, (30.0,)), RenderOptions(steps=1)
+    with pytest.raises(DeviceMemoryError, match="out of memory"):
+        engine.render(features, path, options)
+    assert full.forgotten == 1
+    mine, other = (s.render(features, path, options)[0] for s in (engine, plain))
+    assert torch.equal(mine.latents, other.latents)
+    assert full.recorded == 7  # the step that did not fit, then that step and the decoder
+
+
+def test_only_the_shapes_last_used_are_kept() -> None:
+    recent: Recent[str] = Recent(limit=2)
+    made: list[int] = []
+
+    def make(key: int) -> str:
+        made.append(key)
+        return str(key)
+
+    for key in (1, 2, 1, 3, 1, 2):
+        assert recent.get(key, lambda key=key: make(key)) == str(key)
+    assert made == [1, 2, 3, 2]
+    assert len(recent) == 2
+
+
+def test_a_twin_has_the_same_weights_in_memory_and_its_own_modules(plain: Synthesizer) -> None:
+    first, second = plain.networks, twin(plain.networks)
+    pairs = list(zip(first.parameters(), second.parameters(), strict=True))
+    assert all(mine.data_ptr() == other.data_ptr() for mine, other in pairs)
+    assert not {id(module) for module in first.modules()} & {id(module) for module in second.modules()}
+    assert not any(module._compiled_call_impl for module in first.modules())
+
+
+@pytest.mark.parametrize("config", [TINY, TINY_DRIVING])
+def test_every_convolution_of_the_unet_but_its_ends_lies_in_a_compiled_region(config: ModelConfig) -> None:
+    networks = (tiny_synthesizer if config is TINY else tiny_driving)(config).networks
+    inside = {id(part) for region in regions(networks.unet) for part in region.modules()}
+    outside = [
+        name
+        for name, part in networks.unet.named_modules()
+        if isinstance(part, torch.nn.Conv2d | torch.nn.Conv3d) and id(part) not in inside
+    ]
+    assert outside == ["stem", "conv_out"]
+
+
+@pytest.mark.parametrize("solver", ["euler", "dpmpp_2m"])
+def test_what_is_kept_what_is_new_and_what_is_from_before_add_up_to_one(solver: str) -> None:
+    schedule = Schedule.of(TINY, RenderOptions(steps=6, solver="euler" if solver == "euler" else "dpmpp_2m"))
+    _, _, _, _, rest, before = step_numbers(schedule).unbind(dim=1)
+    assert torch.allclose(rest, -before, atol=1e-12)
+    assert bool(before.any()) == (solver == "dpmpp_2m")
+
+
+def test_compiled_code_is_kept_in_the_folder_that_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GCD_CACHE_DIR", str(tmp_path))
+    for name in ("TORCHINDUCTOR_CACHE_DIR", "TRITON_CACHE_DIR"):
+        monkeypatch.setenv(name, "")
+        monkeypatch.delenv(name)
+    assert cache_folder() == tmp_path / "compiled" / torch.__version__
+    keep_compiled(cache_folder())
+    assert cache_folder().is_dir()
+
+
+def test_the_camera_tower_and_encoder_are_those_of_the_checkpoint(plain: Synthesizer) -> None:
+    engine = with_engine(plain)
+    mine, other = (s.encode(random_clip(frames=5, seed=2)) for s in (engine, plain))
+    assert torch.equal(mine.latents, other.latents)
+    assert mine.tokens is not None
+    assert other.tokens is not None
+    assert torch.equal(mine.tokens, other.tokens)
+
+
+def test_whole_levels_are_the_nearest_to_the_same_pictures(plain: Synthesizer) -> None:
+    features = plain.encode(random_clip())
+    (fine,), (coarse,) = (
+        plain.render(features, orbits(plain, (30.0,)), RenderOptions(steps=1, samples=2, whole_levels=levels))
+        for levels in (False, True)
+    )
+    assert coarse.samples.dtype == torch.uint8
+    assert (coarse.samples / 255 - fine.samples).abs().max() <= 0.5 / 255 + 1e-6
+    assert coarse.samples.float().std() > 1
+    assert coarse.std is not None
+    assert fine.std is not None
+    assert torch.allclose(coarse.std, fine.std, atol=0.5 / 255)
+
+
+def test_pictures_that_are_no_numbers_are_refused_as_whole_levels_too() -> None:
+    broken = tiny_synthesizer()
+    with torch.no_grad():
+        broken.networks.decoder.stem.weight.fill_(torch.nan)
+    with pytest.raises(NonFiniteError, match="decoded to NaN"):
+        views_of(broken, RenderOptions(steps=1, whole_levels=True), random_clip(), (30.0,))
+
+
+def test_an_engine_that_cannot_be_is_refused_before_anything_is_loaded(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="the engine cuda needs a CUDA device, got cpu"):
+        load_synthesizer(tmp_path / "absent.ckpt", device="cpu", engine="cuda")
+
+
+class StubStream:
+    def wait_stream(self, other: "StubStream") -> None:
+        pass
+
+
+@contextmanager
+def broken_capture(_graph: object, **_options: object) -> Generator[None]:
+    """As torch does it: to end a capture that broke off is an error of its own."""
+    try:
+        yield
+    except torch.OutOfMemoryError:
+        raise RuntimeError("operation failed due to a previous error during capture")  # noqa: B904  as torch does
+
+
+def test_want_of_memory_in_a_recording_is_told_as_such(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The real recorder, with the device's part stubbed out."""
+    for name in ("CUDAGraph", "graph_pool_handle"):
+        monkeypatch.setattr(torch.cuda, name, object)
+    for name in ("Stream", "current_stream"):
+        monkeypatch.setattr(torch.cuda, name, StubStream)
+    monkeypatch.setattr(torch.cuda, "stream", lambda _: nullcontext())
+    monkeypatch.setattr(torch.cuda, "graph", broken_capture)
+    runs: list[bool] = []
+
+    def work() -> None:
+        runs.append(torch.backends.cudnn.benchmark)
+        if len(runs) == 3:
+            raise torch.OutOfMemoryError("CUDA out of memory.")
+
+    before = torch.backends.cudnn.benchmark
+    with pytest.raises(torch.OutOfMemoryError):
+        CudaGraphs().record(work)
+    assert runs == [True] * 3  # twice to warm up, once to record
+    assert torch.backends.cudnn.benchmark == before

@@ -1,0 +1,74 @@
+"""When the decoder may compute in bfloat16."""
+
+import math
+
+import pytest
+import torch
+from small_models import TINY, tiny_synthesizer
+from torch import nn
+
+from gcd_model.compiled_regions import twin
+from gcd_model.cuda_engine import CudaEngine, CudaOptions
+from gcd_model.decoder_check import checked_decoder, drifting_clip, psnr_db
+from gcd_model.networks import Networks
+
+
+@pytest.fixture
+def networks() -> Networks:
+    """Random networks of float32."""
+    return tiny_synthesizer().networks
+
+
+def make_faint(networks: Networks) -> None:
+    """Pictures that are nearly grey, so that bfloat16 cannot be far off."""
+    with torch.no_grad():
+        for layer in (networks.decoder.conv_out, networks.decoder.mix_frames):
+            assert isinstance(layer, nn.Conv2d | nn.Conv3d)
+            layer.weight.mul_(0.03)
+            assert layer.bias is not None
+            layer.bias.zero_()
+
+
+def test_a_decoder_whose_pictures_stay_alike_computes_in_bfloat16(networks: Networks) -> None:
+    make_faint(networks)
+    choice = checked_decoder(networks)
+    assert choice.psnr_db > 50
+    assert choice.decoder.stem.weight.dtype == torch.bfloat16
+    assert networks.decoder.stem.weight.dtype == torch.float32
+
+
+def test_a_decoder_whose_pictures_change_stays_in_float32(networks: Networks) -> None:
+    choice = checked_decoder(networks)
+    assert choice.psnr_db < 50
+    assert choice.decoder is networks.decoder
+
+
+def test_a_decoder_that_overflows_stays_in_float32(networks: Networks) -> None:
+    with torch.no_grad():
+        networks.decoder.stem.weight.fill_(math.inf)
+    assert checked_decoder(networks).psnr_db == 0
+
+
+@pytest.mark.parametrize(("faint", "dtype"), [(True, torch.bfloat16), (False, torch.float32)])
+def test_the_engine_takes_the_decoder_that_was_chosen(networks: Networks, faint: bool, dtype: torch.dtype) -> None:
+    if faint:
+        make_faint(networks)
+    taken = twin(networks)
+    engine = CudaEngine(taken, CudaOptions(backend=None, channels_last=False))
+    assert taken.decoder.stem.weight.dtype == dtype
+    assert networks.decoder.stem.weight.dtype == torch.float32
+    assert engine.decode(torch.zeros(TINY.frames, 4, 2, 2)).dtype == torch.float32
+
+
+def test_the_test_clip_moves_and_stays_in_range() -> None:
+    clip = drifting_clip(3, 32, 64)
+    assert clip.shape == (3, 3, 32, 64)
+    assert clip.abs().max() <= 1
+    assert torch.equal(clip[1], clip[0].roll(1, dims=-1))
+    assert clip.std() > 0.1
+
+
+def test_psnr_is_that_of_pictures_in_zero_to_one() -> None:
+    assert psnr_db(torch.full((4,), 0.6), torch.full((4,), 0.5)) == pytest.approx(20.0, abs=1e-4)
+    assert psnr_db(torch.ones(3), torch.ones(3)) == math.inf
+    assert psnr_db(torch.full((3,), math.nan), torch.ones(3)) == 0

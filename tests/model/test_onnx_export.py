@@ -1,0 +1,124 @@
+"""Whole exports, run by onnxruntime, against torch: minutes, as exporting is slow. Run with `pytest -m slow`."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from msgspec import structs
+from small_models import TINY_DRIVING, random_clip, relative_error, tiny_driving, tiny_synthesizer
+
+from gcd_model.checkpoints import LoadedWeights
+from gcd_model.clip import RenderOptions, View
+from gcd_model.errors import OptionError
+from gcd_model.geometry import SphericalDelta
+from gcd_model.loading import load_synthesizer
+from gcd_model.onnx_export import export_onnx
+from gcd_model.onnx_manifest import Manifest
+from gcd_model.synthesizer import Synthesizer
+
+pytest.importorskip("onnxruntime")
+pytest.importorskip("onnxscript")
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
+
+WORKER = Path(__file__).parent / "full_size_export.py"
+
+
+def exported(
+    synthesizer: Synthesizer, folder: Path, precision: str = "float32", apart_above: int = 1 << 30
+) -> Manifest:
+    traits = synthesizer.traits
+    loaded = LoadedWeights(
+        name=traits.name,
+        networks=synthesizer.networks,
+        family=traits.family,
+        move_time=traits.move_time,
+        trained=False,
+        sha256_12=traits.sha256_12,
+    )
+    return export_onnx(loaded, folder, precision=precision, apart_above=apart_above)
+
+
+def view(synthesizer: Synthesizer) -> View:
+    """Two guided steps and two samples of a random clip."""
+    config, steered = synthesizer.traits.config, synthesizer.traits.config.camera != "none"
+    path = synthesizer.traits.plan_view(SphericalDelta(azimuth_deg=10.0) if steered else None)
+    options = RenderOptions(seed=1, steps=2, guidance=(1.0, 2.0), samples=2)
+    return synthesizer.render(synthesizer.encode(random_clip(config)), [path], options)[0]
+
+
+@pytest.mark.parametrize("made", [tiny_synthesizer, tiny_driving], ids=["published", "ours"])
+def test_an_export_gives_what_torch_gives(made: object, tmp_path: Path) -> None:
+    torched = made()  # type: ignore[operator]
+    manifest = exported(torched, tmp_path / "export", apart_above=1 << 16)
+    assert any(len(graph.files) == 2 for graph in manifest.graphs.values()), "no weights lie apart: nothing was tried"
+    onnxed = load_synthesizer(tmp_path / "export", engine="onnxruntime")
+    expected, found = view(torched), view(onnxed)
+    assert expected.video.std() > 0.01, "a constant picture would show nothing"
+    assert relative_error(found.latents, expected.latents) < 1e-4
+    assert relative_error(found.video, expected.video) < 1e-4
+    assert onnxed.traits.sha256_12 == manifest.sha256_12
+    assert onnxed.traits.family == torched.traits.family
+    assert "/work" not in "".join(path.read_bytes().decode("latin1") for path in (tmp_path / "export").glob("*.onnx"))
+
+
+@pytest.mark.parametrize(("precision", "error"), [("float16", 0.02), ("int8", 0.1)])
+def test_narrow_numbers_miss_by_little_and_take_less_room(precision: str, error: float, tmp_path: Path) -> None:
+    torched = tiny_driving()
+    whole, narrow = exported(torched, tmp_path / "whole"), exported(torched, tmp_path / "narrow", precision)
+    sizes = [sum(file.size for file in each.graphs["step"].files) for each in (whole, narrow)]
+    assert sizes[1] < 0.75 * sizes[0]
+    found, expected = view(load_synthesizer(tmp_path / "narrow")), view(torched)
+    assert 0 < relative_error(found.video, expected.video) < error
+    assert {name: graph.precision for name, graph in narrow.graphs.items() if graph.precision != precision} == {
+        "decoder": "float32",
+        "plane_mix": "float32",
+    }
+
+
+def test_another_size_is_another_export(tmp_path: Path) -> None:
+    torched = tiny_driving()
+    config = structs.replace(torched.traits.config, height=64)
+    export_onnx(
+        LoadedWeights(
+            name="tiny",
+            networks=torched.networks,
+            family=torched.traits.family,
+            move_time=2,
+            trained=False,
+            sha256_12="0" * 12,
+        ),
+        tmp_path / "export",
+        height=64,
+    )
+    larger = load_synthesizer(tmp_path / "export")
+    assert larger.traits.config == config
+    assert larger.encode(random_clip(config)).latents.shape[-2:] == (16, 12)
+    with pytest.raises(OptionError, match="takes frames of 64x48 alone"):
+        larger.encode(random_clip(TINY_DRIVING))
+
+
+def test_the_shipped_model_is_the_same_under_onnxruntime(tmp_path: Path) -> None:
+    torched = load_synthesizer("package:driving-small", device="cpu")
+    exported(torched, tmp_path / "export")
+    onnxed = load_synthesizer(tmp_path / "export")
+    expected, found = view(torched), view(onnxed)
+    assert relative_error(found.video, expected.video) < 1e-4
+    assert expected.classes is not None
+    assert found.classes is not None
+    assert (found.classes != expected.classes).float().mean() < 1e-4
+
+
+def test_the_full_size_step_is_exported_within_twelve_gigabytes(tmp_path: Path) -> None:
+    """Structure and memory alone: nothing is run."""
+    done = subprocess.run([sys.executable, WORKER, tmp_path], capture_output=True, text=True, check=True)
+    found = json.loads(done.stdout.splitlines()[-1])
+    print(found)
+    assert found["peak_gb"] <= 12.0
+    assert found["inputs"]["latents"] == [14, 4, 32, 48]
+    assert found["inputs"]["temporal_cross"][0] == 1
+    assert found["files"] == ["step.onnx", "step.onnx.data"]
+    assert found["graph_mb"] < 50, "weights stand in the graph"
+    assert 4.5 < found["data_gb"] < 6.2, "cross-attention, position and embedding weights are no part of a step"
+    assert found["apart"] > 0.99 * found["weights"]

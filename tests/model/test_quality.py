@@ -1,0 +1,118 @@
+"""What the qualities make of a checkpoint's own sampling, and what they cost where the denoiser is known exactly."""
+
+import math
+import threading
+from dataclasses import replace
+from functools import lru_cache
+
+import pytest
+from mixture import apart, followed
+from msgspec import structs
+from small_models import TINY, random_clip, tiny_synthesizer
+from torch import Tensor
+
+from gcd_model import SVD_14, RenderOptions, Sampler, Schedule, SphericalDelta, sampler_of, synthesize
+from gcd_model.clip import QUALITIES, Quality, SolverName
+from gcd_model.config import DRIVING_SMALL, OBJECTS_SMALL, PLAIN_SMALL, SamplingConfig
+from gcd_model.errors import Cancelled, OptionError
+from gcd_model.quality import FAST, FASTEST
+
+PUBLISHED = SamplingConfig()
+FEW_STEPS = (DRIVING_SMALL, OBJECTS_SMALL, PLAIN_SMALL)
+
+
+@lru_cache
+def flow(solver: SolverName, steps: int) -> Tensor:
+    """Of the mixture's noise."""
+    return followed(solver, steps)
+
+
+def error(solver: SolverName, steps: int) -> float:
+    """How far the samples end from where many steps bring them, mean."""
+    return apart(flow(solver, steps), flow("dpmpp_2m", 1200)).mean().item()
+
+
+def in_quality(quality: Quality, sampling: SamplingConfig = PUBLISHED) -> Sampler:
+    return sampler_of(sampling, RenderOptions(quality=quality))
+
+
+def test_exact_is_what_was_published() -> None:
+    assert in_quality("exact") == Sampler(steps=25, solver="euler", guidance=(1.0, 1.5), guidance_interval=None)
+    assert sampler_of(PUBLISHED, RenderOptions()) == in_quality("exact")
+
+
+@pytest.mark.parametrize("quality", QUALITIES)
+@pytest.mark.parametrize("config", FEW_STEPS)
+def test_a_checkpoint_of_few_steps_is_sampled_its_own_way_in_every_quality(config: object, quality: Quality) -> None:
+    sampling = next(each.sampling for each in FEW_STEPS if each is config)
+    own = Sampler(steps=sampling.steps, solver="euler", guidance=sampling.guidance)
+    assert in_quality(quality, sampling) == own
+
+
+@pytest.mark.parametrize("steps", range(1, 60))
+def test_no_quality_takes_more_of_the_network_than_a_better_one(steps: int) -> None:
+    config = structs.replace(SVD_14, sampling=SamplingConfig(steps=steps))
+    cost = [Schedule.of(config, RenderOptions(quality=quality)).evaluations for quality in QUALITIES]
+    assert cost == sorted(cost, reverse=True)
+    assert cost[0] == 2 * steps
+
+
+@pytest.mark.parametrize("quality", QUALITIES)
+def test_what_is_named_wins_over_the_quality(quality: Quality) -> None:
+    named = RenderOptions(quality=quality, steps=7, solver="euler", guidance=(2.0, 3.0), guidance_interval=(0.5, 5.0))
+    assert sampler_of(PUBLISHED, named) == Sampler(
+        steps=7, solver="euler", guidance=(2.0, 3.0), guidance_interval=(0.5, 5.0)
+    )
+
+
+def test_what_is_not_named_is_as_the_quality_has_it() -> None:
+    assert sampler_of(PUBLISHED, RenderOptions(quality="fast", steps=7)) == replace(in_quality("fast"), steps=7)
+    assert sampler_of(PUBLISHED, RenderOptions(solver="dpmpp_2m")) == replace(in_quality("exact"), solver="dpmpp_2m")
+
+
+def test_guidance_is_the_checkpoints_own_in_every_quality() -> None:
+    strong = SamplingConfig(guidance=(1.0, 2.5))
+    assert {in_quality(quality, strong).guidance for quality in QUALITIES} == {(1.0, 2.5)}
+    assert {in_quality(quality, strong).guidance_interval for quality in QUALITIES} == {None}
+
+
+def test_an_unknown_quality_is_refused() -> None:
+    with pytest.raises(OptionError, match="one of exact, fast, fastest, got 'best'"):
+        RenderOptions(quality="best")  # pyright: ignore[reportArgumentType]
+
+
+def test_a_window_is_rendered_in_the_steps_of_its_quality() -> None:
+    synthesizer = tiny_synthesizer(structs.replace(TINY, sampling=SamplingConfig(steps=25)))
+    path = synthesizer.traits.plan_view(SphericalDelta(azimuth_deg=30.0))
+    stop, steps = threading.Event(), list[int]()
+
+    def once(_done: int, total: int) -> None:
+        steps.append(total)
+        stop.set()
+
+    for quality in QUALITIES:
+        stop.clear()
+        with pytest.raises(Cancelled):
+            synthesize(synthesizer, random_clip(), path, RenderOptions(quality=quality, progress=once, cancel=stop))
+    assert steps == [25, FAST.steps, FASTEST.steps]
+
+
+@pytest.mark.parametrize(("solver", "order"), [("euler", 1), ("dpmpp_2m", 2)])
+def test_a_solver_approaches_the_true_flow_of_a_mixture_with_its_order(solver: SolverName, order: int) -> None:
+    """Median, as some samples near the border of two centres change sides."""
+    exact = flow("dpmpp_2m", 1200)
+    coarse, fine = (apart(flow(solver, steps), exact).median().item() for steps in (200, 400))
+    assert math.log2(coarse / fine) == pytest.approx(order, abs=0.25)
+
+
+def test_fast_is_no_farther_from_the_limit_than_25_euler_steps_are() -> None:
+    assert error(FAST.solver, FAST.steps) <= error("euler", 25)
+
+
+def test_fastest_is_at_most_three_times_as_far() -> None:
+    assert error("euler", 25) < error(FASTEST.solver, FASTEST.steps) <= 3 * error("euler", 25)
+
+
+def test_two_steps_less_would_break_either_promise() -> None:
+    assert error(FAST.solver, FAST.steps - 2) > error("euler", 25)
+    assert error(FASTEST.solver, FASTEST.steps - 2) > 3 * error("euler", 25)

@@ -1,0 +1,112 @@
+"""What a window is sampled with: solver, guidance and the noise levels it applies at."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from small_models import TINY, random_clip, tiny_synthesizer
+from torch import Tensor
+from torch.testing import assert_close
+
+from gcd_model.clip import RenderOptions
+from gcd_model.engine import TorchEngine
+from gcd_model.errors import OptionError
+from gcd_model.geometry import SphericalDelta
+from gcd_model.schedule import Schedule
+from gcd_model.synthesizer import Synthesizer, synthesize
+from gcd_model.unet import StageInputs
+
+STEPS = 4
+
+
+@pytest.fixture(scope="module")
+def synthesizer() -> Synthesizer:
+    return tiny_synthesizer()
+
+
+def latents(synthesizer: Synthesizer, options: RenderOptions) -> Tensor:
+    path = synthesizer.traits.plan_view(SphericalDelta(azimuth_deg=30.0))
+    return synthesize(synthesizer, random_clip(), path, replace(options, steps=STEPS)).latents
+
+
+def test_as_it_is_a_schedule_is_the_checkpoints_own() -> None:
+    schedule = Schedule.of(TINY)
+    assert (len(schedule.steps), schedule.branches, schedule.evaluations) == (3, 2, 6)
+    assert schedule.guided == (True, True, True)
+
+
+def test_guidance_applies_within_its_interval_alone() -> None:
+    levels = Schedule.of(TINY, RenderOptions(steps=STEPS)).sigmas.tolist()
+    schedule = Schedule.of(TINY, RenderOptions(steps=STEPS, guidance_interval=(levels[2], levels[1])))
+    assert schedule.guided == (False, True, True, False)
+    assert (schedule.branches, schedule.evaluations) == (2, STEPS + 2)
+
+
+@pytest.mark.parametrize("guidance", [None, (1.0, 3.0)])
+def test_an_interval_over_all_noise_levels_changes_no_bit(
+    synthesizer: Synthesizer, guidance: tuple[float, float] | None
+) -> None:
+    everywhere = RenderOptions(guidance=guidance)
+    bounded = replace(everywhere, guidance_interval=(0.0, 1e9))
+    assert torch.equal(latents(synthesizer, everywhere), latents(synthesizer, bounded))
+
+
+def test_an_interval_without_any_noise_level_is_no_guidance(synthesizer: Synthesizer) -> None:
+    nowhere = RenderOptions(guidance=(1.0, 3.0), guidance_interval=(1e5, 1e9))
+    assert torch.equal(latents(synthesizer, nowhere), latents(synthesizer, RenderOptions(guidance=(1.0, 1.0))))
+
+
+def test_outside_the_interval_the_network_sees_the_conditional_rows_alone(
+    synthesizer: Synthesizer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unet, seen = synthesizer.networks.unet, list[int]()
+    forward = unet.forward
+
+    def counted(rows: Tensor, condition: Tensor, inputs: tuple[StageInputs, ...]) -> Tensor:
+        seen.append(len(rows))
+        return forward(rows, condition, inputs)
+
+    monkeypatch.setattr(unet, "forward", counted)
+    levels = Schedule.of(TINY, RenderOptions(steps=STEPS)).sigmas.tolist()
+    latents(synthesizer, RenderOptions(guidance_interval=(levels[1], levels[0])))
+    assert seen == [2 * TINY.frames, 2 * TINY.frames, TINY.frames, TINY.frames]
+
+
+def test_unguided_steps_of_a_guided_run_equal_those_of_an_unguided_one(synthesizer: Synthesizer) -> None:
+    """With a scale of 1 the guided steps give the conditional prediction, so that both runs are the same function."""
+    levels = Schedule.of(TINY, RenderOptions(steps=STEPS)).sigmas.tolist()
+    ones = RenderOptions(guidance=(1.0, 1.0 + 1e-12), guidance_interval=(levels[2], levels[2]))
+    assert_close(latents(synthesizer, ones), latents(synthesizer, RenderOptions(guidance=(1.0, 1.0))))
+
+
+def test_the_multistep_solver_is_nearer_to_many_steps_than_euler_is(synthesizer: Synthesizer) -> None:
+    path = synthesizer.traits.plan_view(SphericalDelta(azimuth_deg=30.0))
+
+    def drawn(steps: int, options: RenderOptions) -> Tensor:
+        return synthesize(synthesizer, random_clip(), path, replace(options, steps=steps)).latents
+
+    truth = drawn(200, RenderOptions(solver="dpmpp_2m"))
+    plain, second = (drawn(25, RenderOptions(solver=name)) for name in ("euler", "dpmpp_2m"))
+    assert (second - truth).norm() < 0.5 * (plain - truth).norm()
+
+
+@pytest.mark.parametrize("interval", [(2.0, 1.0), (-1.0, 1.0), (float("nan"), 1.0)])
+def test_an_interval_that_is_none_is_refused(interval: tuple[float, float]) -> None:
+    with pytest.raises(OptionError, match="guidance_interval goes from a noise level up to another"):
+        RenderOptions(guidance_interval=interval)
+
+
+def test_another_engine_computes_the_networks_of_a_synthesizer() -> None:
+    plain = tiny_synthesizer()
+
+    class Louder(TorchEngine):
+        """A stand-in whose pictures are all white."""
+
+        def decode(self, latents: Tensor) -> Tensor:
+            return torch.ones_like(super().decode(latents))
+
+    louder = Synthesizer(plain.networks, plain.traits, Louder(plain.networks))
+    path = plain.traits.plan_view(SphericalDelta(azimuth_deg=30.0))
+    ours, theirs = (synthesize(each, random_clip(), path) for each in (plain, louder))
+    assert theirs.video.min() == 1.0
+    assert torch.equal(ours.latents, theirs.latents)

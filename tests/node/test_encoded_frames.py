@@ -1,0 +1,387 @@
+"""Frames are encoded while their window fills, and once for all windows that hold them: exactly, and not in vain."""
+
+import functools
+import queue
+import random
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from dataclasses import replace as changed
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from cameras import Bench, Camera, until
+from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, made_node, traits
+from media import frames_at
+from rig import Rig
+
+from gcd_model import (
+    Augmentation,
+    CameraMount,
+    Clip,
+    DeviceMemoryError,
+    NonFiniteError,
+    RenderOptions,
+    SourceFeatures,
+    load_synthesizer,
+)
+from gcd_node.config import NodeConfig, parse_config
+from gcd_node.frame import Frame
+from gcd_node.rendering.encoded_frames import EncodedFrames, EncodeTerms
+from gcd_node.rendering.seeds import frame_seed, window_seed
+from gcd_node.window import FrameWindow, WindowBuilder
+
+T = 14
+TERMS = EncodeTerms(digest="0123456789ab", strength=0.02, mount=None)
+
+
+class Encoder(FakeSynthesizer):
+    """Adds the noise it is told to add, and remembers which frames it was given; `before` is called with each."""
+
+    def __init__(
+        self, act: Callable[[RenderOptions], None] | None = None, before: Callable[[int], None] | None = None
+    ) -> None:
+        super().__init__(traits(), act)
+        self.encoded: list[int] = []
+        self.seeds: list[int] = []
+        self._before = before
+
+    def encode(
+        self, clip: Clip, augmentation: Augmentation | None = None, extra: torch.Tensor | None = None
+    ) -> SourceFeatures:
+        features = super().encode(clip, augmentation, extra)
+        if augmentation is None:  # the warm-up
+            return features
+        assert clip.frames == 1
+        seq = round((clip.video[0, 0, 0, 0].item() + 1) / 2 * 255) - 20
+        if self._before is not None:
+            self._before(seq)
+        self.encoded.append(seq)
+        self.seeds.append(augmentation.seed)
+        noise = torch.randn(clip.video.shape, generator=torch.Generator().manual_seed(augmentation.seed))
+        return changed(features, latents=clip.video + (augmentation.strength or 0.0) * noise)
+
+
+class Fed(FakeSource):
+    """Gives frames when a test says so. wanted: which frame is asked for; everything was done with those before."""
+
+    def __init__(self) -> None:
+        super().__init__(10_000)
+        self.wanted = -1
+        self._allowed: queue.SimpleQueue[bool] = queue.SimpleQueue()
+
+    def feed(self, count: int) -> None:
+        for _ in range(count):
+            self._allowed.put(True)
+
+    def end(self) -> None:
+        self._allowed.put(False)
+
+    def frames(self) -> Iterator[Frame]:
+        for frame in super().frames():
+            self.wanted = frame.seq
+            if not self._allowed.get():
+                return
+            yield frame
+
+
+def config(more: str = "", *, stride: int = T, pace: str = "lockstep") -> NodeConfig:
+    text = f"""
+        {more}
+        [source]
+        kind = "synthetic"
+        pace = "{pace}"
+        [window]
+        stride = {stride}
+        [model]
+        weights = "fake"
+        cond_aug = 0.1
+        [view.main]
+    """
+    return parse_config(text.encode(), "test")
+
+
+@dataclass
+class Life:
+    """A node whose source and model a test controls, in a thread of its own."""
+
+    settings: NodeConfig
+    model: Encoder
+    source: Fed = field(default_factory=Fed)
+    box: Box = field(default_factory=Box)
+
+    def __enter__(self) -> "Life":
+        self._thread = threading.Thread(target=made_node(self.settings, self.model, self.source, self.box).run)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.source.end()
+        self._thread.join(60)
+        assert not self._thread.is_alive(), "the node did not end"
+
+    @property
+    def windows(self) -> dict[int, bytes]:
+        return pixels(self.box)
+
+
+def pixels(box: Box) -> dict[int, bytes]:
+    """What was published, by window."""
+    return {message.header.window_id: bytes(message.payload) for message in box.of("win")}
+
+
+def placed(frames: Sequence[Frame], stride: int = T, *, builder: WindowBuilder | None = None) -> list[FrameWindow]:
+    builder = builder or WindowBuilder(frames=T, fps=10.0, stride=stride)
+    return [window for frame in frames for window in builder.push(frame, frame.stamp_ns)]
+
+
+def ten_fps(count: int, *, first: int = 0) -> list[Frame]:
+    """Pictures of the fakes' size that hold their number."""
+    made = frames_at((i * 100.0 for i in range(count)), WIDTH, HEIGHT)
+    return [changed(frame, image=frame.image + np.uint8(20)) for frame in made][first:]
+
+
+def kept() -> EncodedFrames:
+    return EncodedFrames(lambda: None)
+
+
+def same(one: SourceFeatures, other: SourceFeatures) -> bool:
+    tensors = [(one.latents, other.latents), (one.tokens, other.tokens), (one.video, other.video)]
+    return all((a is None and b is None) or (a is not None and b is not None and torch.equal(a, b)) for a, b in tensors)
+
+
+# Laws.
+
+
+def test_windows_that_overlap_agree_to_the_last_bit_on_the_frames_they_share() -> None:
+    model, encoded = load_synthesizer("package:driving-small", device="cpu"), kept()
+    picture = np.random.default_rng(0).integers(0, 256, (128, 192, 3), np.uint8)
+    frames = [changed(frame, image=np.roll(picture, frame.seq, axis=1)) for frame in frames_at([0, 100, 200, 300, 400])]
+    one, two = placed(frames, builder=WindowBuilder(frames=4, fps=10.0, stride=1))
+    first, second = (encoded.features(model, window, TERMS) for window in (one, two))
+    assert same(first.rows(1, 4), second.rows(0, 3))
+    assert same(second, kept().features(model, two, TERMS))
+
+
+@functools.cache
+def undisturbed(stride: int) -> dict[int, bytes]:
+    """The windows of 40 frames that were all there at once."""
+    box = Box()
+    made_node(config(stride=stride), Encoder(), FakeSource(40), box).run()
+    return pixels(box)
+
+
+@pytest.mark.parametrize(("stride", "pace"), [(5, "lockstep"), (T, "realtime"), (17, "lockstep")])
+def test_views_are_the_same_to_the_last_bit_whatever_the_timing(stride: int, pace: str) -> None:
+    wanted = undisturbed(stride)
+    assert len(set(wanted.values())) == len(wanted) >= 2
+    chance = random.Random(stride)
+
+    def dawdle(_: object) -> None:
+        time.sleep(chance.choice([0.0, 0.0, 0.001, 0.02]))
+
+    model, source, box = Encoder(dawdle, dawdle), FakeSource(40), Box()
+    source.period_s = 0.004
+    made_node(config(stride=stride, pace=pace), model, source, box).run()
+    found = pixels(box)
+    assert found == (wanted if pace == "lockstep" else {number: wanted[number] for number in found})
+    assert max(found) == max(wanted)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_it_makes_no_difference_in_what_order_frames_are_encoded(seed: int) -> None:
+    chance, model, encoded = random.Random(seed), Encoder(), kept()
+    builder, windows = WindowBuilder(frames=T, fps=10.0, stride=chance.randint(1, T)), 0
+    for frame in ten_fps(50):
+        for window in builder.push(frame, frame.stamp_ns):
+            windows += 1
+            wanted = kept().features(Encoder(), window, TERMS)
+            assert same(encoded.features(model, window, TERMS), wanted)
+        while chance.random() < 0.6 and encoded.ahead(model, builder.filling, TERMS):
+            assert len(encoded) <= T
+    assert windows >= 3
+    assert sorted(set(model.encoded)) == sorted(model.encoded)  # each once
+
+
+def test_the_noise_of_a_frame_follows_from_what_its_message_says() -> None:
+    model, box = Encoder(), Box()
+    made_node(config(stride=7), model, FakeSource(28), box).run()
+    header = box.of("win")[-1].header
+    assert model.encoded == list(range(28))
+    assert model.seeds[T:] == [frame_seed(header.cfg_digest, seq) for seq in header.src.seq]
+    assert len({*model.seeds, window_seed(header.cfg_digest, 0, 0)}) == 29
+    noise = np.frombuffer(box.of("win")[-1].payload, np.uint8).reshape(T, -1).astype(float)
+    assert noise.std(axis=1).min() > 5  # grey levels
+
+
+# When frames are encoded.
+
+
+def test_when_a_window_is_complete_only_its_last_frame_is_left_to_encode() -> None:
+    model, begun = Encoder(), threading.Event()
+    with Life(config(), model) as life:
+        life.source.feed(T - 1)
+        until(lambda: len(model.encoded) == T - 1)
+        assert model.asked == []
+        model._before = lambda _: begun.set()
+        life.source.feed(1)
+        until(lambda: len(life.windows) == 1)
+        assert begun.is_set()
+    assert model.encoded == list(range(T))
+
+
+@pytest.mark.parametrize("stride", [1, 6])
+def test_a_frame_of_several_windows_is_encoded_once(stride: int) -> None:
+    model = Encoder()
+    with Life(config(stride=stride), model) as life:
+        life.source.feed(26)
+    assert len(life.windows) == 1 + (26 - T) // stride
+    last = max(message.header.src.seq[-1] for message in life.box.of("win"))
+    assert model.encoded[: last + 1] == list(range(last + 1))
+    assert model.encoded[last + 1 :] == list(range(last + 1, len(model.encoded)))
+
+
+def test_frames_of_windows_that_were_overtaken_are_not_encoded() -> None:
+    begun, go_on = threading.Event(), threading.Event()
+
+    def wait(options: RenderOptions) -> None:
+        if options.seed != 0:  # not in the warm-up
+            begun.set()
+            assert go_on.wait(60)
+
+    model = Encoder(wait)
+    with Life(config(pace="realtime"), model) as life:
+        life.source.feed(T)
+        assert begun.wait(60)
+        life.source.feed(5 * T)
+        until(lambda: life.source.wanted == 6 * T)
+        go_on.set()
+    assert sorted(life.windows) == [0, 5]
+    assert model.encoded == [*range(T), *range(5 * T, 6 * T)]
+
+
+def test_a_window_waits_for_one_frame_that_is_being_encoded_and_no_more() -> None:
+    busy, go_on = threading.Event(), threading.Event()
+
+    def stall(seq: int) -> None:
+        if seq == 15:
+            busy.set()
+            assert go_on.wait(60)
+
+    model = Encoder(before=stall)
+    with Life(config(pace="realtime"), model) as life:
+        life.source.feed(T + 4)
+        assert busy.wait(60)
+        life.source.feed(2 * T + 4)  # the windows of 14 to 27 and of 28 to 41 are complete: the newer one wins
+        until(lambda: life.source.wanted == 3 * T + 8)
+        go_on.set()
+        until(lambda: len(life.windows) == 2)
+    assert sorted(life.windows) == [0, 2]
+    assert model.encoded[T : 2 * T + 2] == [14, 15, *range(28, 42)]
+
+
+def test_nothing_is_encoded_for_nobody() -> None:
+    model = Encoder()
+    with Life(config("life = {idle_s = 0.05}", pace="realtime"), model) as life:
+        until(lambda: bool(model.asked))  # warm
+        time.sleep(0.2)
+        life.source.feed(T + 5)
+    assert model.encoded == []
+
+
+# What is forgotten.
+
+
+def test_frames_that_the_next_window_does_not_hold_are_forgotten() -> None:
+    builder, encoded, model = WindowBuilder(frames=T, fps=10.0, source_fps=10.0), kept(), Encoder()
+    frames = ten_fps(40)
+    placed(frames[:10], builder=builder)
+    while encoded.ahead(model, builder.filling, TERMS):
+        pass
+    assert len(encoded) == 10
+    placed(frames[12:15], builder=builder)  # two are missing
+    assert builder.filling.seqs == (12, 13, 14)
+    encoded.ahead(model, builder.filling, TERMS)
+    assert len(encoded) == 1
+    builder.restart("SRC_LOST")
+    assert not encoded.ahead(model, builder.filling, TERMS)
+    assert len(encoded) == 0
+    assert model.encoded == [*range(10), 12]
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        changed(TERMS, digest="ba9876543210"),
+        changed(TERMS, strength=0.5),
+        changed(TERMS, mount=CameraMount(height_m=2.0)),
+    ],
+)
+def test_what_was_encoded_on_other_terms_is_encoded_anew(other: EncodeTerms) -> None:
+    (window,) = placed(ten_fps(T))
+    model, encoded = Encoder(), kept()
+    encoded.features(model, window, TERMS)
+    again = encoded.features(model, window, other)
+    assert model.encoded == [*range(T), *range(T)]
+    assert same(again, kept().features(Encoder(), window, other))
+    encoded.features(model, changed(window, fps=5.0), other)
+    encoded.features(model, changed(window, epoch=window.epoch + 1, fps=5.0), other)
+    assert len(model.encoded) == 4 * T
+
+
+def test_a_window_that_is_rendered_once_more_is_encoded_once_more_with_the_same_noise() -> None:
+    seeds: list[int] = []
+
+    def fail_once(options: RenderOptions) -> None:
+        seeds.append(options.seed)
+        if len(seeds) == 1:
+            raise NonFiniteError("NaN")
+
+    model, box = Encoder(fail_once), Box()
+    made_node(config(), model, FakeSource(T), box).run()
+    assert model.encoded == [*range(T), *range(T)]
+    assert model.seeds[:T] == model.seeds[T:]
+    assert seeds[0] != seeds[1]
+
+
+def test_a_device_that_is_full_encodes_nothing_ahead_until_the_next_window() -> None:
+    calls: list[int] = []
+
+    def full_once(seq: int) -> None:
+        calls.append(seq)
+        if len(calls) == 1:
+            raise DeviceMemoryError("no memory")
+
+    model = Encoder(before=full_once)
+    with Life(config(), model) as life:
+        life.source.feed(T - 1)
+        until(lambda: calls == [0])
+        life.source.feed(1)
+        until(lambda: len(life.windows) == 1)
+        assert calls == [0, *range(T)]
+        life.source.feed(5)
+        until(lambda: len(calls) == 1 + T + 5)
+
+
+def test_of_a_lost_camera_nothing_more_is_encoded(tmp_path: Path) -> None:
+    begun, go_on = threading.Event(), threading.Event()
+
+    def wait(_: int) -> None:
+        begun.set()
+        assert go_on.wait(60)
+
+    camera, model = Camera(), Encoder(before=wait)
+    bench = Bench(camera)
+    with Rig(tmp_path, bench, model, views="[view.main]") as rig:
+        rig.await_state("active")
+        camera.run(10, pause_s=0.0)
+        assert begun.wait(60)
+        camera.feed(None)
+        until(lambda: bench.tries >= 2)  # it is sought already
+        go_on.set()
+        until(lambda: bool(model.encoded))
+        time.sleep(0.1)
+    assert len(model.encoded) == 1

@@ -1,0 +1,339 @@
+"""A student of few steps: its sampler, its losses, its critic, and whole distillations at a tiny size."""
+
+import json
+from copy import deepcopy
+from pathlib import Path
+
+import msgspec
+import pytest
+import torch
+from test_training_run import assert_same
+from tiny_driving import write_untrained
+from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips
+
+from gcd_model import SVD_14, Clip, RenderOptions, Synthesizer, Traits, load_synthesizer
+from gcd_model.checkpoints import load_weights, read_adapter, save_weights
+from gcd_model.config import DRIVING_CLASSES, DRIVING_SMALL, ClassHeadConfig
+from gcd_model.families import FAMILIES
+from gcd_model.networks import Networks, random_networks
+from gcd_model.own_format import Card
+from gcd_train.batches import PixelBatches
+from gcd_train.checkpoint import load_state
+from gcd_train.datasets.clip_source import to_network
+from gcd_train.distillation.critic import Critic, fooling_loss, heard, looked_at, telling_loss
+from gcd_train.distillation.distiller import Distiller, DistillInputs
+from gcd_train.distillation.paired import denoiser_of
+from gcd_train.distillation.recipe import (
+    CriticRecipe,
+    DistillRecipe,
+    SampleLossRecipe,
+    StudentRecipe,
+    load_distillation,
+    packaged_distillations,
+)
+from gcd_train.distillation.sample_losses import SampleLoss, colour_loss
+from gcd_train.distillation.student import Sampled, sampled, schedule_of
+from gcd_train.distillation.teacher import student_config, teacher_of
+from gcd_train.draws import Draws
+from gcd_train.engine.blocks import recompute_blocks
+from gcd_train.errors import Interrupted, RecipeError
+from gcd_train.objective import Batch, Weights
+from gcd_train.precision import Precision
+from gcd_train.recipe import ComputeRecipe, OptimiserRecipe, UNetRecipe
+from gcd_train.recipe.loading import checked_recipe
+from gcd_train.recipe.values import Budget
+from gcd_train.run_data import RunData
+from gcd_train.run_folder import RunFolder
+from gcd_train.start import loaded_base
+from gcd_train.stop import StopSignal
+
+CPU = Precision.of(ComputeRecipe(device="cpu"))
+STAGE = {"budget": {"updates": 2}, "optimiser": {"rate": 1e-3}}
+STUDENT = {"steps": 2, "sigma_min": 1.0, "train": "lora", "lora": {"rank": 2}}
+LOSS = {"latent": 1.0, "l1": 1.0, "class_map": 0.3, "frames": 2}
+
+
+def tiny(teacher: Path, **changes: object) -> DistillRecipe:
+    table = {
+        "name": "tiny-student",
+        "seed": 5,
+        "teacher": {"weights": str(teacher)},
+        "student": STUDENT,
+        "compute": {"device": "cpu"},
+        "log": {"valid_clips": 1},
+        "latents": {},
+        "batches": {"clip_batch": 1},
+        "paired": {**STAGE, "loss": LOSS, "steps": [1, 2]},
+        "matching": {**STAGE, "loss": LOSS, "critic": {"width": 8}, "ema": {"limit": 0.9}},
+    }
+    return checked_recipe({**table, **changes}, "tiny", DistillRecipe)
+
+
+def distiller(recipe: DistillRecipe, path: Path, stop: StopSignal | None = None) -> Distiller:
+    inputs = DistillInputs(
+        recipe=recipe,
+        teacher=teacher_of(recipe),
+        data=RunData(clips=TinyClips(2), valid=TinyClips(1, seed=9)),
+        folder=RunFolder(path),
+        stop=stop or Never(),
+    )
+    return Distiller(inputs)
+
+
+@pytest.fixture(scope="module")
+def teacher(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Random weights of a tiny driving model with a class head and no warps; tests only read them."""
+    change = msgspec.structs.replace
+    config = change(
+        DRIVING_SMALL,
+        frames=FRAMES,
+        height=HEIGHT,
+        width=WIDTH,
+        plane_warp=None,
+        plane_mix=None,
+        class_head=ClassHeadConfig(classes=DRIVING_CLASSES),
+        unet=change(
+            DRIVING_SMALL.unet,
+            condition_channels=12,
+            width=8,
+            multipliers=(1, 2),
+            attention=(False, True),
+            embedding_width=16,
+            head_width=8,
+        ),
+        vae=change(DRIVING_SMALL.vae, width=8, multipliers=(1, 1, 2)),
+    )
+    path = tmp_path_factory.mktemp("teacher") / "teacher.safetensors"
+    save_weights(random_networks(config, seed=0), path, Card(name="t", config=config, family="driving", move_time=3))
+    return path
+
+
+@pytest.fixture(scope="module")
+def networks(teacher: Path) -> Networks:
+    """The teacher's, in float32."""
+    return loaded_base(str(teacher)).networks.float()
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory, teacher: Path) -> Path:
+    """A finished distillation; tests only read it."""
+    path = tmp_path_factory.mktemp("run")
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    distiller(tiny(teacher), path).run()
+    torch.set_num_threads(threads)
+    return path
+
+
+@pytest.fixture(scope="module")
+def batch(networks: Networks) -> Batch:
+    """One clip, encoded anew."""
+    recipe = UNetRecipe(
+        budget=Budget(updates=1), optimiser=OptimiserRecipe(rate=1.0), source="pixels", dropout=0.0, augmentation=0.0
+    )
+    return PixelBatches(TinyClips(1), networks, recipe, CPU).batch([0], Draws(1, "batch", 0, CPU.device))
+
+
+def test_the_student_samples_in_training_as_the_synthesizer_does(networks: Networks, batch: Batch) -> None:
+    noise = torch.randn(batch.target.shape, generator=torch.Generator().manual_seed(2))
+    with torch.no_grad():
+        made = sampled(denoiser_of(deepcopy(networks).train()), batch, noise, schedule_of(networks.config, 3))
+    traits = Traits(
+        name="tiny",
+        config=networks.config,
+        family=FAMILIES["driving"],
+        move_time=FRAMES - 1,
+        sha256_12="0" * 12,
+        precision="float32",
+        device="cpu",
+    )
+    synthesizer = Synthesizer(deepcopy(networks), traits)
+    features = synthesizer.encode(Clip(video=to_network(TinyClips(1).rgb(0)[0]), fps=10.0))
+    options = RenderOptions(steps=3, initial_noise=noise)
+    view = synthesizer.render(features, [TinyClips(1).trajectory(0)], options)[0]
+    assert torch.allclose(made.latents, view.latents[0], atol=2e-4)
+
+
+def test_gradients_go_through_every_step_of_the_sampler(networks: Networks, batch: Batch) -> None:
+    denoiser = denoiser_of(deepcopy(networks).requires_grad_(True).train())
+    schedule = schedule_of(student_config(networks.config, StudentRecipe(steps=3, sigma_min=1.0)), 3)
+    seen: list[torch.Tensor] = []
+    denoiser.register_forward_hook(lambda _module, _given, made: seen.append(made[0]))
+    made = sampled(denoiser, batch, torch.zeros_like(batch.target), schedule)
+    gradients = torch.autograd.grad(made.latents.square().sum(), seen)
+    assert len(seen) == 3
+    assert all(gradient.abs().max() > 0 for gradient in gradients)
+
+
+def test_a_student_has_its_own_steps_and_no_guidance() -> None:
+    config = student_config(SVD_14, StudentRecipe(steps=4, sigma_min=0.5))
+    sampling = config.sampling
+    assert (sampling.steps, sampling.sigma_min, sampling.guidance) == (4, 0.5, (1.0, 1.0))
+    assert schedule_of(config, 4).branches == 1
+    with pytest.raises(RecipeError, match="below sigma_max"):
+        student_config(config, StudentRecipe(steps=2, sigma_min=900.0))
+
+
+def test_what_the_student_hears_of_the_critic_teaches_the_critic_nothing(networks: Networks, batch: Batch) -> None:
+    critic = Critic(networks, 8, trained=True).train()
+    noise, sigma = looked_at(batch, CriticRecipe(), Draws(0, "look", 0, CPU.device))
+    latents = batch.target.clone().requires_grad_(True)
+    words = heard(critic, latents, noise, sigma, batch)
+    fooling_loss(words).backward()
+    assert latents.grad is not None
+    assert latents.grad.abs().max() > 0
+    assert all(parameter.grad is None for parameter in critic.parameters())
+    assert torch.equal(words, critic(latents, noise, sigma, batch))
+
+
+def test_a_critic_that_only_trains_its_heads_leaves_the_teachers_features_alone(
+    networks: Networks, batch: Batch
+) -> None:
+    critic = Critic(networks, 8, trained=False)
+    assert {name.split(".")[0] for name, p in critic.named_parameters() if p.requires_grad} == {"heads"}
+    assert len(networks.unet.up) == len(networks.config.unet.multipliers)
+    assert len(critic.unet.up) == 0
+    shared = {id(p) for p in networks.parameters()} & {id(p) for p in critic.parameters()}
+    assert not shared
+
+
+def test_a_critic_whose_blocks_are_computed_anew_teaches_the_same(networks: Networks, batch: Batch) -> None:
+    noise, sigma = looked_at(batch, CriticRecipe(), Draws(0, "look", 0, CPU.device))
+    taught = list[torch.Tensor]()
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        critic = Critic(networks, 8, trained=False).train()
+    for anew in (False, True):
+        if anew:
+            recompute_blocks(critic, 1)
+        latents = batch.target.clone().requires_grad_(True)
+        fooling_loss(heard(critic, latents, noise, sigma, batch)).backward()
+        assert latents.grad is not None
+        taught.append(latents.grad)
+    assert torch.allclose(taught[0], taught[1])
+
+
+def test_the_critic_wants_true_latents_above_one_and_samples_below_minus_one() -> None:
+    high, low = torch.full((1, 5), 1.5), torch.full((1, 5), -1.5)
+    assert telling_loss(high, low) == 0
+    assert telling_loss(low, high) == pytest.approx(5.0)
+    assert fooling_loss(high) < fooling_loss(low)
+
+
+def test_a_colour_between_two_classes_costs_more_than_either() -> None:
+    colours = torch.tensor([kind.colour for kind in DRIVING_CLASSES]) / 255
+    road, car = (colours[i].view(1, 3, 1, 1) * 2 - 1 for i in (1, 8))
+    right, between, wrong = (colour_loss(each, car, colours, 0.15) for each in (car, (road + car) / 2, road))
+    assert right < between < wrong
+
+
+def test_losses_that_the_model_cannot_have_are_refused(networks: Networks) -> None:
+    with pytest.raises(RecipeError, match=r"loss\.colours"):
+        SampleLoss(networks, SampleLossRecipe(colours=1.0), Weights(), CPU)
+
+
+def test_a_perfect_sample_costs_nothing_but_its_classes(networks: Networks, batch: Batch) -> None:
+    loss = SampleLoss(networks, SampleLossRecipe(l1=1.0, gradient=1.0, ssim=1.0, energy=1.0), Weights(), CPU)
+    compared = loss.of(Sampled(batch.target, None), batch, Draws(0, "run", 0, CPU.device))
+    assert set(compared.parts) == {"latent", "l1", "gradient", "ssim", "energy"}
+    assert compared.total.item() == pytest.approx(0.0, abs=1e-5)
+
+
+def test_a_distillation_ends_in_a_weight_file_that_takes_the_students_steps(run: Path) -> None:
+    synthesizer = load_synthesizer(run / "tiny-student.safetensors", device="cpu")
+    sampling = synthesizer.traits.config.sampling
+    assert (sampling.steps, sampling.sigma_min, sampling.guidance) == (2, 1.0, (1.0, 1.0))
+    steps: list[tuple[int, int]] = []
+    features = synthesizer.encode(Clip(video=to_network(TinyClips(1).rgb(0)[0]), fps=10.0))
+    options = RenderOptions(progress=lambda done, of: steps.append((done, of)))
+    view = synthesizer.render(features, [synthesizer.traits.plan_view()], options)[0]
+    assert steps == [(1, 2), (2, 2)]
+    assert view.classes is not None
+    assert synthesizer.traits.trained
+
+
+def test_every_stage_learns_on_from_the_one_before(run: Path) -> None:
+    paired, matched = (load_state(run / stage / "state.pt", stage).best for stage in ("paired", "matching"))
+    factors = [name for name in paired if name.endswith(".up")]
+    assert all(paired[name].any() for name in factors)
+    assert not any(torch.equal(paired[name], matched[name]) for name in factors)
+    far = max((paired[name] - matched[name]).abs().max().item() for name in factors)
+    assert far < 3e-3  # two updates of 1e-3 each, not four from zero
+
+
+def test_a_distillation_says_what_it_measures(run: Path) -> None:
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    measured = {line["stage"]: line for line in lines if line["kind"] == "measured"}
+    assert set(measured) == {"paired", "matching", "export"}
+    assert all(5 < line["psnr"] < 60 for line in measured.values())
+    said = next(line for line in lines if line["kind"] == "loss" and line["stage"] == "matching")
+    assert {"latent", "l1", "class_map", "fooling", "telling", "word_of_true", "word_of_made"} <= set(said)
+
+
+@pytest.mark.slow
+def test_a_stopped_distillation_goes_on_to_the_same_weights(run: Path, teacher: Path, tmp_path: Path) -> None:
+    for part in ("latents", "paired"):
+        (tmp_path / part).symlink_to(run / part)
+    with pytest.raises(Interrupted):
+        distiller(tiny(teacher), tmp_path, After(1)).run("matching")
+    assert load_state(tmp_path / "matching" / "state.pt", "matching").updates == 1
+    distiller(tiny(teacher), tmp_path).run("matching")
+    ended, whole = (load_state(path / "matching" / "state.pt", "matching") for path in (tmp_path, run))
+    assert_same(ended.best, whole.best)
+    assert_same(ended.optimiser, whole.optimiser)
+
+
+@pytest.mark.slow
+def test_the_kept_student_is_exported_as_weights_and_as_an_adapter(run: Path, teacher: Path, tmp_path: Path) -> None:
+    for part in ("latents", "paired"):
+        (tmp_path / part).symlink_to(run / part)
+    distiller(tiny(teacher, student={**STUDENT, "keep": "paired"}), tmp_path).run("export")
+    paired = load_state(tmp_path / "paired" / "state.pt", "paired").best
+    adapter = read_adapter(tmp_path / "tiny-student-adapter.safetensors")
+    assert adapter.tensors.keys() == paired.keys()
+    assert all(torch.equal(adapter.tensors[name], paired[name]) for name in paired)
+    shipped = load_weights(tmp_path / "tiny-student.safetensors").networks.state_dict()
+    start = loaded_base(str(teacher)).networks.state_dict()
+    changed = {name for name, value in shipped.items() if not torch.equal(value, start[name].half())}
+    assert changed == {f"{name.removesuffix('.up')}.weight" for name in paired if name.endswith(".up")}
+
+
+@pytest.mark.slow
+def test_whole_students_and_the_plane_mix_learn_too(tmp_path: Path) -> None:
+    student, matching = {"steps": 1}, {**STAGE, "loss": LOSS, "critic": {"width": 8, "trained": True}}
+    changes = {"student": student, "matching": matching, "decoder": {**STAGE, "clips": 1, "batch": 2}}
+    distiller(tiny(write_untrained(tmp_path), **changes), tmp_path / "run").run()
+    shipped = load_weights(tmp_path / "run" / "tiny-student.safetensors").networks.state_dict()
+    for stage, name in (("matching", "unet.conv_out.weight"), ("decoder", "plane_mix.choice.weight")):
+        assert torch.equal(shipped[name], load_state(tmp_path / "run" / stage / "state.pt", stage).best[name].half())
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"paired": None, "matching": None}, "learns in"),
+        ({"matching": None, "student": {"keep": "matching"}}, "no table"),
+        ({"latents": None, "decoder": None}, "go together"),
+        ({"matching": {**STAGE, "critic": {"trained": True}}, "compute": {"checkpoint_activations": True}}, "anew"),
+    ],
+)
+def test_a_recipe_that_cannot_be_run_says_what_is_wrong(teacher: Path, changes: dict[str, object], said: str) -> None:
+    with pytest.raises(RecipeError, match=said):
+        tiny(teacher, **changes)
+
+
+def test_a_teacher_whose_camera_goes_another_way_is_refused(teacher: Path) -> None:
+    with pytest.raises(RecipeError, match="at its goal in frame 3"):
+        teacher_of(tiny(teacher, data={"path": "direct"}))
+
+
+def test_every_recipe_that_ships_can_be_read() -> None:
+    names = packaged_distillations()
+    assert {"distill-driving-small", "distill-objects-small", "distill-kubric"} <= set(names)
+    assert [load_distillation(f"package:{name}").name for name in names] == names
+
+
+def test_a_recipe_without_a_teacher_is_sent_to_train(tmp_path: Path) -> None:
+    (tmp_path / "plain.toml").write_text("seed = 1\n")
+    with pytest.raises(RecipeError, match=r"names no \[teacher\]"):
+        load_distillation(tmp_path / "plain.toml")

@@ -1,0 +1,285 @@
+"""A distillation: the stages of its recipe in their order, each from where it stopped."""
+
+import logging
+from collections.abc import Mapping
+from copy import deepcopy
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gcd_model.adapter import Adapter, base_digest
+from gcd_model.networks import Networks, weights_digest
+from gcd_model.own_format import Card
+from gcd_train.batches import BatchSource, EncodedBatches, PixelBatches
+from gcd_train.datasets.clip_source import KeptClips, numbers_of
+from gcd_train.datasets.latents import EncodedClips
+from gcd_train.datasets.predictions import Predictions, PredictionsMeta, write_predictions
+from gcd_train.distillation.critic import Critic
+from gcd_train.distillation.matching import MatchingTask
+from gcd_train.distillation.paired import PairedTask
+from gcd_train.distillation.recipe import DistillRecipe, MatchingRecipe, PairedRecipe, SampleLossRecipe, StudentStage
+from gcd_train.distillation.sample_losses import SampleLoss
+from gcd_train.distillation.teacher import Teacher, as_training, student_config
+from gcd_train.draws import Draws
+from gcd_train.encodings import Encodings, class_weights
+from gcd_train.engine.engine import Engine
+from gcd_train.errors import RecipeError
+from gcd_train.loop import Loop, LoopOptions, Task
+from gcd_train.lora import adapter_of, merge_lora
+from gcd_train.model_setup import digest_of, fill, require_exportable
+from gcd_train.objective import Weights
+from gcd_train.precision import Precision
+from gcd_train.recipe import AnyStageName, DecoderRecipe, DistillStageName
+from gcd_train.run_data import RunData
+from gcd_train.run_folder import RunFolder
+from gcd_train.stages.decoder import DecoderData, DecoderTask, Predictor
+from gcd_train.stages.export import ExportJob, export
+from gcd_train.start import carried_leftovers, start_networks
+from gcd_train.stop import StopSignal
+from gcd_train.trained_part import halve_frozen, let_train, thaw
+from gcd_train.validation import Validation
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DistillInputs:
+    """What a distillation works with. stop: asked between updates. latents: see `RunInputs`."""
+
+    recipe: DistillRecipe
+    teacher: Teacher
+    data: RunData
+    folder: RunFolder
+    stop: StopSignal
+    latents: Path | None = None
+
+
+class Distiller:
+    """The stages of one distillation."""
+
+    def __init__(self, inputs: DistillInputs) -> None:
+        """Raises RecipeError if the student cannot be built or exported, or its device is not there."""
+        self._inputs, self._recipe, self._folder = inputs, inputs.recipe, inputs.folder
+        self._updates = 0  # of the stage that was filled in last
+        self._shared = as_training(inputs.recipe, inputs.teacher)
+        self._config = student_config(inputs.teacher.config, inputs.recipe.student)
+        if inputs.recipe.decoder is not None and self._config.plane_mix is None:
+            raise RecipeError("[decoder] trains the plane mix, which this teacher has not; leave it out")
+        require_exportable(self._shared, self._config)
+        self._precision = Precision.of(inputs.recipe.compute)
+        self._encodings = Encodings(
+            recipe=self._shared,
+            config=self._config,
+            family=inputs.teacher.family,
+            precision=self._precision,
+            sets=(inputs.data.clips,),
+            as_videos=False,
+            folder=inputs.folder.stage("latents"),
+            shared=inputs.latents,
+            stop=inputs.stop,
+        )
+
+    def run(self, only: DistillStageName | None = None) -> None:
+        """Every stage that is not finished, or just one.
+
+        Raises:
+            Interrupted: the stop signal was set; what was done is saved.
+            RunError: the run folder holds something that does not fit. RecipeError: no such stage in the recipe.
+        """
+        if only is not None and only not in self._recipe.stages:
+            raise RecipeError(f"this recipe has no stage {only!r}, only {', '.join(self._recipe.stages)}")
+        steps = {
+            "latents": lambda: self._encodings.encode(self._teacher()),
+            "paired": self._train_paired,
+            "matching": self._train_matching,
+            "decoder": self._train_decoder,
+            "export": self._export,
+        }
+        for stage in (only,) if only else self._recipe.stages:
+            _log.info("stage %s", stage)
+            steps[stage]()
+
+    @cached_property
+    def _base(self) -> str:
+        """Names the teacher's weights."""
+        return base_digest(self._read.state_dict())
+
+    @cached_property
+    def _read(self) -> Networks:
+        return start_networks(self._shared.model, self._config, self._recipe.seed)
+
+    def _teacher(self) -> Networks:
+        """The teacher's weights under the student's sampler."""
+        return deepcopy(self._read)
+
+    def _student(self, *stages: StudentStage) -> Networks:
+        """The student with what those stages taught it, ready to learn; adapters beside their layers."""
+        networks = self._teacher()
+        let_train(networks, self._shared.model, self._recipe.seed)
+        for stage in stages:
+            self._updates = fill(networks, self._folder, stage, self._identity(stage, networks))
+        return networks
+
+    def _identity(self, stage: StudentStage, networks: Networks) -> str:
+        """What a stage's state belongs to; `networks` hold what was learned before it."""
+        student, seed, sampling = self._recipe.student, self._recipe.seed, self._config.sampling
+        learned = {name: value for name, value in networks.named_parameters() if value.requires_grad}
+        before = weights_digest(learned) if stage == "matching" and self._recipe.paired is not None else "teacher"
+        critic = None if stage == "paired" else self._matching.critic
+        built = () if critic is None else (critic.width, critic.trained)
+        return f"{self._base}-{before}-{digest_of(seed, sampling, student.train, student.lora, built)}"
+
+    @property
+    def _before_matching(self) -> tuple[StudentStage, ...]:
+        return () if self._recipe.paired is None else ("paired",)
+
+    @property
+    def _kept_stages(self) -> tuple[StudentStage, ...]:
+        """What taught the student that is exported."""
+        return ("paired",) if self._recipe.kept == "paired" else (*self._before_matching, "matching")
+
+    @property
+    def _matching(self) -> MatchingRecipe:
+        recipe = self._recipe.matching
+        assert recipe is not None, "a stage runs only if the recipe has its table"
+        return recipe
+
+    def _train_paired(self) -> None:
+        recipe, networks = self._recipe.paired, self._student()
+        assert recipe is not None, "a stage runs only if the recipe has its table"
+        identity = self._identity("paired", networks)
+        batches, weights = self._ready(networks, recipe.loss)
+        loss = SampleLoss(networks, recipe.loss, weights, self._precision)
+        task = PairedTask(
+            networks,
+            batches,
+            self._validation(),
+            recipe,
+            self._recipe.batches,
+            loss,
+            self._precision,
+            self._recipe.seed,
+        )
+        self._loop(task, "paired", recipe, identity)
+
+    def _train_matching(self) -> None:
+        recipe, networks = self._matching, self._student(*self._before_matching)
+        identity = self._identity("matching", networks)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self._recipe.seed)
+            critic = Critic(self._teacher(), recipe.critic.width, trained=recipe.critic.trained)
+        if self._recipe.compute.frozen == "bfloat16":
+            halve_frozen(critic)
+        batches, weights = self._ready(networks, recipe.loss)
+        loss = SampleLoss(networks, recipe.loss, weights, self._precision)
+        task = MatchingTask(
+            networks,
+            critic,
+            batches,
+            self._validation(),
+            recipe,
+            self._recipe.batches,
+            loss,
+            self._precision,
+            self._recipe.seed,
+        )
+        self._loop(task, "matching", recipe, identity)
+
+    def _ready(self, networks: Networks, loss: SampleLossRecipe) -> tuple[BatchSource, Weights]:
+        """Batches for networks that are placed to learn, and the constant weights of their loss."""
+        shared = self._shared
+        if shared.compute.frozen == "bfloat16":
+            halve_frozen(networks)
+        if shared.unet.source == "latents":
+            clips = self._encodings.pairs(networks)
+            self._precision.placed(networks.unet)
+            return EncodedBatches(clips, self._config, shared.unet, self._precision), self._weights(clips, loss)
+        self._precision.placed(networks)
+        made = self._inputs.data.batches
+        if made is not None:
+            return made(networks, self._precision), Weights()
+        family = self._inputs.teacher.family
+        return PixelBatches(self._inputs.data.clips, networks, shared.unet, self._precision, family), Weights()
+
+    def _weights(self, clips: EncodedClips, loss: SampleLossRecipe) -> Weights:
+        device = self._precision.device
+        channels = torch.tensor(clips.meta.sensitivity, device=device) if loss.sensitivity else None
+        return Weights(channels=channels, classes=class_weights(clips, loss.class_power, device))
+
+    def _train_decoder(self) -> None:
+        recipe, networks = self._recipe.decoder, self._merged()
+        assert recipe is not None, "a stage runs only if the recipe has its table"
+        identity = self._decoder_identity(networks)
+        clips = self._encodings.pairs(networks)
+        self._precision.placed(networks)
+        batches = EncodedBatches(clips, self._config, self._shared.unet, self._precision)
+        order = Draws(self._recipe.seed, "decoder-clips", 0, torch.device("cpu")).order(clips.meta.clips)
+        meta = PredictionsMeta(identity=identity, clips=tuple(order[: recipe.clips]))
+        folder = self._folder.path / "predictions"
+        predictor = Predictor(networks, clips, batches, self._precision, self._recipe.seed)
+        write_predictions(folder, meta, predictor.predict, self._inputs.stop)
+        data = DecoderData(
+            clips=KeptClips(self._inputs.data.clips, numbers_of(self._inputs.data.clips, clips.meta.seeds)),
+            latents=clips,
+            predictions=Predictions.open(folder),
+            class_weights=class_weights(clips, recipe.class_power, self._precision.device),
+        )
+        task = DecoderTask(networks, data, self._validation(), recipe, self._precision, self._recipe.seed)
+        self._loop(task, "decoder", recipe, identity)
+
+    def _decoder_identity(self, networks: Networks) -> str:
+        made = digest_of(self._recipe.seed, self._config.plane_warp, self._config.plane_mix, self._config.sampling)
+        return f"{weights_digest(networks.unet.state_dict())}-{made}"
+
+    def _merged(self) -> Networks:
+        """The student that is exported as plain networks, as far as the decoder stage."""
+        networks = self._student(*self._kept_stages)
+        merge_lora(networks)
+        thaw(networks)
+        return networks
+
+    def _export(self) -> None:
+        networks, recipe = self._merged(), self._recipe
+        if recipe.decoder is not None:
+            fill(networks, self._folder, "decoder", self._decoder_identity(networks))
+        job = ExportJob(
+            name=recipe.name,
+            family=self._inputs.teacher.family,
+            move_time=self._inputs.teacher.move_time,
+            updates=self._updates,
+            recipe=recipe.export,
+            leftovers=self._leftovers,
+            adapter=self._adapter if recipe.student.train == "lora" else None,
+        )
+        export(networks, self._folder, job, self._validation())
+
+    def _leftovers(self) -> Mapping[str, Tensor]:
+        return carried_leftovers(self._shared.model)
+
+    def _adapter(self, card: Card) -> Adapter:
+        """What the student learned, apart from its teacher."""
+        return adapter_of(self._student(*self._kept_stages), self._recipe.student.lora, card, self._base)
+
+    def _validation(self) -> Validation:
+        count = self._recipe.log.valid_clips
+        return Validation(self._inputs.data.valid, self._inputs.teacher.family, count=count, plane_mix=True)
+
+    def _loop(
+        self, task: Task, stage: AnyStageName, recipe: PairedRecipe | MatchingRecipe | DecoderRecipe, identity: str
+    ) -> None:
+        options = LoopOptions(
+            stage=stage,
+            identity=identity,
+            budget=recipe.budget,
+            optimiser=recipe.optimiser,
+            ema=recipe.ema,
+            log=self._recipe.log,
+            stop=self._inputs.stop,
+            frames_per_clip=self._config.frames,
+            parts=1 if isinstance(recipe, DecoderRecipe) else self._recipe.batches.accumulate,
+            engine=Engine() if isinstance(recipe, DecoderRecipe) else Engine(compute=self._recipe.compute),
+        )
+        Loop(task, self._folder, options).run()

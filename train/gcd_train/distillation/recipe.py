@@ -1,0 +1,227 @@
+"""What a distillation does, as a recipe file states it (TOML): every option is named here, with its meaning."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal, TypeAlias
+
+import msgspec
+from msgspec import Meta
+
+from gcd_train.errors import RecipeError
+from gcd_train.recipe import (
+    ClassWeightsName,
+    ComputeRecipe,
+    Count,
+    DataRecipe,
+    DecoderRecipe,
+    EmaRecipe,
+    ExportRecipe,
+    LatentsRecipe,
+    LogRecipe,
+    LoraRecipe,
+    NotNegative,
+    OptimiserRecipe,
+    Positive,
+)
+from gcd_train.recipe.loading import checked_recipe
+from gcd_train.recipe.merging import read_merged, require_known
+from gcd_train.recipe.values import Budget, DistillStageName
+
+PACKAGED = Path(__file__).parents[1] / "recipes" / "distillation"
+"""Where the recipes that ship with the package lie."""
+
+StudentStage: TypeAlias = Literal["paired", "matching"]
+
+
+class TeacherRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Whom to learn from.
+
+    weights: a weight file of any layout, or package:NAME. family: how it is used, where the file does not tell.
+    """
+
+    weights: str
+    family: str | None = None
+
+
+class StudentRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What comes out: the teacher's networks with another sampler, and no guidance.
+
+    steps: of the sampler that ships. sigma_max, sigma_min: its first and its last noise level; left out as the teacher
+    has them. train: all of the U-Net and what steers it, or adapters beside it, as [student.lora] says.
+    keep: the stage whose student is exported, left out the last one there is.
+    """
+
+    steps: Count = 1
+    sigma_max: Positive | None = None
+    sigma_min: Positive | None = None
+    train: Literal["all", "lora"] = "all"
+    lora: LoraRecipe = LoraRecipe()
+    keep: StudentStage | None = None
+
+
+class BatchRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Which clips an update is made of; see `UNetRecipe`, whose words these are.
+
+    augmentation: left out, as strong as the teacher is used with.
+    """
+
+    source: Literal["latents", "pixels", "cache"] = "latents"
+    clip_batch: Count = 2
+    accumulate: Count = 1
+    augmentation: NotNegative | None = None
+    fps: Positive = 10.0
+    motion_bucket: float = 127.0
+
+
+class SampleLossRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a student's sample is compared with its pair in; each is a weight, and what weighs nothing is not computed.
+
+    latent: squared error of latents; sensitivity weighs channels by what the decoder makes of them, where encoded clips
+    say so. class_weights: emphasis by colour there, see `LossRecipe`.
+    l1, gradient, ssim, energy: of decoded pictures, see `picture_losses`; `frames` consecutive ones of each clip.
+    colours: cross-entropy of the classes that decoded colours stand for, for models that paint classes; softness is the
+    distance of colours (of 0 to 1) at which it becomes unsure. class_map: of the class head's cross-entropy;
+    class_power: its class weights are frequency^-class_power.
+    """
+
+    latent: NotNegative = 1.0
+    sensitivity: bool = True
+    class_weights: ClassWeightsName = "none"
+    l1: NotNegative = 0.0
+    gradient: NotNegative = 0.0
+    ssim: NotNegative = 0.0
+    energy: NotNegative = 0.0
+    colours: NotNegative = 0.0
+    softness: Positive = 0.15
+    class_map: NotNegative = 0.0
+    class_power: NotNegative = 0.35
+    frames: Count = 4
+
+    @property
+    def of_pictures(self) -> bool:
+        """Whether anything has to be decoded."""
+        return any((self.l1, self.gradient, self.ssim, self.energy, self.colours))
+
+
+class PairedRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Finetuning through the student's own sampler, on pairs.
+
+    steps: numbers of sampler steps, of which each update draws one; left out, the student's own alone.
+    """
+
+    budget: Budget
+    optimiser: OptimiserRecipe
+    ema: EmaRecipe | None = None
+    steps: tuple[Count, ...] | None = None
+    loss: SampleLossRecipe = SampleLossRecipe()
+
+
+class CriticRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The network that tells samples from true latents: the teacher's encoder half and small heads on it.
+
+    log_mean, log_std: noise levels, log-normal, at which it looks. width: of the heads. rate: its learning rate, in
+    rates of the student. trained: let the encoder half learn, too; a teacher that only ever saw its first noise level
+    has learned to overlook the latents it is to judge. start: updates before the student listens to it.
+    """
+
+    log_mean: float = -0.7
+    log_std: NotNegative = 1.2
+    width: Count = 64
+    rate: Positive = 2.0
+    trained: bool = False
+    start: Annotated[int, Meta(ge=0)] = 0
+
+
+class MatchingRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Adversarial matching of the distribution of latents, held by the paired loss.
+
+    weight: of the critic's word beside the paired loss, whose own weights are `loss`. steps: as in [paired].
+    """
+
+    budget: Budget
+    optimiser: OptimiserRecipe
+    ema: EmaRecipe | None = None
+    steps: tuple[Count, ...] | None = None
+    weight: NotNegative = 0.05
+    loss: SampleLossRecipe = SampleLossRecipe()
+    critic: CriticRecipe = CriticRecipe()
+
+
+class DistillRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A whole recipe of a distillation; a table that is left out leaves its stage out.
+
+    seed: every random draw follows from it, the stage and the update. decoder: trains the plane mix anew on what the
+    student makes, from the teacher's.
+    """
+
+    name: Annotated[str, Meta(pattern="^[a-z0-9][a-z0-9-]{0,40}$")]
+    seed: int = 0
+    teacher: TeacherRecipe
+    student: StudentRecipe = StudentRecipe()
+    data: DataRecipe = DataRecipe()
+    compute: ComputeRecipe = ComputeRecipe()
+    log: LogRecipe = LogRecipe()
+    latents: LatentsRecipe | None = None
+    batches: BatchRecipe = BatchRecipe()
+    paired: PairedRecipe | None = None
+    matching: MatchingRecipe | None = None
+    decoder: DecoderRecipe | None = None
+    export: ExportRecipe = ExportRecipe()
+
+    def __post_init__(self) -> None:
+        if not self.student_stages:
+            raise ValueError("a student learns in [paired], in [matching] or in both: give one of these tables")
+        if self.student.keep is not None and self.student.keep not in self.student_stages:
+            raise ValueError(f'student.keep is "{self.student.keep}", but there is no table [{self.student.keep}]')
+        if (self.batches.source == "latents") != (self.latents is not None):
+            raise ValueError('batches.source "latents" and a table [latents] go together: give both or neither')
+        if self.decoder is not None and self.latents is None:
+            raise ValueError("[decoder] works on encoded clips and needs a [latents] table")
+        if self.compute.checkpoint_activations and self.matching is not None and self.matching.critic.trained:
+            raise ValueError(
+                "matching.critic.trained cannot compute blocks anew, as they would then learn from the student's "
+                "losses, too; leave it or compute.checkpoint_activations out"
+            )
+
+    @property
+    def student_stages(self) -> tuple[StudentStage, ...]:
+        """The stages in which the student learns, in their order."""
+        there: dict[StudentStage, bool] = {"paired": self.paired is not None, "matching": self.matching is not None}
+        return tuple(name for name, wanted in there.items() if wanted)
+
+    @property
+    def kept(self) -> StudentStage:
+        """The stage whose student is exported."""
+        return self.student.keep or self.student_stages[-1]
+
+    @property
+    def stages(self) -> tuple[DistillStageName, ...]:
+        """The steps of a run, in their order."""
+        encoded: tuple[DistillStageName, ...] = () if self.latents is None else ("latents",)
+        mixed: tuple[DistillStageName, ...] = () if self.decoder is None else ("decoder",)
+        return (*encoded, *self.student_stages, *mixed, "export")
+
+
+def packaged_distillations() -> list[str]:
+    """Names of the recipes that ship."""
+    return sorted(file.stem for file in PACKAGED.glob("*.toml"))
+
+
+def load_distillation(source: str | Path, changes: Sequence[str] = ()) -> DistillRecipe:
+    """Read a recipe: a path, or `package:NAME`, on top of the bases it names.
+
+    changes: `KEY=VALUE` each, on top of all, such as `student.steps=4`.
+
+    Raises:
+        RecipeError: as `load_recipe`; for a recipe that trains instead of distilling, too.
+    """
+    kind, _, name = str(source).partition(":")
+    read = read_merged(PACKAGED / f"{name}.toml" if kind == "package" else Path(source))
+    if "teacher" not in read.table:
+        shipped = ", ".join(f"package:{each}" for each in packaged_distillations())
+        raise RecipeError(
+            f"{read.place} names no [teacher], so it is no distillation; train it with `gcd-train train`, or take one "
+            f"of {shipped}"
+        )
+    require_known(read.table, DistillRecipe.__struct_fields__, read.place)
+    return checked_recipe(read.table, read.place, DistillRecipe, changes)
