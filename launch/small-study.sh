@@ -6,7 +6,7 @@
 #   launch/small-study.sh [FOLDER]      FOLDER: for data, latents, trainings, evaluations, report (runs/small-study)
 #
 #   DATA     a folder that holds train/, valid/ and test/, each with gradual/ and direct/; nothing is generated then
-#   CLIPS, VALID, TEST   pairs to learn from, to watch and to measure on, where they are generated (800, 8, 40)
+#   CLIPS, VALID, TEST   pairs to learn from, to watch and to measure on, where they are generated (500, 8, 40)
 #   THREADS  of CPU computation (1)
 #   HEXPLANE whether HexPlane is measured, too, by far the slowest baseline (yes)
 #   LPIPS    a folder with LPIPS weights; without one that column stays empty
@@ -26,7 +26,7 @@ if [ -n "$SMALL" ]; then
   CLIPS=2 VALID=1 TEST=2
   FORM=(--width 64 --height 32 --frames 4 --oversample 1)
 else
-  CLIPS=${CLIPS:-800} VALID=${VALID:-8} TEST=${TEST:-40}
+  CLIPS=${CLIPS:-500} VALID=${VALID:-8} TEST=${TEST:-40}
   FORM=()
 fi
 

@@ -67,6 +67,15 @@ class Events:
         wait_for(lambda: code in self.codes())
         return next(fields for each, fields in self.seen if each == code)
 
+    def within(self, code: str, seconds: float) -> bool:
+        """Whether there was an event with this code before so many seconds have passed."""
+        until = time.monotonic() + seconds
+        while code not in self.codes():
+            if time.monotonic() >= until:
+                return False
+            time.sleep(0.005)
+        return True
+
 
 def wait_for(condition: Callable[[], bool], seconds: float = 20.0) -> None:
     until = time.monotonic() + seconds
