@@ -1,21 +1,27 @@
 """`gcd-train train`: from clips to a weight file, stage by stage; `gcd-train recipes`: what there is to train."""
 
 import logging
-import signal
-import threading
 import warnings
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated, TypeAlias, get_args
 
-import torch
-import typer
 from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 from typer import Argument, Option
 
 from gcd_train.cli.errors import errors_shown
+from gcd_train.cli.training_run import (
+    Changes,
+    Data,
+    Latents,
+    Out,
+    Threads,
+    Valid,
+    prepare_process,
+    stage_named,
+    stop_when_asked,
+)
 from gcd_train.recipe import Recipe, StageName, load_recipe, packaged_recipes, to_toml
 
 if TYPE_CHECKING:
@@ -28,22 +34,9 @@ RecipeFile: TypeAlias = Annotated[
 Shown: TypeAlias = Annotated[
     str | None, Argument(metavar="[RECIPE]", help="Show this one whole, with its bases and every default.")
 ]
-Data: TypeAlias = Annotated[Path, Option(help="What to learn from: the recipe's data.kind says what lies there.")]
-Valid: TypeAlias = Annotated[
-    Path | None, Option(help="Held-out data of the same kind to measure on; left out, a part of --data (data.split).")
-]
-Out: TypeAlias = Annotated[Path, Option(help="Folder of the run; run again to go on.")]
-Latents: TypeAlias = Annotated[
-    Path | None, Option(help="Folder for encoded clips, shared by runs of one autoencoder; else in --out.")
-]
 Stage: TypeAlias = Annotated[str | None, Option(help=f"Only this one: {', '.join(get_args(StageName))}.")]
-Threads: TypeAlias = Annotated[int | None, Option(min=1, help="CPU threads; else torch's own choice.")]
 Small: TypeAlias = Annotated[
     bool, Option("--small", help="Model, size, batch and budget of the recipe's table `small`, for a CPU.")
-]
-Changes: TypeAlias = Annotated[
-    list[str] | None,
-    Option("--set", metavar="KEY=VALUE", help="Change the recipe: unet.batch=8, for one; may be repeated."),
 ]
 
 
@@ -59,18 +52,14 @@ def train(
     changes: Changes = None,
 ) -> None:
     """Train a model on clips, or go on where a run stopped. Ctrl-C stops after the update and saves."""
-    # a remark on speed that torch makes once, about the decoder's last layer
-    warnings.filterwarnings("ignore", message="grad and param do not obey the gradient layout contract")
     # projected embeddings are views of what their layer made; nobody writes into them
     warnings.filterwarnings("ignore", message="FSDP2-wrapped module")
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
-    if threads is not None:
-        torch.set_num_threads(threads)
+    prepare_process(threads)
     from gcd_train.run_data import DataPlaces
 
     with errors_shown():
         loaded = load_recipe(recipe, small=small, changes=changes or ())
-        _in_processes(loaded, DataPlaces(data=data, valid=valid), out, latents, _stage_named(stage))
+        _in_processes(loaded, DataPlaces(data=data, valid=valid), out, latents, stage_named(stage, get_args(StageName)))
 
 
 def recipes(recipe: Shown = None, small: Small = False, changes: Changes = None) -> None:
@@ -123,13 +112,7 @@ def _run(
     from gcd_train.run_folder import RunFolder
     from gcd_train.trainer import RunInputs, Trainer
 
-    stop = threading.Event()
-
-    def ask(_number: int, _frame: FrameType | None) -> None:
-        stop.set()
-
-    signal.signal(signal.SIGINT, ask)
-    signal.signal(signal.SIGTERM, ask)
+    stop = stop_when_asked()
     board = TensorBoard(out / "tensorboard") if recipe.log.tensorboard and processes.first else None
     opened = open_data(recipe, model_config(recipe.model), family_of(recipe.model), places)
     inputs = RunInputs(
@@ -144,12 +127,3 @@ def _run(
         processes=processes,
     )
     Trainer(inputs).run(stage)
-
-
-def _stage_named(name: str | None) -> StageName | None:
-    for known in get_args(StageName):
-        if name == known:
-            return known
-    if name is not None:
-        raise typer.BadParameter(f"no stage is called {name!r}; there are {', '.join(get_args(StageName))}")
-    return None
