@@ -2,13 +2,13 @@
 #   make demo    replay the packaged drive through the model and over ZeroMQ into a second process
 #   make test    the default tests            make check   format, lint, types
 #   make slow    full-size tests (minutes, about 10 GB of memory)
-# WORKERS test processes run beside each other, on a thread each.
+# WORKERS test processes run beside each other, on a thread each; many of the tests wait rather than compute.
 # TORCH_INDEX names another package index for torch, for example a CPU-only or CUDA one.
 
 PYTHON ?= python3
 VENV ?= .venv
 TORCH_INDEX ?=
-WORKERS ?= 2
+WORKERS ?= 3
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install -q -c constraints.txt

@@ -2,8 +2,11 @@
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from statistics import median
+
+import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = {
@@ -23,10 +26,28 @@ def files(package: str) -> list[Path]:
     return found
 
 
+@pytest.fixture(autouse=True, scope="module")
+def forgotten() -> Iterator[None]:
+    """A million syntax nodes would slow down every search for garbage in the tests that follow."""
+    yield
+    nodes.cache_clear()
+    parsed.cache_clear()
+
+
+@cache
+def nodes(path: Path) -> tuple[ast.AST, ...]:
+    """All of a file's, in no particular order; parsed once."""
+    return tuple(ast.walk(parsed(path)))
+
+
+@cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
 def imports(path: Path, *, top_level_only: bool = False) -> Iterator[str]:
     """Dotted names a file imports; `from a import b` gives `a` and `a.b`."""
-    tree = ast.parse(path.read_text())
-    for node in tree.body if top_level_only else ast.walk(tree):
+    for node in parsed(path).body if top_level_only else nodes(path):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -45,7 +66,7 @@ def offenders(paths: list[Path], *roots: str, top_level_only: bool = False) -> l
 
 
 def functions(path: Path) -> Iterator[tuple[str, int]]:
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in nodes(path):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             yield node.name, (node.end_lineno or node.lineno) - node.lineno + 1
 
@@ -63,7 +84,7 @@ def test_only_checkpoints_and_exporters_open_files_in_the_model() -> None:
         f"{path.name}:{node.lineno}"
         for path in files("gcd_model")
         if path.name not in MAY_OPEN_FILES
-        for node in ast.walk(ast.parse(path.read_text()))
+        for node in nodes(path)
         if isinstance(node, ast.Call) and _opens_a_file(node.func)
     ]
     assert found == []

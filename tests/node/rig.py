@@ -1,5 +1,6 @@
 """A whole node over real sockets in a folder of its own: its cameras and its model do what a test tells them."""
 
+import gc
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -112,6 +113,7 @@ class Rig:
         self._threads = [threading.Thread(target=target, daemon=True) for target in targets]
 
     def __enter__(self) -> "Rig":
+        gc.freeze()  # a node's own process holds no thousand tests: looking through these would take it seconds
         self.client = ControlClient(f"ipc://{self.folder}/control", timeout_s=20.0, attempts=1)
         for thread in self._threads[:-1]:
             thread.start()
@@ -129,6 +131,7 @@ class Rig:
         for thread in self._threads[:-1]:
             thread.join(10)
         self.client.close()
+        gc.unfreeze()
         assert not alive, "the node did not end"
 
     def _live(self) -> None:

@@ -10,8 +10,9 @@ import pytest
 import torch
 from fakes import FakeSynthesizer, warping_traits
 from msgspec.structs import replace
+from tiny_weights import HEIGHT, UNET, VAE, WIDTH, write_tiny
 
-from gcd_model import DRIVING_CLASSES, DRIVING_SEMANTIC_SMALL, DRIVING_SMALL, OBJECTS_SMALL, CameraMount
+from gcd_model import DRIVING_CLASSES, DRIVING_SEMANTIC_SMALL, OBJECTS_SMALL, CameraMount
 from gcd_model.checkpoints import save_weights
 from gcd_model.networks import random_networks
 from gcd_model.own_format import Card
@@ -19,18 +20,10 @@ from gcd_node.cli import synthesize as cli_synthesize
 from gcd_node.cli.main import run_app
 from gcd_node.pictures.files import write_video
 
-HEIGHT, WIDTH = 64, 96
-UNET = replace(DRIVING_SMALL.unet, width=16, head_width=16, embedding_width=32)
-VAE = replace(DRIVING_SMALL.vae, width=8)
-TINY = replace(DRIVING_SMALL, height=HEIGHT, width=WIDTH, unet=UNET, vae=VAE)
-
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
-    card = Card(name="tiny", config=TINY, family="driving", move_time=13, trained=False)
-    save_weights(random_networks(TINY, seed=0), path, card)
-    return path
+    return write_tiny(tmp_path_factory.mktemp("weights"))
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 from fakes import FakeSource, FakeSynthesizer, traits
 from rig import Rig
+from tiny_weights import write_tiny
 
 from gcd_model import (
     Clip,
@@ -27,8 +28,8 @@ from gcd_node.session import load_model
 LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
 
 
-def test_a_halved_model_has_half_the_weights_and_still_renders() -> None:
-    slot = ModelSlot(ModelSection(weights="random:driving", device="cpu", threads=1), load_model)
+def test_a_halved_model_has_half_the_weights_and_still_renders(tmp_path: Path) -> None:
+    slot = ModelSlot(ModelSection(weights=str(write_tiny(tmp_path)), device="cpu", threads=1), load_model)
     assert (slot.traits.precision, slot.can_halve) == ("float32", False)  # a CPU gains nothing by it, and is not asked
     slot.halve()
     assert slot.traits.precision == "bfloat16"

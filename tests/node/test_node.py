@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, made_node, traits
+from tiny_weights import write_tiny
 
 from gcd_model import (
     Cancelled,
@@ -466,14 +467,14 @@ def test_a_lockstep_node_that_nobody_reads_still_stops(tmp_path: Path) -> None:
     assert time.monotonic() - started_s < 10
 
 
-def test_two_lockstep_runs_of_a_real_network_publish_identical_payloads() -> None:
-    text = """
+def test_two_lockstep_runs_of_a_real_network_publish_identical_payloads(tmp_path: Path) -> None:
+    text = f"""
         [source]
         kind = "synthetic"
         pace = "lockstep"
         frames = 28
         [model]
-        weights = "random:driving"
+        weights = "{write_tiny(tmp_path)}"
         steps = 1
         [view.main]
     """

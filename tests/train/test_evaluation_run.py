@@ -102,9 +102,37 @@ def test_names_become_file_names_and_two_methods_never_share_a_folder(tmp_path: 
 
 def test_a_run_goes_on_with_more_methods_and_keeps_its_first_command(tmp_path: Path) -> None:
     RunKeeper(tmp_path).begin(note(methods={"a": {"seed": "0"}}, command="first"))
+    RunKeeper(tmp_path).keep(record("a", "k"))
     joined = RunKeeper(tmp_path).begin(note(methods={"b": {"seed": "0"}}, command="second"))
     assert (joined.command, list(joined.methods)) == ("first", ["a", "b"])
     assert read_run(tmp_path)[0] == joined
+
+
+def test_what_never_measured_anything_binds_nobody(tmp_path: Path) -> None:
+    keeper = RunKeeper(tmp_path)
+    keeper.begin(note(methods={"a": {}}, data_identity="a mistake", command="first"))
+    begun = keeper.begin(note(methods={"b": {"digest": "1"}}, command="second"))
+    assert (begun.command, list(begun.methods)) == ("second", ["b"])
+    keeper.keep(record("b", "k"))
+    keeper.begin(note(methods={"none": {"digest": "of nothing"}, "typo": {}}))
+    joined = keeper.begin(note(methods={"none": {"digest": "2"}}, command="third"))
+    assert (joined.command, joined.methods) == ("second", {"b": {"digest": "1"}, "none": {"digest": "2"}})
+    with pytest.raises(RunError, match="digest of b was 1, is 3"):
+        keeper.begin(note(methods={"b": {"digest": "3"}}))
+
+
+def test_frames_are_known_again_by_what_they_are_and_not_by_their_place(tmp_path: Path) -> None:
+    keeper = RunKeeper(tmp_path)
+    keeper.begin(note(methods={"flat": {"frames in": "p/flat", "digest": "1"}}))
+    keeper.keep(record("flat", "k"))
+    assert keeper.begin(note(methods={"flat": {"frames in": "q", "digest": "1"}})).methods["flat"]["frames in"] == "q"
+
+
+def test_a_run_whose_baselines_once_told_more_than_they_use_goes_on(tmp_path: Path) -> None:
+    keeper = RunKeeper(tmp_path)
+    keeper.begin(note(methods={"a": {"baseline": "a", "samples": "4", "seed": "0", "means of": "nothing"}}))
+    keeper.keep(record("a", "k"))
+    assert keeper.begin(note(methods={"a": {"baseline": "a"}})).methods == {"a": {"baseline": "a"}}
 
 
 @pytest.mark.parametrize(
@@ -119,6 +147,7 @@ def test_a_run_goes_on_with_more_methods_and_keeps_its_first_command(tmp_path: P
 def test_another_evaluation_is_refused_with_what_differs(tmp_path: Path, other: dict[str, object], said: str) -> None:
     first = note(methods={"a": {"steps": "1"}})
     RunKeeper(tmp_path).begin(first)
+    RunKeeper(tmp_path).keep(record("a", "k"))
     with pytest.raises(RunError, match=said):
         RunKeeper(tmp_path).begin(msgspec.structs.replace(first, **other))
     assert read_run(tmp_path)[0] == first
@@ -269,6 +298,21 @@ def test_the_command_measures_and_goes_on(tmp_path: Path) -> None:
     assert list(told.methods) == ["copy_source", "saved"]
     scores = {each.method: each.regions["all"].psnr_db for each in records if each.key == "driving-01000001"}
     assert scores["saved"] == scores["copy_source"]
+
+
+def test_a_line_that_measured_nothing_can_be_corrected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    PlaneClips.make(1).write(tmp_path / "data")
+    code, said = evaluated(tmp_path, "--methods", "copy_source", "--views", "all")
+    assert code == 0, said
+    (tmp_path / "logs").mkdir()
+    frames = tmp_path / "run" / "views" / "copy_source"
+    code, said = evaluated(tmp_path, "--no-baselines", "--predictions", f"none={tmp_path / 'logs'}")
+    assert (code != 0, "clips: 0 measured" in said, "1 failures" in said) == (True, True, True), said
+    monkeypatch.chdir(frames.parent)
+    for folder in (str(frames), "copy_source", "./copy_source"):
+        code, said = evaluated(tmp_path, "--no-baselines", "--predictions", f"none={folder}")
+        assert code == 0, said
+    assert list(read_run(tmp_path / "run")[0].methods) == ["copy_source", "none"]
 
 
 def test_what_is_wrong_is_said_before_training_clips_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,9 +23,9 @@ def made(folder: Path, first_seed: int, clips: int) -> PairedClips:
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Evaluation]:
-    """The model and what it is compared with on four held-out scenes, by name."""
+    """The model and what it is compared with on three held-out scenes, by name."""
     folder = tmp_path_factory.mktemp("scenes")
-    clips, training = made(folder / "held-out", 1_000_000, 4), made(folder / "train", 0, 4)
+    clips, training = made(folder / "held-out", 1_000_000, 3), made(folder / "train", 0, 2)
     model = SynthesizedViews.of(load_synthesizer("package:driving-small", device="cpu"), clips)
     settings = BaselineSettings(
         frames=clips.frames,

@@ -21,8 +21,10 @@ from gcd_train.errors import RunError
 from gcd_train.evaluation.record import ClipRecord, RunNote
 
 RUN_FILE = "run.json"
-_SAME = ("data_identity", "kind", "modality", "protocol", "frames", "height", "width", "fps", "seed", "classes")
+_SAME = ("data_identity", "kind", "modality", "protocol", "frames", "height", "width", "seed", "classes")
 _PACKAGE = "gcd-node"
+_INFORMS = ("frames in",)  # the digest says whether frames are the same, wherever they lie
+_ONCE_TOLD = ("samples", "seed", "means of", "published rounding")  # earlier, also of methods that use none of them
 _SHOWN = 48  # letters of a value in a message
 
 
@@ -40,6 +42,9 @@ class RunKeeper:
     def begin(self, note: RunNote) -> RunNote:
         """Write `run.json`, or add this note's methods to the one that is there, whose command and time stay.
 
+        What has no record binds nobody: a note of which nothing was measured is written anew, and a method without
+        records is corrected, or dropped where this note does not name it.
+
         Returns: what now stands there.
         Raises:
             RunError: the folder holds records of another evaluation, two methods would share a folder, or nothing can
@@ -47,7 +52,8 @@ class RunKeeper:
         """
         path = self.folder / RUN_FILE
         if path.exists():
-            note = _joined(self.folder, _read_note(path), note)
+            found = self._with_records(_read_note(path))
+            note = _joined(self.folder, found, note) if found.methods else note
         _require_own_folders(note.methods)
         write_whole(path, msgspec.json.format(msgspec.json.encode(note), indent=1))
         return note
@@ -67,6 +73,15 @@ class RunKeeper:
     def views(self, method: str, key: str) -> Path:
         """Where the frames of a method on a clip lie."""
         return self.folder / "views" / folder_name(method) / folder_name(key)
+
+    def _with_records(self, note: RunNote) -> RunNote:
+        """The note, reduced to methods that were measured on any clip."""
+        measured = {
+            name: told
+            for name, told in note.methods.items()
+            if any((self.folder / "records" / folder_name(name)).glob("*.json"))
+        }
+        return msgspec.structs.replace(note, methods=measured)
 
     def _record(self, method: str, key: str) -> Path:
         return self.folder / "records" / folder_name(method) / f"{folder_name(key)}.json"
@@ -122,12 +137,13 @@ def _joined(folder: Path, found: RunNote, new: RunNote) -> RunNote:
         raise RunError(
             f"{folder} holds records of another evaluation: {'; '.join(told)}. Choose another --out, or delete it"
         )
-    return msgspec.structs.replace(found, methods={**found.methods, **new.methods})
+    return msgspec.structs.replace(found, fps=new.fps, methods={**found.methods, **new.methods})
 
 
 def _differences(method: str, was: Mapping[str, str], now: Mapping[str, str]) -> dict[str, tuple[str, str]]:
     names = dict.fromkeys([*was, *now])
-    return {f"{name} of {method}": (was.get(name, "not told"), now.get(name, "not told")) for name in names}
+    counting = [name for name in names if name not in _INFORMS and (name in now or name not in _ONCE_TOLD)]
+    return {f"{name} of {method}": (was.get(name, "not told"), now.get(name, "not told")) for name in counting}
 
 
 def _short(value: object) -> str:

@@ -173,7 +173,7 @@ def _of_saved_frames(named: str, painted: tuple[SemanticClass, ...], privileged:
     place = Path(folder).resolve()
     SavedFrames.open(name, place)  # to refuse at once
     more = name in privileged
-    told = {"frames in": folder, "digest": _listing(place)} | ({"privileged": "yes"} if more else {})
+    told = {"frames in": str(place), "digest": _listing(place)} | ({"privileged": "yes"} if more else {})
     return Method(name=name, make=partial(SavedFrames.open, name, place, painted=painted, privileged=more), told=told)
 
 
