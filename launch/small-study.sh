@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # The study at small scale, whole: do the paper's findings hold for four small driving models? Design and figures are in
-# docs/small-study.md. Six to seven hours of one CPU core; every step keeps what it has done: after a stop, run the same
+# docs/small-study.md. About three hours of one CPU core; every step keeps what it has done: after a stop, run the same
 # line again.
 #
 #   launch/small-study.sh [FOLDER]      FOLDER: for data, latents, trainings, evaluations, report (runs/small-study)
@@ -8,7 +8,8 @@
 #   DATA     a folder that holds train/, valid/ and test/, each with gradual/ and direct/; nothing is generated then
 #   CLIPS, VALID, TEST   pairs to learn from, to watch and to measure on, where they are generated (500, 8, 40)
 #   THREADS  of CPU computation (1)
-#   HEXPLANE whether HexPlane is measured, too, by far the slowest baseline (yes)
+#   HEXPLANE whether HexPlane is measured, too, by far the slowest baseline (yes); UPDATES, RAYS how long it learns a clip
+#            (200 of 512 rays, a tenth of what `gcd-train evaluate` takes by default)
 #   LPIPS    a folder with LPIPS weights; without one that column stays empty
 #   SMALL    anything: a tiny form of it all, to see that it runs; its figures are worth nothing
 #   PYTHON   the interpreter that has torch (python3)
@@ -57,6 +58,7 @@ done
 
 METHODS=copy_source,mean_target,ground_homography,depth_reprojection,depth_reprojection_on_mean,reproject_rgbd,vanilla_svd
 if [ "${HEXPLANE:-yes}" = yes ]; then METHODS=$METHODS,hexplane_1; fi
+BUDGET=(--hexplane-updates "${UPDATES:-200}" --hexplane-rays "${RAYS:-512}")
 MEASURE=(${LPIPS:+--lpips "$LPIPS"} --views last)
 
 for path in gradual direct; do
@@ -67,7 +69,7 @@ for path in gradual direct; do
   done
 done
 gcd_train evaluate --methods "$METHODS" --svd "$PRETRAINED" --train "$DATA/train/gradual" --train-limit 400 \
-  --data "$DATA/test/gradual" --out "$ROOT/evaluated/baselines" "${MEASURE[@]}"
+  --data "$DATA/test/gradual" --out "$ROOT/evaluated/baselines" "${BUDGET[@]}" "${MEASURE[@]}"
 
 gcd_train findings "$ROOT"/evaluated/* --out "$ROOT/findings" ${SMALL:+--small}
 gcd_train report "$ROOT"/evaluated/* --out "$ROOT/report"

@@ -187,3 +187,13 @@ def test_the_published_controls_fit_the_clips_they_are_for() -> None:
     every = [control for samples in controls.values() for control in samples]
     assert max(control.frame_numbers(14)[-1] for control in every) == 48  # the last frame is never reached
     assert {control.fps(10.0) for control in every} == {5.0, 10.0}
+
+
+def test_who_tells_what_is_left_out_himself_has_it_in_plain_lines_and_nothing_in_the_log(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    skips = Skips(logged=False)
+    for number in range(3):
+        skips.add(f"scene{number}", "--data", "is not there")
+    assert skips.plain_lines(2) == ["scene0: --data is not there", "scene1: --data is not there", "and 1 more"]
+    assert caplog.text == ""

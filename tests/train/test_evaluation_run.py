@@ -1,7 +1,7 @@
 """Runs that are kept: records, resuming, failures, processes, frames that are read back."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import msgspec
@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from driving_plane import PlaneClips
 from made_records import note, record
+from tiny_driving import write_untrained
 from typer.testing import CliRunner
 
 from gcd_train.baselines import (
@@ -24,13 +25,15 @@ from gcd_train.baselines import (
 )
 from gcd_train.cli.main import app
 from gcd_train.datasets.paired import PairedClips
-from gcd_train.errors import DataError, RunError
+from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.evaluation import ClipWork, HeldOutClip, PairedSet, RunKeeper, folder_name, measure_all, read_run
 from gcd_train.evaluation.gpu_seats import gpu_seats
-from gcd_train.evaluation.kept_frames import png
+from gcd_train.evaluation.kept_frames import KeptViews, png
+from gcd_train.evaluation.methods import of_baselines
 from gcd_train.evaluation.paired_set import chosen, identity_of
 from gcd_train.evaluation.run import predicted_and_measured
 from gcd_train.evaluation.spread import GIVE_UP_AFTER, Account
+from gcd_train.reports.material import Run, gather
 
 
 @dataclass
@@ -68,9 +71,10 @@ def pairs(count: int = 3, kind: type[PairedSet] = PairedSet) -> PairedSet:
     return kind(clips=PlaneClips.make(count), identity="plane")
 
 
-def finished(folder: Path, clips: PairedSet, *methods: Predictor) -> Account:
+def finished(folder: Path, clips: PairedSet, *methods: Predictor, views: KeptViews = "none") -> Account:
     """The account at the end of a run."""
-    work = ClipWork(folder=folder, clips=clips, makers={each.name: lambda each=each: each for each in methods})
+    makers = {each.name: lambda each=each: each for each in methods}
+    work = ClipWork(folder=folder, clips=clips, makers=makers, views=views)
     *_, last = measure_all(work)
     return last
 
@@ -195,7 +199,8 @@ def test_a_method_that_fails_takes_nothing_from_the_others(tmp_path: Path) -> No
 
 def test_a_run_in_which_nothing_goes_right_gives_up(tmp_path: Path) -> None:
     account = finished(tmp_path, pairs(7, AllDamaged), Counting())
-    assert (account.measured, account.gave_up) == (GIVE_UP_AFTER, True)
+    assert (account.measured, account.done, account.gave_up) == (0, GIVE_UP_AFTER, True)
+    assert account.lines()[0] == f"clips: 0 measured, 0 there already; {GIVE_UP_AFTER} failures"
     assert "gave up" in account.lines()[-1]
 
 
@@ -254,6 +259,27 @@ def test_only_the_last_frame_is_kept_where_that_is_asked(tmp_path: Path) -> None
     *_, account = measure_all(work)
     assert account.done == 1
     assert {path.name for path in (tmp_path / "views").rglob("*.png")} == {"0003.png"}
+
+
+def pictures_in(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted((folder / "views").rglob("*.png"))}
+
+
+def test_frames_that_a_finished_run_did_not_keep_are_drawn_again_and_records_stay(tmp_path: Path) -> None:
+    finished(tmp_path / "whole", pairs(2), CopySource(), views="all")
+    method = CopySource()
+    finished(tmp_path / "run", pairs(2), method)
+    records = [(tmp_path / "run" / "records" / path).read_bytes() for path in records_in(tmp_path / "run")]
+    wanted: tuple[tuple[KeptViews, int], ...] = (("last", 2), ("all", 2), ("all", 0), ("last", 0), ("none", 0))
+    for views, count in wanted:
+        account = finished(tmp_path / "run", pairs(2), method, views=views)
+        assert (account.measured, account.drawn, account.there) == (0, count, 2 - count)
+    assert pictures_in(tmp_path / "run") == pictures_in(tmp_path / "whole")
+    next((tmp_path / "run" / "views").rglob("sample_0/0001.png")).unlink()
+    account = finished(tmp_path / "run", pairs(2), method, views="all")
+    told = "clips: 0 measured, 1 there already, 1 drawn again for their frames; 0 failures"
+    assert (account.lines(), pictures_in(tmp_path / "run")) == ([told], pictures_in(tmp_path / "whole"))
+    assert records == [(tmp_path / "run" / "records" / path).read_bytes() for path in records_in(tmp_path / "run")]
 
 
 # --- the command ---------------------------------------------------------------------------------------------------
@@ -395,6 +421,11 @@ def test_frames_of_a_method_that_was_given_more_are_starred(tmp_path: Path) -> N
         (["--methods", "copy_source", "--split", "drop-test"], 66, "the world drop, but these pairs are of driving"),
         (["--methods", "copy_source", "--split", "driving-test"], 66, "is of the split"),
         (["--no-baselines"], 78, "there is nothing to measure"),
+        (["--no-baselines", "--methods", "copy_source"], 78, "leave one of the two out"),
+        (["--methods", "copy_source", "--svd", "random:svd"], 78, "--svd is for vanilla_svd"),
+        (["--methods", "vanilla_svd", "--svd", "random:driving"], 78, "random:driving is of the family driving"),
+        (["--methods", "copy_source", "--weights", "random:driving", "--weights", "b"], 78, "got random:driving and b"),
+        (["--methods", "copy_source,hexplane_2"], 78, "hexplane_2 wants 2 cameras, and these clips have the source"),
         (["--no-baselines", "--predictions", "frames"], 78, "NAME=FOLDER"),
         (["--methods", "copy_source", "--privileged", "mine"], 78, "got 'mine'; there are none"),
         ([], 78, "baselines want training clips"),
@@ -405,3 +436,47 @@ def test_the_command_says_what_is_wrong(tmp_path: Path, options: list[str], code
     found, said = evaluated(tmp_path, *options)
     assert (found, words in said) == (code, True), said
     assert "Traceback" not in said
+    assert not (tmp_path / "run" / "run.json").exists()
+
+
+def test_vanilla_svd_takes_weights_that_make_a_video_out_of_a_picture(tmp_path: Path) -> None:
+    settings = BaselineSettings(frames=4, height=32, width=48, samples=3, seed=5)
+    (method,) = of_baselines(["vanilla_svd"], replace(settings, svd="random:svd"), "nothing")
+    told = {"baseline": "vanilla_svd", "samples": "3", "seed": "5", "weights": "random:svd"}
+    assert method.told == told
+    for weights in ("package:driving-small", str(write_untrained(tmp_path))):
+        with pytest.raises(RecipeError, match="is of the family driving"):
+            of_baselines(["vanilla_svd"], replace(settings, svd=weights), "nothing")
+
+
+def test_a_baseline_tells_no_more_than_it_uses_so_that_runs_go_together(tmp_path: Path) -> None:
+    PlaneClips.make(1).write(tmp_path / "data")
+    PlaneClips.make(2).write(tmp_path / "train", first_seed=5)
+    lines = (
+        ["--methods", "copy_source,reproject_rgbd"],
+        ["--methods", "copy_source,reproject_rgbd,mean_target", "--train", str(tmp_path / "train"), "--samples", "3"],
+    )
+    for number, options in enumerate(lines):
+        code, said = evaluated(tmp_path, *options, "--out", str(tmp_path / str(number)))
+        assert code == 0, said
+    (one,) = gather([Run.read(tmp_path / each) for each in "01"])
+    assert [method.name for method in one.methods] == ["copy_source", "reproject_rgbd", "mean_target"]
+    assert one.method("copy_source").details == {"baseline": "copy_source"}
+    assert set(one.method("mean_target").details) == {"baseline", "means of"}
+
+
+def test_weights_of_vanilla_svd_are_told_where_they_lie_whoever_stands_where(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    PlaneClips.make(1).write(tmp_path / "data")
+    met: list[BaselineSettings] = []
+
+    def noted(names: object, settings: BaselineSettings, trained_on: str) -> tuple[()]:
+        met.append(settings)
+        return ()
+
+    monkeypatch.setattr("gcd_train.evaluation.plan.of_baselines", noted)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "svd.safetensors").touch()
+    evaluated(tmp_path, "--methods", "vanilla_svd", "--svd", "svd.safetensors")
+    assert [each.svd for each in met] == [str(tmp_path / "svd.safetensors")]

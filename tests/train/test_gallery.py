@@ -2,6 +2,8 @@
 
 import os
 import re
+import subprocess
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -162,6 +164,21 @@ def test_what_is_no_video_is_refused_by_name(tmp_path: Path, content: bytes, sai
     (tmp_path / "broken.mp4").write_bytes(content)
     with pytest.raises(DataError, match=rf"broken.mp4 {said}"):
         windows_of(tmp_path / "broken.mp4")
+
+
+def test_the_decoder_prints_no_lines_of_its_own(tmp_path: Path) -> None:
+    broken = tmp_path / "broken.mp4"
+    broken.write_bytes(b"\0\0\0\x18ftypmp42" + b"\0" * 64)
+    code = f"from gcd_train.gallery import find_videos; find_videos([__import__('pathlib').Path({str(broken)!r})])[0]"
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}.measured()"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={name: value for name, value in os.environ.items() if name != "OPENCV_FFMPEG_LOGLEVEL"},
+    )
+    assert "cannot be decoded" in done.stderr
+    assert "moov atom" not in done.stderr + done.stdout
 
 
 def test_a_short_video_is_refused_with_what_it_lacks(tmp_path: Path) -> None:

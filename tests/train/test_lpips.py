@@ -168,12 +168,20 @@ def test_files_that_lack_a_tensor_or_hold_no_numbers_are_refused(alex: Made, tmp
 def test_damaged_files_and_files_of_code_are_one_line(alex: Made, tmp_path: Path) -> None:
     folder = write(tmp_path / "bad", "alex", alex.features, alex.heads)
     whole = (folder / "alex.pth").read_bytes()
+    (tmp_path / "whole.pth").write_bytes(whole)
     short = [whole[:size] for size in range(2, min(len(whole), 900), 37)]  # each breaks off in another way
     for content in (b"", b"no weights at all", *short):
         (folder / "alex.pth").write_bytes(content)
         with pytest.raises(DataError, match=r"cannot read the LPIPS weights .*alex\.pth") as caught:
             Lpips.open(folder)
         assert "\n" not in str(caught.value)
+    torch.save(torch.load(tmp_path / "whole.pth"), folder / "alex.pth")  # in torch's newer format
+    newer = (folder / "alex.pth").read_bytes()
+    (folder / "alex.pth").write_bytes(newer[: len(newer) // 2])
+    with pytest.raises(
+        DataError, match=r"reading zip archive: failed finding central directory; fetch the file again$"
+    ):
+        Lpips.open(folder)
     torch.save(nn.Linear(2, 2), folder / "alex.pth")  # a pickled object: reading it would run code
     with pytest.raises(DataError, match="cannot read"):
         Lpips.open(folder)

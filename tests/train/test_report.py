@@ -90,6 +90,31 @@ def test_a_class_that_is_too_small_for_the_class_grid_has_a_dash_there(report: R
     assert "nan" not in text
 
 
+def test_class_figures_of_who_copies_the_exact_classes_have_a_star(report: Report) -> None:
+    lines = {line.split("|")[1].strip(): line for line in to_markdown(report).splitlines() if "|" in line}
+    of_classes = [" *" in cell for name in ("copy_source", "majority_map") for cell in lines[name].split("|")[2:]]
+    assert sum(of_classes[: len(of_classes) // 2]) == 2  # mIoU and accuracy
+    assert sum(of_classes[len(of_classes) // 2 :]) == 0
+
+
+def test_a_class_that_nobody_saw_or_said_has_no_row_and_without_class_maps_there_is_no_table(report: Report) -> None:
+    nothing = (math.nan,) * len(report.classes)
+    unseen = tuple(
+        replace(each, total=replace(each.total, class_iou=(math.nan, *each.total.class_iou[1:])))
+        for each in report.baselines
+    )
+    unseen = tuple(
+        replace(each, total=replace(each.total, class_iou_full=(math.nan, *each.total.class_iou_full[1:])))
+        for each in unseen
+    )
+    assert f"| {report.classes[0]} |" in to_markdown(report)
+    assert f"| {report.classes[0]} |" not in to_markdown(replace(report, baselines=unseen))
+    bare = replace(report.baselines[0].total, miou=math.nan, class_iou=nothing, class_iou_full=nothing)
+    assert "IoU of each class" not in to_markdown(
+        replace(report, baselines=(replace(report.baselines[0], total=bare),))
+    )
+
+
 def test_what_a_predictor_lacks_is_a_dash(report: Report) -> None:
     line = next(line for line in to_markdown(report).splitlines() if line.startswith("| majority_map |"))
     assert line.split("|")[2].strip() == "-"

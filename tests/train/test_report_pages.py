@@ -307,6 +307,30 @@ def test_two_methods_of_one_name_are_refused() -> None:
         gather([one, two])
 
 
+def test_a_method_measured_with_lpips_in_one_run_and_frames_that_were_moved_stay_one_method() -> None:
+    kinds = (
+        ({"baseline": "a"}, {"baseline": "a", "lpips": "vgg"}),
+        (
+            {"frames in": "/one", "digest": "d"},
+            {"frames in": "/two", "digest": "d"},
+        ),
+    )
+    for first, second in kinds:
+        one = run(note(methods={"a": first}), records("a"), folder="one")
+        two = run(note(methods={"a": second}), records("a"), folder="two")
+        assert [method.name for method in gather([one, two])[0].methods] == ["a"]
+    vgg, alex = (run(note(methods={"a": {"lpips": name}}), records("a"), folder=name) for name in ("vgg", "alex"))
+    with pytest.raises(RunError, match="measure it alike in both"):
+        gather([vgg, alex])
+
+
+def test_a_clip_is_as_fast_as_its_record_says_else_as_its_run() -> None:
+    (told,) = gather(
+        [run(note(methods={"a": WEIGHTS}), (msgspec.structs.replace(record("a", "x"), fps=6.0), record("a", "y")))]
+    )
+    assert (told.fps("x"), told.fps("y")) == (6.0, 10.0)
+
+
 def test_the_same_clips_measured_in_another_way_are_refused() -> None:
     one, two = (run(note(protocol=name), records("a"), folder=name) for name in ("paper", "released"))
     with pytest.raises(RunError, match="released has protocol released, paper has paper"):

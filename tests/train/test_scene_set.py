@@ -13,20 +13,25 @@ from tiny_scenes4d import draw, kubric_poses, write_driving, write_kubric
 from typer.testing import CliRunner
 
 from gcd_model.geometry import Spherical
+from gcd_train.baselines import CopySource
 from gcd_train.cli.main import app
 from gcd_train.datasets.clip_frames import FrameSampling
 from gcd_train.datasets.public_splits import public_split, public_split_names
 from gcd_train.datasets.trajectories import OrbitSampling
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation import EvaluationSet, read_run
+from gcd_train.evaluation.asked import Asked, Rivals, SceneWishes
 from gcd_train.evaluation.choosing import Choice
 from gcd_train.evaluation.fingerprint import fingerprint
 from gcd_train.evaluation.opening import SceneCuts, data_kind, open_scenes, usual_samples
+from gcd_train.evaluation.plan import planned
 from gcd_train.evaluation.protocols import PAPER_SOURCE, RELEASED_SOURCE, DrawnControls, FrameBounds, ReleasedControl
+from gcd_train.evaluation.run import predicted_and_measured
 from gcd_train.evaluation.scene_set import far_apart
 from gcd_train.layouts.manifest import MANIFEST, SceneManifest
 from gcd_train.pointcloud import visibility
 
+SCENES = ("scn02900", "scene_000005")
 VIEWS = tuple(f"view{number}" for number in range(4))
 KUBRIC = SceneCuts(frames=3, height=32, width=48, cameras=VIEWS, bounds=FrameBounds(start=0, skip=1))
 DRIVING = replace(KUBRIC, cameras=("camera0", "yaw-0", "yaw-60"))
@@ -108,6 +113,68 @@ def test_a_control_list_says_which_clips_there_are_and_who_is_missing_is_told(ku
     clip = found.clips.clip("scn02901.sample_01")
     assert clip.change == pytest.approx((30.0, 5.0, -1.0))
     assert clip.seen.fps == 24.0
+
+
+def test_a_control_list_that_does_not_fit_is_refused_at_once(kubric: Path, driving: Path, tmp_path: Path) -> None:
+    cuts = replace(KUBRIC, bounds=FrameBounds())
+    listed = controls(tmp_path, ["scn00001"])
+    with pytest.raises(
+        DataError, match=r"controls\.json has none of the 2 scenes in .*, first scn02900; give the list"
+    ):
+        opened(kubric, replace(cuts, controls=listed))
+    driven = tmp_path / "driven.json"
+    driven.write_text(json.dumps({name: {"sample_00": {"frame_start": 0, "frame_skip": 1}} for name in SCENES}))
+    with pytest.raises(DataError, match="scn02900, sample_00 has no spherical_start: it is a driving control"):
+        opened(kubric, replace(cuts, controls=driven))
+    assert opened(driving, replace(DRIVING, bounds=FrameBounds(), controls=driven)).keys == ("scene_000005.sample_00",)
+
+
+def test_a_camera_below_the_ground_is_told(kubric: Path, tmp_path: Path) -> None:
+    path = controls(tmp_path, ["scn02900", "scn02901"], samples=1)
+    path.write_text(path.read_text().replace("[50, 40, 14]", "[50, -40, 14]", 1))
+    cuts = replace(KUBRIC, bounds=FrameBounds(), controls=path)
+    (told,) = open_scenes(kubric, Choice(), cuts).notes
+    assert told.endswith("1 of 2 clips have a camera below the ground, first scn02900, sample_00; see its angles")
+    assert (
+        open_scenes(kubric, Choice(), replace(cuts, controls=controls(tmp_path, ["scn02901", "scn02900"]))).notes == ()
+    )
+
+
+def test_cameras_that_no_scene_has_are_refused_at_once(kubric: Path, driving: Path) -> None:
+    for root, cuts, names in (
+        (kubric, KUBRIC, (*VIEWS, "view9")),
+        (kubric, KUBRIC, ("nope",)),
+        (driving, DRIVING, None),
+    ):
+        with pytest.raises(DataError, match=r"none of \d scenes can be opened with .*; name those there are"):
+            opened(root, replace(cuts, cameras=names or ("yaw-0", "nope")))
+
+
+def test_more_views_than_there_are_cameras_are_refused_at_once(kubric: Path) -> None:
+    def asked(names: str) -> Asked:
+        cut = SceneWishes(cameras=VIEWS, bounds=FrameBounds(start=0, skip=1))
+        return Asked(data=[kubric], cut=cut, rivals=Rivals(names=[names]))
+
+    assert len(planned(asked("hexplane_4")).methods) == 1
+    with pytest.raises(RecipeError, match="hexplane_9 wants 9 cameras, and these clips have 3 beside the source; give"):
+        planned(asked("copy_source,hexplane_9"))
+
+
+def test_rates_follow_the_strides(kubric: Path, tmp_path: Path) -> None:
+    drawn = opened(kubric, replace(KUBRIC, bounds=FrameBounds(), protocol="paper"))
+    assert (drawn.fps, tuple(drawn.rates)) == (24.0, (24.0, 12.0, 8.0, 6.0))
+    released = opened(kubric, replace(KUBRIC, bounds=FrameBounds(), protocol="released"))
+    assert (released.fps, tuple(released.rates)) == (12.0, (12.0,))
+    listed = opened(kubric, replace(KUBRIC, bounds=FrameBounds(), controls=controls(tmp_path, ["scn02900"])))
+    assert tuple(listed.rates) == (24.0,)
+    assert tuple(opened(kubric, replace(KUBRIC, bounds=FrameBounds(skip=3))).rates) == (8.0,)
+
+
+def test_a_record_tells_its_clips_own_rate(kubric: Path) -> None:
+    clips = opened(kubric, replace(KUBRIC, frames=2, protocol="released", bounds=FrameBounds(skip=3)))
+    clip = clips.clip("scn02900.sample_00")
+    _, record = predicted_and_measured(CopySource(), clip, classes=())
+    assert (record.fps, clips.fps) == (8.0, 8.0)
 
 
 def test_a_source_that_is_a_camera_of_the_scene_has_its_own_depth(kubric: Path, tmp_path: Path) -> None:

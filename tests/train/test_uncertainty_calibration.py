@@ -176,7 +176,11 @@ def test_the_command_reports_and_stores_a_scale(tmp_path: Path, weights: Path) -
     note = json.loads((tmp_path / "out" / "calibration.json").read_text())
     scale = note["found"]["scale"]
     assert set(note["found"]["regions"]) == {"all", "visible", "occluded"}
-    assert f"**Scale {scale:.3g}**" in (tmp_path / "out" / "calibration.md").read_text()
+    text = (tmp_path / "out" / "calibration.md").read_text()
+    assert f"**Scale {scale:.3g}**, chosen on 1 scene; the table is of the other 1." in text
+    assert "Measured on 2 scenes: of fewer than 10 no claim can rest on this scale." in text
+    assert "warning: Measured on 2 scenes" in said
+    assert f"{stored} holds the scale {scale:.3g}: for 2 samples in" in " ".join(said.split())
     assert (tmp_path / "out" / "reliability.png").read_bytes().startswith(b"\x89PNG")
     assert inspect_weights(weights).uncertainty_scale is None
     assert inspect_weights(stored).uncertainty_scale == scale

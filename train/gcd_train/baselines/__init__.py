@@ -19,6 +19,7 @@ from gcd_train.baselines.predictor import (
 from gcd_train.baselines.published_reprojection import REPROJECT_RGBD, REPROJECT_SEMD, ReprojectRgbd, ReprojectSemd
 from gcd_train.baselines.registry import (
     DEPTH_ON_MEAN,
+    FROM_EXACT_CLASSES,
     HEXPLANE_VIEWS,
     BaselineSettings,
     ClassesAlone,
@@ -34,6 +35,7 @@ from gcd_train.baselines.vanilla_svd import VANILLA_SVD, VanillaSVD
 
 __all__ = [
     "DEPTH_ON_MEAN",
+    "FROM_EXACT_CLASSES",
     "HEXPLANE_VIEWS",
     "REPROJECT_RGBD",
     "REPROJECT_SEMD",

@@ -27,6 +27,8 @@ DEPTH_ON_MEAN = "depth_reprojection_on_mean"
 """Depth reprojection with holes as in the mean target and the majority map."""
 HEXPLANE_VIEWS = (1, 2, 4, 8)
 """Numbers of input views that a HexPlane is usually given; any other number goes too."""
+FROM_EXACT_CLASSES = ("copy_source", "ground_homography")
+"""Baselines that are not privileged in their pictures, but make their class maps from the source's exact ones."""
 
 _HEXPLANE = re.compile(r"hexplane_([1-9]\d*)")
 

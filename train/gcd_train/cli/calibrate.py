@@ -40,7 +40,7 @@ def calibrate_command(
     with errors_shown():
         from gcd_model import RenderOptions, convert_weights, load_synthesizer
         from gcd_train.evaluation.calibration import calibrate
-        from gcd_train.evaluation.calibration_report import CalibrationNote, write_calibration
+        from gcd_train.evaluation.calibration_report import CalibrationNote, stored_line, warnings, write_calibration
         from gcd_train.evaluation.choosing import Choice
         from gcd_train.evaluation.synthesized import SynthesizedViews
         from gcd_train.show.matplotlib_door import require_matplotlib
@@ -69,9 +69,16 @@ def calibrate_command(
         text = write_calibration(note, out)
         if path is not None and store is not None:
             convert_weights(path, store, uncertainty_scale=found.scale)
+            _say(stored_line(note, store))
     echo(text)
+    for line in warnings(note):
+        _say(f"warning: {line}")
     written = f"{out}/calibration.json, calibration.md and reliability.png" + ("" if store is None else f", {store}")
-    _LOG.print(f"wrote {written}", markup=False, soft_wrap=True)
+    _say(f"wrote {written}")
+
+
+def _say(line: str) -> None:
+    _LOG.print(line, markup=False, soft_wrap=True)
 
 
 def _clips(data: Sequence[Path], choice: "Choice", model: "Synthesizer", seed: int) -> "EvaluationSet":
@@ -93,7 +100,7 @@ def _clips(data: Sequence[Path], choice: "Choice", model: "Synthesizer", seed: i
         )
         opened = open_scenes(data[0], choice, cuts)
     for note in opened.notes:
-        _LOG.print(note, markup=False, soft_wrap=True)
+        _say(note)
     return opened.clips
 
 
@@ -123,7 +130,7 @@ def _measured(clips: "EvaluationSet", views: "Predictor") -> "tuple[Sequence[Dis
                 clip = clips.clip(key)
             except DataError as error:
                 unreadable.append(f"{key}: {error}")
-                _LOG.print(f"left out {key}: {error}", markup=False, soft_wrap=True)
+                _say(f"left out {key}: {error}")
             else:
                 measured.append(distances(clip, views.predict(clip.seen)))
             show(number)

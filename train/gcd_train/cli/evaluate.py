@@ -15,6 +15,7 @@ from typer import Option
 from gcd_model import Quality, RenderOptions, SolverName
 from gcd_train.cli.errors import errors_shown
 from gcd_train.cli.progress_bar import progress_bar
+from gcd_train.errors import RecipeError
 from gcd_train.evaluation import ClipWork, RunKeeper, measure_all
 from gcd_train.evaluation.asked import Asked, Candidate, Looks, Rivals, SceneWishes, declared_mount
 from gcd_train.evaluation.choosing import Choice
@@ -32,7 +33,7 @@ _FIELD = HexPlaneSettings()
 
 Folders = Annotated[list[Path], Option(help="Folder of pairs (several may be given), or one of whole scenes.")]
 Out = Annotated[Path, Option(help="Folder of the run: run.json, records, tables; one that is there is gone on with.")]
-WeightsPath = Annotated[str | None, Option(help="package:NAME or a path; without, baselines alone.")]
+WeightsPath = Annotated[list[str] | None, Option(help="package:NAME or a path; without, baselines alone.")]
 Steps = Annotated[list[int] | None, Option(min=1, help="Also with so many steps of the sampler; may be repeated.")]
 Samples = Annotated[int | None, Option(min=1, help="Draws of each view; by default 1 of pairs, else by the protocol.")]
 Guidance = Annotated[tuple[float, float] | None, Option(help="Of the first and the last frame; by default as shipped.")]
@@ -128,11 +129,19 @@ def evaluate_command(
         rivals = replace(known, predictions=predictions, privileged=privileged, hexplane=field)
         sampler = RenderOptions(quality=quality, solver=solver, guidance=guidance, guidance_interval=guidance_interval)
         sampling = replace(sampler, samples=samples or usual_samples(data, protocol), seed=seed)
-        tested = Candidate(weights=weights, device=device, dtype=dtype, steps=steps, sampling=sampling)
+        tested = Candidate(weights=_one(weights), device=device, dtype=dtype, steps=steps, sampling=sampling)
         asked = Asked(
             data=data, protocol=protocol, choice=choice, cut=cut, mount=mount, tested=tested, rivals=rivals, lpips=lpips
         )
         _evaluate(asked, out, views=views, workers=workers, ray=ray, sheet_clips=sheet_clips)
+
+
+def _one(weights: list[str] | None) -> str | None:
+    if weights and len(weights) > 1:
+        raise RecipeError(
+            f"one --weights is measured at a time, got {' and '.join(weights)}; give each its own line, to one --out"
+        )
+    return weights[0] if weights else None
 
 
 def _evaluate(asked: Asked, out: Path, *, views: KeptViews, workers: int, ray: str | None, sheet_clips: int) -> None:
@@ -140,7 +149,8 @@ def _evaluate(asked: Asked, out: Path, *, views: KeptViews, workers: int, ray: s
     plan = planned(asked)
     for line in plan.opened.notes:
         _say(line)
-    RunKeeper(out).begin(note_of(plan, _command_line()))
+    note = note_of(plan, _command_line())
+    RunKeeper(out).begin(note)
     plan = plan.with_means(progress_bar)
     work = ClipWork(
         folder=out.resolve(),
@@ -150,6 +160,7 @@ def _evaluate(asked: Asked, out: Path, *, views: KeptViews, workers: int, ray: s
         views=views,
     )
     account = _measured(work, workers, ray, asked.tested.device)
+    RunKeeper(out).begin(note)  # anew: a line that ran beside this one saw no records yet, and dropped the methods
     for line in account.lines():
         _say(line)
     typer.echo(write_outcome(plan, work, sheet_clips))

@@ -12,7 +12,7 @@ def findings_command(
     runs: Annotated[list[Path], typer.Argument(help="Folders that `gcd-train evaluate` wrote.", metavar="RUN...")],
     out: Annotated[Path, typer.Option(help="Folder for findings.md and findings.csv.")],
     small: Annotated[bool, typer.Option("--small", help="Of models trained with --small.")] = False,
-    seed: Annotated[int, typer.Option(help="Of the draws of scenes that intervals come from.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the draws of scenes that intervals come from.")] = 0,
 ) -> None:
     """Say which claims of the small-scale study hold; a claim needs its 95 % interval off zero."""
     from gcd_train.evaluation.report import write_file  # here: `--help` wants none of it

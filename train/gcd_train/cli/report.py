@@ -24,7 +24,7 @@ def report_command(
     clips: Annotated[int, typer.Option(min=0, help="Clips in the gallery.")] = 4,
     worst: Annotated[int, typer.Option(min=0, help="Worst clips of each compared method.")] = 4,
     plots: Annotated[bool, typer.Option(help="Draw plots; needs matplotlib.")] = True,
-    seed: Annotated[int, typer.Option(help="Of the draws of scenes that intervals come from.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the draws of scenes that intervals come from.")] = 0,
 ) -> None:
     """Write the paper's tables, or the same for our own clips, from what was measured; nothing is measured again."""
     from gcd_train.reports.pages import Choices, make_report  # here: `--help` wants none of it

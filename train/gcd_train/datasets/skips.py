@@ -37,12 +37,13 @@ class Skipped:
 
 
 class Skips:
-    """Everything left out so far. Each distinct one is logged once, as a warning.
+    """Everything left out so far. Each distinct one is logged once, as a warning, unless whoever asks tells it himself.
 
     A loader worker has its own; `PairSample.skipped` carries what it left out, for `extend` in the main process.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, logged: bool = True) -> None:
+        self._logged = logged
         self._counts: Counter[Skipped] = Counter()
         self._beyond = 0
 
@@ -59,7 +60,8 @@ class Skips:
                 self._counts[skipped] += 1
             elif len(self._counts) < _DISTINCT:
                 self._counts[skipped] = 1
-                _LOG.warning("left out %s", skipped)
+                if self._logged:
+                    _LOG.warning("left out %s", skipped)
             else:
                 self._beyond += 1  # a set in which everything is wrong must not fill the memory
 
@@ -80,6 +82,11 @@ class Skips:
         for skipped, count in self._counts.items():
             scenes[skipped.scene] += count
         return dict(scenes)
+
+    def plain_lines(self, most: int = _SHOWN) -> list[str]:
+        """The first ones, a line each, and how many more there are."""
+        rest = len(self._counts) - most
+        return [*map(str, list(self._counts)[:most]), *([f"and {rest} more"] if rest > 0 else [])]
 
     def lines(self, most: int = _SHOWN) -> list[str]:
         """A short account to print, the most frequent first; empty if nothing was left out."""

@@ -11,6 +11,9 @@ from gcd_train.evaluation.record import Region
 STATED = (0.5, 0.9)
 """Levels that tables show."""
 
+FEW_SCENES = 10
+"""Of fewer, no claim can rest on what was found."""
+
 _COLOURS: dict[Region, str] = {"all": "#1f4e9c", "visible": "#2c8a4b", "occluded": "#c0392b"}
 
 
@@ -54,17 +57,34 @@ def calibration_text(note: CalibrationNote) -> str:
         f"# Calibration of {note.weights}",
         "",
         f"Weights {note.sha256_12}, {note.samples} samples, steps {note.steps}, seed {note.seed}; {note.clips} clips "
-        f"({note.data_identity}) of {len(found.fitted) + len(found.reported)} scenes in {', '.join(note.data)}.",
+        f"({note.data_identity}) of {_scenes(len(found.fitted) + len(found.reported))} in {', '.join(note.data)}.",
         "",
-        f"**Scale {found.scale:.3g}**, chosen on {len(found.fitted)} scenes; the table is of the other "
+        f"**Scale {found.scale:.3g}**, chosen on {_scenes(len(found.fitted))}; the table is of the other "
         f"{len(found.reported)}.",
         "",
+        *(f"{line}\n" for line in warnings(note)),
         f"| {' | '.join(columns)} |",
         "|" + " --- |" * (2 * len(STATED) + 3),
         *(_row(region, found.regions[region]) for region in found.regions),
         *(f"\nNot read: {told}" for told in note.unreadable),
     ]
     return "\n".join(lines) + "\n"
+
+
+def warnings(note: CalibrationNote) -> tuple[str, ...]:
+    """What the scale should not be trusted for, line by line."""
+    scenes = len(note.found.fitted) + len(note.found.reported)
+    if scenes >= FEW_SCENES:
+        return ()
+    return (f"Measured on {_scenes(scenes)}: of fewer than {FEW_SCENES} no claim can rest on this scale.",)
+
+
+def stored_line(note: CalibrationNote, file: Path) -> str:
+    """What a scale that was stored holds for; the file keeps the number alone."""
+    return (
+        f"{file} holds the scale {note.found.scale:.3g}: for {note.samples} samples in {note.steps} steps, and scenes "
+        "like these; with other --samples it is wrong"
+    )
 
 
 def write_plot(found: Calibration, out: Path) -> None:
@@ -98,6 +118,10 @@ def _row(region: Region, of: Reliability) -> str:
         place = LEVELS.index(level)
         cells += [_percent(of.held[place]), _percent(of.held_scaled[place])]
     return f"| {' | '.join([*cells, f'{of.miscoverage:.3f}', f'{of.miscoverage_scaled:.3f}'])} |"
+
+
+def _scenes(count: int) -> str:
+    return f"{count} scene" + "s" * (count != 1)
 
 
 def _percent(share: float) -> str:

@@ -56,6 +56,7 @@ class ClipFacts(Protocol):
 class EvaluationSet(ClipFacts, Protocol):
     """Clips by key, the same whenever they are asked for, in any process.
 
+    fps: frames per second; of clips that differ, the highest. rates: all that clips may have, the highest first.
     identity: digest of what the clips are read from and how they were drawn.
     """
 
@@ -65,6 +66,8 @@ class EvaluationSet(ClipFacts, Protocol):
     def kind(self) -> SetKind: ...
     @property
     def fps(self) -> float: ...
+    @property
+    def rates(self) -> Sequence[float]: ...
     @property
     def identity(self) -> str: ...
 

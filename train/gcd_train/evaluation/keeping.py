@@ -18,12 +18,12 @@ from pathlib import Path
 import msgspec
 
 from gcd_train.errors import RunError
-from gcd_train.evaluation.record import ClipRecord, RunNote
+from gcd_train.evaluation.record import FRAMES_IN, ClipRecord, RunNote
 
 RUN_FILE = "run.json"
 _SAME = ("data_identity", "kind", "modality", "protocol", "frames", "height", "width", "seed", "classes")
 _PACKAGE = "gcd-node"
-_INFORMS = ("frames in",)  # the digest says whether frames are the same, wherever they lie
+_INFORMS = (FRAMES_IN,)  # the digest says whether frames are the same, wherever they lie
 _ONCE_TOLD = ("samples", "seed", "means of", "published rounding")  # earlier, also of methods that use none of them
 _SHOWN = 48  # letters of a value in a message
 
@@ -137,7 +137,7 @@ def _joined(folder: Path, found: RunNote, new: RunNote) -> RunNote:
         raise RunError(
             f"{folder} holds records of another evaluation: {'; '.join(told)}. Choose another --out, or delete it"
         )
-    return msgspec.structs.replace(found, fps=new.fps, methods={**found.methods, **new.methods})
+    return msgspec.structs.replace(found, fps=new.fps, rates=new.rates, methods={**found.methods, **new.methods})
 
 
 def _differences(method: str, was: Mapping[str, str], now: Mapping[str, str]) -> dict[str, tuple[str, str]]:

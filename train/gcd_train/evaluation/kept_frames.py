@@ -26,11 +26,12 @@ def write_views(
     """Write `source/`, `target/` and `sample_0/` and so on, each frame under its number from 0000.png on.
 
     A method that makes class maps alone has them painted there; one that makes both has `classes_0/` and
-    `target_classes/` beside. classes: the ontology. Raises RunError if a file cannot be written.
+    `target_classes/` beside. The target is written last: where it is whole, all is. classes: the ontology. Raises
+    RunError if a file cannot be written.
     """
     if which == "none":
         return
-    strips = {"source": clip.seen.source, "target": clip.target}
+    strips = {"source": clip.seen.source}
     for number, draw in enumerate(prediction.draws):
         labels = None if draw.classes is None or not classes else painted(draw.classes, classes)
         if draw.video is not None:
@@ -40,9 +41,27 @@ def write_views(
     true = to_labels(clip.target_classes)
     if true is not None and classes and "classes_0" in strips:
         strips["target_classes"] = painted(true, classes)
+    strips["target"] = clip.target
     for name, frames in strips.items():
-        for t in range(len(frames) - 1 if which == "last" else 0, len(frames)):
-            write_whole(folder / name / f"{t:04d}.png", png(frames[t]))
+        for t in _wanted(which, len(frames)):
+            write_whole(folder / name / _file(t), png(frames[t]))
+
+
+def has_views(folder: Path, which: KeptViews, frames: int) -> bool:
+    """Whether `write_views` has written what is wanted of a clip of so many frames, and nobody took any of it away."""
+    if which == "none":
+        return True
+    strips = {place.name: {path.name for path in place.iterdir()} for place in folder.glob("*/")}
+    wanted = {_file(t) for t in _wanted(which, frames)}
+    return "target" in strips and all(wanted <= there for there in strips.values())
+
+
+def _wanted(which: KeptViews, frames: int) -> range:
+    return range(frames - 1 if which == "last" else 0, frames)
+
+
+def _file(frame: int) -> str:
+    return f"{frame:04d}.png"
 
 
 def painted(labels: Tensor, classes: Sequence[SemanticClass]) -> Bytes:

@@ -51,6 +51,7 @@ def measure(
         scene=clip.scene,
         change=clip.change,
         frames=len(target),
+        fps=clip.seen.fps,
         draws=len(prediction.draws),
         seconds=seconds,
         regions={region: _region(mask, target, shown, painted) for region, mask in masks.items()},

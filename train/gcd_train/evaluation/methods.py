@@ -6,9 +6,13 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 
-from gcd_model import RenderOptions, Synthesizer, load_synthesizer, sampler_of
+from gcd_model import RenderOptions, Synthesizer, inspect_weights, load_synthesizer, sampler_of
 from gcd_model.config import CameraControl, SemanticClass
+from gcd_model.loading import packaged_weights
 from gcd_train.baselines import (
+    DEPTH_ON_MEAN,
+    REPROJECT_RGBD,
+    REPROJECT_SEMD,
     VANILLA_SVD,
     BaselineSettings,
     Predictor,
@@ -18,9 +22,16 @@ from gcd_train.baselines import (
     usual_baselines,
 )
 from gcd_train.errors import DataError, RecipeError
+from gcd_train.evaluation.record import FRAMES_IN
 from gcd_train.evaluation.spread import Maker
 from gcd_train.evaluation.synthesized import ClipFacts, SynthesizedViews
 
+HEXPLANE = "hexplane_"
+"""What the name of every HexPlane begins with; the number of its views follows."""
+_SVD = "svd"
+"""The family of image-to-video weights."""
+_OF_MEANS = ("mean_target", "majority_map", "ground_homography", "depth_reprojection", DEPTH_ON_MEAN)
+_ROUNDED = (REPROJECT_RGBD, REPROJECT_SEMD)
 _DIGITS = 12
 
 
@@ -90,19 +101,30 @@ def of_baselines(names: Sequence[str] | None, settings: BaselineSettings, traine
         RecipeError: there is none of a name, or it lacks what it needs.
     """
     chosen = usual_baselines(settings) if names is None else names
+    if VANILLA_SVD in chosen and settings.svd is not None:
+        _require_image_to_video(settings.svd)
     for name in chosen:
         if name != VANILLA_SVD or settings.svd is None:
             build(name, settings)  # to refuse at once; weights are opened where they are used
-    told = {"samples": str(settings.samples), "seed": str(settings.seed), "means of": trained_on}
-    told |= {"published rounding": "yes"} if settings.published else {}
     return tuple(
         Method(
             name=name,
             make=partial(build, name, settings),
-            told={"baseline": name, **told, **described(name, settings)},
+            told={"baseline": name, **_used(name, settings, trained_on), **described(name, settings)},
         )
         for name in chosen
     )
+
+
+def require_views(names: Sequence[str], others: int) -> None:
+    """Raises RecipeError where a HexPlane wants more views than there are. others: cameras beside the source."""
+    for name in names:
+        views = name.removeprefix(HEXPLANE)
+        if name != views and views.isdecimal() and int(views) > others + 1:
+            there = f"{others} beside the source" if others else "the source alone"
+            raise RecipeError(
+                f"{name} wants {views} cameras, and these clips have {there}; give {HEXPLANE}{others + 1} or less"
+            )
 
 
 def of_saved_frames(
@@ -126,6 +148,28 @@ def of_saved_frames(
             f"there are {', '.join(names) or 'none'}"
         )
     return methods
+
+
+def _used(name: str, settings: BaselineSettings, trained_on: str) -> dict[str, str]:
+    """What of all that baselines are told this one works with: it is the same method wherever that is the same."""
+    told = {"samples": str(settings.samples)} if name == VANILLA_SVD else {}
+    told |= {"seed": str(settings.seed)} if name == VANILLA_SVD or name.startswith(HEXPLANE) else {}
+    told |= {"means of": trained_on} if name in _OF_MEANS else {}
+    return told | ({"published rounding": "yes"} if settings.published and name in _ROUNDED else {})
+
+
+def _require_image_to_video(weights: str) -> None:
+    """Raises RecipeError for weights that say they do something else; CheckpointError if they cannot be opened."""
+    kind, _, name = weights.partition(":")
+    if kind == "random":
+        family = name
+    else:
+        family = inspect_weights(packaged_weights(name) if kind == "package" else weights).family or _SVD
+    if family != _SVD:
+        raise RecipeError(
+            f"{VANILLA_SVD} wants weights that make a video out of a picture, {weights} is of the family {family}; "
+            "give svd.safetensors"
+        )
 
 
 def require_names_apart(methods: Sequence[Method]) -> None:
@@ -173,7 +217,7 @@ def _of_saved_frames(named: str, painted: tuple[SemanticClass, ...], privileged:
     place = Path(folder).resolve()
     SavedFrames.open(name, place)  # to refuse at once
     more = name in privileged
-    told = {"frames in": str(place), "digest": _listing(place)} | ({"privileged": "yes"} if more else {})
+    told = {FRAMES_IN: str(place), "digest": _listing(place)} | ({"privileged": "yes"} if more else {})
     return Method(name=name, make=partial(SavedFrames.open, name, place, painted=painted, privileged=more), told=told)
 
 

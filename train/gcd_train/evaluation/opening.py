@@ -33,6 +33,7 @@ from gcd_train.evaluation.protocols import (
     ProtocolName,
     ReleasedControl,
 )
+from gcd_train.evaluation.scene_checks import controlled, orbit_notes, require_cameras
 from gcd_train.evaluation.scene_set import SceneSet
 from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
 
@@ -70,7 +71,7 @@ class SceneCuts:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Opened:
-    """Clips to be measured. notes: what of the split or list is not there, line by line."""
+    """Clips to be measured. notes: what of the split or list is not there, and what is odd, line by line."""
 
     clips: EvaluationSet
     notes: tuple[str, ...] = ()
@@ -108,14 +109,17 @@ def open_pairs(folders: Sequence[Path], choice: Choice, mount: CameraMount | Non
     """
     if choice.listed is not None:
         raise RecipeError("--list names whole scenes, and these are pairs; give --split NAME, or leave it out")
-    clips, notes = PairedClips.open([folder.resolve() for folder in folders]), Skips()  # processes may stand elsewhere
+    clips, notes = (
+        PairedClips.open([folder.resolve() for folder in folders]),
+        Skips(logged=False),
+    )  # processes may stand elsewhere
     scenes = [clips.scene(number) for number in range(len(clips))]
     wanted = None
     if choice.split is not None:
         wanted = pairs_of_split(choice.split, scenes, notes)
     return Opened(
         clips=PairedSet.of(chosen(clips, scenes=wanted, limit=choice.limit), declared=_declared(mount, clips)),
-        notes=tuple(notes.lines()),
+        notes=tuple(notes.plain_lines()),
     )
 
 
@@ -127,12 +131,14 @@ def open_scenes(folder: Path, choice: Choice, cuts: SceneCuts) -> Opened:
             each other, or no such split.
     """
     folder = folder.resolve()  # processes may stand elsewhere
-    orbits, notes = data_kind([folder]) == "kubric4d", Skips()
+    orbits, notes = data_kind([folder]) == "kubric4d", Skips(logged=False)
     whole = _kubric(folder, cuts) if orbits else _driving(folder, cuts)
     controls = _controls(cuts, orbits=orbits)
     scenes = wanted_scenes(folder, whole.scenes, choice, notes)
-    scenes = _controlled(scenes, controls, cuts, notes)[: choice.limit]
+    scenes = controlled(scenes, controls, cuts.controls, folder, notes)[: choice.limit]
     data = whole.only(scenes)
+    odd = _odd(controls, scenes, cuts) if orbits else ()
+    require_cameras(data)
     pairs = ViewPairs(
         data,
         _sampling(cuts, orbits=orbits),
@@ -150,12 +156,19 @@ def open_scenes(folder: Path, choice: Choice, cuts: SceneCuts) -> Opened:
         frames=cuts.frames,
         height=cuts.height,
         width=cuts.width,
-        fps=data.fps / (cuts.bounds.skip or 1),
         kind="kubric" if orbits else "driving",
         identity=_identity(folder, scenes, cuts),
         semantic=cuts.semantic,
     )
-    return Opened(clips=clips, notes=tuple(notes.lines()))
+    return Opened(clips=clips, notes=(*notes.plain_lines(), *odd))
+
+
+def _odd(controls: ClipControls, scenes: Sequence[str], cuts: SceneCuts) -> tuple[str, ...]:
+    """See `orbit_notes`; only a list can be odd."""
+    if cuts.controls is None or not isinstance(controls, ListedControls):
+        return ()
+    chosen = [(scene, name) for scene in scenes for name in controls.names(scene)]
+    return orbit_notes(controls.controls, chosen, cuts.controls)
 
 
 def _declared(mount: CameraMount | None, clips: PairedClips) -> CameraMount | None:
@@ -184,14 +197,6 @@ def _names(folder: Path) -> list[str]:
         return [path.name for path in folder.iterdir()]
     except OSError as error:
         raise DataError(f"{folder} cannot be read ({error}); give a folder with pairs or with scenes") from error
-
-
-def _controlled(scenes: Sequence[str], controls: ClipControls, cuts: SceneCuts, notes: Skips) -> tuple[str, ...]:
-    """Those of which there are clips; the others are counted."""
-    for scene in scenes:
-        if not controls.names(scene):
-            notes.add(scene, str(cuts.controls), "has no control for it")
-    return tuple(scene for scene in scenes if controls.names(scene))
 
 
 def _controls(cuts: SceneCuts, *, orbits: bool) -> ClipControls:

@@ -97,6 +97,11 @@ class PairedSet:
         """Frames per second."""
         return self.clips.fps
 
+    @property
+    def rates(self) -> Sequence[float]:
+        """One for all."""
+        return (self.fps,)
+
     def number(self, key: str, /) -> int:
         """Of the clip with this name. Raises DataError for another."""
         if key not in self._numbers:

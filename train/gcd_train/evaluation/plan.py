@@ -11,7 +11,7 @@ from typing import TypeAlias
 import torch
 
 from gcd_model import Traits
-from gcd_train.baselines import BaselineSettings, TargetStatistics, fit_statistics
+from gcd_train.baselines import VANILLA_SVD, BaselineSettings, TargetStatistics, fit_statistics
 from gcd_train.datasets.paired import PairedClips, require_apart
 from gcd_train.errors import RecipeError
 from gcd_train.evaluation.asked import Asked, SceneWishes
@@ -24,10 +24,12 @@ from gcd_train.evaluation.methods import (
     of_saved_frames,
     of_weights,
     require_names_apart,
+    require_views,
 )
 from gcd_train.evaluation.opening import Opened, SceneCuts, data_kind, open_pairs, open_scenes
 from gcd_train.evaluation.paired_set import PairedSet, identity_of
-from gcd_train.evaluation.record import RunNote
+from gcd_train.evaluation.record import LPIPS, RunNote
+from gcd_train.evaluation.scene_set import SceneSet
 from gcd_train.layouts.manifest import package_version
 from gcd_train.metrics import Lpips
 
@@ -106,6 +108,7 @@ def planned(asked: Asked) -> Plan:
         DataError: data or frames are missing, or do not fit together. RecipeError: options contradict each other, or
             there is nothing to measure. CheckpointError: weights cannot be opened.
     """
+    _require_used(asked)
     lpips = None if asked.lpips is None else Lpips.open(asked.lpips).identity
     if data_kind(asked.data) == "pairs":
         _require_pairs_options(asked)
@@ -147,7 +150,7 @@ def planned(asked: Asked) -> Plan:
 def note_of(plan: Plan, command: str) -> RunNote:
     """What the run says of itself. command: the line that began it."""
     clips, asked = plan.clips, plan.asked
-    lpips = {} if plan.lpips is None else {"lpips": plan.lpips}
+    lpips = {} if plan.lpips is None else {LPIPS: plan.lpips}
     return RunNote(
         command=command,
         made=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -165,6 +168,7 @@ def note_of(plan: Plan, command: str) -> RunNote:
         height=clips.height,
         width=clips.width,
         fps=clips.fps,
+        rates=tuple(clips.rates) if len(clips.rates) > 1 else (),
         seed=asked.tested.sampling.seed,
         classes=tuple(each.name for each in clips.classes),
         methods={method.name: {**method.told, **lpips} for method in plan.methods},
@@ -172,9 +176,28 @@ def note_of(plan: Plan, command: str) -> RunNote:
 
 
 def _weights(asked: Asked) -> Weights:
-    named = asked.tested.weights or ""
-    path = str(Path(named).resolve()) if Path(named).exists() else named  # processes may stand elsewhere
+    path = _resolved(asked.tested.weights or "")
     return Weights(path=path, device=asked.tested.device, dtype=asked.tested.dtype)
+
+
+def _resolved(weights: str) -> str:
+    """A path that does not depend on where a process stands; names of weights as they are."""
+    return str(Path(weights).resolve()) if weights and Path(weights).exists() else weights
+
+
+def _names(asked: Asked) -> list[str] | None:
+    """The baselines that are asked for by name; None for the usual ones."""
+    told = asked.rivals.names
+    return None if told is None else [name.strip() for name in ",".join(told).split(",") if name.strip()]
+
+
+def _require_used(asked: Asked) -> None:
+    """Raises RecipeError for what would be left aside without a word."""
+    told = asked.rivals
+    if told.names is not None and not told.usual:
+        raise RecipeError("--methods names baselines and --no-baselines wants none; leave one of the two out")
+    if told.svd is not None and VANILLA_SVD not in (_names(asked) or ()):
+        raise RecipeError(f"--svd is for {VANILLA_SVD}, which --methods does not name; name it, or leave out --svd")
 
 
 def _model(asked: Asked) -> Traits | None:
@@ -237,6 +260,11 @@ def _nothing_yet(clips: EvaluationSet) -> TargetStatistics:
     return TargetStatistics(mean=torch.zeros(clips.frames, 3, *frame), majority=majority)
 
 
+def _further_cameras(clips: EvaluationSet) -> int:
+    """How many cameras a scene has beside the source's; pairs have none."""
+    return len(clips.dataset.cameras) - 1 if isinstance(clips, SceneSet) else 0
+
+
 def _baselines(
     asked: Asked,
     clips: EvaluationSet,
@@ -256,7 +284,7 @@ def _baselines(
         classes=tuple(clips.classes),
         painted=painted,
         statistics=statistics,
-        svd=told.svd,
+        svd=None if told.svd is None else _resolved(told.svd),
         device=asked.tested.device,
         dtype=asked.tested.dtype,
         samples=asked.tested.sampling.samples,
@@ -264,10 +292,11 @@ def _baselines(
         published=asked.protocol == "released",
         hexplane=told.hexplane,
     )
-    names = None if told.names is None else [name.strip() for name in ",".join(told.names).split(",") if name.strip()]
+    names = _names(asked)
     if names is None and training is None and isinstance(clips, PairedSet):
         raise RecipeError(
             "baselines want training clips for their means: give --train FOLDER, name some that need none with "
             "--methods, or --no-baselines"
         )
+    require_views(names or (), _further_cameras(clips))
     return of_baselines(names, settings, "nothing" if training is None else training.identity)

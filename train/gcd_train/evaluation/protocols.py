@@ -46,6 +46,10 @@ class ClipControls(Protocol):
         """One of them, for a scene of so many time steps. Raises DataError if the scene is too short."""
         ...
 
+    def strides(self, scene: str, /) -> Sequence[int]:
+        """That clips of a scene may have."""
+        ...
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class FrameBounds:
@@ -88,6 +92,11 @@ class ListedControls:
                 return self.bounds.of(control)
         raise DataError(f"{scene} has no control {name}; look at the control list")
 
+    def strides(self, scene: str, /) -> Sequence[int]:
+        """As listed, or as bound."""
+        names = self.names(scene)
+        return [self.bounds.of(each).frame_skip for each in self.controls.get(scene, ()) if each.name in names]
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class DrawnControls:
@@ -121,6 +130,11 @@ class DrawnControls:
             start=None if change is None else self.source,
             goal=None if change is None else _goal(self.source, change),
         )
+
+    def strides(self, scene: str, /) -> Sequence[int]:
+        """Those that are drawn from, or the one that is bound."""
+        del scene
+        return self.frames.strides if self.bounds.skip is None else (self.bounds.skip,)
 
     def _frames(self, rng: np.random.Generator, frames: int) -> tuple[int, int]:
         start, skip = self.bounds.start, self.bounds.skip
@@ -157,6 +171,11 @@ class ReleasedControl:
                 goal=goal if self.orbit else None,
             )
         )
+
+    def strides(self, scene: str, /) -> Sequence[int]:
+        """One."""
+        del scene
+        return (RELEASED_SKIP if self.bounds.skip is None else self.bounds.skip,)
 
 
 def _goal(source: Spherical, change: SphericalDelta) -> Spherical:

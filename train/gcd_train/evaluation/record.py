@@ -9,6 +9,9 @@ Region: TypeAlias = Literal["all", "visible", "occluded"]
 
 REGIONS: tuple[Region, ...] = get_args(Region)
 
+FRAMES_IN, LPIPS = "frames in", "lpips"
+"""In what a note says of a method: where another method's frames lie, and which LPIPS it was measured with."""
+
 Frames: TypeAlias = tuple[float | None, ...]
 """A value of each frame, from the first; None where there is no pixel to measure."""
 
@@ -38,7 +41,8 @@ class ClipRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     method: its name. privileged: whether it is given the exact depth, or further cameras. key: of the clip in its set.
     scene: the clip's; errors are over scenes. change: azimuth and elevation in degrees and radius in metres from source
-    to goal; None for the fixed path of driving. seconds: that the method took.
+    to goal; None for the fixed path of driving. fps: of the clip; None in records that were made before it was kept.
+    seconds: that the method took.
     regions: by name; "visible" and "occluded" are missing where nobody knows what the source camera saw.
     lpips: [S][T], None where no weights were given. step, step_target: [S][T-1] and T-1, mean change from frame to
     frame. grid_confusion: as in a region, at the class grid. Where the method makes no pictures all else is None.
@@ -50,6 +54,7 @@ class ClipRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     scene: str
     change: tuple[float, float, float] | None
     frames: int
+    fps: float | None = None
     draws: int
     seconds: float
     regions: dict[Region, RegionRecord]
@@ -64,7 +69,9 @@ class RunNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     command: the line that began it. made: UTC, ISO 8601. versions: of gcd-node, torch, python. data: folders.
     data_identity: digest of the clips. kind: "kubric", "driving" or "orbit": which tables they belong to.
-    modality: of the target pictures. protocol: "paper", "released" or "pairs". classes: names, empty for none.
+    modality: of the target pictures. protocol: "paper", "released" or "pairs". fps: frames per second of the clips.
+    rates: empty where all have that one; else all that clips may have, of which `fps` is the highest, and each record
+    tells its clip's. classes: names, empty for none.
     methods: name to what it is: a weight file's digest, steps, guidance, draws, seed, views; all as text.
     """
 
@@ -80,6 +87,7 @@ class RunNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     height: int
     width: int
     fps: float
+    rates: tuple[float, ...] = ()
     seed: int
     classes: tuple[str, ...] = ()
     methods: dict[str, dict[str, str]] = {}

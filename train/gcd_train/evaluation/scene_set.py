@@ -14,6 +14,7 @@ from gcd_model.config import CameraControl, SemanticClass
 from gcd_model.geometry import CameraMount, center_crop_box, pose_trajectory, to_pose
 from gcd_train.baselines import CameraPair, SourceClip
 from gcd_train.datasets.clip_source import Bytes
+from gcd_train.datasets.controls import Control
 from gcd_train.datasets.dataset4d import Dataset4D, PairSample
 from gcd_train.datasets.ontology import Ontology
 from gcd_train.datasets.pictures_of_draws import trained_lens, trained_picture
@@ -33,8 +34,8 @@ class SceneSet:
     """Clips of whole scenes by name: `scn02900.sample_00`, the scene and its control.
 
     pairs: makes the pictures; it must tell what is visible, and class ids where `classes` are wanted. controls: which
-    clips there are. frames, height, width: T, H and W of the clips. fps: of the scenes, over the stride where that is
-    one for all. semantic: class maps are wanted. kind, identity: see EvaluationSet.
+    clips there are. frames, height, width: T, H and W of the clips. semantic: class maps are wanted. kind, identity:
+    see EvaluationSet.
     """
 
     pairs: ViewPairs
@@ -42,7 +43,6 @@ class SceneSet:
     frames: int
     height: int
     width: int
-    fps: float
     kind: SetKind
     identity: str
     semantic: bool = False
@@ -63,6 +63,18 @@ class SceneSet:
     def keys(self) -> Sequence[str]:
         """Names, scene by scene."""
         return tuple(self._places)
+
+    @property
+    def fps(self) -> float:
+        """See EvaluationSet."""
+        return self.rates[0]
+
+    @property
+    def rates(self) -> Sequence[float]:
+        """As networks are told them, from the strides of all scenes."""
+        strides = {stride for scene in self.dataset.scenes for stride in self.controls.strides(scene)}
+        each = [Control(name="", frame_start=0, frame_skip=stride) for stride in strides]
+        return sorted({control.fps(self.dataset.fps) for control in each}, reverse=True)
 
     @property
     def camera(self) -> CameraControl:

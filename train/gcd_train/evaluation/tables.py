@@ -4,23 +4,26 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
+from gcd_train.baselines import FROM_EXACT_CLASSES
 from gcd_train.evaluation.figures import Evaluation, Figures, lead
 from gcd_train.evaluation.report import Report, best_of
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Column:
-    """One figure as a column. full: the same at picture size, shown in brackets."""
+    """One figure as a column. full: the same at picture size, shown in brackets. of_classes: of class maps."""
 
     heading: str
     figure: Callable[[Figures], float]
     digits: int
     full: Callable[[Figures], float] | None = None
+    of_classes: bool = False
 
     def cell(self, each: Evaluation) -> str:
         text = _with_error(self.figure(each.total), self.figure(each.error), self.digits)
         full = math.nan if self.full is None else self.full(each.total)
-        return text if math.isnan(full) else f"{text} ({full:.{self.digits}f})"
+        text = text if math.isnan(full) else f"{text} ({full:.{self.digits}f})"
+        return f"{text} *" if self.of_classes and text != "-" and each.name in FROM_EXACT_CLASSES else text
 
     def ahead(self, first: Evaluation, other: Evaluation) -> str:
         return "-" if first is other else _with_error(*lead(first, other, self.figure), self.digits)
@@ -28,7 +31,7 @@ class _Column:
 
 _PSNR = _Column(heading="PSNR dB", figure=lambda f: f.psnr_db, digits=2)
 _SSIM = _Column(heading="SSIM", figure=lambda f: f.ssim, digits=3)
-_MIOU = _Column(heading="mIoU", figure=lambda f: f.miou, digits=3, full=lambda f: f.miou_full)
+_MIOU = _Column(heading="mIoU", figure=lambda f: f.miou, digits=3, full=lambda f: f.miou_full, of_classes=True)
 _COLUMNS = (
     _PSNR,
     _Column(heading="last frame", figure=lambda f: f.last_psnr_db, digits=2),
@@ -38,7 +41,7 @@ _COLUMNS = (
     _Column(heading="gradient energy", figure=lambda f: f.gradient_energy, digits=2),
     _Column(heading="flicker", figure=lambda f: f.flicker, digits=2),
     _MIOU,
-    _Column(heading="accuracy", figure=lambda f: f.accuracy, digits=3),
+    _Column(heading="accuracy", figure=lambda f: f.accuracy, digits=3, of_classes=True),
 )
 
 
@@ -49,7 +52,7 @@ def to_markdown(report: Report) -> str:
         parts.append(["Wanted:", "", *(f"- {bar}" for bar in report.bars)])
     if len(report.model) > 1:
         parts.append(_steps(report))
-    if report.classes:
+    if any(not math.isnan(each.total.miou) for each in report.evaluations):
         parts.append(_classes(report))
     if report.model:
         parts.append(_clips(report))
@@ -117,7 +120,8 @@ def _classes(report: Report) -> list[str]:
         shown = tuple("-" if math.isnan(value) else f"{value:.2f}" for value in (iou, full))
         return "-" if shown == ("-", "-") else f"{shown[0]} ({shown[1]})"
 
-    rows = [[name, *(cell(each, i) for each in shown)] for i, name in enumerate(report.classes)]
+    every = [[name, *(cell(each, i) for each in shown)] for i, name in enumerate(report.classes)]
+    rows = [row for row in every if set(row[1:]) != {"-"}]  # a class that nobody saw or said, as void
     return ["IoU of each class:", "", *_table(["class", *(each.name for each in shown)], rows)]
 
 

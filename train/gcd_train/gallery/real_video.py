@@ -1,6 +1,7 @@
 """Windows of frames out of any video: at a rate the network was trained with, cut and resized to its size."""
 
 import math
+import os
 import re
 from collections import Counter
 from collections.abc import Generator, Iterator, Mapping, Sequence
@@ -23,6 +24,7 @@ VIDEO_SUFFIXES = (".mp4", ".mkv", ".webm", ".avi", ".mov", ".m4v")
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
 _BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide")
 _MIN_RATE, _MAX_RATE = 0.1, 1000.0
+_QUIET = ("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read when the first video is opened; the decoder prints its own lines else
 _RATE_TOLERANCE = 1.01  # 23.976 is 24
 
 
@@ -201,6 +203,7 @@ def _by_number(path: Path) -> list[tuple[str, int]]:
 def _opened(path: Path) -> Generator[cv2.VideoCapture]:
     if not _is_container(path):
         raise DataError(f"{path} is no whole video file; wanted is one of {', '.join(VIDEO_SUFFIXES)}")
+    os.environ.setdefault(*_QUIET)
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)

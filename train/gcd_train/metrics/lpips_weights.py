@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import shorten
 from typing import cast
 
 import torch
@@ -10,6 +11,8 @@ from torch import Tensor
 
 from gcd_train.errors import DataError
 
+_TOLD = 120
+"""Letters of torch's own words in a message."""
 _WANTED = (
     "wanted torchvision's vgg16-*.pth and the linear weights vgg.pth, or alexnet-*.pth and alex.pth, in one folder"
 )
@@ -140,8 +143,9 @@ def _read(path: Path) -> Mapping[str, object]:
     try:
         held: object = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # what a damaged pickle raises depends on which byte is wrong
-        cause = str(error).strip().split("\n")[0]
-        raise DataError(f"cannot read the LPIPS weights {path}: {cause[:120]}; fetch the file again") from error
+        cause = str(error).strip().split("\n")[0].split(". ")[0]
+        told = shorten(cause, _TOLD, placeholder=" ...")
+        raise DataError(f"cannot read the LPIPS weights {path}: {told}; fetch the file again") from error
     if not isinstance(held, Mapping):
         raise DataError(f"the LPIPS weights {path} must be named tensors, got {type(held).__name__}; {_WANTED}")
     return cast("Mapping[str, object]", held)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from gcd_train.evaluation.tallies import Selection, Span
 from gcd_train.reports.figure_tables import Measured
 from gcd_train.reports.intervals import Drawn, Interval, common_clips, difference, drawn
-from gcd_train.reports.material import Method
+from gcd_train.reports.material import EvaluatedSet, Method
 from gcd_train.reports.paper import CLASS_COLUMNS, PICTURE_COLUMNS, Column
 from gcd_train.reports.table import NOTHING, Cell, csv_text, markdown_rows
 
@@ -16,7 +16,10 @@ _BETTER_IF_LOW = ("lpips",)
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Difference:
-    """How far one method lies above another in one figure. clips: that both have."""
+    """How far one method lies above another in one figure. clips: that both have.
+
+    starred: one of them was given more for this figure than for its others, see `Method.copies_classes`.
+    """
 
     first: str
     other: str
@@ -24,6 +27,7 @@ class Difference:
     frames: Span
     clips: int
     apart: Interval
+    starred: bool = False
 
     @property
     def verdict(self) -> str:
@@ -45,9 +49,16 @@ def _apart(measured: Measured, first: Method, other: Method, frames: Span) -> li
         pair = _sums(measured, first, other, Selection(frames=frames, region=column.region))
         apart = None if pair is None else difference(pair.first, pair.other, column.figure)
         if pair is not None and apart is not None and apart.known:
-            names = (first.name, other.name)
             found.append(
-                Difference(first=names[0], other=names[1], column=column, frames=frames, clips=pair.clips, apart=apart)
+                Difference(
+                    first=first.name,
+                    other=other.name,
+                    column=column,
+                    frames=frames,
+                    clips=pair.clips,
+                    apart=apart,
+                    starred=(first.copies_classes or other.copies_classes) and column.of_classes,
+                )
             )
     return found
 
@@ -89,12 +100,17 @@ def to_csv(found: Sequence[Difference]) -> str:
     return csv_text(["first", "other", "frames", "figure", "first ahead", "low", "high", "clips", "verdict"], lines)
 
 
-def to_markdown(found: Sequence[Difference]) -> str:
-    """A row for each other method, a column for each figure; bold where zero lies outside the interval."""
+def to_markdown(found: Sequence[Difference], of: EvaluatedSet) -> str:
+    """A row for each other method, a column for each figure; bold where zero lies outside the interval.
+
+    Stars as in the other tables of the set.
+    """
     headings = list(dict.fromkeys(each.column.heading for each in found))
     cells = {(each.other, each.column.heading): _told(each) for each in found}
     others = list(dict.fromkeys(each.other for each in found))
-    rows = [[other, *(cells.get((other, heading), NOTHING) for heading in headings)] for other in others]
+    rows = [
+        [of.method(other).starred, *(cells.get((other, heading), NOTHING) for heading in headings)] for other in others
+    ]
     return "\n".join(markdown_rows(["", *headings], rows)) + "\n"
 
 
@@ -102,7 +118,8 @@ def _told(each: Difference) -> str:
     value, low, high = (
         f"{number:+.{each.column.digits}f}" for number in (each.apart.value, each.apart.low, each.apart.high)
     )
+    star = " *" if each.starred else ""
     if each.apart.low != each.apart.low:  # NaN: one scene tells nothing of it
-        return value
+        return value + star
     text = f"{value} [{low}, {high}]"
-    return text if each.verdict == "open" else f"**{text}** {each.verdict}"
+    return (text if each.verdict == "open" else f"**{text}** {each.verdict}") + star

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -36,7 +36,10 @@ class Curve:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Plot:
-    """name: of its files. title, across, up: what it shows. levels: lines right across, of what has no x."""
+    """name: of its files. title, across, up: what it shows. levels: lines right across, of what has no x.
+
+    counted: x are whole numbers, of frames or views.
+    """
 
     name: str
     title: str
@@ -44,6 +47,7 @@ class Plot:
     up: str
     curves: tuple[Curve, ...]
     levels: tuple[Curve, ...] = ()
+    counted: bool = False
 
 
 def all_plots(measured: Measured) -> tuple[Plot, ...]:
@@ -77,7 +81,7 @@ def psnr_by_frame(measured: Measured) -> Plot | None:
         ]
         curves.append(Curve(name=method.name, points=tuple(point for point in found if point.y.known)))
     up = "PSNR, dB" if pictures else "mIoU"
-    return _plot("by_frame", "Each frame, all pixels", "frame", up, curves, least=2)
+    return _plot("by_frame", "Each frame, all pixels", "frame", up, curves, least=2, counted=True)
 
 
 def ssim_by_views(measured: Measured) -> Plot | None:
@@ -94,12 +98,10 @@ def ssim_by_views(measured: Measured) -> Plot | None:
         for method in measured.of.methods
         if method.name not in hexplanes and method.makes_pictures
     ]
-    plot = _plot("ssim_by_views", "HexPlane, frames 2 to the last", "views given", "SSIM", curves, least=1)
-    if plot is None:
-        return None
-    return Plot(
-        name=plot.name, title=plot.title, across=plot.across, up=plot.up, curves=plot.curves, levels=tuple(levels)
+    plot = _plot(
+        "ssim_by_views", "HexPlane, frames 2 to the last", "views given", "SSIM", curves, least=1, counted=True
     )
+    return None if plot is None else replace(plot, levels=tuple(levels))
 
 
 def curves_csv(plot: Plot) -> str:
@@ -147,7 +149,11 @@ def _whole(measured: Measured, name: str, region: Region, x: float) -> Point:
     return Point(x=x, y=measured.sums(method, Selection(region=region)).interval("ssim"), clips=len(method.records))
 
 
-def _plot(name: str, title: str, across: str, up: str, curves: Sequence[Curve], *, least: int) -> Plot | None:
+def _plot(
+    name: str, title: str, across: str, up: str, curves: Sequence[Curve], *, least: int, counted: bool = False
+) -> Plot | None:
     """None where no curve has so many points."""
     shown = tuple(curve for curve in curves if len(curve.points) >= least)
-    return Plot(name=name, title=title, across=across, up=up, curves=shown) if shown else None
+    if not shown:
+        return None
+    return Plot(name=name, title=title, across=across, up=up, curves=shown, counted=counted)

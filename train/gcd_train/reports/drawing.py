@@ -1,11 +1,17 @@
 """Curves drawn with matplotlib, which is an extra and is opened only here."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gcd_train.reports.curves import Curve, Plot
 from gcd_train.show.matplotlib_door import new_figure, save
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 _SIZE_IN = (7.2, 4.4)
+_MOST_TICKS = 16
 _MARKS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 
@@ -26,11 +32,23 @@ def draw(plot: Plot, out: Path) -> None:
     axes.set_title(plot.title, fontsize=10, loc="left")
     axes.set_xlabel(plot.across)
     axes.set_ylabel(plot.up)
+    if plot.counted:
+        _whole_ticks(axes, [point.x for curve in plot.curves for point in curve.points])
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
     figure.tight_layout()
     save(figure, out)
+
+
+def _whole_ticks(axes: "Axes", places: Sequence[float]) -> None:
+    """Ticks at whole numbers: where the points are, or, of many, at some between the first and the last."""
+    from matplotlib.ticker import FixedLocator, MaxNLocator
+
+    each = sorted(set(places))
+    axes.xaxis.set_major_locator(FixedLocator(each) if len(each) <= _MOST_TICKS else MaxNLocator(integer=True))
+    if len(each) == 1:
+        axes.set_xlim(each[0] - 1, each[0] + 1)
 
 
 def _bars(curve: Curve) -> tuple[list[float], list[float]]:

@@ -15,7 +15,10 @@ from gcd_train.reports.table import NOTHING, csv_text, markdown_rows
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class WorstClip:
-    """One clip of a method. occluded: the figure there; NaN for none. best, best_value: of the other methods on it."""
+    """One clip of a method. occluded: the figure there; NaN for none. best, best_value: of the other methods on it.
+
+    best is starred where it was given more for this figure than the source video.
+    """
 
     key: str
     value: float
@@ -85,7 +88,7 @@ def _figures_of(record: ClipRecord) -> list[str]:
 
 
 def _told(record: ClipRecord, name: FigureName, others: Sequence[Method]) -> WorstClip:
-    same = [(other.name, each) for other in others for each in other.records if each.key == record.key]
+    same = [(_starred(other, name), each) for other in others for each in other.records if each.key == record.key]
     rivals = [(_of(each, "all", name), rival) for rival, each in same]
     best_value, best = max((pair for pair in rivals if np.isfinite(pair[0])), default=(float("nan"), ""))
     return WorstClip(
@@ -96,6 +99,10 @@ def _told(record: ClipRecord, name: FigureName, others: Sequence[Method]) -> Wor
         best_value=best_value,
         change=record.change,
     )
+
+
+def _starred(method: Method, name: FigureName) -> str:
+    return f"{method.name} *" if method.copies_classes and name != "psnr_db" else method.starred
 
 
 def _of(record: ClipRecord, region: Region, name: FigureName) -> float:

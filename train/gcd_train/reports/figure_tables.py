@@ -14,6 +14,8 @@ from gcd_train.reports.table import NO_WEIGHTS, NOT_RUN, NOTHING, Cell, Row, Tab
 _SPANS: tuple[Span, ...] = ("2-last", "last", "all")
 _OWN_NAMES: dict[Span, str] = {"2-last": "main", "last": "last_frame", "all": "all_frames"}
 _BRACKETS = "In brackets: 95 % interval, bootstrap over scenes. * is given more than the source video."
+STAR_OF_FIGURE = "A * behind a mIoU: these class maps are made from the source's exact ones, which no model is given."
+"""Stands below tables with such a star."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -87,13 +89,13 @@ def _columns(of: EvaluatedSet) -> tuple[Column, ...]:
 
 def _own_table(measured: Measured, columns: Sequence[Column], frames: Span) -> Table:
     told = frames_told(measured.of, frames)
-    rows = [_measured_row(measured, method, columns, frames, PaperRow(label="")) for method in measured.of.methods]
+    rows = [measured_row(measured, method, columns, frames, PaperRow(label="")) for method in measured.of.methods]
     return Table(
         name=_OWN_NAMES[frames],
         title=f"{measured.of.title}: {told}",
         headings=tuple(column.heading for column in columns),
         rows=tuple(rows),
-        notes=_notes(measured, columns, frames),
+        notes=table_notes(measured, columns, frames),
     )
 
 
@@ -105,26 +107,33 @@ def _paper_table(measured: Measured, table: PaperTable) -> Table:
     rows: list[Row] = []
     for row in table.rows:
         found = placed.pop(row.label, [])
-        rows += [_measured_row(measured, each, table.columns, table.frames, row) for each in found]
+        rows += [measured_row(measured, each, table.columns, table.frames, row) for each in found]
         rows += [] if found else [_not_run(row, table.columns)]
-    left = [each for methods in placed.values() for each in methods] if table.frames == "2-last" else []
     rows += [
-        _measured_row(measured, each, table.columns, table.frames, PaperRow(label="not in the paper")) for each in left
+        measured_row(measured, each, table.columns, table.frames, PaperRow(label=_below(label)))
+        for label, methods in placed.items()
+        for each in methods
     ]
     return Table(
         name=table.name,
         title=f"{table.title} ({measured.of.title})",
         headings=tuple(column.heading for column in table.columns),
         rows=tuple(rows),
-        notes=_notes(measured, table.columns, table.frames),
+        notes=table_notes(measured, table.columns, table.frames),
     )
 
 
-def _measured_row(measured: Measured, method: Method, columns: Sequence[Column], frames: Span, row: PaperRow) -> Row:
+def _below(label: str) -> str:
+    """How a method is called below the paper's rows. label: of its row in another of the paper's tables, or empty."""
+    return f"{label}, not in this table" if label else "not in the paper"
+
+
+def measured_row(measured: Measured, method: Method, columns: Sequence[Column], frames: Span, row: PaperRow) -> Row:
+    """A method's figures, beside what the paper prints in its row."""
     printed = (*row.printed, *(None,) * len(columns))
     return Row(
         label=row.label,
-        method=method.name + (" *" if method.privileged else ""),
+        method=method.starred,
         clips=f"{len(method.records)} of {len(measured.of.keys)}",
         cells=tuple(
             Cell(
@@ -132,6 +141,7 @@ def _measured_row(measured: Measured, method: Method, columns: Sequence[Column],
                 digits=column.digits,
                 note=_why_not(measured.of, method, column),
                 paper=paper,
+                starred=method.copies_classes and column.of_classes,
             )
             for column, paper in zip(columns, printed, strict=False)
         ),
@@ -160,9 +170,12 @@ def frames_told(of: EvaluatedSet, frames: Span) -> str:
     return {"2-last": f"frames 2-{of.note.frames}", "last": "last frame", "all": f"all {of.note.frames} frames"}[frames]
 
 
-def _notes(measured: Measured, columns: Sequence[Column], frames: Span) -> tuple[str, ...]:
+def table_notes(measured: Measured, columns: Sequence[Column], frames: Span) -> tuple[str, ...]:
+    """What stands below a table: its frames and clips, what brackets and stars mean, what is not known."""
     of, told = measured.of, frames_told(measured.of, frames)
     notes = [f"{told[0].upper()}{told[1:]} of {len(of.keys)} clips of {of.scenes} scenes. {_BRACKETS}"]
+    if any(column.of_classes for column in columns) and any(each.copies_classes for each in of.methods):
+        notes.append(STAR_OF_FIGURE)
     if any(_unknown_region(of, column.region) for column in columns):
         notes.append("Unknown: nobody knows which pixels of these clips the source camera saw.")
     if any(column.figure == "lpips" for column in columns) and len(of.regions) > 1:

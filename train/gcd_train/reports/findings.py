@@ -8,12 +8,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from gcd_train.errors import RunError
+from gcd_train.evaluation.record import ClipRecord
 from gcd_train.evaluation.tallies import Selection, Span
 from gcd_train.reports.comparison import Difference
-from gcd_train.reports.intervals import common_clips, difference, drawn
+from gcd_train.reports.goals import SharedClips, shared_clips
+from gcd_train.reports.intervals import difference, drawn
 from gcd_train.reports.material import Method, Run, gather
 from gcd_train.reports.paper import PICTURE_COLUMNS, Column
-from gcd_train.reports.table import NOTHING, markdown_rows
+from gcd_train.reports.table import NOT_RUN, NOTHING, markdown_rows
 
 _SHOWN = {"better": "holds", "worse": "the opposite holds", "open": "not shown"}
 
@@ -30,10 +32,15 @@ class Claim:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Finding:
-    """A claim and, for each figure, how far the first method is ahead; none where one of the two was not run."""
+    """A claim and, for each figure, how far the first method is ahead; none where there is nothing to compare.
+
+    note: which clips of the same names are not compared, and why; empty for none. run: whether both methods were.
+    """
 
     claim: Claim
     apart: tuple[Difference, ...]
+    note: str = ""
+    run: bool = True
 
 
 def study_claims(suffix: str = "") -> tuple[Claim, ...]:
@@ -65,20 +72,22 @@ def study_claims(suffix: str = "") -> tuple[Claim, ...]:
 def findings(runs: Sequence[Run], claims: Sequence[Claim], *, seed: int = 0) -> tuple[Finding, ...]:
     """Each claim with its differences and their paired 95 % intervals, bootstrap over scenes.
 
-    Methods may have been measured on sets of their own, of the same scenes: clips are paired by their keys.
+    Methods may have been measured on sets of their own, of the same scenes: clips are paired by their keys, where their
+    targets are the same in the claim's frames.
 
     Raises:
         RunError: two runs name two different methods alike, or one method was measured on two sets.
     """
     methods = _by_name(runs)
-    return tuple(Finding(claim=claim, apart=_apart(methods, claim, seed)) for claim in claims)
+    return tuple(_finding(methods, claim, seed) for claim in claims)
 
 
 def to_markdown(found: Sequence[Finding]) -> str:
     """A row for each claim and figure: how far ahead, its interval, and whether the claim holds."""
     heads = ["claim", "first", "other", "frames", "figure", "first ahead [95 %]", "clips", "the claim"]
     rows = [row for finding in found for row in _rows(finding)]
-    return "\n".join(markdown_rows(heads, rows)) + "\n"
+    notes = [f"\n{finding.note}" for finding in found if finding.note]
+    return "\n".join([*markdown_rows(heads, rows), *notes]) + "\n"
 
 
 def _by_name(runs: Sequence[Run]) -> Mapping[str, Method]:
@@ -94,12 +103,18 @@ def _by_name(runs: Sequence[Run]) -> Mapping[str, Method]:
     return methods
 
 
-def _apart(methods: Mapping[str, Method], claim: Claim, seed: int) -> tuple[Difference, ...]:
+def _finding(methods: Mapping[str, Method], claim: Claim, seed: int) -> Finding:
     if claim.first not in methods or claim.other not in methods:
-        return ()
-    ours, theirs = common_clips(methods[claim.first].records, methods[claim.other].records)
-    if not ours:
-        return ()
+        return Finding(claim=claim, apart=(), run=False)
+    shared = shared_clips(methods[claim.first].records, methods[claim.other].records, claim.frames)
+    return Finding(
+        claim=claim,
+        apart=_apart(claim, shared.first, shared.other, seed) if shared.first else (),
+        note=_left_out(claim, shared),
+    )
+
+
+def _apart(claim: Claim, ours: Sequence[ClipRecord], theirs: Sequence[ClipRecord], seed: int) -> tuple[Difference, ...]:
     found: list[Difference] = []
     for column in PICTURE_COLUMNS:
         selection = Selection(frames=claim.frames, region=column.region)
@@ -119,11 +134,21 @@ def _apart(methods: Mapping[str, Method], claim: Claim, seed: int) -> tuple[Diff
     return tuple(found)
 
 
+def _left_out(claim: Claim, shared: SharedClips) -> str:
+    if not shared.left_out:
+        return ""
+    key, reason = next(iter(shared.left_out.items()))
+    return (
+        f"{claim.first} and {claim.other}, frames {claim.frames}: of {len(shared.left_out) + len(shared.first)} clips "
+        f"of the same names {len(shared.left_out)} do not show the same, so they are not compared. In {key} {reason}."
+    )
+
+
 def _rows(finding: Finding) -> list[list[str]]:
     claim = finding.claim
     head = [claim.text, claim.first, claim.other, claim.frames]
     if not finding.apart:
-        return [[*head, NOTHING, "not run", NOTHING, NOTHING]]
+        return [[*head, NOTHING, "no clips in common" if finding.run else NOT_RUN, NOTHING, NOTHING]]
     return [
         [*head, each.column.heading, _figures(each, each.column), str(each.clips), _SHOWN[each.verdict]]
         for each in finding.apart

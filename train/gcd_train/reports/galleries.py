@@ -17,8 +17,9 @@ from gcd_train.reports.material import EvaluatedSet, Method
 Pictures = NDArray[np.uint8]
 
 SHOWN_FRAMES = 6
-_GAP, _MARGIN, _STRIP, _INK = 4, 140, 18, (40, 40, 40)
+_GAP, _MARGIN, _INK = 4, 140, (40, 40, 40)
 _LINE, _LETTERS, _FONT = 14, 20, cv2.FONT_HERSHEY_SIMPLEX
+_SCALE, _SMALL = 0.38, 0.3  # of captions; the small one where the other would be broken
 _HOLD_S = 0.7
 
 
@@ -104,10 +105,11 @@ def _row(label: str, strip: Strip) -> Pictures:
     numbers = sorted(strip.frames)
     places = np.linspace(0, len(numbers) - 1, min(SHOWN_FRAMES, len(numbers))).round().astype(int)
     pictures = [strip.frames[numbers[place]] for place in places]
-    height = max(pictures[0].shape[0], 3 * _LINE)
+    lines = (*wrap(strip.name, _LETTERS), *wrap(label, _LETTERS))
+    height = max(pictures[0].shape[0], max(3, len(lines)) * _LINE)
     margin = np.full((height + _GAP, _MARGIN, 3), 255, np.uint8)
-    for line, text in enumerate((*wrap(strip.name, _LETTERS), *wrap(label, _LETTERS))):
-        cv2.putText(margin, text, (4, _LINE * (1 + line)), _FONT, 0.38, _INK, 1, cv2.LINE_AA)
+    for line, text in enumerate(lines):
+        cv2.putText(margin, text, (4, _LINE * (1 + line)), _FONT, _SCALE, _INK, 1, cv2.LINE_AA)
     framed = [
         cv2.copyMakeBorder(p, 0, height + _GAP - p.shape[0], 0, _GAP, cv2.BORDER_CONSTANT, value=(255,) * 3)
         for p in pictures
@@ -117,7 +119,10 @@ def _row(label: str, strip: Strip) -> Pictures:
 
 def _beside(rows: Sequence[Strip], moment: int) -> Pictures:
     """All rows' pictures of one moment with their names above, of even size as codecs want it."""
-    named = [_named(row.name, row.frames[moment]) for row in rows]
+    pictures = [row.frames[moment] for row in rows]
+    captions = [caption(row.name, each.shape[1]) for row, each in zip(rows, pictures, strict=True)]
+    lines = max(len(each.lines) for each in captions)
+    named = [_named(text, lines, picture) for text, picture in zip(captions, pictures, strict=True)]
     height = max(each.shape[0] for each in named)
     panels = [np.pad(each, ((0, height - each.shape[0]), (0, _GAP), (0, 0)), constant_values=255) for each in named]
     whole = np.concatenate(panels, axis=1)
@@ -125,9 +130,48 @@ def _beside(rows: Sequence[Strip], moment: int) -> Pictures:
     return np.pad(whole, ((0, odd[0]), (0, odd[1]), (0, 0)), constant_values=255)
 
 
-def _named(name: str, picture: Pictures) -> Pictures:
-    strip = np.full((_STRIP, picture.shape[1], 3), 255, np.uint8)
-    cv2.putText(strip, name, (2, _STRIP - 5), _FONT, 0.38, _INK, 1, cv2.LINE_AA)
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Caption:
+    """A name as it is written above a picture: lines, in letters of this scale."""
+
+    lines: tuple[str, ...]
+    scale: float
+
+    @property
+    def width(self) -> int:
+        """Pixels."""
+        return max(_width(line, self.scale) for line in self.lines)
+
+
+def caption(name: str, width: int) -> Caption:
+    """A name over a picture of so many pixels: in one line, else in smaller letters, else broken into lines."""
+    for scale in (_SCALE, _SMALL):
+        if _width(name, scale) <= width - 2:
+            return Caption(lines=(name,), scale=scale)
+    return Caption(lines=_broken(name, width), scale=_SMALL)
+
+
+def _broken(name: str, width: int) -> tuple[str, ...]:
+    """Lines that fit, broken behind a space, underscore or hyphen where there is one; a letter at the least."""
+    lines, rest = list[str](), name
+    while rest:
+        fitting = max([count for count in range(1, len(rest) + 1) if _width(rest[:count], _SMALL) <= width - 2] or [1])
+        ends = [count for count in range(1, fitting + 1) if count == len(rest) or rest[count - 1] in " _-"]
+        taken = ends[-1] if ends else fitting
+        lines.append(rest[:taken].strip())
+        rest = rest[taken:].lstrip()
+    return tuple(lines)
+
+
+def _width(text: str, scale: float) -> int:
+    return cv2.getTextSize(text, _FONT, scale, 1)[0][0] + 2  # the margin before it
+
+
+def _named(text: Caption, lines: int, picture: Pictures) -> Pictures:
+    """A picture under its caption, with room for so many lines."""
+    strip = np.full((_LINE * lines + _GAP, picture.shape[1], 3), 255, np.uint8)
+    for line, words in enumerate(text.lines, start=1 + lines - len(text.lines)):
+        cv2.putText(strip, words, (2, _LINE * line - 1), _FONT, text.scale, _INK, 1, cv2.LINE_AA)
     return np.concatenate([strip, picture])
 
 

@@ -1,17 +1,17 @@
 """Runs of evaluations put together: what was measured on the same clips stands in the same tables."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
-import msgspec
-
+from gcd_train.baselines import FROM_EXACT_CLASSES
 from gcd_train.errors import RunError
 from gcd_train.evaluation.keeping import read_run
-from gcd_train.evaluation.record import REGIONS, ClipRecord, Region, RunNote
+from gcd_train.evaluation.record import FRAMES_IN, LPIPS, REGIONS, ClipRecord, Region, RunNote
 
-_COMPARABLE = ("kind", "modality", "protocol", "frames", "height", "width", "fps", "classes")
+COMPARABLE = ("kind", "modality", "protocol", "frames", "height", "width", "fps", "classes")
+"""What the notes of two runs must have alike before any of their figures are compared."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -47,6 +47,16 @@ class Method:
     def privileged(self) -> bool:
         """Whether it was given the exact depth, or further cameras."""
         return self.records[0].privileged
+
+    @property
+    def starred(self) -> str:
+        """Its name, with a star where it was given more than the source video."""
+        return f"{self.name} *" if self.privileged else self.name
+
+    @property
+    def copies_classes(self) -> bool:
+        """Whether its class maps, and nothing else of it, are made from the source's exact ones."""
+        return not self.privileged and self.details.get("baseline") in FROM_EXACT_CLASSES
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -97,6 +107,11 @@ class EvaluatedSet:
         records = [record for method in self.methods for record in method.records]
         return tuple(region for region in REGIONS if any(region in record.regions for record in records))
 
+    def fps(self, key: str) -> float:
+        """Frames per second of a clip; the run's, where the record does not say."""
+        told = (record.fps for method in self.methods for record in method.records if record.key == key)
+        return next((fps for fps in told if fps is not None), self.note.fps)
+
     def method(self, name: str) -> Method:
         """Raises RunError where there is none of the name."""
         for each in self.methods:
@@ -122,29 +137,6 @@ def gather(runs: Sequence[Run]) -> tuple[EvaluatedSet, ...]:
     return tuple(_set(tuple(members)) for _, members in groups)
 
 
-def on_the_same_goals(sets: Sequence[EvaluatedSet]) -> tuple[EvaluatedSet, ...]:
-    """Sets of the same clips by name that differ in the way there, put together, for figures of the last frame.
-
-    A gradual and a direct path end at the same goal, so their last frames can be compared and no others. A method that
-    several of the sets have is taken from the first.
-    """
-    groups: dict[tuple[object, ...], list[EvaluatedSet]] = {}
-    for each in sets:
-        alike = tuple(getattr(each.note, name) for name in _COMPARABLE)
-        groups.setdefault((*alike, frozenset(each.keys)), []).append(each)
-    return tuple(_joined(members) for members in groups.values() if len(members) > 1)
-
-
-def _joined(sets: Sequence[EvaluatedSet]) -> EvaluatedSet:
-    methods = {method.name: method for each in reversed(sets) for method in reversed(each.methods)}
-    data = tuple(folder for each in sets for folder in each.note.data)
-    return EvaluatedSet(
-        note=msgspec.structs.replace(sets[0].note, data=data),
-        runs=tuple(run for each in sets for run in each.runs),
-        methods=tuple(methods.values())[::-1],
-    )
-
-
 def _set(runs: tuple[Run, ...]) -> EvaluatedSet:
     for run in runs[1:]:
         _require_comparable(runs[0], run)
@@ -152,16 +144,25 @@ def _set(runs: tuple[Run, ...]) -> EvaluatedSet:
     for run in runs:
         for method in _methods(run):
             other = found.setdefault(method.name, method)
-            if other.details != method.details:
+            if not _alike(other.details, method.details):
                 raise RunError(
                     f"{method.name} is another method in {other.folder} than in {run.folder}: {other.details} and "
-                    f"{method.details}; rename one of the weight files, or report the runs apart"
+                    f"{method.details}; measure it alike in both, give one another name, or report the runs apart"
                 )
     return EvaluatedSet(note=runs[0].note, runs=runs, methods=tuple(found.values()))
 
 
+def _alike(first: Mapping[str, str], other: Mapping[str, str]) -> bool:
+    """Whether two notes are of one method: frames from elsewhere are known by their content, wherever they lie, and
+    LPIPS may have been left out of one of the two runs."""
+    kept = [{name: value for name, value in each.items() if name != FRAMES_IN} for each in (first, other)]
+    if any(LPIPS not in each for each in kept):
+        kept = [{name: value for name, value in each.items() if name != LPIPS} for each in kept]
+    return kept[0] == kept[1]
+
+
 def _require_comparable(first: Run, other: Run) -> None:
-    for name in _COMPARABLE:
+    for name in COMPARABLE:
         was, now = getattr(first.note, name), getattr(other.note, name)
         if was != now:
             raise RunError(

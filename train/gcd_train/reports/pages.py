@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gcd_train.errors import RunError
+from gcd_train.errors import RecipeError, RunError
 from gcd_train.evaluation.keeping import folder_name
 from gcd_train.evaluation.report import write_file
 from gcd_train.evaluation.tallies import Span
@@ -12,11 +12,13 @@ from gcd_train.reports import comparison, failures
 from gcd_train.reports.comparison import Difference
 from gcd_train.reports.curves import all_plots, curves_csv
 from gcd_train.reports.drawing import draw
-from gcd_train.reports.figure_tables import Measured, all_figures, frames_told, main_tables
+from gcd_train.reports.figure_tables import STAR_OF_FIGURE, Measured, all_figures, frames_told, main_tables
 from gcd_train.reports.galleries import shown_clips, strips, write_sheet, write_video
-from gcd_train.reports.material import EvaluatedSet, Method, Run, gather, on_the_same_goals
-from gcd_train.reports.paper import is_model
-from gcd_train.reports.table import markdown_rows, to_csv, to_markdown
+from gcd_train.reports.goals import on_the_same_goals
+from gcd_train.reports.material import EvaluatedSet, Method, Run, gather
+from gcd_train.reports.paper import is_model, tables_for
+from gcd_train.reports.region_tables import frames_csv, region_table
+from gcd_train.reports.table import Table, markdown_rows, to_csv, to_markdown
 from gcd_train.show.matplotlib_door import require_matplotlib
 
 FEWEST_SCENES = 10
@@ -53,6 +55,7 @@ def make_report(folders: Sequence[Path], out: Path, choices: Choices | None = No
         The path of `report.md`.
     Raises:
         RunError: a run cannot be read, two do not go together, or a file cannot be written.
+        RecipeError: a row is none of the paper's tables that its method's clips belong in.
         RenderError: plots are wanted and matplotlib is not installed.
     """
     choices = choices or Choices()
@@ -61,13 +64,17 @@ def make_report(folders: Sequence[Path], out: Path, choices: Choices | None = No
     runs = tuple(Run.read(folder) for folder in folders)
     sets = gather(runs)
     _require_known((*choices.leads, *choices.rows), sets)
+    _require_rows(choices.rows, sets)
     pages = [_first_page(runs, command, choices)]
     for number, each in enumerate(sets, start=1):
         place = "." if len(sets) == 1 else f"{number}-{each.note.kind}-{each.note.modality}"
         pages.append("\n".join(_Writer(of=each, out=out, place=place, choices=choices).sections()))
-    for number, each in enumerate(on_the_same_goals(sets), start=1):
+    joined = on_the_same_goals(sets)
+    for number, each in enumerate(joined.sets, start=1):
         writer = _Writer(of=each, out=out, place=f"last-frame-{number}", choices=choices)
         pages.append("\n".join(writer.last_frames()))
+    if joined.notes:
+        pages.append("\n".join(["## What is not compared\n", *(f"- {note}" for note in joined.notes)]))
     path = out / "report.md"
     write_file(path, ("\n".join(pages).rstrip() + "\n").encode())
     return path
@@ -87,6 +94,20 @@ def _require_known(names: Sequence[str], sets: Sequence[EvaluatedSet]) -> None:
     unknown = [name for name in names if name not in known]
     if unknown:
         raise RunError(f"no method is called {unknown[0]!r} in these runs; there are {', '.join(known)}")
+
+
+def _require_rows(rows: Mapping[str, str], sets: Sequence[EvaluatedSet]) -> None:
+    """Raises RecipeError for a row that no table has which the method can stand in."""
+    for method, label in rows.items():
+        its = [each for each in sets if any(known.name == method for known in each.methods)]
+        labels = dict.fromkeys(row.label for each in its for table in tables_for(each.note) for row in table.rows)
+        if not labels:
+            raise RecipeError(
+                f"--row says where {method} stands in the paper's tables, and none of them is for these clips; "
+                "leave it out"
+            )
+        if label not in labels:
+            raise RecipeError(f"--row {method}: no row is called {label!r}; there are {'; '.join(labels)}")
 
 
 def _first_page(runs: Sequence[Run], command: str, choices: Choices) -> str:
@@ -145,21 +166,27 @@ class _Writer:
         """Only what the last frame tells, of methods that go there in different ways."""
         measured = Measured(of=self.of, seed=self.choices.seed, rows=self.choices.rows)
         yield f"## The last frame together: {self.of.title}\n"
-        yield "These sets go different ways to the same goals, so their last frames are comparable and no others.\n"
+        yield "Clips of the same names end at the same goals here, so their last frames are comparable and no others.\n"
         yield from self._main_tables(measured, ("last",))
         yield from self._differences(measured, leads(self.of, self.choices), ("last",))
 
     def _main_tables(self, measured: Measured, spans: Sequence[Span]) -> Iterator[str]:
         for table in main_tables(measured, spans):
-            self._write(f"tables/{table.name}.csv", to_csv(table))
-            yield f"{to_markdown(table)}\n{self._link(f'tables/{table.name}.csv')}\n"
+            yield self._table(table)
+
+    def _table(self, table: Table) -> str:
+        self._write(f"tables/{table.name}.csv", to_csv(table))
+        return f"{to_markdown(table)}\n{self._link(f'tables/{table.name}.csv')}\n"
 
     def _tables(self, measured: Measured) -> Iterator[str]:
         yield from self._main_tables(measured, self.spans)
+        yield self._table(region_table(measured, self.spans[0]))
         self._write("tables/figures.csv", all_figures(measured))
+        self._write("tables/frames.csv", frames_csv(measured))
         self._write("tables/clips.csv", failures.clips_csv(measured))
         yield (
             f"All figures with their intervals: {self._link('tables/figures.csv')}; "
+            f"frame by frame: {self._link('tables/frames.csv')}; "
             f"clip by clip: {self._link('tables/clips.csv')}.\n"
         )
 
@@ -171,14 +198,16 @@ class _Writer:
                 found = comparison.differences(measured, lead, frames)
                 every += found
                 if found:
-                    yield f"### {lead.name} against the others, {told}\n"
-                    yield comparison.to_markdown(found)
+                    yield f"### {lead.starred} against the others, {told}\n"
+                    yield comparison.to_markdown(found, self.of)
         if every:
             self._write("tables/differences.csv", comparison.to_csv(every))
             yield (
                 "How far it lies above the other on the same clips; bold where zero lies outside the 95 % interval, "
                 f"which is paired over scenes. {self._link('tables/differences.csv')}\n"
             )
+        if any(each.starred for each in every):
+            yield f"{STAR_OF_FIGURE}\n"
         if every and self.of.scenes < FEWEST_SCENES:
             yield f"Of {self.of.scenes} scenes alone: too few to rest a claim on, whatever is bold.\n"
 
@@ -192,6 +221,8 @@ class _Writer:
             yield f"The numbers: {self._link(f'plots/{plot.name}.csv')}\n"
 
     def _gallery(self) -> Iterator[str]:
+        if not self.choices.clips:
+            return
         keys = shown_clips(self.of, self.of.methods, self.choices.clips)
         if keys:
             yield "### Gallery\n"
@@ -216,7 +247,8 @@ class _Writer:
         yield f"![{', '.join(keys)}]({self._name(f'{folder}/sheet.png')})\n"
         names = [f"{folder}/{folder_name(key)}.mp4" for key in keys]
         made = [
-            write_video(rows, self.of.note.fps, self._path(name)) for name, (_, rows) in zip(names, clips, strict=True)
+            write_video(rows, self.of.fps(key), self._path(name))
+            for name, (key, rows) in zip(names, clips, strict=True)
         ]
         videos = [self._link(name) for name, done in zip(names, made, strict=True) if done]
         if videos:

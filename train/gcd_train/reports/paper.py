@@ -22,6 +22,11 @@ class Column:
     region: Region = "all"
     digits: int = 2
 
+    @property
+    def of_classes(self) -> bool:
+        """Whether it tells how good class maps are, not pictures."""
+        return self.figure in ("miou", "miou_full", "miou_common", "accuracy")
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PaperRow:

@@ -14,21 +14,23 @@ NOT_RUN, NO_WEIGHTS, NOTHING = "not run", "no weights given", "-"
 class Cell:
     """One figure of a table, or why there is none.
 
-    digits: behind the point. note: stands in for the figure. paper: what the paper prints there, its own data.
+    digits: behind the point. note: stands in for the figure. paper: what the paper prints there, its own data. starred:
+    the method was given more for this figure than for its others.
     """
 
     figure: Interval | None = None
     digits: int = 2
     note: str = NOTHING
     paper: float | None = None
+    starred: bool = False
 
     def __str__(self) -> str:
         if self.figure is None or not self.figure.known:
             return self.note
-        value = f"{self.figure.value:.{self.digits}f}"
+        star, value = " *" if self.starred else "", f"{self.figure.value:.{self.digits}f}"
         if self.figure.low != self.figure.low:  # NaN: one scene tells nothing of it
-            return value
-        return f"{value} [{self.figure.low:.{self.digits}f}, {self.figure.high:.{self.digits}f}]"
+            return value + star
+        return f"{value} [{self.figure.low:.{self.digits}f}, {self.figure.high:.{self.digits}f}]{star}"
 
     def numbers(self) -> tuple[str, str, str]:
         """Value and bounds in full, empty for none."""

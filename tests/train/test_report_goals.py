@@ -1,0 +1,142 @@
+"""Only clips whose targets are the same are compared across sets."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+import pytest
+from made_records import FRAMES, note, record, region
+
+from gcd_train.evaluation.keeping import RunKeeper
+from gcd_train.evaluation.record import ClipRecord, RegionRecord
+from gcd_train.reports import Choices, EvaluatedSet, Run, gather, make_report
+from gcd_train.reports.findings import Claim, findings, to_markdown
+from gcd_train.reports.goals import on_the_same_goals, shared_clips
+
+Change = tuple[float, float, float]
+AHEAD: Change = (30.0, 5.0, 0.0)
+ASIDE: Change = (-60.0, 20.0, 1.0)
+
+
+def sharp(values: Sequence[float]) -> RegionRecord:
+    """All pixels of a clip whose target is so sharp in each frame."""
+    return msgspec.structs.replace(region((20.0,) * FRAMES), gradient_target=tuple(values))
+
+
+def clips(method: str, *changes: Change | None, target: Sequence[float] = (2.0,) * FRAMES) -> list[ClipRecord]:
+    """A clip of each of as many scenes as there are changes."""
+    return [
+        record(method, f"scn{number:05d}.sample_00", change=change, regions={"all": sharp(target)})
+        for number, change in enumerate(changes)
+    ]
+
+
+def sets(**methods: list[list[ClipRecord]]) -> tuple[EvaluatedSet, ...]:
+    """A run by each name, of clips of its own digest."""
+    return gather([run(name, *of) for name, of in methods.items()])
+
+
+def run(name: str, *of: list[ClipRecord]) -> Run:
+    told = note(kind="kubric", protocol="paper", data_identity=name, methods={each[0].method: {} for each in of})
+    return Run(folder=Path(name), note=told, records=tuple(each for method in of for each in method))
+
+
+def test_clips_of_the_same_name_that_go_elsewhere_are_not_joined_and_it_is_said_why() -> None:
+    found = on_the_same_goals(sets(k0=[clips("a", AHEAD, ASIDE)], k1=[clips("b", ASIDE, AHEAD)]))
+    assert found.sets == ()
+    (told,) = found.notes
+    assert told.startswith("k0 and k1: of 2 clips of the same names 2 do not end at the same goal")
+    assert "azimuth +30.0, elevation +5.0, radius +0.0 and by azimuth -60.0" in told
+
+
+def test_of_clips_that_end_at_the_same_goal_in_part_only_those_are_joined() -> None:
+    nearly = (30.001, 5.0, 0.0)
+    found = on_the_same_goals(sets(k0=[clips("a", AHEAD, ASIDE)], k1=[clips("b", nearly, AHEAD)]))
+    (joined,) = found.sets
+    assert {method.name: method.keys for method in joined.methods} == {
+        "a": ("scn00000.sample_00", "scn00001.sample_00"),
+        "b": ("scn00000.sample_00",),
+    }
+    assert "of 2 clips of the same names 1 do not" in found.notes[0]
+
+
+@pytest.mark.parametrize("change", [None, AHEAD])
+def test_the_same_path_at_another_moment_is_another_goal(change: Change | None) -> None:
+    moved = clips("b", change, change, target=(2.0, 2.0, 2.0, 2.01))
+    found = on_the_same_goals(sets(k0=[clips("a", change, change)], k1=[moved]))
+    assert (found.sets, len(found.notes)) == ((), 1)
+    assert "the target's pictures differ" in found.notes[0]
+
+
+def test_another_way_to_the_same_last_picture_is_joined() -> None:
+    direct = clips("b", None, target=(5.0, 5.0, 5.0, 2.0))
+    (joined,) = on_the_same_goals(sets(k0=[clips("a", None)], k1=[direct])).sets
+    assert [method.name for method in joined.methods] == ["a", "b"]
+
+
+def test_class_maps_alone_tell_whether_the_goal_is_the_same() -> None:
+    seen, same, other = (
+        [record(name, "s.0", regions={"all": region(counts=counts)})]
+        for name, counts in (
+            ("a", [(0, 0, 5), (1, 1, 5)]),
+            ("b", [(0, 1, 5), (1, 0, 5)]),
+            ("c", [(0, 0, 4), (1, 1, 6)]),
+        )
+    )
+    bare = [
+        [
+            msgspec.structs.replace(
+                of[0], regions={"all": msgspec.structs.replace(of[0].regions["all"], gradient_target=None)}
+            )
+        ]
+        for of in (seen, same, other)
+    ]
+    assert shared_clips(bare[0], bare[1], "last").left_out == {}
+    assert list(shared_clips(bare[0], bare[2], "last").left_out) == ["s.0"]
+
+
+def test_where_nobody_knows_the_goal_nothing_is_compared() -> None:
+    bare = msgspec.structs.replace(sharp((2.0,) * FRAMES), gradient_target=None)
+    ours, theirs = ([record(name, "s.0", regions={"all": bare})] for name in ("a", "b"))
+    assert "nobody knows" in shared_clips(ours, theirs, "last").left_out["s.0"]
+
+
+def test_methods_stand_in_the_order_of_the_first_run_and_then_as_they_come() -> None:
+    of = {"k0": ("a", "copy_source", "b"), "k1": ("c", "copy_source", "a", "d")}
+    made = sets(**{name: [clips(method, AHEAD) for method in methods] for name, methods in of.items()})
+    (joined,) = on_the_same_goals(made).sets
+    assert [method.name for method in joined.methods] == ["a", "copy_source", "b", "c", "d"]
+    assert joined.method("a").folder == Path("k0")
+
+
+def test_two_methods_of_one_name_in_two_sets_are_told() -> None:
+    ours, theirs = (run(name, clips("a", AHEAD)) for name in ("k0", "k1"))
+    named = msgspec.structs.replace(theirs.note, methods={"a": {"weights": "other"}})
+    found = on_the_same_goals(gather([ours, Run(folder=theirs.folder, note=named, records=theirs.records)]))
+    assert "a is another method in k1 than in k0" in found.notes[0]
+
+
+def test_a_report_of_other_goals_makes_no_claim_and_says_so(tmp_path: Path) -> None:
+    for name, change in (("k0", AHEAD), ("k1", ASIDE)):
+        keeper = RunKeeper(tmp_path / name)
+        keeper.begin(note(kind="kubric", protocol="paper", data_identity=name, methods={name: {"weights": "ab"}}))
+        for each in clips(name, change, change):
+            keeper.keep(each)
+    text = make_report([tmp_path / "k0", tmp_path / "k1"], tmp_path / "out", Choices(drawn=False, worst=0)).read_text()
+    assert "The last frame together" not in text
+    assert "## What is not compared" in text
+    assert "do not end at the same goal" in text
+
+
+def test_findings_pair_only_clips_of_the_same_target_in_the_frames_of_the_claim() -> None:
+    ours, direct = run("k0", clips("a", AHEAD, ASIDE)), clips("b", AHEAD, AHEAD, target=(2.0, 5.0, 5.0, 2.0))
+    last, whole = findings(
+        [ours, run("k1", direct)],
+        [Claim(text="x", first="a", other="b", frames=frames) for frames in ("last", "2-last")],
+    )
+    assert {each.clips for each in last.apart} == {1}
+    assert whole.apart == ()
+    table = to_markdown([last, whole])
+    assert "no clips in common" in table
+    assert "a and b, frames last: of 2 clips of the same names 1 do not show the same" in table
+    assert "a and b, frames 2-last: of 2 clips of the same names 2 do not show the same" in table
