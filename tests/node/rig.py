@@ -103,7 +103,7 @@ class Rig:
         self.folder = folder
         self.notes: list[tuple[float, str, Mapping[str, Any]]] = []
         self.views: list[Seen] = []
-        self._keep = keep
+        self._keep, self._froze = keep, False
         self.ended: set[str] = set()
         self.summary: Summary | None = None
         self.failure: Exception | None = None
@@ -113,7 +113,9 @@ class Rig:
         self._threads = [threading.Thread(target=target, daemon=True) for target in targets]
 
     def __enter__(self) -> "Rig":
-        gc.freeze()  # a node's own process holds no thousand tests: looking through these would take it seconds
+        self._froze = gc.get_freeze_count() == 0
+        if self._froze:  # a node's own process holds no thousand tests: looking through these would take it seconds
+            gc.freeze()
         self.client = ControlClient(f"ipc://{self.folder}/control", timeout_s=20.0, attempts=1)
         for thread in self._threads[:-1]:
             thread.start()
@@ -131,7 +133,8 @@ class Rig:
         for thread in self._threads[:-1]:
             thread.join(10)
         self.client.close()
-        gc.unfreeze()
+        if self._froze:
+            gc.unfreeze()
         assert not alive, "the node did not end"
 
     def _live(self) -> None:
