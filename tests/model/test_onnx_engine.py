@@ -100,8 +100,8 @@ def test_another_size_than_the_exports_is_refused() -> None:
 
 def one_graph(tmp_path: Path, operator: str = "Add") -> dict[GraphName, Path]:
     """A file with one operator of two inputs [2]."""
-    onnx = pytest.importorskip("onnx")
-    pytest.importorskip("onnxruntime")
+    onnx = pytest.importorskip("onnx", reason="needs the extra `onnx`")
+    pytest.importorskip("onnxruntime", reason="needs the extra `onnx`")
     names = ("first", "second", "sum")
     values = [onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [2]) for name in names]
     nodes = [onnx.helper.make_node(operator, ["first", "second"], ["sum"])]

@@ -18,8 +18,8 @@ from gcd_model.onnx_export import export_onnx
 from gcd_model.onnx_manifest import Manifest
 from gcd_model.synthesizer import Synthesizer
 
-pytest.importorskip("onnxruntime")
-pytest.importorskip("onnxscript")
+pytest.importorskip("onnxruntime", reason="needs the extra `onnx`")
+pytest.importorskip("onnxscript", reason="needs the extra `onnx`")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 
 WORKER = Path(__file__).parent / "full_size_export.py"

@@ -370,7 +370,7 @@ def test_the_committed_page_is_what_the_command_writes(tmp_path: Path) -> None:
 
 
 def test_a_plot_is_a_picture(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
+    pytest.importorskip("matplotlib", reason="needs the extra `train`")
     from gcd_node.load.plots import write_plot
 
     for name, report in (("model", REPORT), ("stream", stream_report(StreamBenchOptions(), WATCHED))):

@@ -28,7 +28,7 @@ def test_two_precisions_exclude_each_other(tmp_path: Path, capsys: pytest.Captur
 
 
 def test_an_export_over_a_folder_of_mine_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("onnxscript")
+    pytest.importorskip("onnxscript", reason="needs the extra `onnx`")
     assert run_app(["export", "--weights", "random:driving", "--onnx", str(tmp_path), "--overwrite"]) == 64
     assert "exists; give another name, or allow an export to be overwritten" in capsys.readouterr().err
 

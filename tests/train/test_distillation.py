@@ -4,16 +4,15 @@ import json
 from copy import deepcopy
 from pathlib import Path
 
-import msgspec
 import pytest
 import torch
 from test_training_run import assert_same
-from tiny_driving import write_untrained
+from tiny_driving import without_warps, write_untrained
 from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips
 
 from gcd_model import SVD_14, Clip, RenderOptions, Synthesizer, Traits, load_synthesizer
 from gcd_model.checkpoints import load_weights, read_adapter, save_weights
-from gcd_model.config import DRIVING_CLASSES, DRIVING_SMALL, ClassHeadConfig
+from gcd_model.config import DRIVING_CLASSES
 from gcd_model.families import FAMILIES
 from gcd_model.networks import Networks, random_networks
 from gcd_model.own_format import Card
@@ -22,7 +21,6 @@ from gcd_train.checkpoint import load_state
 from gcd_train.datasets.clip_source import to_network
 from gcd_train.distillation.critic import Critic, fooling_loss, heard, looked_at, telling_loss
 from gcd_train.distillation.distiller import Distiller, DistillInputs
-from gcd_train.distillation.paired import denoiser_of
 from gcd_train.distillation.recipe import (
     CriticRecipe,
     DistillRecipe,
@@ -37,7 +35,7 @@ from gcd_train.distillation.teacher import student_config, teacher_of
 from gcd_train.draws import Draws
 from gcd_train.engine.blocks import recompute_blocks
 from gcd_train.errors import Interrupted, RecipeError
-from gcd_train.objective import Batch, Weights
+from gcd_train.objective import Batch, Weights, denoiser_of
 from gcd_train.precision import Precision
 from gcd_train.recipe import ComputeRecipe, OptimiserRecipe, UNetRecipe
 from gcd_train.recipe.loading import checked_recipe
@@ -83,26 +81,7 @@ def distiller(recipe: DistillRecipe, path: Path, stop: StopSignal | None = None)
 @pytest.fixture(scope="module")
 def teacher(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Random weights of a tiny driving model with a class head and no warps; tests only read them."""
-    change = msgspec.structs.replace
-    config = change(
-        DRIVING_SMALL,
-        frames=FRAMES,
-        height=HEIGHT,
-        width=WIDTH,
-        plane_warp=None,
-        plane_mix=None,
-        class_head=ClassHeadConfig(classes=DRIVING_CLASSES),
-        unet=change(
-            DRIVING_SMALL.unet,
-            condition_channels=12,
-            width=8,
-            multipliers=(1, 2),
-            attention=(False, True),
-            embedding_width=16,
-            head_width=8,
-        ),
-        vae=change(DRIVING_SMALL.vae, width=8, multipliers=(1, 1, 2)),
-    )
+    config = without_warps(FRAMES, HEIGHT, WIDTH)
     path = tmp_path_factory.mktemp("teacher") / "teacher.safetensors"
     save_weights(random_networks(config, seed=0), path, Card(name="t", config=config, family="driving", move_time=3))
     return path

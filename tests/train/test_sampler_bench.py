@@ -8,11 +8,12 @@ import msgspec
 import pytest
 import torch
 from driving_plane import PlaneClips
+from tiny_driving import without_warps
 from typer.testing import CliRunner
 
-from gcd_model import DRIVING_CLASSES, RenderOptions, Sampler, load_synthesizer
+from gcd_model import RenderOptions, Sampler, load_synthesizer
 from gcd_model.checkpoints import save_weights
-from gcd_model.config import DRIVING_SMALL, ClassHeadConfig, ModelConfig, SamplingConfig
+from gcd_model.config import ModelConfig, SamplingConfig
 from gcd_model.errors import OptionError
 from gcd_model.networks import random_networks
 from gcd_model.own_format import Card
@@ -26,28 +27,7 @@ GUIDED = SamplingConfig(steps=2, sigma_max=80.0, sigma_min=0.1, guidance=(1.0, 1
 
 def tiny_config() -> ModelConfig:
     """A driving model with a class head, without warps."""
-    change = msgspec.structs.replace
-    unet = change(
-        DRIVING_SMALL.unet,
-        condition_channels=12,
-        width=8,
-        multipliers=(1, 2),
-        attention=(False, True),
-        embedding_width=16,
-        head_width=8,
-    )
-    return change(
-        DRIVING_SMALL,
-        frames=FRAMES,
-        height=HEIGHT,
-        width=WIDTH,
-        plane_warp=None,
-        plane_mix=None,
-        class_head=ClassHeadConfig(classes=DRIVING_CLASSES),
-        unet=unet,
-        vae=change(DRIVING_SMALL.vae, width=8, multipliers=(1, 1, 2)),
-        sampling=GUIDED,
-    )
+    return msgspec.structs.replace(without_warps(FRAMES, HEIGHT, WIDTH), sampling=GUIDED)
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from gcd_model.class_head import ClassHead
 from gcd_model.conditioning import CameraEmbedder
 from gcd_model.config import Prediction
+from gcd_model.networks import Networks
 from gcd_model.noise import preconditioning
 from gcd_model.unet import VideoUNet
 from gcd_train.draws import Draws
@@ -54,6 +55,11 @@ class Denoiser(nn.Module):
         raw = self.unet.project(features).float()
         logits = None if self.class_head is None else self.class_head(features).float()
         return _column(levels.c_skip) * noisy + _column(levels.c_out) * raw, logits
+
+
+def denoiser_of(networks: Networks) -> Denoiser:
+    """What is trained to denoise: U-Net, class head and camera embedder."""
+    return Denoiser(networks.unet, networks.class_head, networks.config.prediction, networks.camera)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -17,13 +17,12 @@ from torch import nn
 from gcd_model.networks import Networks
 from gcd_train.batches import BatchSource
 from gcd_train.distillation.critic import Critic, fooling_loss, heard, looked_at, telling_loss, trained_of
-from gcd_train.distillation.paired import denoiser_of
 from gcd_train.distillation.recipe import BatchRecipe, MatchingRecipe
 from gcd_train.distillation.sample_losses import SampleLoss
 from gcd_train.distillation.student import drawn_steps, sampled, schedule_of, start_of
 from gcd_train.draws import Draws
 from gcd_train.loop import Progress, StepLoss
-from gcd_train.objective import Denoiser
+from gcd_train.objective import Denoiser, denoiser_of
 from gcd_train.precision import Precision
 from gcd_train.schedule import ParameterGroup
 from gcd_train.trained_part import keep_trained_alone

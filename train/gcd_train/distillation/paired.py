@@ -12,7 +12,7 @@ from gcd_train.distillation.sample_losses import SampleLoss
 from gcd_train.distillation.student import drawn_steps, sampled, schedule_of, start_of
 from gcd_train.draws import Draws
 from gcd_train.loop import Progress, StepLoss
-from gcd_train.objective import Denoiser
+from gcd_train.objective import denoiser_of
 from gcd_train.precision import Precision
 from gcd_train.schedule import ParameterGroup
 from gcd_train.trained_part import keep_trained_alone
@@ -68,8 +68,3 @@ class PairedTask:
     def measure(self, picture: Path) -> dict[str, float]:
         """Held-out clips through the shipped synthesizer, in the student's own steps."""
         return self._validation.measure(self._networks, picture)
-
-
-def denoiser_of(networks: Networks) -> Denoiser:
-    """What a student learns with: its U-Net, class head and camera embedder."""
-    return Denoiser(networks.unet, networks.class_head, networks.config.prediction, networks.camera)

@@ -9,7 +9,7 @@ from gcd_model.networks import Networks
 from gcd_train.batches import BatchSource
 from gcd_train.draws import Draws
 from gcd_train.loop import Progress, StepLoss
-from gcd_train.objective import Denoiser, Weights, diffusion_loss
+from gcd_train.objective import Weights, denoiser_of, diffusion_loss
 from gcd_train.precision import Precision
 from gcd_train.recipe import UNetRecipe
 from gcd_train.schedule import ParameterGroup
@@ -32,9 +32,7 @@ class UNetTask:
     ) -> None:
         self._networks, self._batches, self._validation = networks, batches, validation
         self._recipe, self._weights, self._precision, self._seed = recipe, weights, precision, seed
-        self._denoiser = precision.placed(
-            Denoiser(networks.unet, networks.class_head, networks.config.prediction, networks.camera)
-        )
+        self._denoiser = precision.placed(denoiser_of(networks))
         self._network: nn.Module = self._denoiser
         keep_trained_alone(self._denoiser)
 
