@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gcd_model.config import ClassHeadConfig, SemanticClass
+from gcd_model.frugal import silu
 
 __all__ = ["ClassHead", "ClassHeadConfig", "SemanticClass", "class_map", "nearest_classes", "palette"]
 
@@ -28,9 +29,9 @@ class ClassHead(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """features: [N, C, h, w], from `VideoUNet.features` -> logits [N, K, h * upscale, w * upscale]."""
-        x = self.conv_in(F.silu(self.norm_in(features)))
-        x = self.conv_out(F.silu(self.norm_out(x)))
-        return F.pixel_shuffle(self.logits(F.silu(x)), self.upscale)
+        x = self.conv_in(silu(self.norm_in(features)))
+        x = self.conv_out(silu(self.norm_out(x)))
+        return F.pixel_shuffle(self.logits(silu(x)), self.upscale)
 
 
 def class_map(logits: Tensor, height: int, width: int) -> Tensor:

@@ -5,6 +5,7 @@ is computed for it. Smaller ones are used again. None of this changes what is co
 """
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 REUSED_FLOATS = 7 * 2**20
@@ -19,6 +20,16 @@ def frugal(x: Tensor) -> bool:
 def rows_at_once(x: Tensor, floats_per_row: int) -> int:
     """How many rows of x to compute at once, if each needs a buffer of `floats_per_row`: all of them or a few."""
     return max(1, REUSED_FLOATS // floats_per_row) if frugal(x) else len(x)
+
+
+def silu(fresh: Tensor) -> Tensor:
+    """SiLU of values that nobody else needs, such as what a norm has just given: in their own place where frugal."""
+    return F.silu(fresh, inplace=frugal(fresh))
+
+
+def added(fresh: Tensor, more: Tensor) -> Tensor:
+    """The sum of both, in the place of `fresh`, which nobody else needs, where frugal. more: broadcasts over fresh."""
+    return fresh.add_(more) if frugal(fresh) else fresh + more
 
 
 def laid_out(x: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gcd_model.frugal import frugal, rows_at_once
+from gcd_model.frugal import added, frugal, rows_at_once, silu
 
 Kept = TypeVar("Kept")
 Layer = TypeVar("Layer", bound=nn.Module)
@@ -140,15 +140,15 @@ class ResBlock(nn.Module):
 
     def residual(self, x: Tensor, embedding: Tensor | None) -> Tensor:
         """The branch beside the skip connection. embedding broadcasts over x after the first convolution."""
-        h = self.conv1(F.silu(self.norm1(x)))
+        h = self.conv1(silu(self.norm1(x)))
         if embedding is not None:
-            h = h + embedding
-        return self.conv2(F.silu(self.norm2(h)))
+            h = added(h, embedding)
+        return self.conv2(silu(self.norm2(h)))
 
     def forward(self, x: Tensor, embedding: Tensor | None = None) -> Tensor:
         """x: [N, C, H, W] -> [N, C', H, W]. embedding: [N, C', 1, 1]."""
         skip = x if self.skip is None else self.skip(x)
-        return skip + self.residual(x, embedding)
+        return added(self.residual(x, embedding), skip)
 
 
 class FrameConv(nn.Conv3d):
@@ -275,12 +275,22 @@ class Upsample(Derived[Tensor]):
         """x: [N, C, H, W] -> [N, C, 2H, 2W]."""
         height, width = x.shape[-2:]
         kernels, padded = self.derived(), F.pad(x, (1, 1, 1, 1))
-        phases = [
+        phases = (
             F.conv2d(padded[..., a : a + height + 1, b : b + width + 1], kernels[a, b], self.conv.bias)
             for a in (0, 1)
             for b in (0, 1)
-        ]
-        return F.pixel_shuffle(torch.stack(phases, dim=2).flatten(1, 2), 2)
+        )
+        return _interleaved(phases) if frugal(x) else F.pixel_shuffle(torch.stack([*phases], dim=2).flatten(1, 2), 2)
+
+
+def _interleaved(phases: Iterator[Tensor]) -> Tensor:
+    """Four maps [N, C, H, W] for even and odd rows and columns, one at a time, as one of twice the size."""
+    first = next(phases)
+    whole = first.new_empty(*first.shape[:2], 2 * first.shape[2], 2 * first.shape[3])
+    whole[..., ::2, ::2] = first
+    for (row, column), phase in zip(((0, 1), (1, 0), (1, 1)), phases, strict=True):
+        whole[..., row::2, column::2] = phase
+    return whole
 
 
 def phase_kernels(weight: Tensor) -> Tensor:

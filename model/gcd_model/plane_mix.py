@@ -4,14 +4,19 @@ A small decoder blurs; a warp by the right plane is as sharp as the source. The 
 quarter of the picture's size and says how much each counts.
 """
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gcd_model.config import PlaneMixConfig
+from gcd_model.frugal import added, frugal, silu
 from gcd_model.layers import Layers, zeroed
 
 _COARSE = 4
+_CACHED_FLOATS = 4 * 2**20
+"""Warps of so many values, 16 MB, are mixed at once on a CPU: with what is made of them they stay in its cache."""
 _INVALID_LOGIT = -12.0
 _GENERATED_LOGIT = 1.0  # before training: prefer the generated layer over any single warp
 _LEAST_GENERATED = 1e-4  # so that pixels without a valid warp have something to show
@@ -28,7 +33,7 @@ class MixBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """x: [N, C, h, w] -> the same shape."""
-        return x + self.conv2(F.silu(self.norm2(self.conv1(F.silu(self.norm1(x))))))
+        return added(self.conv2(silu(self.norm2(self.conv1(silu(self.norm1(x)))))), x)
 
 
 class PlaneMix(nn.Module):
@@ -67,12 +72,24 @@ class PlaneMix(nn.Module):
         Returns:
             The picture [N, 3, H, W], about [-1, 1], and the sharpened class logits (same shape) or None.
         """
+        given = (decoded, warped, valid, latents, class_logits)
+        rows = max(1, _CACHED_FLOATS // warped[0].numel()) if frugal(decoded) else len(decoded)
+        if rows >= len(decoded):
+            return self._mixed(*given)
+        parts = [
+            self._mixed(*piece) for piece in zip(*(_pieces(each, rows, len(decoded)) for each in given), strict=True)
+        ]
+        sharpened = [logits for _, logits in parts if logits is not None]
+        return torch.cat([picture for picture, _ in parts]), torch.cat(sharpened) if sharpened else None
+
+    def _mixed(
+        self, decoded: Tensor, warped: Tensor, valid: Tensor, latents: Tensor, class_logits: Tensor | None
+    ) -> tuple[Tensor, Tensor | None]:
         present = valid.to(decoded.dtype)
         fine = self._look(decoded, warped, present, latents, class_logits)  # [N, width/2, H/2, W/2]
         weights = self._weights(fine, present)  # [N, L+1, H, W]
         generated = decoded + F.pixel_shuffle(self.residual(fine), 2)
-        picture = torch.einsum("nlhw,nlchw->nchw", weights[:, :-1], warped) + weights[:, -1:] * generated
-        return picture, self._sharpened(fine, class_logits)
+        return _blended(weights, warped, generated), self._sharpened(fine, class_logits)
 
     def _look(
         self, decoded: Tensor, warped: Tensor, present: Tensor, latents: Tensor, class_logits: Tensor | None
@@ -85,7 +102,7 @@ class PlaneMix(nn.Module):
         x = self.stem(torch.cat(seen, dim=1))
         for block in self.blocks:
             x = block(x)
-        return F.silu(F.pixel_shuffle(self.rise(F.silu(self.norm(x))), 2))
+        return silu(F.pixel_shuffle(self.rise(silu(self.norm(x))), 2))
 
     def _weights(self, fine: Tensor, present: Tensor) -> Tensor:
         """Shares of the warps and, last, of the generated layer; they sum to 1 and are 0 where a warp is not valid."""
@@ -101,6 +118,18 @@ class PlaneMix(nn.Module):
         if class_logits is None or self.class_residual is None:
             return class_logits
         return class_logits + _resized(self.class_residual(fine), class_logits.shape[-2:])
+
+
+def _pieces(rows: Tensor | None, size: int, count: int) -> Sequence[Tensor | None]:
+    return [None] * -(-count // size) if rows is None else rows.split(size)
+
+
+def _blended(weights: Tensor, warped: Tensor, generated: Tensor) -> Tensor:
+    """The layers by their weights [N, L+1, H, W], layer by layer: their product, L pictures, is never held."""
+    picture = weights[:, -1:] * generated
+    for number in range(warped.shape[1]):
+        picture = torch.addcmul(picture, weights[:, number : number + 1], warped[:, number])
+    return picture
 
 
 def _resized(x: Tensor, size: torch.Size) -> Tensor:

@@ -72,7 +72,7 @@ class VideoResBlock(nn.Module):
             temporal_embedding = temporal_embedding.unflatten(0, (-1, frames)).transpose(1, 2)[..., None, None]
         video = x.unflatten(0, (-1, frames)).transpose(1, 2)  # [B, C', T, H, W]
         change = self.temporal.residual(video, temporal_embedding)
-        return self.share.add(x, change.transpose(1, 2).flatten(0, 1))
+        return self.share.add(x.unflatten(0, (-1, frames)), change.transpose(1, 2)).flatten(0, 1)
 
 
 class FramePositions(Derived[Tensor]):

@@ -7,11 +7,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gcd_model.config import UNetConfig
-from gcd_model.frugal import laid_out, rows_at_once
+from gcd_model.frugal import laid_out, rows_at_once, silu
 from gcd_model.layers import Downsample, Layers, Upsample, embedding_mlp, sinusoid, zeroed
 from gcd_model.temporal import TemporalShare, VideoResBlock, VideoTransformer
 
@@ -244,7 +243,7 @@ class VideoUNet(nn.Module):
 
     def project(self, features: Tensor) -> Tensor:
         """[B*T, width, h, w] -> [B*T, C, h, w]."""
-        return self.conv_out(F.silu(self.norm_out(features))).contiguous()
+        return self.conv_out(silu(self.norm_out(features))).contiguous()
 
     def start_apart(self) -> None:
         """Make all transformers across frames the identity too: for learning from single frames first, then clips."""

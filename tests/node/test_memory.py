@@ -1,6 +1,9 @@
 """What is not needed any more goes back to the system, and what was imported is not searched for garbage."""
 
+import ctypes
 import gc
+import subprocess
+import sys
 import threading
 
 import numpy as np
@@ -43,6 +46,27 @@ def test_a_settled_process_searches_for_new_garbage_only_and_is_settled_once() -
     ring = Ring()
     del ring
     assert gc.collect() > 0
+
+
+_TWO_WINDOWS = """
+import resource
+import torch
+from gcd_node.life.memory import settle_process
+settle_process()
+faults = []
+for _ in range(2):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    torch.ones(12 * 2**20)
+    faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+print(*faults)
+"""
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "gnu_get_libc_version"), reason="needs the GNU C library")
+def test_a_window_works_in_the_memory_of_the_one_before() -> None:
+    ran = subprocess.run([sys.executable, "-c", _TWO_WINDOWS], capture_output=True, text=True, check=True)
+    first, second = map(int, ran.stdout.split())
+    assert second < 0.1 * first
 
 
 def test_another_c_library_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -196,7 +196,7 @@ def test_the_cube_stands_where_cameras_of_an_orbit_look() -> None:
     assert_close(found.centre, torch.tensor([0.0, 0.0, 1.0]), rtol=0, atol=0.02)
     assert found.half_m == pytest.approx(4.5, abs=0.01)
     assert found.begin == pytest.approx(0.6, abs=0.01)
-    assert found.reach == pytest.approx(3.0, abs=0.01)
+    assert found.reach == pytest.approx(2.5, abs=0.01)
 
 
 def test_cameras_with_parallel_axes_look_at_what_lies_ahead() -> None:

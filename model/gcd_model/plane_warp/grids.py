@@ -8,6 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from gcd_model.frugal import frugal
+
 NEAREST_M = 0.1
 """What lies nearer to the source camera than this, along its axis, is not seen by it."""
 _NEUTRAL_M, _DECADES = 10.0, 1.0  # ground distance as log10(distance / 10 m), clipped to +-1
@@ -83,4 +85,5 @@ def warp(source: Tensor, grids: Tensor, valid: Tensor) -> Tensor:
     """
     rows = grids.flatten(1, 2)  # [N, L*H', W', 2]: one call for all layers
     sampled = F.grid_sample(source.to(grids.dtype), rows, padding_mode="border", align_corners=False)
-    return sampled.unflatten(2, grids.shape[1:3]).transpose(1, 2) * valid[:, :, None]
+    layers = sampled.unflatten(2, grids.shape[1:3]).transpose(1, 2)
+    return layers.mul_(valid[:, :, None]) if frugal(layers) else layers * valid[:, :, None]

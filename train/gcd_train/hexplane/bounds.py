@@ -10,7 +10,7 @@ _INNER = 0.5
 _BEGIN = 0.3
 """Where rays begin, as a share of the nearest camera's distance from the middle. Pictures painted on the air in front
 of each camera explain all inputs and no other view."""
-_END = 1.0
+_END = 0.5
 """Where rays end, in halves of the cube beyond the middle as the farthest camera sees it. What lies farther off is seen
 by one camera only, and with many cameras around a scene each would paint its whole picture there."""
 _PULL = 1e-3

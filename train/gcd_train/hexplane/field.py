@@ -7,13 +7,18 @@ from gcd_train.hexplane.bounds import SceneBounds
 from gcd_train.hexplane.planes import HexPlanes
 from gcd_train.hexplane.settings import HexPlaneSettings
 
-_THIN = -1.0
-"""Added to the density before it is made positive, so that space is a fog at first that lets half of the light pass."""
+_THIN = -4.0
+"""Added to the density before it is made positive, so that space is a thin haze at first: surfaces grow where pictures
+want them, and fog in front of cameras is not what learning begins with."""
 _HARMONICS = 9
+_HEIGHT_WAVES = (2.0, 4.0, 8.0, 16.0)
+"""Waves over the vertical part of a direction, in radians of phase, for a sharp horizon all around."""
+
+_BACKGROUND_WIDTH = 32
 
 
 class HexField(nn.Module):
-    """Six planes and two small heads, before a smooth background that stands still.
+    """Six planes and two small heads, before a background that stands still, smooth but for its horizon.
 
     Colour does not depend on the direction that it is seen from.
     bounds: the part of the world that the planes cover. frames: T of the clip, a row of the time planes each.
@@ -34,7 +39,11 @@ class HexField(nn.Module):
             nn.ReLU(),
             _linear(settings.hidden, 3, generator),
         )
-        self.background_head = _linear(_HARMONICS, 3, generator)
+        self.background_head = nn.Sequential(
+            _linear(_HARMONICS + 2 * len(_HEIGHT_WAVES), _BACKGROUND_WIDTH, generator),
+            nn.ReLU(),
+            _linear(_BACKGROUND_WIDTH, 3, generator),
+        )
 
     def forward(self, points: Tensor, times: Tensor) -> Tensor:
         """What the heads read. points: [P, 3], world, metres; times: [P], -1 first frame, 1 last -> [P, D]."""
@@ -51,10 +60,11 @@ class HexField(nn.Module):
         return self.colour_head(features).sigmoid()
 
     def background(self, directions: Tensor) -> Tensor:
-        """RGB in [0, 1] of what lies behind everything, by the direction [P, 3] of length 1: of second degree in it."""
+        """RGB in [0, 1] of what lies behind everything, by the direction [P, 3] of length 1, z up in the world."""
         x, y, z = directions.unbind(dim=-1)
         harmonics = [torch.ones_like(x), x, y, z, x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1]
-        return self.background_head(torch.stack(harmonics, dim=-1)).sigmoid()
+        heights = [wave(rate * z) for rate in _HEIGHT_WAVES for wave in (torch.sin, torch.cos)]
+        return self.background_head(torch.stack([*harmonics, *heights], dim=-1)).sigmoid()
 
 
 def _linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
