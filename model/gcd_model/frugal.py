@@ -4,6 +4,8 @@ A buffer above 32 MB is fetched from the system afresh each time, page by page; 
 is computed for it. Smaller ones are used again. None of this changes what is computed.
 """
 
+from collections.abc import Callable
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -20,6 +22,17 @@ def frugal(x: Tensor) -> bool:
 def rows_at_once(x: Tensor, floats_per_row: int) -> int:
     """How many rows of x to compute at once, if each needs a buffer of `floats_per_row`: all of them or a few."""
     return max(1, REUSED_FLOATS // floats_per_row) if frugal(x) else len(x)
+
+
+def by_rows(compute: Callable[[Tensor], Tensor], x: Tensor, floats_per_row: int) -> Tensor:
+    """compute(x), for what gives every row of x for itself and in its shape, in pieces where `rows_at_once` says so."""
+    at_once = rows_at_once(x, floats_per_row)
+    if at_once >= len(x):
+        return compute(x)
+    result = torch.empty_like(x)
+    for few, into in zip(x.split(at_once), result.split(at_once), strict=True):
+        into.copy_(compute(few))
+    return result
 
 
 def silu(fresh: Tensor) -> Tensor:

@@ -112,13 +112,6 @@ class Stage(nn.Module):
 
     def forward(self, x: Tensor, inputs: StageInputs, frames: int | None) -> Tensor:
         """x: [N, C, h, w] -> [N, C', h, w]. frames: None for unrelated frames."""
-        clips = 1 if frames is None else len(x) // frames
-        if clips == 1 or rows_at_once(x, x[0].numel()) >= len(x):
-            return self._together(x, inputs, frames)
-        parts = zip(x.chunk(clips), inputs.split(clips), strict=True)
-        return torch.cat([self._together(clip, its_own, frames) for clip, its_own in parts])
-
-    def _together(self, x: Tensor, inputs: StageInputs, frames: int | None) -> Tensor:
         x = self.res(x, frames, inputs.spatial_embedding, inputs.temporal_embedding)
         if self.attention is None:
             return x
@@ -221,8 +214,23 @@ class VideoUNet(nn.Module):
     def features(
         self, latents: Tensor, condition: Tensor, inputs: Sequence[StageInputs], *, image_mode: bool = False
     ) -> Tensor:
-        """What the last norm sees, [B*T, width, h, w]; `project` makes the network's output of it. See `forward`."""
-        inputs_left, frames = iter(inputs), None if image_mode else self.frames
+        """What the last norm sees, [B*T, width, h, w]; `project` makes the network's output of it. See `forward`.
+
+        Clips that are large together go through it one after the other: nothing of one is held for the next.
+        """
+        frames = None if image_mode else self.frames
+        clips = 1 if frames is None else len(latents) // frames
+        widest = self.stem.out_channels * latents[0, 0].numel()
+        if clips == 1 or rows_at_once(latents, widest) >= len(latents):
+            return self._together(latents, condition, inputs, frames)
+        each = zip(*(stage.split(clips) for stage in inputs), strict=True)
+        parts = zip(latents.chunk(clips), condition.chunk(clips), each, strict=True)
+        return torch.cat([self._together(*part, frames) for part in parts])
+
+    def _together(
+        self, latents: Tensor, condition: Tensor, inputs: Sequence[StageInputs], frames: int | None
+    ) -> Tensor:
+        inputs_left = iter(inputs)
         x = laid_out(self.stem(torch.cat([latents, condition], dim=1)))
         skips = [x]
         for level in self.down:
@@ -236,7 +244,8 @@ class VideoUNet(nn.Module):
             x = stage(x, next(inputs_left), frames)
         for level in self.up:
             for stage in level.stages:
-                x = stage(torch.cat([x, skips.pop()], dim=1), next(inputs_left), frames)
+                x = torch.cat([x, skips.pop()], dim=1)  # so that nobody holds the two any more
+                x = stage(x, next(inputs_left), frames)
             if level.up is not None:
                 x = laid_out(level.up(x))
         return x

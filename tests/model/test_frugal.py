@@ -8,9 +8,9 @@ from small_models import UNET, draw, randomise
 from torch import Tensor, nn
 from torch.testing import assert_close
 
-from gcd_model import frugal, plane_mix
+from gcd_model import frugal, layers, plane_mix
 from gcd_model.config import PlaneMixConfig
-from gcd_model.layers import FeedForward, ResBlock, Upsample, prepare
+from gcd_model.layers import Attention, FeedForward, ResBlock, Upsample, prepare
 from gcd_model.plane_mix import PlaneMix
 from gcd_model.unet import StageInputs, VideoUNet
 
@@ -45,22 +45,6 @@ def test_the_u_net_is_the_same_however_little_memory_is_used_at_once(
     assert whole.abs().max() > 0.1
     assert_close(pieces, whole, rtol=1e-4, atol=1e-5)
     assert pieces.is_contiguous()
-
-
-def test_clips_that_are_large_go_through_a_stage_one_after_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    unet, latents = _unet(), draw(CLIPS * FRAMES, 4, 8, 16, seed=4)
-    inputs, seen = _inputs(unet), list[int]()
-
-    def note(_module: nn.Module, given: Sequence[object]) -> None:
-        assert isinstance(given[0], Tensor)
-        seen.append(len(given[0]))
-
-    next(unet.all_stages()).res.register_forward_pre_hook(note)
-    with torch.no_grad():
-        unet(latents, latents, inputs)
-        monkeypatch.setattr(frugal, "REUSED_FLOATS", 20_000)
-        unet(latents, latents, inputs)
-    assert seen == [CLIPS * FRAMES, FRAMES, FRAMES]
 
 
 class _Adapted(nn.Module):
@@ -143,3 +127,59 @@ def test_pictures_are_mixed_the_same_frame_by_frame(monkeypatch: pytest.MonkeyPa
         assert few_sharpened is None
     else:
         assert_close(few_sharpened, sharpened.detach())
+
+
+@pytest.mark.parametrize("floats", [1, 6 * 35 * 2, frugal.REUSED_FLOATS])
+@pytest.mark.parametrize("embedded", [False, True])
+def test_a_residual_block_is_the_same_a_few_rows_at_a_time(
+    monkeypatch: pytest.MonkeyPatch, floats: int, embedded: bool
+) -> None:
+    block, x = ResBlock(6, 4, groups=2, eps=1e-5), draw(5, 6, 5, 7)
+    embedding = draw(5, 4, 1, 1, seed=2) if embedded else None
+    whole = block(x, embedding).detach()
+    monkeypatch.setattr(frugal, "REUSED_FLOATS", floats)
+    with torch.no_grad():
+        assert_close(block(x, embedding), whole)
+
+
+@pytest.mark.parametrize("floats", [1, 2 * 3 * 40, frugal.REUSED_FLOATS])
+def test_attention_is_the_same_a_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch, floats: int) -> None:
+    attention, x = Attention(8, 2), draw(5, 5, 8)
+    whole = attention(x).detach()
+    monkeypatch.setattr(frugal, "REUSED_FLOATS", floats)
+    with torch.no_grad():
+        assert_close(attention(x), whole)
+
+
+def test_kernels_folded_for_up_sampling_are_kept_unless_they_are_large_and_on_a_cpu(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    x, small, large = draw(2, 6, 3, 4), Upsample(6), Upsample(6)
+    large.load_state_dict(small.state_dict())
+    prepare(small)
+    monkeypatch.setattr(layers, "REUSED_FLOATS", 16 * 6 * 6 - 1)
+    prepare(large)
+    with torch.no_grad():
+        assert small.derived() is small.derived()
+        assert large.derived() is not large.derived()
+        assert torch.equal(large(x), small(x))
+    monkeypatch.setattr(layers, "REUSED_FLOATS", 16 * 6 * 6)
+    prepare(large)
+    assert large.derived() is large.derived()
+
+
+def test_large_clips_go_through_the_whole_network_one_after_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    unet, latents = _unet(), draw(CLIPS * FRAMES, 4, 8, 16, seed=4)
+    inputs, seen = _inputs(unet), list[tuple[str, int]]()
+
+    def note(module: nn.Module, given: Sequence[object]) -> None:
+        assert isinstance(given[0], Tensor)
+        seen.append(("stem" if module is unet.stem else "stage", len(given[0])))
+
+    unet.stem.register_forward_pre_hook(note)
+    next(unet.all_stages()).res.register_forward_pre_hook(note)
+    with torch.no_grad():
+        unet(latents, latents, inputs)
+        monkeypatch.setattr(frugal, "REUSED_FLOATS", 20_000)
+        unet(latents, latents, inputs)
+    assert seen == [("stem", 6), ("stage", 6), ("stem", 3), ("stage", 3), ("stem", 3), ("stage", 3)]

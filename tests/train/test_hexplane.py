@@ -228,6 +228,25 @@ def test_nothing_but_fog_of_no_density_shows_the_background() -> None:
     assert_close(render(field, rays, coarse=8, fine=8), field.background(rays.directions))
 
 
+def test_a_background_has_a_sharp_horizon_after_few_updates() -> None:
+    generator = torch.Generator().manual_seed(0)
+    field = HexField(bounds(), FRAMES, TINY, generator)
+    optimiser = torch.optim.Adam(field.background_head.parameters(), lr=TINY.head_rate, betas=(0.9, 0.99))
+    sky, ground = torch.tensor([0.7, 0.5, 0.4]), torch.tensor([0.3, 0.35, 0.4])
+
+    def some(count: int) -> tuple[Tensor, Tensor]:
+        directions = F.normalize(torch.randn(count, 3, generator=generator) * torch.tensor([1.0, 1.0, 0.5]), dim=-1)
+        return directions, torch.where(directions[:, 2:] > -0.05, sky, ground)
+
+    for _ in range(100):
+        directions, seen = some(256)
+        optimiser.zero_grad()
+        F.mse_loss(field.background(directions), seen).backward()
+        optimiser.step()
+    directions, seen = some(4096)
+    assert (field.background(directions) - seen).abs().mean() < 0.03  # of second degree in the direction: 0.05 and more
+
+
 def test_rays_go_through_the_middles_of_their_pixels() -> None:
     lens = replace(LENS, cx=10.0, cy=9.0)
     pose = to_pose(Spherical(azimuth_deg=40.0, elevation_deg=10.0, radius_m=15.0))

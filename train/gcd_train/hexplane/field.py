@@ -7,9 +7,8 @@ from gcd_train.hexplane.bounds import SceneBounds
 from gcd_train.hexplane.planes import HexPlanes
 from gcd_train.hexplane.settings import HexPlaneSettings
 
-_THIN = -4.0
-"""Added to the density before it is made positive, so that space is a thin haze at first: surfaces grow where pictures
-want them, and fog in front of cameras is not what learning begins with."""
+_THIN = -1.0
+"""Added to the density before it is made positive, so that space is a fog at first that lets half of the light pass."""
 _HARMONICS = 9
 _HEIGHT_WAVES = (2.0, 4.0, 8.0, 16.0)
 """Waves over the vertical part of a direction, in radians of phase, for a sharp horizon all around."""
