@@ -7,8 +7,10 @@ from functools import cache
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # mallopt(3)
 _KEPT_B = 512 * 2**20
 """So much free memory at the end of the heap is kept for the next window instead of being returned after each."""
-_LARGEST_IN_HEAP_B = 64 * 2**20
-"""Buffers above this, by default above 32 MiB at most, are fetched from the system page by page each time."""
+_LARGEST_IN_HEAP_B = (64 * 2**20, 32 * 2**20)
+"""Buffers above this are fetched from the system page by page each time; the first that the library accepts. Older ones
+allow 32 MiB. Without either they find a threshold of their own, which they do no more once they were told another one.
+"""
 
 
 @cache
@@ -25,8 +27,8 @@ def settle_process() -> None:
     library = _glibc()
     if library is not None:
         library.mallopt(_ARENA_MAX, 1)
-        library.mallopt(_MMAP_THRESHOLD, _LARGEST_IN_HEAP_B)
-        library.mallopt(_TRIM_THRESHOLD, _KEPT_B)
+        if any(library.mallopt(_MMAP_THRESHOLD, largest) for largest in _LARGEST_IN_HEAP_B):
+            library.mallopt(_TRIM_THRESHOLD, _KEPT_B)
 
 
 def give_back_memory() -> None:

@@ -1,7 +1,7 @@
 """How a CPU is served best: working sets that fit its caches and the memory it has at hand.
 
-A buffer above 32 MB is fetched from the system afresh each time, page by page; writing it then costs more than what
-is computed for it. Smaller ones are used again. None of this changes what is computed.
+A buffer above 32 MB (64 MB in a node) is fetched from the system afresh each time, page by page; writing it then costs
+more than what is computed for it. Smaller ones are used again. None of this changes what is computed.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ def frugal(x: Tensor) -> bool:
 
 def rows_at_once(x: Tensor, floats_per_row: int) -> int:
     """How many rows of x to compute at once, if each needs a buffer of `floats_per_row`: all of them or a few."""
-    return max(1, REUSED_FLOATS // floats_per_row) if frugal(x) else len(x)
+    return max(1, REUSED_FLOATS // max(1, floats_per_row)) if frugal(x) else len(x)
 
 
 def by_rows(compute: Callable[[Tensor], Tensor], x: Tensor, floats_per_row: int) -> Tensor:

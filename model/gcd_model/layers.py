@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterable, Iterator
-from itertools import repeat
 from typing import Generic, TypeVar, cast
 
 import torch
@@ -148,11 +147,12 @@ class ResBlock(nn.Module):
 
     def forward(self, x: Tensor, embedding: Tensor | None = None) -> Tensor:
         """x: [N, C, H, W] -> [N, C', H, W]. embedding: [N, C', 1, 1]."""
-        at_once = rows_at_once(x, x[0].numel())
+        at_once = rows_at_once(x, x.shape[1:].numel())
         if at_once >= len(x):
             return self._few(x, embedding)
-        embeddings = repeat(None) if embedding is None else embedding.split(at_once)
-        return torch.cat([self._few(*few) for few in zip(x.split(at_once), embeddings, strict=False)])
+        pieces = x.split(at_once)
+        embeddings = [None] * len(pieces) if embedding is None else embedding.expand(len(x), -1, -1, -1).split(at_once)
+        return torch.cat([self._few(*few) for few in zip(pieces, embeddings, strict=True)])
 
     def _few(self, x: Tensor, embedding: Tensor | None) -> Tensor:
         skip = x if self.skip is None else self.skip(x)
@@ -193,7 +193,7 @@ class Attention(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """x: [N, L, C]."""
-        return by_rows(self._few, x, 3 * x[0].numel())
+        return by_rows(self._few, x, 3 * x.shape[1:].numel())
 
     def _few(self, x: Tensor) -> Tensor:
         query, key, value = (self._split(layer(x)) for layer in (self.query, self.key, self.value))
@@ -271,7 +271,8 @@ class Upsample(Derived[Tensor]):
         self.conv = nn.Conv2d(channels, channels, 3, padding=1)
 
     def keep(self) -> None:
-        """Unless they are large and on a CPU: it folds them in a tenth of the time that it then convolves by them."""
+        """Unless they are large and on a CPU: there they are folded for each call, a hundredth of a full-size step, and
+        0.2 GB less is held."""
         weight = self.conv.weight
         folded = 4 * 4 * weight[..., 0, 0].numel()
         if weight.device.type != "cpu" or folded <= REUSED_FLOATS:

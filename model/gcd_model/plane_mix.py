@@ -73,7 +73,7 @@ class PlaneMix(nn.Module):
             The picture [N, 3, H, W], about [-1, 1], and the sharpened class logits (same shape) or None.
         """
         given = (decoded, warped, valid, latents, class_logits)
-        rows = max(1, _CACHED_FLOATS // warped[0].numel()) if frugal(decoded) else len(decoded)
+        rows = max(1, _CACHED_FLOATS // warped.shape[1:].numel()) if frugal(decoded) else len(decoded)
         if rows >= len(decoded):
             return self._mixed(*given)
         parts = [

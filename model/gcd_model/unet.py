@@ -220,7 +220,7 @@ class VideoUNet(nn.Module):
         """
         frames = None if image_mode else self.frames
         clips = 1 if frames is None else len(latents) // frames
-        widest = self.stem.out_channels * latents[0, 0].numel()
+        widest = self.stem.out_channels * latents.shape[-2:].numel()
         if clips == 1 or rows_at_once(latents, widest) >= len(latents):
             return self._together(latents, condition, inputs, frames)
         each = zip(*(stage.split(clips) for stage in inputs), strict=True)

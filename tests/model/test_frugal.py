@@ -183,3 +183,18 @@ def test_large_clips_go_through_the_whole_network_one_after_the_other(monkeypatc
         monkeypatch.setattr(frugal, "REUSED_FLOATS", 20_000)
         unet(latents, latents, inputs)
     assert seen == [("stem", 6), ("stage", 6), ("stem", 3), ("stage", 3), ("stem", 3), ("stage", 3)]
+
+
+def test_an_embedding_of_one_row_counts_for_all_rows_however_they_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    block, x, embedding = ResBlock(6, 4, groups=2, eps=1e-5), draw(5, 6, 5, 7), draw(1, 4, 1, 1, seed=2)
+    whole = block(x, embedding).detach()
+    monkeypatch.setattr(frugal, "REUSED_FLOATS", 6 * 35 * 2)
+    with torch.no_grad():
+        assert_close(block(x, embedding), whole)
+
+
+def test_no_rows_give_no_rows() -> None:
+    with torch.no_grad():
+        assert ResBlock(6, 4, groups=2, eps=1e-5)(draw(2, 6, 5, 7)[:0]).shape == (0, 4, 5, 7)
+        assert Attention(8, 2)(draw(2, 5, 8)[:0]).shape == (0, 5, 8)
+        assert Attention(8, 2)(draw(2, 5, 8)[:, :0]).shape == (2, 0, 8)
