@@ -59,6 +59,11 @@ class Connections:
         except OSError as error:
             _LOG.debug("a connection was gone before it could be looked at: %s", error)
 
+    def missed(self, handle: int) -> None:
+        """It had ended before it could be looked at; what was kept may be another one, so it goes unnoticed."""
+        self._forget(handle)
+        self._unnoticed.discard(handle)
+
     def failed(self) -> None:
         """A handshake came to nothing."""
         self._failed = True

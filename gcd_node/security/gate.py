@@ -10,6 +10,7 @@ Longer than most files: all of it waits in one thread for the same sockets.
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -197,8 +198,9 @@ class Gate:
             poller.register(each, zmq.POLLIN)
         try:
             while not self._closing.is_set():
-                for ready, _ in poller.poll(_TICK_MS):
-                    self._hear(ready, poller)
+                ready = {each for each, _ in poller.poll(0 if self._ahead() else _TICK_MS)}
+                for each in (*ready, *(self._ahead() - ready)):
+                    self._hear(each, poller)
                 self._look_at_list()
                 self._cut_endless()
         finally:
@@ -207,6 +209,10 @@ class Gate:
                 each.close(0)
             if self._zap is not None:
                 self._zap.close(0)
+
+    def _ahead(self) -> set[object]:
+        """The monitors with events that were taken and not looked at."""
+        return {monitor for monitor, monitored in self._monitors.items() if monitored.ahead}
 
     def _hear(self, ready: object, poller: zmq.Poller) -> None:
         try:
@@ -265,28 +271,45 @@ class Gate:
         self._on_event("TOO_LARGE", {"level": 1, "channel": channel})
 
     def _notice(self, monitor: Socket, monitored: "_Monitored") -> bool:
-        """One event of a bound socket; False once the socket is closed."""
-        heard = parse_monitor_message(monitor.recv_multipart())
-        event, handle, connections = int(heard["event"]), int(heard["value"]), monitored.connections
+        """What a bound socket's monitor has by now; False once the socket is closed."""
+        monitored.take(monitor)
+        for _ in range(len(monitored.ahead)):  # not what comes meanwhile: others wait for the gate, too
+            event, handle = monitored.ahead.popleft()
+            if event == zmq.EVENT_MONITOR_STOPPED:
+                return False
+            self._look_at(event, handle, monitor, monitored)
+        return True
+
+    def _look_at(self, event: int, handle: int, monitor: Socket, monitored: "_Monitored") -> None:
+        connections = monitored.connections
         if event & _FAILED:
             connections.failed()
         if event & _FAILED and monitored.secured:  # no keys, or the wrong one for this node
             self._denials.tell(None, f"gcd.{monitored.channel}", "")
         if event == zmq.EVENT_ACCEPTED:
             connections.accepted(handle)
+            monitored.take(monitor)
+            if (zmq.EVENT_DISCONNECTED, handle) in monitored.ahead:  # its number may be another connection's by now
+                connections.missed(handle)
         if event == zmq.EVENT_DISCONNECTED and connections.cut_off(handle) and monitored.channel == "control":
             self._tell_too_large(monitored.channel)
-        return event != zmq.EVENT_MONITOR_STOPPED
 
 
 @dataclass(kw_only=True, slots=True)
 class _Monitored:
-    """A bound socket that is listened to. port: of tcp."""
+    """A bound socket that is listened to. port: of tcp. ahead: events taken from its monitor, not yet looked at."""
 
     channel: Channel
     secured: bool
     port: int = 0
     connections: Connections = field(default_factory=Connections)
+    ahead: deque[tuple[int, int]] = field(default_factory=deque[tuple[int, int]])
+
+    def take(self, monitor: Socket) -> None:
+        """All events that wait. ZeroMQ tells of an end before it gives the connection's number away."""
+        while monitor.poll(0):
+            heard = parse_monitor_message(monitor.recv_multipart())
+            self.ahead.append((int(heard["event"]), int(heard["value"])))
 
 
 class _Denials:

@@ -2,6 +2,7 @@
 no test says."""
 
 import json
+import mmap
 import os
 import time
 from collections.abc import Callable
@@ -245,10 +246,11 @@ def test_a_process_of_its_own_tells_its_memory_or_why_it_could_not() -> None:
 def test_a_process_is_seen_to_take_memory_and_time_and_one_that_is_gone_is_said_to_be() -> None:
     pid, before = os.getpid(), memory(os.getpid())
     with PrivatePeak(pid) as peak:
-        taken = bytearray(os.urandom(32 * 2**20))
+        taken = mmap.mmap(-1, 32 * 2**20, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)  # a heap may have it at hand
+        taken.write(os.urandom(len(taken)))
         after = memory(pid)
         time.sleep(0.05)
-    assert len(taken) == 32 * 2**20
+    taken.close()
     assert after.private - before.private > 16 * 2**20
     assert peak.bytes >= after.private
     assert after.peak_resident >= after.private

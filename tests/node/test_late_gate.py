@@ -1,0 +1,54 @@
+"""A gate that hears of connections late, as on a busy machine: their numbers have come to stand for others."""
+
+import socket
+from collections.abc import Iterator
+
+import pytest
+import zmq
+from control_fakes import Events
+
+from gcd_node.load.zmtp import GREETING, message, ready
+from gcd_node.security.gate import Gate
+
+
+@pytest.fixture
+def server() -> Iterator["zmq.Socket[bytes]"]:
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as made:
+        made.set(zmq.MAXMSGSIZE, 1000)
+        yield made
+
+
+@pytest.fixture
+def events() -> Events:
+    return Events()
+
+
+def welcomed(client: socket.socket) -> None:
+    client.sendall(GREETING + ready("DEALER"))
+    told = b""
+    while b"ROUTER" not in told:
+        told += client.recv(4096) or pytest.fail("hung up during the handshake")
+
+
+def came_and_went(port: int) -> None:
+    """A connection that was welcomed and has ended on both sides: the next one gets its number."""
+    with socket.create_connection(("127.0.0.1", port), timeout=30) as client:
+        welcomed(client)
+        client.shutdown(socket.SHUT_WR)
+        while client.recv(4096):
+            pass
+
+
+def test_f17_who_has_the_number_of_one_that_left_was_not_too_large(server: "zmq.Socket[bytes]", events: Events) -> None:
+    gate = Gate(server.context, None, events)
+    port = int(gate.bind(server, "tcp://127.0.0.1:0", "control").rpartition(":")[2])
+    for _ in range(3):
+        came_and_went(port)
+    with socket.create_connection(("127.0.0.1", port), timeout=30) as here:
+        welcomed(here)
+        gate.start()
+        assert not events.within("TOO_LARGE", 0.5)
+        here.sendall(message(b"x" * 5000))  # this one itself is still told of
+        assert events.wait("TOO_LARGE") == {"level": 1, "channel": "control"}
+    gate.close()
+    assert events.codes() == ["TOO_LARGE"]
