@@ -2,6 +2,7 @@
 
 import ctypes
 import gc
+import os
 from functools import cache
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # mallopt(3)
@@ -11,6 +12,10 @@ _LARGEST_IN_HEAP_B = (64 * 2**20, 32 * 2**20)
 """Buffers above this are fetched from the system page by page each time; the first that the library accepts. Older ones
 allow 32 MiB. Without either they find a threshold of their own, which they do no more once they were told another one.
 """
+_TUNES = frozenset(
+    f"MALLOC_{name}"
+    for name in ("ARENA_MAX", "ARENA_TEST", "TOP_PAD_", "MMAP_MAX_", "MMAP_THRESHOLD_", "TRIM_THRESHOLD_")
+)
 
 
 @cache
@@ -21,14 +26,21 @@ def settle_process() -> None:
     threads allocate from one heap. Otherwise each of the first 8 threads a core has one of its own, which keeps what
     was freed in it; a node begins new threads whenever a camera comes back, and frees 20 MB with every window. What
     a window frees is kept for the next: otherwise a tenth of the time of a small model goes into fetching pages.
+    Where the environment says how to allocate (_TUNES, or `glibc.malloc.` in GLIBC_TUNABLES), nothing of it is changed.
     """
     gc.collect()
     gc.freeze()
     library = _glibc()
-    if library is not None:
-        library.mallopt(_ARENA_MAX, 1)
-        if any(library.mallopt(_MMAP_THRESHOLD, largest) for largest in _LARGEST_IN_HEAP_B):
-            library.mallopt(_TRIM_THRESHOLD, _KEPT_B)
+    if library is None or _operator_tunes():
+        return
+    library.mallopt(_ARENA_MAX, 1)
+    if any(library.mallopt(_MMAP_THRESHOLD, largest) for largest in _LARGEST_IN_HEAP_B):
+        library.mallopt(_TRIM_THRESHOLD, _KEPT_B)
+
+
+def _operator_tunes() -> bool:
+    """Whether somebody has told the C library by its environment how to allocate: he knows his machine."""
+    return not _TUNES.isdisjoint(os.environ) or "glibc.malloc." in os.environ.get("GLIBC_TUNABLES", "")
 
 
 def give_back_memory() -> None:

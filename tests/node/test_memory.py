@@ -1,6 +1,7 @@
 """What is not needed any more goes back to the system, and what was imported is not searched for garbage."""
 
 import gc
+import os
 import subprocess
 import sys
 import threading
@@ -96,8 +97,35 @@ def test_a_library_keeps_its_own_thresholds_unless_it_accepts_one(
 ) -> None:
     library = _Library(highest_mib * 2**20)
     monkeypatch.setattr(memory, "_glibc", lambda: library)
+    _forget_tunes(monkeypatch)
     settle_process.__wrapped__()
     assert library.told == [(-8, 1), *((option, mib * 2**20) for option, mib in told_mib)]
+
+
+def _forget_tunes(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in os.environ if name.startswith("MALLOC_") or name == "GLIBC_TUNABLES"]:
+        monkeypatch.delenv(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [
+        ("MALLOC_ARENA_MAX", "4", 0),
+        ("MALLOC_TRIM_THRESHOLD_", "100000", 0),
+        ("GLIBC_TUNABLES", "glibc.malloc.arena_max=4", 0),
+        ("GLIBC_TUNABLES", "glibc.rtld.nns=3", 3),
+        ("MALLOC_PERTURB_", "7", 3),  # for who looks for faults: says nothing of how much is kept
+    ],
+)
+def test_what_an_operator_said_of_allocation_stays(
+    monkeypatch: pytest.MonkeyPatch, name: str, value: str, told: int
+) -> None:
+    library = _Library(2**30)
+    monkeypatch.setattr(memory, "_glibc", lambda: library)
+    _forget_tunes(monkeypatch)
+    monkeypatch.setenv(name, value)
+    settle_process.__wrapped__()
+    assert len(library.told) == told
 
 
 def test_another_c_library_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:

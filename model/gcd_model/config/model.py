@@ -31,8 +31,8 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     image_encoder: None for a model without image token.
     semantic_classes: the colours a semantic model paints its pictures in, by class id; views then come with class maps.
         Empty where nobody named them. Not together with a class head, which makes class maps of its own.
-    prediction, plane_warp, plane_mix, class_head, vae.patch, vae.linear, sampling.shared_noise: ours, for small models;
-        as they are here the model is the paper's.
+    prediction, plane_warp, plane_mix, class_head, vae.patch, vae.linear, vae.coarse, sampling.shared_noise: ours, for
+        small models; as they are here the model is the paper's.
     """
 
     frames: int = 14
@@ -96,6 +96,7 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
             or self.class_head is not None
             or self.vae.patch > 1
             or self.vae.linear
+            or self.vae.coarse > 0
             or self.sampling.shared_noise
         )
 

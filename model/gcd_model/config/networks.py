@@ -66,6 +66,8 @@ class VAEConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     patch: pixels along each side that become channels before the first and after the last layer; 1 as published.
     linear: a linear map from each block of down_factor x down_factor pixels to its latent, and one back, beside the
         convolutions; ours, so that a small autoencoder starts from principal components instead of from nothing.
+    coarse: so many of the finest levels the decoder leaves out: its last layer makes patches that are 2^coarse times as
+        large instead; ours, for models whose time goes into decoding.
     """
 
     latent_channels: int = 4
@@ -77,11 +79,15 @@ class VAEConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     shared: bool = False
     patch: int = 1
     linear: bool = False
+    coarse: int = 0
 
     def __post_init__(self) -> None:
         require_multiple("the VAE", self.width, "norm_groups", self.norm_groups)
         if self.patch < 1:
             raise OptionError(f"the VAE's patch must be at least 1 pixel, got {self.patch}")
+        if not 0 <= self.coarse < len(self.multipliers):
+            most = len(self.multipliers) - 1
+            raise OptionError(f"the VAE's decoder can leave out 0 to {most} levels, got coarse = {self.coarse}")
 
     @property
     def widths(self) -> tuple[int, ...]:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gcd_model.adapter import Adapter, base_digest
+from gcd_model.layers import zeroed
 from gcd_model.networks import Networks, weights_digest
 from gcd_model.own_format import Card
 from gcd_train.batches import BatchSource, EncodedBatches, PixelBatches
@@ -22,7 +23,7 @@ from gcd_train.distillation.matching import MatchingTask
 from gcd_train.distillation.paired import PairedTask
 from gcd_train.distillation.recipe import DistillRecipe, MatchingRecipe, PairedRecipe, SampleLossRecipe, StudentStage
 from gcd_train.distillation.sample_losses import SampleLoss
-from gcd_train.distillation.teacher import Teacher, as_training, student_config
+from gcd_train.distillation.teacher import Teacher, as_training, coarser_config, student_config
 from gcd_train.draws import Draws
 from gcd_train.encodings import Encodings, class_weights
 from gcd_train.engine.engine import Engine
@@ -37,7 +38,7 @@ from gcd_train.run_data import RunData
 from gcd_train.run_folder import RunFolder
 from gcd_train.stages.decoder import DecoderData, DecoderTask, Predictor
 from gcd_train.stages.export import ExportJob, export
-from gcd_train.start import carried_leftovers, start_networks
+from gcd_train.start import carried_leftovers, fresh_networks, start_networks
 from gcd_train.stop import StopSignal
 from gcd_train.trained_part import halve_frozen, let_train, thaw
 from gcd_train.validation import Validation
@@ -66,6 +67,7 @@ class Distiller:
         self._updates = 0  # of the stage that was filled in last
         self._shared = as_training(inputs.recipe, inputs.teacher)
         self._config = student_config(inputs.teacher.config, inputs.recipe.student)
+        coarser_config(self._config, inputs.recipe.student.coarse)
         if inputs.recipe.decoder is not None and self._config.plane_mix is None:
             raise RecipeError("[decoder] trains the plane mix, which this teacher has not; leave it out")
         require_exportable(self._shared, self._config)
@@ -139,6 +141,8 @@ class Distiller:
     @property
     def _kept_stages(self) -> tuple[StudentStage, ...]:
         """What taught the student that is exported."""
+        if self._recipe.kept is None:
+            return ()
         return ("paired",) if self._recipe.kept == "paired" else (*self._before_matching, "matching")
 
     @property
@@ -212,10 +216,11 @@ class Distiller:
     def _train_decoder(self) -> None:
         recipe, networks = self._recipe.decoder, self._merged()
         assert recipe is not None, "a stage runs only if the recipe has its table"
-        identity = self._decoder_identity(networks)
+        identity, learner = self._decoder_identity(networks), self._coarser(networks)
         clips = self._encodings.pairs(networks)
         self._precision.placed(networks)
         batches = EncodedBatches(clips, self._config, self._shared.unet, self._precision)
+        self._precision.placed(learner)
         order = Draws(self._recipe.seed, "decoder-clips", 0, torch.device("cpu")).order(clips.meta.clips)
         meta = PredictionsMeta(identity=identity, clips=tuple(order[: recipe.clips]))
         folder = self._folder.path / "predictions"
@@ -227,12 +232,25 @@ class Distiller:
             predictions=Predictions.open(folder),
             class_weights=class_weights(clips, recipe.class_power, self._precision.device),
         )
-        task = DecoderTask(networks, data, self._validation(), recipe, self._precision, self._recipe.seed)
+        task = DecoderTask(learner, data, self._validation(), recipe, self._precision, self._recipe.seed)
         self._loop(task, "decoder", recipe, identity)
 
     def _decoder_identity(self, networks: Networks) -> str:
         made = digest_of(self._recipe.seed, self._config.plane_warp, self._config.plane_mix, self._config.sampling)
-        return f"{weights_digest(networks.unet.state_dict())}-{made}"
+        built = f"-{self._recipe.student.coarse}" if self._recipe.student.coarse else ""
+        return f"{weights_digest(networks.unet.state_dict())}-{made}{built}"
+
+    def _coarser(self, networks: Networks) -> Networks:
+        """The same with the decoder that is exported: what is left of it as it was, its last layers at their start."""
+        levels = self._recipe.student.coarse
+        if not levels:
+            return networks
+        config = coarser_config(self._config, levels)
+        made, given = fresh_networks(config, self._recipe.seed), networks.state_dict()
+        fits = {name: given[name] for name, value in made.state_dict().items() if _fits(given.get(name), value)}
+        made.load_state_dict(fits, strict=False)
+        zeroed(made.decoder.conv_out)
+        return made
 
     def _merged(self) -> Networks:
         """The student that is exported as plain networks, as far as the decoder stage."""
@@ -242,9 +260,10 @@ class Distiller:
         return networks
 
     def _export(self) -> None:
-        networks, recipe = self._merged(), self._recipe
+        networks, recipe = self._coarser(self._merged()), self._recipe
         if recipe.decoder is not None:
-            fill(networks, self._folder, "decoder", self._decoder_identity(networks))
+            updates = fill(networks, self._folder, "decoder", self._decoder_identity(networks))
+            self._updates = self._updates or updates
         job = ExportJob(
             name=recipe.name,
             family=self._inputs.teacher.family,
@@ -283,3 +302,7 @@ class Distiller:
             engine=Engine() if isinstance(recipe, DecoderRecipe) else Engine(compute=self._recipe.compute),
         )
         Loop(task, self._folder, options).run()
+
+
+def _fits(given: Tensor | None, wanted: Tensor) -> bool:
+    return given is not None and given.shape == wanted.shape

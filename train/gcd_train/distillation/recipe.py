@@ -48,7 +48,8 @@ class StudentRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     steps: of the sampler that ships. sigma_max, sigma_min: its first and its last noise level; left out as the teacher
     has them. train: all of the U-Net and what steers it, or adapters beside it, as [student.lora] says.
-    keep: the stage whose student is exported, left out the last one there is.
+    keep: the stage whose student is exported, left out the last one there is. coarse: so many more of its finest levels
+    the decoder leaves out, see `VAEConfig`; [decoder] trains what is left, with finetune_vae.
     """
 
     steps: Count = 1
@@ -57,6 +58,7 @@ class StudentRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     train: Literal["all", "lora"] = "all"
     lora: LoraRecipe = LoraRecipe()
     keep: StudentStage | None = None
+    coarse: Annotated[int, Meta(ge=0)] = 0
 
 
 class BatchRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -151,7 +153,7 @@ class DistillRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """A whole recipe of a distillation; a table that is left out leaves its stage out.
 
     seed: every random draw follows from it, the stage and the update. decoder: trains the plane mix anew on what the
-    student makes, from the teacher's.
+    student makes, from the teacher's; with student.coarse a smaller decoder as well.
     """
 
     name: Annotated[str, Meta(pattern="^[a-z0-9][a-z0-9-]{0,40}$")]
@@ -169,8 +171,16 @@ class DistillRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     export: ExportRecipe = ExportRecipe()
 
     def __post_init__(self) -> None:
-        if not self.student_stages:
-            raise ValueError("a student learns in [paired], in [matching] or in both: give one of these tables")
+        coarser = self.student.coarse > 0
+        if not self.student_stages and not coarser:
+            raise ValueError(
+                "a student learns in [paired], in [matching] or in both, or gets a coarser decoder: give one of these "
+                "tables, or student.coarse"
+            )
+        if coarser and (self.decoder is None or not self.decoder.finetune_vae):
+            raise ValueError(
+                "student.coarse makes a decoder that has to learn: give [decoder] with finetune_vae = true"
+            )
         if self.student.keep is not None and self.student.keep not in self.student_stages:
             raise ValueError(f'student.keep is "{self.student.keep}", but there is no table [{self.student.keep}]')
         if (self.batches.source == "latents") != (self.latents is not None):
@@ -190,9 +200,9 @@ class DistillRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         return tuple(name for name, wanted in there.items() if wanted)
 
     @property
-    def kept(self) -> StudentStage:
-        """The stage whose student is exported."""
-        return self.student.keep or self.student_stages[-1]
+    def kept(self) -> StudentStage | None:
+        """The stage whose student is exported; None if only its decoder learns."""
+        return self.student.keep or (self.student_stages[-1] if self.student_stages else None)
 
     @property
     def stages(self) -> tuple[DistillStageName, ...]:

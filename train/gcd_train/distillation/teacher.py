@@ -54,6 +54,16 @@ def student_config(teacher: ModelConfig, recipe: StudentRecipe) -> ModelConfig:
     return msgspec.structs.replace(teacher, sampling=changed)
 
 
+def coarser_config(config: ModelConfig, levels: int) -> ModelConfig:
+    """The same with a decoder that leaves out so many more levels. Raises RecipeError where that leaves none."""
+    try:
+        return msgspec.structs.replace(
+            config, vae=msgspec.structs.replace(config.vae, coarse=config.vae.coarse + levels)
+        )
+    except OptionError as error:
+        raise RecipeError(f"student.coarse cannot be {levels}: {error}") from error
+
+
 def as_training(recipe: DistillRecipe, teacher: Teacher) -> Recipe:
     """The distillation as far as a training says it: what data, encoders and batches are told.
 
@@ -61,7 +71,7 @@ def as_training(recipe: DistillRecipe, teacher: Teacher) -> Recipe:
     """
     batches, told = recipe.batches, recipe.batches.augmentation
     losses = [stage.loss for stage in (recipe.paired, recipe.matching) if stage is not None]
-    painted: set[ClassWeightsName] = {loss.class_weights for loss in losses}
+    painted: set[ClassWeightsName] = {loss.class_weights for loss in losses} or {"none"}
     if len(painted) > 1:
         raise RecipeError("paired.loss and matching.loss weigh classes differently; clips are encoded once: say one")
     unet = UNetRecipe(

@@ -1,7 +1,7 @@
 """The plane mix, on what the frozen U-Net predicts of some clips."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -125,10 +125,10 @@ class DecoderTask:
         source, target = self._pictures(clips, frames)
         warped, valid = self._layers(source, clips, frames)
         # in float32 throughout, as it is shipped: sums of pictures show the rounding of bfloat16
-        picture, logits = self._maker.plane_mix(
-            self._decoded(predicted), warped, valid, predicted.latents, predicted.logits
-        )
-        return self._loss(picture, target, logits, self._classes(clips, frames))
+        decoded = self._decoded(predicted)
+        picture, logits = self._maker.plane_mix(decoded, warped, valid, predicted.latents, predicted.logits)
+        loss = self._loss(picture, target, logits, self._classes(clips, frames))
+        return self._imitating(loss, decoded, predicted.decoded)
 
     def after_update(self, progress: Progress) -> bool:
         """Nothing to do."""
@@ -178,6 +178,13 @@ class DecoderTask:
             return predicted.decoded
         latents = predicted.latents / self._networks.config.vae.scale
         return self._maker.decoder(self._precision.frames(latents), self._recipe.run)
+
+    def _imitating(self, loss: StepLoss, decoded: Tensor, before: Tensor) -> StepLoss:
+        """The loss, and how far what is decoded now is from what was decoded beforehand."""
+        if not self._recipe.imitate:
+            return loss
+        apart = (decoded - before).abs().mean() + self._recipe.gradient * gradient_l1(decoded, before)
+        return replace(loss, total=loss.total + self._recipe.imitate * apart, parts={**loss.parts, "imitated": apart})
 
     def _loss(self, picture: Tensor, target: Tensor, logits: Tensor | None, classes: Tensor | None) -> StepLoss:
         recipe = self._recipe
