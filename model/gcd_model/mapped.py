@@ -15,7 +15,6 @@ from torch import Tensor, nn
 LEAST_BYTES = 2**20
 """Smaller weights are not worth a word with the system."""
 
-_PAGEMAP = "/proc/self/pagemap"
 _DONT_NEED = 4  # MADV_DONTNEED in Linux' uapi/asm-generic/mman-common.h
 _ENTRY, _OF_FILE, _SWAPPED = 8, 61, 62  # of /proc/PID/pagemap, a page: bytes, and two bits; bit 63, the sign: present
 
@@ -44,7 +43,7 @@ def _let_go(weight: Tensor) -> None:
 def _all_of_file(first: int, pages: int) -> bool:
     """Whether each of these pages that is in memory is one of a file, as it is there; else it must not be dropped."""
     try:
-        with open(_PAGEMAP, "rb", buffering=0) as pagemap:
+        with open("/proc/self/pagemap", "rb", buffering=0) as pagemap:
             pagemap.seek(first * _ENTRY)
             told = pagemap.read(pages * _ENTRY)
     except OSError:

@@ -77,12 +77,16 @@ def test_a_part_of_a_weight_takes_nothing_from_its_neighbours(layer: nn.Linear, 
     assert torch.equal(layer.weight, drawn)
 
 
+def _refused(*_: object, **__: object) -> None:
+    raise PermissionError("not here")
+
+
 @pytest.mark.parametrize("why", ["no pagemap", "another system"])
 def test_what_cannot_be_known_stays(layer: nn.Linear, monkeypatch: pytest.MonkeyPatch, why: str) -> None:
     if why == "another system":
         monkeypatch.setattr(mapped, "_library", lambda: None)
     else:
-        monkeypatch.setattr(mapped, "_PAGEMAP", "/nowhere/pagemap")
+        monkeypatch.setattr(mapped, "open", _refused, raising=False)
     let_go(layer)
     assert held_mb(layer.weight) > MEGABYTES - 0.1
 
