@@ -32,8 +32,8 @@ class Preset:
 FAST = Preset(steps=16, solver="dpmpp_2m")
 """No farther from the limit of many steps than 25 Euler steps are, on mixtures whose denoiser is known exactly."""
 FASTEST = Preset(steps=10, solver="dpmpp_2m")
-"""At most three times as far, on the same. The two trained small models of many steps are nearer to the limit with either
-than with 25 Euler steps; guidance is left alone, as nothing was measured of it."""
+"""At most three times as far, on the same. Trained small models of many steps are nearer to the limit with either than
+with 25 Euler steps; guidance is left alone, as nothing was measured of it."""
 _PRESETS: dict[Quality, Preset] = {"fast": FAST, "fastest": FASTEST}
 
 

@@ -121,4 +121,4 @@ def test_the_full_size_step_is_exported_within_twelve_gigabytes(tmp_path: Path) 
     assert found["files"] == ["step.onnx", "step.onnx.data"]
     assert found["graph_mb"] < 50, "weights stand in the graph"
     assert 4.5 < found["data_gb"] < 6.2, "cross-attention, position and embedding weights are no part of a step"
-    assert found["apart"] > 0.99 * found["weights"]
+    assert found["apart"] == found["weights"] > 500
