@@ -12,10 +12,8 @@ _LARGEST_IN_HEAP_B = (64 * 2**20, 32 * 2**20)
 """Buffers above this are fetched from the system page by page each time; the first that the library accepts. Older ones
 allow 32 MiB. Without either they find a threshold of their own, which they do no more once they were told another one.
 """
-_TUNES = frozenset(
-    f"MALLOC_{name}"
-    for name in ("ARENA_MAX", "ARENA_TEST", "TOP_PAD_", "MMAP_MAX_", "MMAP_THRESHOLD_", "TRIM_THRESHOLD_")
-)
+_TUNES = ("ARENA_MAX", "ARENA_TEST", "TOP_PAD_", "MMAP_MAX_", "MMAP_THRESHOLD_", "TRIM_THRESHOLD_")
+"""What an operator can say of how much is kept: variables MALLOC_..., and `glibc.malloc...` in GLIBC_TUNABLES."""
 
 
 @cache
@@ -26,7 +24,7 @@ def settle_process() -> None:
     threads allocate from one heap. Otherwise each of the first 8 threads a core has one of its own, which keeps what
     was freed in it; a node begins new threads whenever a camera comes back, and frees 20 MB with every window. What
     a window frees is kept for the next: otherwise a tenth of the time of a small model goes into fetching pages.
-    Where the environment says how to allocate (_TUNES, or `glibc.malloc.` in GLIBC_TUNABLES), nothing of it is changed.
+    Where the environment says how much is to be kept (_TUNES), nothing of that is changed.
     """
     gc.collect()
     gc.freeze()
@@ -40,7 +38,10 @@ def settle_process() -> None:
 
 def _operator_tunes() -> bool:
     """Whether somebody has told the C library by its environment how to allocate: he knows his machine."""
-    return not _TUNES.isdisjoint(os.environ) or "glibc.malloc." in os.environ.get("GLIBC_TUNABLES", "")
+    tunables = os.environ.get("GLIBC_TUNABLES", "")
+    return any(os.environ.get(f"MALLOC_{name}") for name in _TUNES) or any(
+        f"glibc.malloc.{name.lower().rstrip('_')}=" in tunables for name in _TUNES
+    )
 
 
 def give_back_memory() -> None:

@@ -10,7 +10,7 @@ Longer than most files: all of it waits in one thread for the same sockets.
 import logging
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,6 +35,7 @@ Context: TypeAlias = "zmq.Context[zmq.Socket[bytes]]"
 
 _ZAP_ENDPOINT = "inproc://zeromq.zap.01"
 _TICK_MS = 100
+_MOST_AT_ONCE = 64  # events of one socket, before others get their turn
 _RECEIVE_BUFFER = 256 * 1024
 _REQUESTS = Allowance(burst=2 * 2**20)  # more than may wait whole: 16 requests of 64 KiB
 _SUBSCRIPTIONS = Allowance(burst=256 * 1024, per_s=1024.0)  # a reader says little, and nobody tells when it has ended
@@ -273,8 +274,8 @@ class Gate:
     def _notice(self, monitor: Socket, monitored: "_Monitored") -> bool:
         """What a bound socket's monitor has by now; False once the socket is closed."""
         monitored.take(monitor)
-        for _ in range(len(monitored.ahead)):  # not what comes meanwhile: others wait for the gate, too
-            event, handle = monitored.ahead.popleft()
+        for _ in range(min(len(monitored.ahead), _MOST_AT_ONCE)):  # others wait for the gate, too
+            event, handle = monitored.next()
             if event == zmq.EVENT_MONITOR_STOPPED:
                 return False
             self._look_at(event, handle, monitor, monitored)
@@ -289,7 +290,7 @@ class Gate:
         if event == zmq.EVENT_ACCEPTED:
             connections.accepted(handle)
             monitored.take(monitor)
-            if (zmq.EVENT_DISCONNECTED, handle) in monitored.ahead:  # its number may be another connection's by now
+            if monitored.ends[handle]:  # its number may be another connection's by now
                 connections.missed(handle)
         if event == zmq.EVENT_DISCONNECTED and connections.cut_off(handle) and monitored.channel == "control":
             self._tell_too_large(monitored.channel)
@@ -297,19 +298,35 @@ class Gate:
 
 @dataclass(kw_only=True, slots=True)
 class _Monitored:
-    """A bound socket that is listened to. port: of tcp. ahead: events taken from its monitor, not yet looked at."""
+    """A bound socket that is listened to. port: of tcp. ahead: events taken from its monitor, not yet looked at.
+
+    ends: how many of these tell of a connection's end, by its number.
+    """
 
     channel: Channel
     secured: bool
     port: int = 0
     connections: Connections = field(default_factory=Connections)
     ahead: deque[tuple[int, int]] = field(default_factory=deque[tuple[int, int]])
+    ends: Counter[int] = field(default_factory=Counter[int])
 
     def take(self, monitor: Socket) -> None:
         """All events that wait. ZeroMQ tells of an end before it gives the connection's number away."""
         while monitor.poll(0):
             heard = parse_monitor_message(monitor.recv_multipart())
-            self.ahead.append((int(heard["event"]), int(heard["value"])))
+            event, handle = int(heard["event"]), int(heard["value"])
+            self.ahead.append((event, handle))
+            if event == zmq.EVENT_DISCONNECTED:
+                self.ends[handle] += 1
+
+    def next(self) -> tuple[int, int]:
+        """The oldest event, and its connection's number."""
+        event, handle = self.ahead.popleft()
+        if event == zmq.EVENT_DISCONNECTED:
+            self.ends[handle] -= 1
+            if not self.ends[handle]:
+                del self.ends[handle]
+        return event, handle
 
 
 class _Denials:

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 import zmq
-from control_fakes import Events
+from control_fakes import Events, wait_for
 
 from gcd_node.load.zmtp import GREETING, message, ready
 from gcd_node.security.gate import Gate
@@ -51,4 +51,21 @@ def test_f17_who_has_the_number_of_one_that_left_was_not_too_large(server: "zmq.
         here.sendall(message(b"x" * 5000))  # this one itself is still told of
         assert events.wait("TOO_LARGE") == {"level": 1, "channel": "control"}
     gate.close()
+    assert events.codes() == ["TOO_LARGE"]
+
+
+def test_a_backlog_is_worked_off_and_leaves_nothing_behind(server: "zmq.Socket[bytes]", events: Events) -> None:
+    gate = Gate(server.context, None, events)
+    port = int(gate.bind(server, "tcp://127.0.0.1:0", "control").rpartition(":")[2])
+    for _ in range(100):  # 200 events, more than one turn takes
+        came_and_went(port)
+    (monitored,) = gate._monitors.values()
+    gate.start()
+    with socket.create_connection(("127.0.0.1", port), timeout=30) as here:
+        welcomed(here)
+        here.sendall(message(b"x" * 5000))
+        assert events.wait("TOO_LARGE") == {"level": 1, "channel": "control"}
+    wait_for(lambda: not monitored.ahead)
+    gate.close()
+    assert not monitored.ends
     assert events.codes() == ["TOO_LARGE"]

@@ -113,7 +113,9 @@ def _forget_tunes(monkeypatch: pytest.MonkeyPatch) -> None:
         ("MALLOC_ARENA_MAX", "4", 0),
         ("MALLOC_TRIM_THRESHOLD_", "100000", 0),
         ("GLIBC_TUNABLES", "glibc.malloc.arena_max=4", 0),
-        ("GLIBC_TUNABLES", "glibc.rtld.nns=3", 3),
+        ("GLIBC_TUNABLES", "glibc.rtld.nns=3:glibc.malloc.trim_threshold=131072", 0),
+        ("GLIBC_TUNABLES", "glibc.rtld.nns=3:glibc.malloc.hugetlb=1", 3),
+        ("MALLOC_ARENA_MAX", "", 3),
         ("MALLOC_PERTURB_", "7", 3),  # for who looks for faults: says nothing of how much is kept
     ],
 )

@@ -96,7 +96,7 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
             or self.class_head is not None
             or self.vae.patch > 1
             or self.vae.linear
-            or self.vae.coarse > 0
+            or self.vae.left_out > 0
             or self.sampling.shared_noise
         )
 

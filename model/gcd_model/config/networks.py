@@ -1,6 +1,7 @@
 """Shapes of the networks the paper uses, and how they are sampled."""
 
 import msgspec
+from msgspec import UNSET, UnsetType
 
 from gcd_model.errors import OptionError
 
@@ -79,15 +80,22 @@ class VAEConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     shared: bool = False
     patch: int = 1
     linear: bool = False
-    coarse: int = 0
+    coarse: int | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         require_multiple("the VAE", self.width, "norm_groups", self.norm_groups)
         if self.patch < 1:
             raise OptionError(f"the VAE's patch must be at least 1 pixel, got {self.patch}")
-        if not 0 <= self.coarse < len(self.multipliers):
+        if not 0 <= self.left_out < len(self.multipliers):
             most = len(self.multipliers) - 1
-            raise OptionError(f"the VAE's decoder can leave out 0 to {most} levels, got coarse = {self.coarse}")
+            raise OptionError(f"the VAE's decoder can leave out 0 to {most} levels, got coarse = {self.left_out}")
+        if self.coarse == 0:  # so that it is not written, and digests of configs without it stay what they were
+            msgspec.structs.force_setattr(self, "coarse", UNSET)
+
+    @property
+    def left_out(self) -> int:
+        """`coarse`, 0 where nothing is said of it."""
+        return 0 if self.coarse is UNSET else self.coarse
 
     @property
     def widths(self) -> tuple[int, ...]:

@@ -66,7 +66,8 @@ class Distiller:
         self._inputs, self._recipe, self._folder = inputs, inputs.recipe, inputs.folder
         self._updates = 0  # of the stage that was filled in last
         self._shared = as_training(inputs.recipe, inputs.teacher)
-        self._config = student_config(inputs.teacher.config, inputs.recipe.student)
+        taught = bool(inputs.recipe.student_stages)
+        self._config = student_config(inputs.teacher.config, inputs.recipe.student, taught=taught)
         coarser_config(self._config, inputs.recipe.student.coarse)
         if inputs.recipe.decoder is not None and self._config.plane_mix is None:
             raise RecipeError("[decoder] trains the plane mix, which this teacher has not; leave it out")
@@ -222,7 +223,7 @@ class Distiller:
         batches = EncodedBatches(clips, self._config, self._shared.unet, self._precision)
         self._precision.placed(learner)
         order = Draws(self._recipe.seed, "decoder-clips", 0, torch.device("cpu")).order(clips.meta.clips)
-        meta = PredictionsMeta(identity=identity, clips=tuple(order[: recipe.clips]))
+        meta = PredictionsMeta(identity=self._predictions_identity(networks), clips=tuple(order[: recipe.clips]))
         folder = self._folder.path / "predictions"
         predictor = Predictor(networks, clips, batches, self._precision, self._recipe.seed)
         write_predictions(folder, meta, predictor.predict, self._inputs.stop)
@@ -235,10 +236,18 @@ class Distiller:
         task = DecoderTask(learner, data, self._validation(), recipe, self._precision, self._recipe.seed)
         self._loop(task, "decoder", recipe, identity)
 
-    def _decoder_identity(self, networks: Networks) -> str:
+    def _predictions_identity(self, networks: Networks) -> str:
         made = digest_of(self._recipe.seed, self._config.plane_warp, self._config.plane_mix, self._config.sampling)
-        built = f"-{self._recipe.student.coarse}" if self._recipe.student.coarse else ""
-        return f"{weights_digest(networks.unet.state_dict())}-{made}{built}"
+        told = f"-{weights_digest(networks.decoder.state_dict())}" if self._recipe.student.coarse else ""
+        return f"{weights_digest(networks.unet.state_dict())}-{made}{told}"
+
+    def _decoder_identity(self, networks: Networks) -> str:
+        """What the stage's state belongs to. networks: before their decoder is made coarser."""
+        predicted, coarse = self._predictions_identity(networks), self._recipe.student.coarse
+        if not coarse:
+            return predicted
+        mix = {} if networks.plane_mix is None else networks.plane_mix.state_dict()
+        return f"{predicted}-{weights_digest(mix)}-{digest_of(coarser_config(self._config, coarse).vae)}"
 
     def _coarser(self, networks: Networks) -> Networks:
         """The same with the decoder that is exported: what is left of it as it was, its last layers at their start."""
@@ -260,10 +269,10 @@ class Distiller:
         return networks
 
     def _export(self) -> None:
-        networks, recipe = self._coarser(self._merged()), self._recipe
+        merged, recipe = self._merged(), self._recipe
+        networks = self._coarser(merged)
         if recipe.decoder is not None:
-            updates = fill(networks, self._folder, "decoder", self._decoder_identity(networks))
-            self._updates = self._updates or updates
+            fill(networks, self._folder, "decoder", self._decoder_identity(merged))
         job = ExportJob(
             name=recipe.name,
             family=self._inputs.teacher.family,

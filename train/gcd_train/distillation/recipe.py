@@ -46,10 +46,11 @@ class TeacherRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 class StudentRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What comes out: the teacher's networks with another sampler, and no guidance.
 
-    steps: of the sampler that ships. sigma_max, sigma_min: its first and its last noise level; left out as the teacher
-    has them. train: all of the U-Net and what steers it, or adapters beside it, as [student.lora] says.
-    keep: the stage whose student is exported, left out the last one there is. coarse: so many more of its finest levels
-    the decoder leaves out, see `VAEConfig`; [decoder] trains what is left, with finetune_vae.
+    steps: of the sampler that ships; the teacher's own where its U-Net stays. sigma_max, sigma_min: its first and last
+    noise level; left out as the teacher has them. train: all of the U-Net and what steers it, or adapters beside it, as
+    [student.lora] says. keep: the stage whose student is exported, left out the last one there is.
+    coarse: so many more of its finest levels the decoder leaves out, see `VAEConfig`; [decoder] trains what is left,
+    with finetune_vae.
     """
 
     steps: Count = 1
@@ -59,6 +60,11 @@ class StudentRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     lora: LoraRecipe = LoraRecipe()
     keep: StudentStage | None = None
     coarse: Annotated[int, Meta(ge=0)] = 0
+
+    @property
+    def sampled_otherwise(self) -> bool:
+        """Whether it names a sampler of its own."""
+        return self.steps != 1 or self.sigma_max is not None or self.sigma_min is not None
 
 
 class BatchRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -180,6 +186,13 @@ class DistillRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         if coarser and (self.decoder is None or not self.decoder.finetune_vae):
             raise ValueError(
                 "student.coarse makes a decoder that has to learn: give [decoder] with finetune_vae = true"
+            )
+        if coarser and self.student.train == "lora":
+            raise ValueError('student.coarse changes what an adapter would lie beside: give student.train = "all"')
+        if not self.student_stages and self.student.sampled_otherwise:
+            raise ValueError(
+                "without [paired] and [matching] nothing teaches other steps or noise levels than the teacher's: leave "
+                "student.steps, sigma_max and sigma_min out"
             )
         if self.student.keep is not None and self.student.keep not in self.student_stages:
             raise ValueError(f'student.keep is "{self.student.keep}", but there is no table [{self.student.keep}]')

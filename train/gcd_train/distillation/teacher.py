@@ -41,11 +41,14 @@ def teacher_of(recipe: DistillRecipe) -> Teacher:
     return teacher
 
 
-def student_config(teacher: ModelConfig, recipe: StudentRecipe) -> ModelConfig:
+def student_config(teacher: ModelConfig, recipe: StudentRecipe, *, taught: bool = True) -> ModelConfig:
     """The teacher's networks, sampled in the student's steps and without guidance.
 
+    taught: the U-Net learns; else it is sampled as the teacher is.
     Raises RecipeError for noise levels that do not fall.
     """
+    if not taught:
+        return teacher
     sampling = teacher.sampling
     high, low = recipe.sigma_max or sampling.sigma_max, recipe.sigma_min or sampling.sigma_min
     if recipe.steps > 1 and low >= high:
@@ -58,7 +61,7 @@ def coarser_config(config: ModelConfig, levels: int) -> ModelConfig:
     """The same with a decoder that leaves out so many more levels. Raises RecipeError where that leaves none."""
     try:
         return msgspec.structs.replace(
-            config, vae=msgspec.structs.replace(config.vae, coarse=config.vae.coarse + levels)
+            config, vae=msgspec.structs.replace(config.vae, coarse=config.vae.left_out + levels)
         )
     except OptionError as error:
         raise RecipeError(f"student.coarse cannot be {levels}: {error}") from error

@@ -1,8 +1,9 @@
 """Which networks a run trains."""
 
-from typing import Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias
 
 import msgspec
+from msgspec import Meta
 
 from gcd_model.config import CameraControl
 from gcd_train.recipe.values import Count, Positive
@@ -30,6 +31,7 @@ class VAEChanges(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     scale: Positive | None = None
     shared: bool | None = None
     linear: bool | None = None
+    coarse: Annotated[int, Meta(ge=0)] | None = None
 
 
 class LoraRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
