@@ -1,5 +1,6 @@
 """The demo: the packaged drive through the model, over ZeroMQ into a second process, and pictures of what arrived."""
 
+import os
 import subprocess
 import sys
 import tempfile
@@ -70,7 +71,7 @@ def demo_config(folder: Path) -> NodeConfig:
     """The demo's launch file, with sockets in a folder of its own so that it never meets a running node."""
     return NodeConfig(
         source=SourceConfig(kind="file", path="package:drive.mp4", pace="realtime", hfov_deg=85.0),
-        model=ModelSection(weights=demo_weights()),
+        model=ModelSection(weights=demo_weights(), threads=min(4, len(os.sched_getaffinity(0)))),
         view={VIEW_ID: ViewConfig(kind="fixed")},
         publish=PublishConfig(data=f"ipc://{folder}/data", status=f"ipc://{folder}/status"),
         control=ControlConfig(endpoint=None),
