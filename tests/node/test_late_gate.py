@@ -30,6 +30,12 @@ def welcomed(client: socket.socket) -> None:
         told += client.recv(4096) or pytest.fail("hung up during the handshake")
 
 
+def knows_one(gate: Gate) -> bool:
+    """Whether the gate has heard of all that was, and of one that is there."""
+    (monitored,) = gate._monitors.values()
+    return not monitored.ahead and len(monitored.connections._kept) == 1
+
+
 def came_and_went(port: int) -> None:
     """A connection that was welcomed and has ended on both sides: the next one gets its number."""
     with socket.create_connection(("127.0.0.1", port), timeout=30) as client:
@@ -48,6 +54,7 @@ def test_f17_who_has_the_number_of_one_that_left_was_not_too_large(server: "zmq.
         welcomed(here)
         gate.start()
         assert not events.within("TOO_LARGE", 0.5)
+        wait_for(lambda: knows_one(gate))
         here.sendall(message(b"x" * 5000))  # this one itself is still told of
         assert events.wait("TOO_LARGE") == {"level": 1, "channel": "control"}
     gate.close()
@@ -63,6 +70,7 @@ def test_a_backlog_is_worked_off_and_leaves_nothing_behind(server: "zmq.Socket[b
     gate.start()
     with socket.create_connection(("127.0.0.1", port), timeout=30) as here:
         welcomed(here)
+        wait_for(lambda: knows_one(gate))
         here.sendall(message(b"x" * 5000))
         assert events.wait("TOO_LARGE") == {"level": 1, "channel": "control"}
     wait_for(lambda: not monitored.ahead)
