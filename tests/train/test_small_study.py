@@ -9,6 +9,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
+import torch
 from headless import needs_egl
 from made_records import FRAMES, note, record, region
 from typer.testing import CliRunner
@@ -20,6 +21,7 @@ from gcd_train.model_setup import model_config, sampled_as_trained
 from gcd_train.recipe import Recipe, load_recipe
 from gcd_train.reports.findings import Claim, findings, study_claims, to_markdown
 from gcd_train.reports.material import Run
+from gcd_train.start import loaded_base, start_networks
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "launch" / "small-study.sh"
@@ -49,7 +51,10 @@ def test_pretraining_sees_the_same_clips_through_the_same_autoencoder() -> None:
     assert (first.latents, first.seed, first.model.weights) == (then.latents, then.seed, "package:driving-small")
     assert first.data.task == "image-to-video"
     assert model_config(first.model) == model_config(then.model)
-    assert model_config(first.model).vae == DRIVING_SMALL.vae
+    packaged = loaded_base("package:driving-small").networks
+    assert model_config(first.model).vae == packaged.config.vae
+    begun = start_networks(first.model, model_config(first.model), first.seed).decoder.state_dict()
+    assert all(torch.equal(begun[name], value.float()) for name, value in packaged.decoder.state_dict().items())
 
 
 def test_the_models_have_the_papers_form() -> None:
