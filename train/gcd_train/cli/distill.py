@@ -29,8 +29,8 @@ RecipeFile: TypeAlias = Annotated[
     str,
     Argument(
         metavar="RECIPE",
-        help="A TOML file, or package:NAME; NAME is distill-driving-small, distill-objects-small, distill-semantic-small, "
-        "distill-coarse-decoder or distill-kubric.",
+        help="A TOML file, or package:NAME of distill-driving-small, distill-objects-small, distill-semantic-small, "
+        "distill-coarse-decoder, distill-kubric.",
     ),
 ]
 Stage: TypeAlias = Annotated[str | None, Option(help=f"Only this one: {', '.join(get_args(DistillStageName))}.")]
