@@ -5,15 +5,7 @@ import gc
 import os
 from functools import cache
 
-_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # mallopt(3)
-_KEPT_B = 512 * 2**20
-"""So much free memory at the end of the heap is kept for the next window instead of being returned after each."""
-_LARGEST_IN_HEAP_B = (64 * 2**20, 32 * 2**20)
-"""Buffers above this are fetched from the system page by page each time; the first that the library accepts. Older ones
-allow 32 MiB. Without either they find a threshold of their own, which they do no more once they were told another one.
-"""
-_TUNES = ("ARENA_MAX", "ARENA_TEST", "TOP_PAD_", "MMAP_MAX_", "MMAP_THRESHOLD_", "TRIM_THRESHOLD_")
-"""What an operator can say of how much is kept: variables MALLOC_..., and `glibc.malloc...` in GLIBC_TUNABLES."""
+_ARENA_MAX = -8  # mallopt(3)
 
 
 @cache
@@ -22,26 +14,19 @@ def settle_process() -> None:
 
     What was imported is never looked at again for garbage: that holds up every thread for 0.1 s each time. And all
     threads allocate from one heap. Otherwise each of the first 8 threads a core has one of its own, which keeps what
-    was freed in it; a node begins new threads whenever a camera comes back, and frees 20 MB with every window. What
-    a window frees is kept for the next: otherwise a tenth of the time of a small model goes into fetching pages.
-    Where the environment says how much is to be kept (_TUNES), nothing of that is changed.
+    was freed in it; a node begins new threads whenever a camera comes back, and frees 20 MB with every window. Where
+    the environment says how many heaps there are to be, that stays.
     """
     gc.collect()
     gc.freeze()
     library = _glibc()
-    if library is None or _operator_tunes():
-        return
-    library.mallopt(_ARENA_MAX, 1)
-    if any(library.mallopt(_MMAP_THRESHOLD, largest) for largest in _LARGEST_IN_HEAP_B):
-        library.mallopt(_TRIM_THRESHOLD, _KEPT_B)
+    if library is not None and not _heaps_are_told():
+        library.mallopt(_ARENA_MAX, 1)
 
 
-def _operator_tunes() -> bool:
-    """Whether somebody has told the C library by its environment how to allocate: he knows his machine."""
-    tunables = os.environ.get("GLIBC_TUNABLES", "")
-    return any(os.environ.get(f"MALLOC_{name}") for name in _TUNES) or any(
-        f"glibc.malloc.{name.lower().rstrip('_')}=" in tunables for name in _TUNES
-    )
+def _heaps_are_told() -> bool:
+    """Whether somebody has told the C library how many heaps to have: he knows his machine."""
+    return bool(os.environ.get("MALLOC_ARENA_MAX")) or "glibc.malloc.arena_max=" in os.environ.get("GLIBC_TUNABLES", "")
 
 
 def give_back_memory() -> None:

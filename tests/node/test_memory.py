@@ -2,8 +2,6 @@
 
 import gc
 import os
-import subprocess
-import sys
 import threading
 
 import numpy as np
@@ -48,58 +46,23 @@ def test_a_settled_process_searches_for_new_garbage_only_and_is_settled_once() -
     assert gc.collect() > 0
 
 
-_WINDOWS = """
-import resource
-import torch
-from gcd_node.life.memory import settle_process
-settle_process()
-faults = []
-for _ in range(60):
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    torch.ones(12 * 2**20)
-    faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
-print(*faults)
-"""
-
-
-def _keeps_64_mib() -> bool:
-    """Asked of a process of its own, which it changes."""
-    ask = "import ctypes, sys; sys.exit(ctypes.CDLL(None).mallopt(-3, 64 * 2**20) != 1)"
-    return subprocess.run([sys.executable, "-c", ask], capture_output=True, check=False).returncode == 0
-
-
-@pytest.mark.skipif(not _keeps_64_mib(), reason="needs a GNU C library that keeps buffers of 64 MiB (2.36 does)")
-def test_a_window_works_in_the_memory_of_the_one_before() -> None:
-    ran = subprocess.run([sys.executable, "-c", _WINDOWS], capture_output=True, text=True, check=True)
-    first, *others = map(int, ran.stdout.split())
-    assert sum(others[-20:]) < first  # of twenty windows less than one fetches
-    assert sum(others) < 20 * first  # until the holes between what stays are large enough, it takes a few
-
-
 class _Library:
-    """Remembers what it was told, and accepts thresholds up to one."""
+    """Remembers what it was told."""
 
-    def __init__(self, highest: int) -> None:
-        self.highest, self.told = highest, list[tuple[int, int]]()
+    def __init__(self) -> None:
+        self.told = list[tuple[int, int]]()
 
     def mallopt(self, option: int, value: int) -> int:
-        accepted = option != -3 or value <= self.highest
-        if accepted:
-            self.told.append((option, value))
-        return int(accepted)
+        self.told.append((option, value))
+        return 1
 
 
-@pytest.mark.parametrize(
-    ("highest_mib", "told_mib"), [(1024, [(-3, 64), (-1, 512)]), (32, [(-3, 32), (-1, 512)]), (0, [])]
-)
-def test_a_library_keeps_its_own_thresholds_unless_it_accepts_one(
-    monkeypatch: pytest.MonkeyPatch, highest_mib: int, told_mib: list[tuple[int, int]]
-) -> None:
-    library = _Library(highest_mib * 2**20)
+def test_all_threads_of_a_settled_process_share_one_heap(monkeypatch: pytest.MonkeyPatch) -> None:
+    library = _Library()
     monkeypatch.setattr(memory, "_glibc", lambda: library)
     _forget_tunes(monkeypatch)
     settle_process.__wrapped__()
-    assert library.told == [(-8, 1), *((option, mib * 2**20) for option, mib in told_mib)]
+    assert library.told == [(-8, 1)]
 
 
 def _forget_tunes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -111,18 +74,16 @@ def _forget_tunes(monkeypatch: pytest.MonkeyPatch) -> None:
     ("name", "value", "told"),
     [
         ("MALLOC_ARENA_MAX", "4", 0),
-        ("MALLOC_TRIM_THRESHOLD_", "100000", 0),
-        ("GLIBC_TUNABLES", "glibc.malloc.arena_max=4", 0),
-        ("GLIBC_TUNABLES", "glibc.rtld.nns=3:glibc.malloc.trim_threshold=131072", 0),
-        ("GLIBC_TUNABLES", "glibc.rtld.nns=3:glibc.malloc.hugetlb=1", 3),
-        ("MALLOC_ARENA_MAX", "", 3),
-        ("MALLOC_PERTURB_", "7", 3),  # for who looks for faults: says nothing of how much is kept
+        ("MALLOC_ARENA_MAX", "", 1),
+        ("MALLOC_TRIM_THRESHOLD_", "100000", 1),  # says nothing of heaps
+        ("GLIBC_TUNABLES", "glibc.rtld.nns=3:glibc.malloc.arena_max=4", 0),
+        ("GLIBC_TUNABLES", "glibc.malloc.hugetlb=1", 1),
     ],
 )
 def test_what_an_operator_said_of_allocation_stays(
     monkeypatch: pytest.MonkeyPatch, name: str, value: str, told: int
 ) -> None:
-    library = _Library(2**30)
+    library = _Library()
     monkeypatch.setattr(memory, "_glibc", lambda: library)
     _forget_tunes(monkeypatch)
     monkeypatch.setenv(name, value)
