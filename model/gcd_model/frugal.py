@@ -1,7 +1,7 @@
 """How a CPU is served best: working sets that fit its caches and the memory it has at hand.
 
-A buffer above 32 MB is fetched from the system afresh each time, page by page; writing it then costs
-more than what is computed for it. Smaller ones are used again. None of this changes what is computed.
+A buffer above 32 MB is fetched from the system afresh each time, page by page; writing it then costs more than what
+is computed for it. Smaller ones are used again. None of this changes what is computed.
 """
 
 from collections.abc import Callable
