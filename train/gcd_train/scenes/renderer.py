@@ -52,13 +52,14 @@ class Rendering:
     """One view of one time step.
 
     rgb: u8 [H, W, 3]. depth: f32 [H, W], metres along the optical axis, 0 where there is only sky.
-    classes, instances: u8 [H, W].
+    classes, instances, bodies: u8 [H, W]; bodies index `Scene.poses`.
     """
 
     rgb: NDArray[np.uint8]
     depth: Floats
     classes: NDArray[np.uint8]
     instances: NDArray[np.uint8]
+    bodies: NDArray[np.uint8]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -112,11 +113,15 @@ class Renderer:
         return made
 
     def views(
-        self, scene: FrozenScene, cameras: Mapping[str, NDArray[np.float64]]
+        self,
+        scene: FrozenScene,
+        cameras: Mapping[str, NDArray[np.float64]],
+        hfov_deg: Mapping[str, float] | None = None,
     ) -> Iterator[tuple[int, str, Rendering]]:
         """Time step, camera and view, one after the other, so that a long scene needs no memory for all.
 
         cameras: name -> world_from_camera [T, 4, 4]. All cameras of a time step follow each other.
+        hfov_deg: name -> horizontal field of view; by default every camera has the scene's.
         Raises: RenderError if there are more bodies than the renderer can move.
         """
         if scene.poses.shape[1] > _BODIES:
@@ -132,7 +137,8 @@ class Renderer:
                     self._cast(scene, step, drawn, places)
                 for name, poses in cameras.items():
                     with self._context:
-                        view = self._view(poses[step], scene, drawn, places)
+                        lens_deg = scene.hfov_deg if hfov_deg is None else hfov_deg[name]
+                        view = self._view(poses[step], lens_deg, scene.extent, drawn, places)
                     yield step, name, view
         finally:
             with self._context:
@@ -195,13 +201,18 @@ class Renderer:
         self._frame["light_from_world"] = light_from_world.T.ravel()
 
     def _view(
-        self, world_from_camera: NDArray[np.float64], scene: FrozenScene, drawn: _Uploaded, places: NDArray[np.float64]
+        self,
+        world_from_camera: NDArray[np.float64],
+        hfov_deg: float,
+        extent: Extent,
+        drawn: _Uploaded,
+        places: NDArray[np.float64],
     ) -> Rendering:
         self._target.use()
         self._context.enable_only(self._context.DEPTH_TEST | self._context.CULL_FACE)
         self._target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
         self._shadow.use(1)
-        lens = clip_from_camera(scene.hfov_deg, self._width / self._height, scene.extent)
+        lens = clip_from_camera(hfov_deg, self._width / self._height, extent)
         clip_from_world = lens @ np.linalg.inv(world_from_camera)
         self._frame["clip_from_world"] = clip_from_world.T.ravel()
         self._frame["eye"][:3] = world_from_camera[:3, 3]
@@ -221,12 +232,13 @@ class Renderer:
         colour = np.frombuffer(self._target.read(components=4, attachment=0), np.uint8).reshape(high, wide, 4)
         facts = np.frombuffer(self._target.read(components=2, attachment=1, dtype="f4"), np.uint64)
         picked = facts.reshape(high, wide)[::-1][n // 2 :: n, n // 2 :: n].copy().view(np.float32)
-        labels = picked[:, 1::2].astype(np.uint16)
+        labels = picked[:, 1::2].astype(np.uint32)  # below 2^24, exact in float32
         return Rendering(
             rgb=_averaged(colour, n),
             depth=np.ascontiguousarray(picked[:, ::2]),
             classes=(labels & 255).astype(np.uint8),
-            instances=(labels >> 8).astype(np.uint8),
+            instances=(labels >> 8 & 255).astype(np.uint8),
+            bodies=(labels >> 16).astype(np.uint8),
         )
 
     def close(self) -> None:

@@ -84,7 +84,7 @@ flat in vec4 paint, second;
 flat in vec3 base_colour, second_colour;
 flat in uvec4 labels;
 layout(location = 0) out vec4 rgb;
-layout(location = 1) out vec2 facts;  // depth; class + 256 * instance
+layout(location = 1) out vec2 facts;  // depth; class + 256 * instance + 65536 * body
 #define eye eye_.xyz
 #define sun_to sun_to_.xyz
 #define sun sun_.xyz
@@ -112,14 +112,14 @@ vec3 seen(vec3 light) { return pow(1.0 - exp(-exposure * light), vec3(1.0 / 2.2)
 _SKY_MAIN = """
 void main() {
     rgb = vec4(seen(sky_colour(normalize(world - eye))), 1.0);
-    facts = vec2(0.0, float(labels.x + 256u * labels.y));
+    facts = vec2(0.0, float(labels.x + 256u * labels.y + 65536u * labels.z));
 }
 """
 
 _DOME_MAIN = """
 void main() {
     rgb = vec4(seen(backdrop(normalize(world))), 1.0);
-    facts = vec2(depth, float(labels.x + 256u * labels.y));
+    facts = vec2(depth, float(labels.x + 256u * labels.y + 65536u * labels.z));
 }
 """
 
@@ -148,7 +148,7 @@ void main() {
     float far = distance(world, eye) / fog_m;
     colour = mix(colour, horizon, 1.0 - exp2(-far * far));
     rgb = vec4(seen(colour), 1.0);
-    facts = vec2(depth, float(labels.x + 256u * labels.y));
+    facts = vec2(depth, float(labels.x + 256u * labels.y + 65536u * labels.z));
 }
 """
 

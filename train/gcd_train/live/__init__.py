@@ -1,0 +1,1 @@
+"""The live model's own data, trainings and measures."""
