@@ -4,6 +4,7 @@
     ├── UsageError 64         options that contradict each other or make no sense
     ├── SourceError 66        an input is missing, empty, damaged or undecodable; a camera is lost
     │   ├── TooShortError 65      an input has fewer frames than one window
+    │   ├── DepthError 65         a depth picture, or a picture that depth is taken from, cannot be used
     │   ├── SourceAbsentError 69  there is no such camera
     │   └── SourceLostError 75    a camera is gone and did not come back
     ├── MessageError 65       bytes that are not a valid message of this protocol
@@ -41,6 +42,12 @@ class SourceError(NodeError):
 
 class TooShortError(SourceError):
     """An input has fewer frames than one window."""
+
+    exit_code = 65
+
+
+class DepthError(SourceError):
+    """A depth picture, or a picture that depth is taken from, cannot be used; the next one may be."""
 
     exit_code = 65
 
