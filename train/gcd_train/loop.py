@@ -177,6 +177,11 @@ class Loop:
         self._measure()
         self._states.finish()
 
+    def adopt_average(self) -> None:
+        """Give the module the averaged weights for good; it is not trained any more after this."""
+        if self._ema is not None:
+            self._task.module.load_state_dict(self._ema.state_dict(), strict=False)
+
     def _agreed(self) -> tuple[float, bool]:
         """The time, and whether to stop: the same in every process, and so is the time spent on training."""
         options = self._options

@@ -22,6 +22,8 @@ from gcd_train.cli.training_run import (
     stage_named,
     stop_when_asked,
 )
+from gcd_train.errors import RecipeError
+from gcd_train.live.recipe import is_live, load_live_recipe
 from gcd_train.recipe import Recipe, StageName, load_recipe, packaged_recipes, to_toml
 
 if TYPE_CHECKING:
@@ -58,8 +60,19 @@ def train(
     from gcd_train.run_data import DataPlaces
 
     with errors_shown():
+        if is_live(recipe):
+            _train_live(recipe, data, valid, out)
+            return
         loaded = load_recipe(recipe, small=small, changes=changes or ())
         _in_processes(loaded, DataPlaces(data=data, valid=valid), out, latents, stage_named(stage, get_args(StageName)))
+
+
+def _train_live(recipe: str, data: Path, valid: Path | None, out: Path) -> None:
+    from gcd_train.live.training import LivePlaces, train_live
+
+    if valid is None:
+        raise RecipeError("a live model is measured on clips of their own: give --valid, see `gcd-train generate live`")
+    train_live(load_live_recipe(recipe), LivePlaces(data=data, valid=valid, out=out), stop_when_asked())
 
 
 def recipes(recipe: Shown = None, small: Small = False, changes: Changes = None) -> None:

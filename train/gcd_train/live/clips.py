@@ -114,7 +114,9 @@ def _renderer(width: int, height: int, oversample: int) -> Renderer:
     return Renderer(width, height, oversample=oversample)
 
 
-def _film(renderer: Renderer, scene: Scene, draw: LiveDraw, world: LiveWorld) -> tuple[dict[str, Array], dict[str, Any]]:
+def _film(
+    renderer: Renderer, scene: Scene, draw: LiveDraw, world: LiveWorld
+) -> tuple[dict[str, Array], dict[str, Any]]:
     steps, unit = list(draw.steps), METRES_A_UNIT[world]
     frozen = freeze(scene)
     cut = type(frozen)(

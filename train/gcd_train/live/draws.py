@@ -29,6 +29,8 @@ TargetPath = Literal["mixed", "paper", "orbit60", "small"]
 FRAMES = 14
 CLIPS_PER_SCENE = {"driving": 1, "driving-first": 1, "drop": 3, "tabletop": 3}
 """A simulated scene is filmed several times, a drive once."""
+LIVE_SCENES: dict[LiveWorld, int] = {"driving": 1400, "driving-first": 560, "drop": 224, "tabletop": 280}
+"""What the packaged model learned from."""
 METRES_A_UNIT = {"driving": 1.0, "driving-first": 1.0, "drop": 1.0, "tabletop": 0.1}
 FLOOR_Z_M = {"driving": 0.0, "driving-first": 0.0, "drop": 0.0, "tabletop": -0.12}
 """Height of the plane on which the world stands: the road, the floor, the table."""
@@ -45,8 +47,8 @@ _ATTEMPTS = 60
 class LiveDraw:
     """What one clip films.
 
-    steps: T time steps of the scene. source, target: world_from_camera [T, 4, 4], in the scene's units. source_hfov_deg,
-    target_hfov_deg: of the two lenses. fps: of the clip.
+    steps: T time steps of the scene. source, target: world_from_camera [T, 4, 4], in the scene's units.
+    source_hfov_deg, target_hfov_deg: of the two lenses. fps: of the clip.
     """
 
     steps: tuple[int, ...]
@@ -135,9 +137,7 @@ def _place(random: Random) -> tuple[Poses, Poses]:
     """A position and what is looked at from there, in the vehicle's frame, metres."""
     height = float(random.uniform(0.9, 10.0))
     low = height < 3.0  # within the vehicle's own lane, which others keep off
-    eye = np.array(
-        [random.uniform(-1.0, 3.0) if low else random.uniform(-12.0, 4.0), random.uniform(-1, 1), height]
-    )
+    eye = np.array([random.uniform(-1.0, 3.0) if low else random.uniform(-12.0, 4.0), random.uniform(-1, 1), height])
     if not low:
         eye[1] = random.uniform(-3.0, 3.0)
     ahead = math.exp(random.uniform(math.log(5.0), math.log(40.0)))
@@ -199,16 +199,18 @@ def _orbit(random: Random, start: Spherical, path: TargetPath) -> Poses:
 def _sphere_path(random: Random, start: Spherical, most_deg: float) -> Poses:
     change = _goal(random, start, most_deg) - start
     shares = np.arange(FRAMES) / (FRAMES - 1)
-    return np.stack([
-        to_pose(
-            Spherical(
-                azimuth_deg=start.azimuth_deg + s * change.azimuth_deg,
-                elevation_deg=start.elevation_deg + s * change.elevation_deg,
-                radius_m=start.radius_m + s * change.radius_m,
-            )
-        ).numpy()
-        for s in shares
-    ])
+    return np.stack(
+        [
+            to_pose(
+                Spherical(
+                    azimuth_deg=start.azimuth_deg + s * change.azimuth_deg,
+                    elevation_deg=start.elevation_deg + s * change.elevation_deg,
+                    radius_m=start.radius_m + s * change.radius_m,
+                )
+            ).numpy()
+            for s in shares
+        ]
+    )
 
 
 def _goal(random: Random, start: Spherical, most_deg: float) -> Spherical:

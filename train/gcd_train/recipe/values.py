@@ -11,7 +11,8 @@ Count: TypeAlias = Annotated[int, Meta(ge=1)]
 Share: TypeAlias = Annotated[float, Meta(ge=0, le=1)]
 StageName: TypeAlias = Literal["vae", "latents", "unet", "decoder", "export"]
 DistillStageName: TypeAlias = Literal["latents", "paired", "matching", "decoder", "export"]
-AnyStageName: TypeAlias = StageName | DistillStageName
+LiveStageName: TypeAlias = Literal["depth", "paint", "export"]
+AnyStageName: TypeAlias = StageName | DistillStageName | LiveStageName
 
 
 class Budget(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

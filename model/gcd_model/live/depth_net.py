@@ -1,0 +1,136 @@
+"""How far everything is, what it is, and whether it moves: from one picture, its lens and, where known, its mount.
+
+Depth is a choice among bins that are even in log-depth, each with an offset: at an edge two peaks stand side by side
+and the likelier one is taken, never their mean.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from gcd_model.geometry import Intrinsics
+from gcd_model.live.blocks import FineHead, Trunk
+from gcd_model.live.config import DepthConfig
+
+SKY_M = 1000.0
+"""Where the sky is put, metres: no step of a robot moves it by a pixel."""
+INPUTS = 7
+_FARTHEST_GROUND_M = 200.0
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DepthOutput:
+    """What the network says of N pictures.
+
+    logits: [N, B, H, W], the last bin is the sky. offsets: [N, B, H, W], parts of a bin from its centre. classes:
+    [N, K, H, W], logits. moves: [N, H, W], logit of a thing in motion.
+    """
+
+    logits: Tensor
+    offsets: Tensor
+    classes: Tensor
+    moves: Tensor
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DepthReading:
+    """What is read off it. metres: [N, H, W], SKY_M for the sky. confidence: [N, H, W], probability of the peak.
+
+    entropy: [N], mean over pixels of the bins' and the classes' entropies, in parts of their largest: high where the
+    network has never been.
+    """
+
+    metres: Tensor
+    confidence: Tensor
+    entropy: Tensor
+
+
+class DepthNet(nn.Module):
+    """See the module. Every output head is its own part of one fine head."""
+
+    def __init__(self, config: DepthConfig, classes: int) -> None:
+        super().__init__()
+        self.config, self.classes = config, classes
+        self.trunk = Trunk(INPUTS, config.widths)
+        self.head = FineHead(INPUTS, config.widths[0], config.fine_width, 2 * config.bins + classes + 1)
+
+    def forward(self, inputs: Tensor, pixels: Tensor | None = None) -> DepthOutput:
+        """inputs: [N, 7, H, W], see `depth_inputs`. pixels: [N, M], of these alone, as pictures of M x 1."""
+        made = self.head(inputs, self.trunk(inputs), pixels).float()
+        bins = self.config.bins
+        logits, offsets, classes, moves = made.split([bins, bins, self.classes, 1], dim=1)
+        return DepthOutput(logits=logits, offsets=offsets.tanh() * 1.5, classes=classes, moves=moves[:, 0])
+
+
+def depth_inputs(pictures: Tensor, rays: Tensor, ground_m: Tensor) -> Tensor:
+    """What the network looks at.
+
+    Args:
+        pictures: [N, 3, H, W] in [-1, 1]. rays: [N, 2, H, W], x / z and y / z of each pixel.
+        ground_m: [N, H, W], depth of the plane on which the camera's carrier stands; 0 where it is not seen, and
+            everywhere without a declared mount.
+    Returns:
+        [N, 7, H, W].
+    """
+    known = ground_m > 0
+    ground = torch.where(known, ground_m.clamp(0.05, _FARTHEST_GROUND_M), 1.0).log() / 3.0
+    return torch.cat([pictures, rays, ground[:, None], known[:, None].to(pictures)], dim=1)
+
+
+def pixel_rays(lens: Intrinsics, device: torch.device | None = None) -> Tensor:
+    """x / z and y / z through each pixel's centre: float32 [2, H, W]."""
+    x = (torch.arange(lens.width, dtype=torch.float32, device=device) + 0.5 - lens.cx) / lens.fx
+    y = (torch.arange(lens.height, dtype=torch.float32, device=device) + 0.5 - lens.cy) / lens.fy
+    return torch.stack(torch.meshgrid(x, y, indexing="xy"))
+
+
+def plane_depth(lens: Intrinsics, up: Tensor, height_m: float) -> Tensor:
+    """Depth of a plane below the camera: float32 [H, W], 0 where no ray meets it.
+
+    up: [3], the plane's normal in camera axes, towards the camera. height_m: of the camera over the plane.
+    """
+    x, y = pixel_rays(lens)
+    falling = -(up[0] * x + up[1] * y + up[2])  # metres down for each metre ahead
+    return torch.where(falling > height_m / SKY_M, height_m / falling.clamp(min=1e-6), 0.0).float()
+
+
+def bin_centres(config: DepthConfig, device: torch.device | None = None) -> Tensor:
+    """Log-depth of the bins' centres, all but the sky's: [B - 1]."""
+    edges = torch.linspace(math.log(config.nearest_m), math.log(config.farthest_m), config.bins, device=device)
+    return (edges[1:] + edges[:-1]) / 2
+
+
+def bin_width(config: DepthConfig) -> float:
+    """In log-depth."""
+    return math.log(config.farthest_m / config.nearest_m) / (config.bins - 1)
+
+
+def read_depth(output: DepthOutput, config: DepthConfig) -> DepthReading:
+    """The likeliest peak of every pixel: a bin and its two neighbours, weighted by their probabilities."""
+    probability = output.logits.softmax(dim=1)
+    solid = probability[:, :-1]  # without the sky
+    mass = solid.clone()
+    mass[:, 1:] += solid[:, :-1]
+    mass[:, :-1] += solid[:, 1:]
+    best, peak = mass.max(dim=1)  # [N, H, W]
+    places = bin_centres(config, output.logits.device)[:, None, None] + output.offsets[:, :-1] * bin_width(config)
+    around = peak[:, None] + torch.arange(-1, 2, device=peak.device).view(1, 3, 1, 1)
+    inside = ((around >= 0) & (around < config.bins - 1)).to(solid.dtype)
+    around = around.clamp(0, config.bins - 2)
+    weight = solid.gather(1, around) * inside
+    place = (places.gather(1, around) * weight).sum(dim=1) / weight.sum(dim=1).clamp(min=1e-8)
+    sky = probability[:, -1] > best
+    metres = torch.where(sky, SKY_M, place.exp())
+    return DepthReading(
+        metres=metres,
+        confidence=torch.maximum(best, probability[:, -1]),
+        entropy=(_entropy(output.logits) + _entropy(output.classes)) / 2,
+    )
+
+
+def _entropy(logits: Tensor) -> Tensor:
+    """Mean over pixels of the entropy of choices [N, C, H, W], in parts of log C: [N]."""
+    log = logits.log_softmax(dim=1)
+    return -(log.exp() * log).sum(dim=1).mean(dim=(1, 2)) / math.log(logits.shape[1])

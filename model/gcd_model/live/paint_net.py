@@ -1,0 +1,201 @@
+"""From what was seen of a view to the whole view: a conditional denoiser that starts as the splat.
+
+    D(x, sigma) = base + c_skip (x - base) + c_out F(c_in (x - base), c_noise; conditions)
+
+`base` is the splat with its holes filled from around, so an untrained network shows the splat. One step from the
+highest noise level paints the mean of what could be there; several steps draw from it. Classes, depth, visibility and
+spread come from the first step, at the highest level, and from heads that no adversary ever trains.
+Source: Karras et al. 2022, Eq. 7, about the base instead of zero; c_noise as in Stable Video Diffusion.
+"""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from gcd_model.layers import embedding_mlp, sinusoid
+from gcd_model.live.blocks import FineHead, Trunk
+from gcd_model.live.config import PaintConfig
+from gcd_model.live.splat import Splat
+
+SIGMA_DATA = 0.3
+"""Standard deviation of a true view about the base, in [-1, 1]."""
+_VOTE_CHANNELS = 4
+_SEEN_CHANNELS = 3 + 5 + _VOTE_CHANNELS  # colour; coverage, now, age, log-depth, known; classes
+_PAINTED_CHANNELS = 3 + 1
+_GOAL_CHANNELS = 2 + 2
+_NOISE_CHANNELS = 3
+INPUTS = _SEEN_CHANNELS + _PAINTED_CHANNELS + _GOAL_CHANNELS + _NOISE_CHANNELS + 3
+_AGE_FRAMES = 20.0
+_VOTE_LOGITS = 6.0
+"""How sure the class of a seen pixel is at first, as a difference of logits."""
+_MEAN_DEPTH_LOG = 2.5  # of unseen pixels at first: 12 m
+_LOG_VARIANCE = -3.0
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Seen:
+    """What is known of N views before anything is painted, all float32.
+
+    colour: [N, 3, H, W] in [-1, 1]. coverage, now_share, age: [N, H, W] (age in frames). log_depth: [N, H, W], of metres;
+    0 where nothing is. votes: [N, K, H, W]. painted: [N, 3, H, W] and painted_coverage: [N, H, W], what was painted a
+    frame ago. rays: [N, 2, H, W], x / z and y / z. ground_m: [N, H, W], depth of the floor, 0 without.
+    """
+
+    colour: Tensor
+    coverage: Tensor
+    now_share: Tensor
+    age: Tensor
+    log_depth: Tensor
+    votes: Tensor
+    painted: Tensor
+    painted_coverage: Tensor
+    rays: Tensor
+    ground_m: Tensor
+
+
+def seen_of(splat: Splat, painted: Splat | None, rays: Tensor, ground_m: Tensor) -> Seen:
+    """One view: the seen surfels' splat and that of what was painted a frame ago."""
+    inverse = splat.inverse_depth
+    empty = torch.zeros_like(splat.coverage)
+    return Seen(
+        colour=splat.colour[None],
+        coverage=splat.coverage[None],
+        now_share=splat.now_share[None],
+        age=splat.age[None],
+        log_depth=torch.where(inverse > 0, -inverse.clamp(min=1e-6).log(), 0.0)[None],
+        votes=splat.votes[None],
+        painted=torch.zeros_like(splat.colour)[None] if painted is None else painted.colour[None],
+        painted_coverage=empty[None] if painted is None else painted.coverage[None],
+        rays=rays[None],
+        ground_m=ground_m[None],
+    )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Painted:
+    """The first step's answer for N views.
+
+    mean: [N, 3, H, W] in [-1, 1], the mean of what could be there. detail: [N, 3, H, W], what is added to it where
+    nothing was seen, to look like one of the things that could be. classes: [N, K, H, W], logits. log_depth: [N, H, W].
+    log_variance: [N, H, W], of the truth about the mean, channel mean, for colours in [-1, 1]. seen: [N, 3, H, W],
+    logits of never, before, now.
+    """
+
+    mean: Tensor
+    detail: Tensor
+    classes: Tensor
+    log_depth: Tensor
+    log_variance: Tensor
+    seen: Tensor
+
+    @property
+    def picture(self) -> Tensor:
+        """Mean and detail: [N, 3, H, W]."""
+        return self.mean + self.detail
+
+
+class PaintNet(nn.Module):
+    """See the module."""
+
+    def __init__(self, config: PaintConfig, classes: int) -> None:
+        super().__init__()
+        self.config, self.classes = config, classes
+        first, fine = config.widths[0], config.fine_width
+        self.votes = nn.Conv2d(classes, _VOTE_CHANNELS, 1)
+        self.noise_level = embedding_mlp(config.embedding_width, config.embedding_width, config.embedding_width)
+        self.trunk = Trunk(INPUTS, config.widths, config.embedding_width, stem_kernel=1)
+        self.head = FineHead(INPUTS, first, fine, 3 + classes + 1 + 1 + 3, zero=True)
+        self.detail = FineHead(INPUTS, first, fine, 3, zero=True)
+
+    def inputs(self, seen: Seen, base: Tensor, noisy: Tensor | None) -> Tensor:
+        """All channels, [N, INPUTS, H, W]."""
+        known = (seen.coverage > 0).float()
+        ground_known = (seen.ground_m > 0).float()
+        ground = torch.where(seen.ground_m > 0, seen.ground_m.clamp(0.05, 200.0), 1.0).log() / 3.0
+        facts = [seen.coverage, seen.now_share, seen.age.clamp(max=_AGE_FRAMES) / _AGE_FRAMES, seen.log_depth / 3.0, known]
+        return torch.cat(
+            [
+                seen.colour,
+                torch.stack(facts, dim=1),
+                self.votes(seen.votes),
+                seen.painted * seen.painted_coverage[:, None],
+                seen.painted_coverage[:, None],
+                seen.rays,
+                torch.stack([ground, ground_known], dim=1),
+                torch.zeros_like(base) if noisy is None else noisy,
+                base,
+            ],
+            dim=1,
+        )
+
+    def embedded(self, sigma: Tensor) -> Tensor:
+        """[N] noise levels -> [N, E]."""
+        return self.noise_level(sinusoid(sigma.log() * 250.0, self.config.embedding_width))
+
+    def first_step(self, seen: Seen, base: Tensor, sigma_max: float) -> Painted:
+        """The answer from the highest noise level, where the noisy picture says nothing and is not shown."""
+        inputs = self.inputs(seen, base, None)
+        sigma = base.new_full((len(base),), sigma_max)
+        features = self.trunk(inputs, self.embedded(sigma))
+        mean, classes, log_depth, log_variance, state = (
+            self.head(inputs, features).float().split([3, self.classes, 1, 1, 3], dim=1)
+        )
+        detail = self.detail(inputs.detach(), features.detach()).float()
+        unseen = (1 - seen.coverage)[:, None]
+        known = (seen.log_depth != 0) & (seen.coverage > 0)
+        return Painted(
+            mean=base + mean,
+            detail=detail * unseen,
+            classes=classes + _VOTE_LOGITS * seen.votes,
+            log_depth=log_depth[:, 0] + torch.where(known, seen.log_depth, _MEAN_DEPTH_LOG),
+            log_variance=log_variance[:, 0] + _LOG_VARIANCE,
+            seen=state + _first_guess(seen),
+        )
+
+    def denoised(self, seen: Seen, base: Tensor, x: Tensor, sigma: Tensor) -> Tensor:
+        """D(x, sigma), [N, 3, H, W]; below the highest level. x: [N, 3, H, W], sigma: [N]."""
+        variance = sigma**2 + SIGMA_DATA**2
+        c_skip, c_out, c_in = SIGMA_DATA**2 / variance, sigma * SIGMA_DATA / variance.sqrt(), variance.rsqrt()
+        away = x - base
+        inputs = self.inputs(seen, base, c_in[:, None, None, None] * away)
+        raw = self.head(inputs, self.trunk(inputs, self.embedded(sigma)))[:, :3].float()
+        scaled = c_skip[:, None, None, None] * away + c_out[:, None, None, None] * raw / SIGMA_DATA
+        return base + scaled
+
+
+def _first_guess(seen: Seen) -> Tensor:
+    """Logits of never, before, now, as the splat has them: [N, 3, H, W]."""
+    covered = (seen.coverage > 0.5).float()
+    now = (seen.now_share > 0.5).float()
+    return 4.0 * torch.stack([1 - covered, covered * (1 - now), covered * now], dim=1)
+
+
+def filled(seen: Seen) -> Tensor:
+    """Where denoising starts: the splat; beside it what was painted a frame ago; else the colours around, from afar.
+
+    Returns:
+        [N, 3, H, W] in [-1, 1].
+    """
+    unseen = 1 - seen.coverage
+    painted = unseen * seen.painted_coverage
+    weight = (seen.coverage + painted)[:, None]
+    colour = seen.colour * seen.coverage[:, None] + seen.painted * painted[:, None]
+    return colour + (1 - weight) * _pulled(colour, weight)
+
+
+def _pulled(colour: Tensor, weight: Tensor) -> Tensor:
+    """Colours, already weighted, spread into their holes from ever coarser pictures: [N, 3, H, W]."""
+    sums = torch.cat([colour, weight], dim=1)
+    levels = [sums]
+    while min(sums.shape[-2:]) > 1:
+        sums = F.avg_pool2d(sums, 2, ceil_mode=True)
+        levels.append(sums)
+    low = levels[-1]
+    spread = low[:, :3] / low[:, 3:].clamp(min=1e-4)
+    for level in reversed(levels[1:-1]):
+        here = level[:, 3:].clamp(max=0.25) * 4  # a quarter covered is enough to go by
+        spread = F.interpolate(spread, size=level.shape[-2:], mode="bilinear", align_corners=False)
+        spread = here * level[:, :3] / level[:, 3:].clamp(min=1e-4) + (1 - here) * spread
+    return F.interpolate(spread, size=colour.shape[-2:], mode="bilinear", align_corners=False)

@@ -1,0 +1,122 @@
+"""Live clips: what is drawn is what the numbers say, and visibility is exact."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gcd_train.errors import DataError
+from gcd_train.live.clips import (
+    SKY_M,
+    ClipSettings,
+    clip_paths,
+    decode_depth,
+    encode_depth,
+    generate_live,
+    read_clip,
+    visibility,
+)
+from gcd_train.live.draws import live_scene
+from gcd_train.scenes.renderer import Rendering
+
+from headless import needs_egl
+from live_clips import HFOV_DEG, cast, looking_ahead, write_clip
+
+
+@given(st.floats(0.03, 900.0))
+def test_depth_survives_its_code_to_a_fiftieth_of_a_per_cent(metres: float) -> None:
+    assert abs(decode_depth(encode_depth(np.array([metres])))[0] / metres - 1) < 2e-4
+
+
+def test_no_depth_is_the_sky() -> None:
+    assert decode_depth(encode_depth(np.array([0.0])))[0] == SKY_M
+
+
+def rendering(pose: np.ndarray) -> Rendering:
+    rgb, depth, labels = cast(pose)
+    nothing = np.zeros_like(labels)
+    return Rendering(rgb=rgb, depth=depth.astype(np.float32), classes=labels, instances=nothing, bodies=nothing)
+
+
+def states(sources: list[np.ndarray], targets: list[np.ndarray], bodies: np.ndarray | None = None) -> np.ndarray:
+    views = {"source": [rendering(p) for p in sources], "target": [rendering(p) for p in targets]}
+    cameras = {"source": np.stack(sources), "target": np.stack(targets)}
+    still = np.broadcast_to(np.eye(4)[:3], (len(sources), 1, 3, 4)) if bodies is None else bodies
+    return visibility(views, cameras, {"source": HFOV_DEG, "target": HFOV_DEG}, still, SKY_M)
+
+
+def test_a_camera_sees_all_of_its_own_view() -> None:
+    pose = looking_ahead(0.0, 1.5)
+    assert (states([pose], [pose]) == 2).all()
+
+
+def test_what_a_box_hides_is_never_seen() -> None:
+    seen = states([looking_ahead(0.0, 1.0, 5.0)], [looking_ahead(4.0, 8.0, 60.0)])[0]
+    view = rendering(looking_ahead(4.0, 8.0, 60.0))
+    behind = (view.classes == 1) & (seen == 0)
+    assert behind.any()
+    assert (seen == 2).any()
+
+
+def test_a_camera_that_turned_away_leaves_what_was_seen_before() -> None:
+    first, away = looking_ahead(0.0, 1.5), looking_ahead(40.0, 1.5)
+    target = looking_ahead(0.0, 1.5)
+    both = states([first, away], [target, target])
+    ground = rendering(target).classes == 1
+    assert (both[0] == 2).all()
+    assert (both[1][ground] == 1).mean() > 0.9
+
+
+def test_what_moved_since_was_not_seen_before() -> None:
+    first, away, target = looking_ahead(0.0, 1.5), looking_ahead(40.0, 1.5), looking_ahead(0.0, 1.5)
+    bodies = np.broadcast_to(np.eye(4)[:3], (2, 1, 3, 4)).copy()
+    bodies[1, 0, 0, 3] = 0.5
+    assert not (states([first, away], [target, target], bodies)[1] == 1).any()
+
+
+def test_a_clip_is_read_as_it_was_written(tmp_path: Path) -> None:
+    clip = read_clip(write_clip(tmp_path, 3), slice(4, 6))
+    assert clip.frames == 2
+    assert clip.name == "driving/0000003-0"
+    pose = clip.arrays["source.pose"][0]
+    assert np.abs(clip.depth("source")[0] - np.where((d := cast(pose)[1]) > 0, d, SKY_M)).max() < 0.3
+
+
+def test_a_damaged_clip_is_one_line(tmp_path: Path) -> None:
+    path = write_clip(tmp_path, 1)
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(DataError):
+        read_clip(path)
+
+
+def test_an_empty_folder_has_no_clips(tmp_path: Path) -> None:
+    with pytest.raises(DataError):
+        clip_paths(tmp_path)
+
+
+@needs_egl
+def test_the_seed_decides_all_of_a_clip(tmp_path: Path) -> None:
+    settings = ClipSettings(width=64, height=32)
+    for folder in ("one", "two"):
+        there, failures = generate_live(tmp_path / folder, "driving", range(1), settings)
+        assert (there, failures) == (1, [])
+    one, two = (read_clip(clip_paths(tmp_path / folder)[0]) for folder in ("one", "two"))
+    assert all((one.arrays[name] == two.arrays[name]).all() for name in one.arrays)
+
+
+@needs_egl
+def test_most_of_the_targets_pixels_are_explained(tmp_path: Path) -> None:
+    """Where a pixel counts as seen now, the source shows nearly its colour there."""
+    generate_live(tmp_path, "driving-first", range(2), ClipSettings(width=64, height=32, path="paper"))
+    for path in clip_paths(tmp_path):
+        first = read_clip(path, slice(0, 1))  # the paper's path begins at the source
+        assert (first.arrays["target.visibility"] == 2).all()
+        assert (first.arrays["target.rgb"] == first.arrays["source.rgb"]).all()
+
+
+def test_targets_keep_above_the_floor_and_differ_from_the_source() -> None:
+    scene, draws = live_scene("driving", 5, "mixed")
+    assert scene.frames == 14
+    assert all(draw.target.shape == (14, 4, 4) and (draw.target[:, 2, 3] > 0.3).all() for draw in draws)

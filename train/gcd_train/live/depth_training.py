@@ -1,0 +1,180 @@
+"""How the depth network learns: the bin, the place within it, the class, and what moves."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from gcd_model.live.config import LiveConfig
+from gcd_model.live.depth_net import (
+    SKY_M,
+    DepthNet,
+    DepthOutput,
+    bin_centres,
+    bin_width,
+    depth_inputs,
+    read_depth,
+)
+from gcd_train.live.batches import FrameBatches, Pictures, class_shares, pictures_of
+from gcd_train.live.clips import read_clip
+from gcd_train.live.look import depth_sheet
+from gcd_train.loop import Progress, StepLoss
+from gcd_train.schedule import ParameterGroup
+
+_CLASS_POWER = -0.5
+_EDGE, _EDGE_WEIGHT, _THIN_WEIGHT = 0.05, 2.0, 5.0
+_OFFSET, _CLASS, _MOVES = 0.5, 0.7, 0.2
+_PIXEL_SHARE = 0.2
+"""Of the pixels of a frame, how many its loss is computed from: the fine head is what costs time at full size."""
+THIN = ("person", "pole", "cyclist", "object")
+"""Small things that count for more."""
+
+
+class DepthTask:
+    """Trains a DepthNet on single frames."""
+
+    def __init__(
+        self, net: DepthNet, config: LiveConfig, paths: Sequence[Path], held_out: Sequence[Path], size: int, seed: int
+    ) -> None:
+        self._net, self._config, self._held_out = net, config, list(held_out)
+        self._batches = FrameBatches(paths, size, seed)
+        shares = class_shares(paths, len(config.classes))
+        weights = shares.clamp(min=1e-4) ** _CLASS_POWER
+        self._class_weights = weights / (weights * shares).sum()
+        names = [entry.name for entry in config.classes]
+        self._thin = torch.tensor([name in THIN for name in names])
+
+    @property
+    def module(self) -> nn.Module:
+        """The network."""
+        return self._net
+
+    def parameter_groups(self) -> Sequence[ParameterGroup]:
+        """All weights."""
+        return [ParameterGroup(parameters=list(self._net.parameters()))]
+
+    def step_loss(self, progress: Progress) -> StepLoss:
+        """Of one batch of frames."""
+        pictures, ground, random = self._batches.batch(progress.updates)
+        self._net.train()
+        inputs = depth_inputs(pictures.video, pictures.rays, ground)
+        n, _, height, width = inputs.shape
+        drawn = random.integers(0, height * width, (n, int(height * width * _PIXEL_SHARE)))
+        pixels = torch.from_numpy(drawn)
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=True):
+            output = self._net(inputs.contiguous(memory_format=torch.channels_last), pixels)
+        parts = self.losses(output, pictures, pixels)
+        total = parts["bin"] + _OFFSET * parts["offset"] + _CLASS * parts["class"] + _MOVES * parts["moves"]
+        return StepLoss(total=total, parts=parts, frames=len(pictures.lenses))
+
+    def losses(self, output: DepthOutput, pictures: Pictures, pixels: Tensor) -> dict[str, Tensor]:
+        """Cross-entropy of the bin, distance of the offset, cross-entropies of class and motion, at some pixels."""
+        config = self._config.depth
+
+        def at(values: Tensor) -> Tensor:
+            return values.flatten(1).gather(1, pixels)[..., None]  # [N, M, 1]
+
+        metres, labels, weight = at(pictures.metres), at(pictures.labels), at(self._pixel_weights(pictures))
+        centres, width = bin_centres(config), bin_width(config)
+        sky = metres >= config.farthest_m
+        place = (metres.log() - centres[0]) / width
+        nearest = place.round().clamp(0, config.bins - 2).long()
+        label = torch.where(sky, config.bins - 1, nearest)
+        bin_loss = F.cross_entropy(output.logits, label, reduction="none")
+        offset = torch.zeros(())
+        for beside in (-1, 0, 1):  # the neighbours' offsets count where the peak is read
+            number = (nearest + beside).clamp(0, config.bins - 2)
+            wanted = (place - number).clamp(-1.45, 1.45)
+            distance = (output.offsets.gather(1, number[:, None])[:, 0] - wanted).abs()
+            offset = offset + ((2 if beside == 0 else 0.5) * distance * weight * ~sky).mean()
+        classes = F.cross_entropy(output.classes, labels, self._class_weights)
+        moves = F.binary_cross_entropy_with_logits(output.moves, at(pictures.moves))
+        return {"bin": (bin_loss * weight).mean(), "offset": offset, "class": classes, "moves": moves}
+
+    def _pixel_weights(self, pictures: Pictures) -> Tensor:
+        """Edges and thin things count for more: [N, H, W], mean 1."""
+        log = pictures.metres.log()[:, None]
+        highest = F.max_pool2d(log, 3, 1, 1)
+        lowest = -F.max_pool2d(-log, 3, 1, 1)
+        edge = ((highest - lowest)[:, 0] > 2 * _EDGE).float()
+        weight = 1 + _EDGE_WEIGHT * edge + _THIN_WEIGHT * self._thin[pictures.labels].float()
+        return weight / weight.mean()
+
+    def after_update(self, progress: Progress) -> bool:
+        """Nothing to do."""
+        _ = progress
+        return False
+
+    @torch.no_grad()
+    def measure(self, picture: Path) -> dict[str, float]:
+        """Kill test 1 on every fourth held-out clip's middle frames."""
+        self._net.eval()
+        return measure_depth(self._net, self._config, self._held_out, picture)
+
+
+@torch.no_grad()
+def measure_depth(
+    net: DepthNet, config: LiveConfig, paths: Sequence[Path], sheet: Path | None = None, frames: Sequence[int] = (3, 10)
+) -> dict[str, float]:
+    """Errors of depth, edges and classes on the source frames of held-out clips.
+
+    mean_relative, median_relative: of depth nearer than the farthest bin. thin_within_10: share of person and pole
+    pixels within 10 %. edge_f1: depth edges within one pixel. miou: of classes that occur.
+    """
+    errors: list[Tensor] = []
+    thin: list[Tensor] = []
+    edges = torch.zeros(3)
+    confusion = torch.zeros(len(config.classes), len(config.classes))
+    names = [entry.name for entry in config.classes]
+    is_thin = torch.tensor([name in ("person", "pole") for name in names])
+    shown: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
+    for path in paths:
+        for frame in frames:
+            truth = pictures_of(read_clip(path, slice(frame, frame + 1)), "source")
+            output = net(depth_inputs(truth.video, truth.rays, truth.ground()))
+            metres, true = read_depth(output, config.depth).metres, truth.metres
+            near = true < config.depth.farthest_m
+            relative = (metres.clamp(max=SKY_M) - true).abs() / true
+            errors.append(relative[near].clamp(max=2.0))
+            thin.append(relative[is_thin[truth.labels] & near])
+            edges += edge_matches(metres, true)
+            classes = output.classes.argmax(1)
+            index = truth.labels * len(config.classes) + classes
+            confusion += torch.bincount(index.flatten(), minlength=confusion.numel()).view_as(confusion)
+            if frame == frames[0]:
+                shown.append((truth.video[0], true[0], metres[0], classes[0]))
+    together, small = torch.cat(errors), torch.cat(thin)
+    if sheet is not None:
+        depth_sheet(shown[:: max(len(shown) // 8, 1)][:8], config.classes, sheet)
+    inside = confusion.diagonal()
+    union = confusion.sum(0) + confusion.sum(1) - inside
+    iou = inside / union.clamp(min=1)
+    occurs = confusion.sum(1) > 0
+    return {
+        "mean_relative": float(together.mean()),
+        "median_relative": float(together.median()),
+        "thin_within_10": float((small < 0.1).float().mean()) if len(small) else float("nan"),
+        "edge_f1": float(2 * edges[0] / (edges[1] + edges[2]).clamp(min=1)),
+        "miou": float(iou[occurs].mean()),
+        **{f"iou_{names[k]}": float(iou[k]) for k in (8, 10, 11, 7, 16) if occurs[k]},
+    }
+
+
+def edge_matches(metres: Tensor, true: Tensor) -> Tensor:
+    """Matched and all edges, for F1 with a pixel's slack: (matched, edges of `metres`, edges of `true`)."""
+    made, wanted = depth_edges(metres), depth_edges(true)
+    near_wanted = F.max_pool2d(wanted[:, None].float(), 3, 1, 1)[:, 0] > 0
+    near_made = F.max_pool2d(made[:, None].float(), 3, 1, 1)[:, 0] > 0
+    matched = ((made & near_wanted).sum() + (wanted & near_made).sum()) / 2
+    return torch.stack([matched, made.sum(), wanted.sum()]).float()
+
+
+def depth_edges(metres: Tensor) -> Tensor:
+    """Pixels from which depth jumps by more than 15 % to the right or down: bool [N, H, W]."""
+    log = metres.log()
+    edges = torch.zeros_like(log, dtype=torch.bool)
+    edges[..., :-1] |= (log[..., 1:] - log[..., :-1]).abs() > 0.15
+    edges[..., :-1, :] |= (log[..., 1:, :] - log[..., :-1, :]).abs() > 0.15
+    return edges

@@ -1,0 +1,70 @@
+"""What a live model is trained from and for how long: `kind = "live"` in a TOML file."""
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from gcd_model.live.config import LiveConfig
+from gcd_train.errors import RecipeError
+from gcd_train.recipe import Budget, EmaRecipe, LogRecipe, OptimiserRecipe
+
+PACKAGED = Path(__file__).parent.parent / "recipes" / "live"
+"""Recipes that ship."""
+
+
+class LiveStage(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How long a stage trains and how. batch: frames (depth) or views (paint, detail) an update."""
+
+    budget: Budget
+    batch: Annotated[int, Meta(ge=1)] = 8
+    optimiser: OptimiserRecipe
+    ema: EmaRecipe = EmaRecipe(limit=0.998, horizon=0.15)
+
+
+class LiveRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A live model's training.
+
+    exact_every: of the clips whose inputs are worked out by exact depth, too: every so many-th. workers: processes that
+    read batches and work out inputs beside the training; 0 for none.
+    """
+
+    kind: Literal["live"]
+    name: str
+    seed: int = 1
+    model: LiveConfig = LiveConfig()
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    workers: Annotated[int, Meta(ge=0)] = 0
+    depth: LiveStage
+    exact_every: Annotated[int, Meta(ge=1)] = 4
+    paint: LiveStage
+    detail: LiveStage
+    log: LogRecipe = LogRecipe()
+
+
+def is_live(source: str) -> bool:
+    """Whether a recipe, by `package:NAME` or path, is a live model's."""
+    try:
+        return _table(source).get("kind") == "live"
+    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError):
+        return False
+
+
+def load_live_recipe(source: str) -> LiveRecipe:
+    """A recipe by `package:NAME` or path. Raises RecipeError for one that cannot be read or has unknown keys."""
+    try:
+        return msgspec.convert(_table(source), LiveRecipe)
+    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError, msgspec.ValidationError) as error:
+        raise RecipeError(f"the recipe {source} cannot be used: {error}") from error
+
+
+def live_recipes() -> list[str]:
+    """Names of those that ship."""
+    return sorted(path.stem for path in PACKAGED.glob("*.toml"))
+
+
+def _table(source: str) -> dict[str, object]:
+    path = PACKAGED / f"{source.removeprefix('package:')}.toml" if source.startswith("package:") else Path(source)
+    return tomllib.loads(path.read_text(encoding="utf-8"))
