@@ -1,7 +1,8 @@
 """How far everything is, what it is, and whether it moves: from one picture, its lens and, where known, its mount.
 
 Depth is a choice among bins that are even in log-depth, each with an offset: at an edge two peaks stand side by side
-and the likelier one is taken, never their mean.
+and the likelier one is taken, never their mean. Where a mount is declared, one gate a pixel says "this is the ground":
+then the bins, and the places within them, are those of the plane.
 """
 
 import math
@@ -18,6 +19,13 @@ SKY_M = 1000.0
 """Where the sky is put, metres: no step of a robot moves it by a pixel."""
 INPUTS = 7
 _FARTHEST_GROUND_M = 200.0
+_GROUND_SCALE = 3.0  # of its log-depth, as an input
+_GROUND_LOGIT = 8.0
+"""How much a fully open gate adds to the bins of the ground."""
+_GATE_AT_FIRST = -3.0
+_OFFSET_REACH = 1.5
+_SMOOTH_PX, _SMOOTH_SPREAD, _SMOOTH_ROUNDS = 2, 0.1, 2
+"""Depth is averaged over so many pixels to each side, where it differs by about this share at most, so many times."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -38,8 +46,8 @@ class DepthOutput:
 class DepthReading:
     """What is read off it. metres: [N, H, W], SKY_M for the sky. confidence: [N, H, W], probability of the peak.
 
-    entropy: [N], mean over pixels of the bins' and the classes' entropies, in parts of their largest: high where the
-    network has never been.
+    entropy: [N], mean over pixels of the classes' entropy, in parts of its largest: high where the network has never
+    been. (It tells real pictures from rendered ones better than the bins' entropy does.)
     """
 
     metres: Tensor
@@ -54,14 +62,28 @@ class DepthNet(nn.Module):
         super().__init__()
         self.config, self.classes = config, classes
         self.trunk = Trunk(INPUTS, config.widths)
-        self.head = FineHead(INPUTS, config.widths[0], config.fine_width, 2 * config.bins + classes + 1)
+        self.head = FineHead(INPUTS, config.widths[0], config.fine_width, 2 * config.bins + classes + 2)
 
     def forward(self, inputs: Tensor, pixels: Tensor | None = None) -> DepthOutput:
         """inputs: [N, 7, H, W], see `depth_inputs`. pixels: [N, M], of these alone, as pictures of M x 1."""
         made = self.head(inputs, self.trunk(inputs), pixels).float()
         bins = self.config.bins
-        logits, offsets, classes, moves = made.split([bins, bins, self.classes, 1], dim=1)
-        return DepthOutput(logits=logits, offsets=offsets.tanh() * 1.5, classes=classes, moves=moves[:, 0])
+        logits, offsets, classes, moves, gate = made.split([bins, bins, self.classes, 1, 1], dim=1)
+        ground = inputs[:, -2:].float()
+        if pixels is not None:
+            ground = ground.flatten(2).gather(2, pixels[:, None].expand(-1, 2, -1))[..., None]
+        opened = torch.sigmoid(gate + _GATE_AT_FIRST) * ground[:, 1:]
+        centres = bin_centres(self.config, inputs.device)
+        place = (ground[:, :1] * _GROUND_SCALE - centres[:, None, None]) / bin_width(self.config)  # [N, B - 1, H, W]
+        prior = _GROUND_LOGIT * opened * (1 - place.abs()).clamp(min=0)
+        share = opened * (place.abs() < _OFFSET_REACH)
+        solid, sky = offsets.tanh().mul(_OFFSET_REACH).split([bins - 1, 1], dim=1)
+        return DepthOutput(
+            logits=torch.cat([logits[:, :-1] + prior, logits[:, -1:]], dim=1),
+            offsets=torch.cat([torch.lerp(solid, place.clamp(-_OFFSET_REACH, _OFFSET_REACH), share), sky], dim=1),
+            classes=classes,
+            moves=moves[:, 0],
+        )
 
 
 def depth_inputs(pictures: Tensor, rays: Tensor, ground_m: Tensor) -> Tensor:
@@ -75,7 +97,7 @@ def depth_inputs(pictures: Tensor, rays: Tensor, ground_m: Tensor) -> Tensor:
         [N, 7, H, W].
     """
     known = ground_m > 0
-    ground = torch.where(known, ground_m.clamp(0.05, _FARTHEST_GROUND_M), 1.0).log() / 3.0
+    ground = torch.where(known, ground_m.clamp(0.05, _FARTHEST_GROUND_M), 1.0).log() / _GROUND_SCALE
     return torch.cat([pictures, rays, ground[:, None], known[:, None].to(pictures)], dim=1)
 
 
@@ -108,7 +130,7 @@ def bin_width(config: DepthConfig) -> float:
 
 
 def read_depth(output: DepthOutput, config: DepthConfig) -> DepthReading:
-    """The likeliest peak of every pixel: a bin and its two neighbours, weighted by their probabilities."""
+    """The likeliest peak of every pixel, a bin and its two neighbours, smoothed along surfaces."""
     probability = output.logits.softmax(dim=1)
     solid = probability[:, :-1]  # without the sky
     mass = solid.clone()
@@ -122,12 +144,37 @@ def read_depth(output: DepthOutput, config: DepthConfig) -> DepthReading:
     weight = solid.gather(1, around) * inside
     place = (places.gather(1, around) * weight).sum(dim=1) / weight.sum(dim=1).clamp(min=1e-8)
     sky = probability[:, -1] > best
+    confidence = torch.maximum(best, probability[:, -1])
     metres = torch.where(sky, SKY_M, place.exp())
     return DepthReading(
-        metres=metres,
-        confidence=torch.maximum(best, probability[:, -1]),
-        entropy=(_entropy(output.logits) + _entropy(output.classes)) / 2,
+        metres=torch.where(sky, SKY_M, _smoothed(metres, confidence)),
+        confidence=confidence,
+        entropy=_entropy(output.classes),
     )
+
+
+def _smoothed(metres: Tensor, confidence: Tensor) -> Tensor:
+    """Averages of inverse depth, which is linear on planes, along rows and then columns; edges stay: [N, H, W]."""
+    inverse = 1 / metres
+    for _ in range(_SMOOTH_ROUNDS):
+        for axis in (2, 1):
+            stacked = torch.stack([inverse, inverse.log(), confidence], dim=1)  # [N, 3, H, W]
+            total, weights = inverse * confidence, confidence
+            for step in range(1, _SMOOTH_PX + 1):
+                for shift in (step, -step):
+                    beside = _shifted(stacked, shift, axis + 1)
+                    near = ((beside[:, 1] - stacked[:, 1]) / _SMOOTH_SPREAD).square()
+                    weight = beside[:, 2] * torch.exp(-near / 2)
+                    total, weights = total + weight * beside[:, 0], weights + weight
+            inverse = total / weights
+    return 1 / inverse
+
+
+def _shifted(x: Tensor, shift: int, axis: int) -> Tensor:
+    """Each pixel's neighbour so far along an axis; the edge is its own neighbour."""
+    size = x.shape[axis]
+    index = (torch.arange(size, device=x.device) + shift).clamp(0, size - 1)
+    return x.index_select(axis, index)
 
 
 def _entropy(logits: Tensor) -> Tensor:

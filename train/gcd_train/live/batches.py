@@ -1,24 +1,27 @@
 """What the live trainings learn from: single frames for depth, short runs of frames for paint, all drawn by number."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.depth_net import pixel_rays, plane_depth
 from gcd_train.live.clips import LiveClip, clip_paths, read_clip
 
 Random = np.random.Generator
+Record = TypeVar("Record")
+Batch = TypeVar("Batch")
 _TARGET_SHARE = 0.25  # of the pictures that depth learns from: targets see the world from above
-_NO_MOUNT = 0.4
-_HEIGHT_SPREAD, _TILT_SPREAD_DEG = 0.07, 1.2  # declared mounts are never exact
+_NO_MOUNT, _EXACT_MOUNT = 0.35, 0.35
+_HEIGHT_SPREAD, _TILT_SPREAD_DEG = 0.05, 0.7  # of the other mounts that are declared
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -64,8 +67,11 @@ def lens_rays(lens: Intrinsics) -> Tensor:
 
 
 def _declared(up: Tensor, height: float, random: Random) -> tuple[Tensor, float] | None:
-    if random.random() < _NO_MOUNT:
+    drawn = random.random()
+    if drawn < _NO_MOUNT:
         return None
+    if drawn < _NO_MOUNT + _EXACT_MOUNT:
+        return up, height
     tilt = torch.from_numpy(random.normal(size=3) * np.radians(_TILT_SPREAD_DEG)).float()
     turned = up + torch.linalg.cross(tilt, up)
     return turned / turned.norm(), height * float(np.exp(random.normal() * _HEIGHT_SPREAD))
@@ -172,6 +178,52 @@ def class_shares(paths: Sequence[Path], classes: int, sample: int = 48) -> Tenso
         labels: NDArray[Any] = read_clip(path, slice(0, 1)).arrays["source.labels"]
         counts += np.bincount(labels.ravel(), minlength=classes)
     return torch.from_numpy(counts / counts.sum()).float()
+
+
+def on(device: torch.device, record: Record) -> Record:
+    """Records with their tensors, and those of the records in them, on a device."""
+    if isinstance(record, Tensor):
+        return cast("Record", record.to(device, non_blocking=True))
+    if isinstance(record, tuple):
+        return cast("Record", tuple(on(device, each) for each in cast("tuple[Any, ...]", record)))
+    if not is_dataclass(record):
+        return record
+    moved = {f.name: on(device, getattr(record, f.name)) for f in fields(record)}
+    return cast("Record", replace(record, **moved))  # pyright: ignore[reportArgumentType]
+
+
+class Ahead(Generic[Batch]):
+    """Batches by number, made in order by other processes before they are asked for; without workers, when they are."""
+
+    def __init__(self, batch: Callable[[int], Batch], workers: int) -> None:
+        self._batch, self._workers = batch, workers
+        self._next, self._made = -1, iter(cast("list[Batch]", []))
+
+    def __call__(self, update: int) -> Batch:
+        """The batch of an update. Asked for out of order, the processes begin anew."""
+        if self._workers == 0:
+            return self._batch(update)
+        if update != self._next:
+            numbers = _Numbered(self._batch, update)
+            self._made = iter(DataLoader(numbers, batch_size=None, num_workers=self._workers, prefetch_factor=4))
+        self._next = update + 1
+        return next(self._made)
+
+
+class _Numbered(IterableDataset[Any]):
+    """Batches from a number on; of W workers, worker w makes every W-th."""
+
+    def __init__(self, batch: Callable[[int], Any], first: int) -> None:
+        self._batch, self._first = batch, first
+
+    def __iter__(self) -> Iterator[Any]:
+        torch.set_num_threads(1)
+        worker = get_worker_info()
+        own, count = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        number = self._first + own
+        while True:
+            yield self._batch(number)
+            number += count
 
 
 def training_paths(folder: Path) -> list[Path]:

@@ -17,7 +17,7 @@ from gcd_model.live.depth_net import (
     depth_inputs,
     read_depth,
 )
-from gcd_train.live.batches import FrameBatches, Pictures, class_shares, pictures_of
+from gcd_train.live.batches import Ahead, FrameBatches, Pictures, class_shares, on, pictures_of
 from gcd_train.live.clips import read_clip
 from gcd_train.live.look import depth_sheet
 from gcd_train.loop import Progress, StepLoss
@@ -36,15 +36,24 @@ class DepthTask:
     """Trains a DepthNet on single frames."""
 
     def __init__(
-        self, net: DepthNet, config: LiveConfig, paths: Sequence[Path], held_out: Sequence[Path], size: int, seed: int
+        self,
+        net: DepthNet,
+        config: LiveConfig,
+        paths: Sequence[Path],
+        held_out: Sequence[Path],
+        size: int,
+        seed: int,
+        workers: int = 0,
     ) -> None:
+        """size: frames an update. workers: processes that read them."""
         self._net, self._config, self._held_out = net, config, list(held_out)
-        self._batches = FrameBatches(paths, size, seed)
+        self._device = next(net.parameters()).device
+        self._batch = Ahead(FrameBatches(paths, size, seed).batch, workers)
         shares = class_shares(paths, len(config.classes))
         weights = shares.clamp(min=1e-4) ** _CLASS_POWER
-        self._class_weights = weights / (weights * shares).sum()
+        self._class_weights = (weights / (weights * shares).sum()).to(self._device)
         names = [entry.name for entry in config.classes]
-        self._thin = torch.tensor([name in THIN for name in names])
+        self._thin = torch.tensor([name in THIN for name in names], device=self._device)
 
     @property
     def module(self) -> nn.Module:
@@ -57,13 +66,14 @@ class DepthTask:
 
     def step_loss(self, progress: Progress) -> StepLoss:
         """Of one batch of frames."""
-        pictures, ground, random = self._batches.batch(progress.updates)
+        pictures, ground, random = self._batch(progress.updates)
         self._net.train()
-        inputs = depth_inputs(pictures.video, pictures.rays, ground)
+        inputs = depth_inputs(pictures.video, pictures.rays, ground).to(self._device)
+        pictures = on(self._device, pictures)
         n, _, height, width = inputs.shape
         drawn = random.integers(0, height * width, (n, int(height * width * _PIXEL_SHARE)))
-        pixels = torch.from_numpy(drawn)
-        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=True):
+        pixels = torch.from_numpy(drawn).to(self._device)
+        with torch.autocast(self._device.type, dtype=torch.bfloat16):
             output = self._net(inputs.contiguous(memory_format=torch.channels_last), pixels)
         parts = self.losses(output, pictures, pixels)
         total = parts["bin"] + _OFFSET * parts["offset"] + _CLASS * parts["class"] + _MOVES * parts["moves"]
@@ -77,13 +87,13 @@ class DepthTask:
             return values.flatten(1).gather(1, pixels)[..., None]  # [N, M, 1]
 
         metres, labels, weight = at(pictures.metres), at(pictures.labels), at(self._pixel_weights(pictures))
-        centres, width = bin_centres(config), bin_width(config)
+        centres, width = bin_centres(config, self._device), bin_width(config)
         sky = metres >= config.farthest_m
         place = (metres.log() - centres[0]) / width
         nearest = place.round().clamp(0, config.bins - 2).long()
         label = torch.where(sky, config.bins - 1, nearest)
         bin_loss = F.cross_entropy(output.logits, label, reduction="none")
-        offset = torch.zeros(())
+        offset = torch.zeros((), device=self._device)
         for beside in (-1, 0, 1):  # the neighbours' offsets count where the peak is read
             number = (nearest + beside).clamp(0, config.bins - 2)
             wanted = (place - number).clamp(-1.45, 1.45)
@@ -133,7 +143,9 @@ def measure_depth(
     for path in paths:
         for frame in frames:
             truth = pictures_of(read_clip(path, slice(frame, frame + 1)), "source")
-            output = net(depth_inputs(truth.video, truth.rays, truth.ground()))
+            device = next(net.parameters()).device
+            output = net(depth_inputs(truth.video, truth.rays, truth.ground()).to(device))
+            output = on(torch.device("cpu"), output)
             metres, true = read_depth(output, config.depth).metres, truth.metres
             near = true < config.depth.farthest_m
             relative = (metres.clamp(max=SKY_M) - true).abs() / true

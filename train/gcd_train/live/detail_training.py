@@ -18,6 +18,7 @@ from torch.nn.utils.parametrizations import spectral_norm
 from gcd_model.live.config import LiveConfig
 from gcd_model.live.depth_net import DepthNet, depth_inputs
 from gcd_model.live.paint_net import Painted, PaintNet, Seen, filled
+from gcd_train.live.batches import Ahead, on
 from gcd_train.live.paint_training import MOVABLE, HeldOutViews, ViewBatches, Views, carry, mirrored
 from gcd_train.loop import Progress, StepLoss
 from gcd_train.schedule import ParameterGroup
@@ -70,19 +71,27 @@ class DetailTask:
     """Trains a PaintNet's detail head against a critic; both take a step an update."""
 
     def __init__(
-        self, net: PaintNet, depth: DepthNet, config: LiveConfig, batches: ViewBatches, held_out: HeldOutViews
+        self,
+        net: PaintNet,
+        depth: DepthNet,
+        config: LiveConfig,
+        batches: ViewBatches,
+        held_out: HeldOutViews,
+        workers: int = 0,
     ) -> None:
+        """workers: processes that read batches."""
         self._net, self._depth, self._config = net, depth.eval().requires_grad_(False), config
-        self._batches, self._held_out = batches, held_out
+        self._held_out, self._batch = held_out, Ahead(batches.batch, workers)
+        self._device = next(net.parameters()).device
         net.requires_grad_(False)
         net.detail.requires_grad_(True)
-        self._trained = DetailAndCritic(net)
-        self._movable = torch.tensor([entry.name in MOVABLE for entry in config.classes])
+        self._trained = DetailAndCritic(net).to(self._device)
+        self._movable = torch.tensor([entry.name in MOVABLE for entry in config.classes], device=self._device)
         torch.manual_seed(0)
         self._random = nn.Sequential(
             nn.Conv2d(3, 32, 5, stride=2, padding=2), nn.LeakyReLU(0.2), nn.Conv2d(32, 48, 3, stride=2, padding=1),
             nn.LeakyReLU(0.2), nn.Conv2d(48, 64, 3, padding=1),
-        ).requires_grad_(False)  # fmt: skip
+        ).requires_grad_(False).to(self._device)  # fmt: skip
 
     @property
     def module(self) -> nn.Module:
@@ -98,10 +107,10 @@ class DetailTask:
 
     def step_loss(self, progress: Progress) -> StepLoss:
         """Of the detail against the critic, and of the critic: their gradients do not meet."""
-        before, now, random = self._batches.batch(progress.updates)
+        before, now, random = on(self._device, self._batch(progress.updates))
         with torch.no_grad():
             painted = self._first_step(before.seen)
-        carried = torch.from_numpy(random.random(len(now.poses)) < 0.6)
+        carried = torch.from_numpy(random.random(len(now.poses)) < 0.6).to(self._device)
         moved = carry(painted, before, now, self._movable)
         coverage = moved.seen.painted_coverage * carried[:, None, None]
         now = _with_painted(moved, coverage)
@@ -113,7 +122,7 @@ class DetailTask:
         return StepLoss(total=torch.stack(list(parts.values())).sum(), parts=parts, frames=len(now.poses))
 
     def _first_step(self, seen: Seen) -> Painted:
-        with torch.autocast("cpu", dtype=torch.bfloat16):
+        with torch.autocast(self._device.type, dtype=torch.bfloat16):
             return self._net.first_step(seen, filled(seen), self._config.sigma_max)
 
     def _losses(self, made: Painted, views: Views) -> dict[str, Tensor]:
@@ -142,8 +151,8 @@ class DetailTask:
         """Distance in features of the depth network, which knows targets too, and of a random network."""
         never = F.avg_pool2d(where.never, 4)
         ground = torch.zeros_like(views.seen.ground_m)
-        distance = torch.zeros(())
-        with torch.autocast("cpu", dtype=torch.bfloat16):
+        distance = torch.zeros((), device=self._device)
+        with torch.autocast(self._device.type, dtype=torch.bfloat16):
             made, true = (self._depth.trunk(depth_inputs(x, views.seen.rays, ground)) for x in (fake, views.target))
             made_random, true_random = self._random(fake), self._random(views.target)
         for a, b in ((made, true), (made_random, true_random)):

@@ -14,7 +14,7 @@ from gcd_model.live.config import LiveConfig
 from gcd_model.live.depth_net import plane_depth
 from gcd_model.live.paint_net import Painted, PaintNet, Seen, filled
 from gcd_model.live.splat import splat, unproject
-from gcd_train.live.batches import Random, class_shares, lens_rays, to_video
+from gcd_train.live.batches import Ahead, Random, class_shares, lens_rays, on, to_video
 from gcd_train.live.clips import LiveClip, read_clip
 from gcd_train.live.inputs import read_inputs
 from gcd_train.live.look import picture, write_rows
@@ -138,7 +138,7 @@ class ViewBatches:
             views = views_of(read_clip(path, cut), inputs, ground=random.random() < 0.6)
             made.append(_other_look(views, random))
         every = together(made)
-        index = torch.arange(self._size) * 2
+        index = torch.arange(0, 2 * self._size, 2)
         return frame_of(every, index), frame_of(every, index + 1), random
 
 
@@ -199,13 +199,21 @@ class PaintTask:
     """Trains a PaintNet's first step on target views."""
 
     def __init__(
-        self, net: PaintNet, config: LiveConfig, batches: ViewBatches, paths: Sequence[Path], held_out: "HeldOutViews"
+        self,
+        net: PaintNet,
+        config: LiveConfig,
+        batches: ViewBatches,
+        paths: Sequence[Path],
+        held_out: "HeldOutViews",
+        workers: int = 0,
     ) -> None:
-        self._net, self._config, self._batches, self._held_out = net, config, batches, held_out
+        """workers: processes that read batches."""
+        self._net, self._config, self._held_out = net, config, held_out
+        self._device, self._batch = next(net.parameters()).device, Ahead(batches.batch, workers)
         shares = class_shares(paths, len(config.classes))
         weights = shares.clamp(min=1e-4) ** _CLASS_POWER
-        self._class_weights = weights / (weights * shares).sum()
-        self._movable = torch.tensor([entry.name in MOVABLE for entry in config.classes])
+        self._class_weights = (weights / (weights * shares).sum()).to(self._device)
+        self._movable = torch.tensor([entry.name in MOVABLE for entry in config.classes], device=self._device)
 
     @property
     def module(self) -> nn.Module:
@@ -219,8 +227,8 @@ class PaintTask:
 
     def step_loss(self, progress: Progress) -> StepLoss:
         """Of one batch of views; half of them see what was painted a frame before."""
-        before, now, random = self._batches.batch(progress.updates)
-        carried = torch.from_numpy(random.random(len(now.poses)) < _CARRIED)
+        before, now, random = on(self._device, self._batch(progress.updates))
+        carried = torch.from_numpy(random.random(len(now.poses)) < _CARRIED).to(self._device)
         if bool(carried.any()):
             index = torch.nonzero(carried)[:, 0]
             some_before, some = frame_of(before, index), frame_of(now, index)
@@ -238,7 +246,7 @@ class PaintTask:
         return StepLoss(total=total, parts=parts, frames=len(now.poses))
 
     def _first_step(self, seen: Seen) -> Painted:
-        with torch.autocast("cpu", dtype=torch.bfloat16):
+        with torch.autocast(self._device.type, dtype=torch.bfloat16):
             return self._net.first_step(seen, filled(seen), self._config.sigma_max)
 
     def losses(self, made: Painted, views: Views) -> dict[str, Tensor]:
@@ -294,9 +302,13 @@ class HeldOutViews:
         k = len(config.classes)
         confusion, states = torch.zeros(k * k), torch.zeros(9)
         rows: list[list[Tensor]] = []
-        for i, views in enumerate(self._views):
+        device = next(net.parameters()).device
+        for i, held in enumerate(self._views):
+            views = on(device, held)
             base = filled(views.seen)
-            made = net.first_step(views.seen, base, config.sigma_max)
+            cpu = torch.device("cpu")
+            made = on(cpu, net.first_step(views.seen, base, config.sigma_max))
+            views, base = held, base.cpu()
             square = ((made.mean.clamp(-1, 1) - views.target) / 2).square().mean(dim=1)
             never = views.visibility == 0
             sums["base"] += float(((base.clamp(-1, 1) - views.target) / 2).square().mean())

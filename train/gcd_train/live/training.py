@@ -55,10 +55,10 @@ def train_live(recipe: LiveRecipe, places: LivePlaces, stop: StopSignal) -> Path
     _require_apart(places)
     folder, paths, held_out = RunFolder(places.out), training_paths(places.data), clip_paths(places.valid)
     torch.manual_seed(recipe.seed)
-    networks = LiveNetworks(recipe.model).to(memory_format=torch.channels_last)
+    networks = LiveNetworks(recipe.model).to(_device(recipe.device), memory_format=torch.channels_last)  # pyright: ignore
     measured = held_out[:: max(len(held_out) // _VALID_SHARE, 1)]
     run = partial(_stage, recipe, folder, stop)
-    depth = DepthTask(networks.depth, recipe.model, paths, measured, recipe.depth.batch, recipe.seed)
+    depth = DepthTask(networks.depth, recipe.model, paths, measured, recipe.depth.batch, recipe.seed, recipe.workers)
     run("depth", recipe.depth, depth)
     inputs = places.out / "inputs"
     for name, chosen, net in (
@@ -69,13 +69,21 @@ def train_live(recipe: LiveRecipe, places: LivePlaces, stop: StopSignal) -> Path
         _make_all_inputs(inputs / name, chosen, net, recipe, stop)
     batches = ViewBatches(paths, [inputs / "exact", inputs / "learned"], recipe.model, recipe.paint.batch, recipe.seed)
     views = HeldOutViews(measured, inputs / "held-out", recipe.model)
-    run("paint", recipe.paint, PaintTask(networks.paint, recipe.model, batches, paths, views))
+    run("paint", recipe.paint, PaintTask(networks.paint, recipe.model, batches, paths, views, recipe.workers))
     batches = ViewBatches(paths, [inputs / "learned"], recipe.model, recipe.detail.batch, recipe.seed + 1)
-    run("detail", recipe.detail, DetailTask(networks.paint, networks.depth, recipe.model, batches, views))
+    run(
+        "detail",
+        recipe.detail,
+        DetailTask(networks.paint, networks.depth, recipe.model, batches, views, recipe.workers),
+    )
     path = places.out / f"{recipe.name}.safetensors"
-    save_live(path, networks, recipe.name, overwrite=True)
+    save_live(path, networks.cpu(), recipe.name, overwrite=True)
     _log.info("wrote %s", path)
     return path
+
+
+def _device(name: str) -> torch.device:
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
 def _require_apart(places: LivePlaces) -> None:
@@ -121,7 +129,7 @@ def _make_all_inputs(
     if not missing:
         return
     _log.info("working out what is seen of %d clips (%s)", len(missing), out.name)
-    state = None if net is None else {name: value.clone() for name, value in net.state_dict().items()}
+    state = None if net is None else {name: value.cpu().clone() for name, value in net.state_dict().items()}
     work = partial(_inputs_of, out, state, recipe)
     for outcome in map_items(work, list(_shares(missing)), workers=max(recipe.workers, 1)):
         outcome.unwrap()
