@@ -13,6 +13,7 @@ import torch
 from gcd_model import (
     FAMILIES,
     CheckpointError,
+    ModelConfig,
     ModelError,
     Schedule,
     Traits,
@@ -28,7 +29,7 @@ from gcd_node.life.live_config import LiveConfig
 from gcd_node.optics.source_pose import in_words
 from gcd_node.recording.folder import LimitReachedError, check_folder
 from gcd_node.rendering.preparation import prepare_run
-from gcd_node.rendering.sampling import drawing_options
+from gcd_node.rendering.sampling import drawing_options, sampler_in_use
 from gcd_node.rendering.virtual_view import VirtualViews
 from gcd_node.session import load_model, model_threads, open_session
 from gcd_node.sources import open_source
@@ -208,7 +209,7 @@ def _traits(report: WeightsReport, section: ModelSection) -> Traits:
         family=None if report.family is None else FAMILIES[report.family],
         move_time=report.move_time,
         sha256_12=report.sha256_12,
-        precision=section.dtype or ("bfloat16" if device != "cpu" else "float32"),
+        precision=section.dtype or ("bfloat16" if device != "cpu" and report.family != "live" else "float32"),
         device=device,
         trained=report.trained,
         uncertainty_scale=report.uncertainty_scale,
@@ -257,7 +258,11 @@ def _time(config: NodeConfig, traits: Traits, info: SourceInfo) -> str:
     _, fps = prepare_run(config, traits, info)
     period_s = (config.window.stride or traits.config.frames) / fps
     model = config.model
-    runs = Schedule.of(traits.config, drawing_options(model)).evaluations * model.samples * len(config.view)
+    if isinstance(traits.config, ModelConfig):
+        runs = Schedule.of(traits.config, drawing_options(model)).evaluations
+    else:
+        runs = sampler_in_use(model, traits).steps * traits.config.frames
+    runs *= model.samples * len(config.view)
     return (
         f"a window every {period_s:.2f} s, {runs} network evaluations each, so {1000 * period_s / runs:.1f} ms for one "
         f"if none is to be left out; {model_threads(model)} CPU threads"

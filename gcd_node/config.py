@@ -17,6 +17,7 @@ Positive: TypeAlias = Annotated[float, Meta(gt=0)]
 NotNegative: TypeAlias = Annotated[float, Meta(ge=0)]
 Count: TypeAlias = Annotated[int, Meta(ge=1)]
 _LEAST_ROTATE_MB, _LEAST_ROTATE_S = 0.1, 1.0
+Matrix: TypeAlias = Annotated[tuple[float, ...], Meta(min_length=16, max_length=16)]
 ViewId: TypeAlias = Annotated[str, Meta(pattern=r"^(?!src$)[a-z0-9_]{1,16}$(?!\n)")]  # src is the input
 
 
@@ -25,8 +26,9 @@ class SourcePose(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     elevation_deg, radius: for models steered by angles: above the ground plane (left out, 5), and distance to the
         scene's centre, metres or scene units (left out, 15). Views are differences, so rigid transforms alone need it.
-    height_m, forward_m, left_m, tilt_deg: for models that warp by known planes: above the ground, ahead and to the
-        left of the vehicle's origin, and how far the camera looks down. What is left out is as the model was trained.
+    height_m, forward_m, left_m, tilt_deg: for models that warp by known planes, and for the live model: above the
+        ground, ahead and to the left of the vehicle's origin, and how far the camera looks down. What is left out is as
+        the model was trained.
     """
 
     elevation_deg: Annotated[float, Meta(gt=-90, lt=90)] | None = None
@@ -77,7 +79,7 @@ class SourceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         out, 10). Not for a log, whose pictures have stamps.
     hfov_deg: horizontal field of view of the source picture, if known; then no lens the source itself knows is used.
         What is wider than the model was trained with is cut off, if enough pixels are left. Published as intrinsics,
-        and part of the mount for models that warp by known planes.
+        part of the mount for models that warp by known planes, and what the live model needs to know most.
     resize: "released" is the bilinear resize the checkpoints were trained with, "area" averages (less aliasing). Where
         there is a calibration neither: pictures are undistorted at twice the size and averaged.
     allow_upscale: enlarge pictures that are smaller than the model takes, instead of refusing them.
@@ -149,6 +151,10 @@ class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     steps, solver, guidance, guidance_interval: what is stated wins over quality. guidance: scale of the first and of
         the last frame; guidance_interval: lowest and highest noise level at which it applies (left out, at all).
     cond_aug: strength of the noise on the conditioning frames.
+    depth_model: for the live model: an ONNX depth network whose depth takes the place of its own. depth_kind: "metric"
+        gives metres; "inverse" is relative, and [source.pose] says where the ground is that gives the scale.
+    on_bad_depth: where that network fails on a frame: "learned" goes on with the model's own depth for it, "stop" drops
+        the windows that hold the frame.
     """
 
     weights: str
@@ -171,6 +177,9 @@ class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     cond_aug: Annotated[float, Meta(ge=0)] | None = None
     head_width: Count | None = None
     image_heads: Count | None = None
+    depth_model: str | None = None
+    depth_kind: Literal["metric", "inverse"] = "metric"
+    on_bad_depth: Literal["learned", "stop"] = "learned"
 
     def __post_init__(self) -> None:
         low, high = self.guidance_interval or (0.0, 0.0)
@@ -181,23 +190,53 @@ class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 class ViewConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A virtual camera.
 
-    fixed: its goal pose, as differences from the source camera; none for a checkpoint with one fixed view.
+    fixed: its goal pose, as differences from the source camera; none for a checkpoint with one fixed view, or for the
+        live model's view from above and behind.
     orbit: starts there and swings in azimuth by rate_deg_s, between -amplitude_deg and +amplitude_deg.
+    position_m, look_at_m: of a fixed view, instead of differences, for models that take any pose: where it stands and
+        what it looks at, (x, y, z) in the frame of what the source camera is mounted on (x ahead, y left, z up, the
+        ground at z = 0).
+    source_from_view: the same as 16 numbers, a rigid 4x4 matrix row by row: the view's camera in source camera axes.
     """
 
     kind: Literal["fixed", "orbit"] = "fixed"
     azimuth_deg: float = 0.0
     elevation_deg: float = 0.0
     radius: float = 0.0
+    position_m: tuple[float, float, float] | None = None
+    look_at_m: tuple[float, float, float] | None = None
+    source_from_view: Matrix | None = None
     rate_deg_s: float | None = None
     amplitude_deg: Positive | None = None
 
     def __post_init__(self) -> None:
+        if (self.position_m is None) != (self.look_at_m is None):
+            raise ValueError("position_m says where a view stands, look_at_m what it looks at: state both")
+        ways = [self.position_m is not None, self.source_from_view is not None, not self.at_source]
+        if sum(ways) > 1:
+            raise ValueError(
+                "a goal is azimuth_deg, elevation_deg and radius, or position_m and look_at_m, or source_from_view: "
+                "state one of them"
+            )
+        if self.kind == "orbit" and any(ways[:2]):
+            raise ValueError('an orbit swings about the scene: leave position_m and source_from_view to kind = "fixed"')
         moving = (self.rate_deg_s is not None, self.amplitude_deg is not None)
         if self.kind == "orbit" and not all(moving):
             raise ValueError("an orbit needs rate_deg_s and amplitude_deg")
         if self.kind == "fixed" and any(moving):
             raise ValueError('a fixed view has no rate_deg_s and no amplitude_deg; for these say kind = "orbit"')
+
+    @property
+    def at_source(self) -> bool:
+        """Whether there is no difference of angles and radius."""
+        return (self.azimuth_deg, self.elevation_deg, self.radius) == (0.0, 0.0, 0.0)
+
+    @property
+    def plain(self) -> dict[str, object]:
+        """Plain values; of position_m, look_at_m and source_from_view, which came later, those that are stated."""
+        later = ("position_m", "look_at_m", "source_from_view")
+        told: dict[str, object] = msgspec.to_builtins(self)
+        return {name: value for name, value in told.items() if name not in later or value is not None}
 
 
 class PublishConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -5,7 +5,7 @@ import hashlib
 import msgspec
 from msgspec.structs import replace
 
-from gcd_model import ASSUMED_SOURCE, Traits
+from gcd_model import ASSUMED_SOURCE, CameraMount, ModelConfig, Traits
 from gcd_node.config import ModelSection, NodeConfig, SourcePose, WindowConfig
 from gcd_node.rendering.sampling import sampler_in_use
 
@@ -24,13 +24,15 @@ def config_digest(config: NodeConfig, traits: Traits) -> str:
     """
     source = config.source
     taken = source.resize, source.allow_upscale, source.hfov_deg, _pose(source.pose, traits)
-    filled = taken, _told(_model(config.model, traits)), config.view, _window(config.window, traits)
+    filled = taken, _told(_model(config.model, traits)), _views(config), _window(config.window, traits)
     plain = _without_negative_zero(msgspec.to_builtins(filled))
     return hashlib.sha256(msgspec.json.encode(plain, order="deterministic")).hexdigest()[:12]
 
 
 def _model(section: ModelSection, traits: Traits) -> ModelSection:
-    sampling, family, tower = traits.config.sampling, traits.family, traits.config.image_encoder
+    sampling, family = traits.config.sampling, traits.family
+    networks = traits.config if isinstance(traits.config, ModelConfig) else None
+    tower = None if networks is None else networks.image_encoder
     used = sampler_in_use(section, traits)
     return replace(
         section,
@@ -48,7 +50,7 @@ def _model(section: ModelSection, traits: Traits) -> ModelSection:
         cond_aug=sampling.augmentation if section.cond_aug is None else section.cond_aug,
         move_time=traits.move_time if section.move_time is None else section.move_time,
         motion_bucket=family.motion_bucket if section.motion_bucket is None and family else section.motion_bucket,
-        head_width=traits.config.unet.head_width,
+        head_width=None if networks is None else networks.unet.head_width,
         image_heads=None if tower is None else tower.heads,
     )
 
@@ -57,8 +59,12 @@ def _told(section: ModelSection) -> dict[str, object]:
     """Without what is newer than the first recordings and as it was then, so that those keep their name."""
     told: dict[str, object] = msgspec.structs.asdict(section)
     as_ever = {"adapter": None, "quality": "exact", "solver": "euler", "guidance_interval": None}
-    as_ever |= {"engine": None, "providers": ()}
+    as_ever |= {"engine": None, "providers": (), "depth_model": None, "depth_kind": "metric", "on_bad_depth": "learned"}
     return {name: value for name, value in told.items() if name not in as_ever or value != as_ever[name]}
+
+
+def _views(config: NodeConfig) -> dict[str, dict[str, object]]:
+    return {view_id: view.plain for view_id, view in config.view.items()}
 
 
 def _window(section: WindowConfig, traits: Traits) -> WindowConfig:
@@ -68,6 +74,8 @@ def _window(section: WindowConfig, traits: Traits) -> WindowConfig:
 def _pose(pose: SourcePose | None, traits: Traits) -> SourcePose | None:
     """Where the camera stands in the words the model knows; None for a model that has no use for them."""
     stated, mount = pose or SourcePose(), traits.mount
+    if traits.live and stated.on_vehicle:
+        mount = CameraMount()
     if mount is not None:
         return SourcePose(
             height_m=mount.height_m if stated.height_m is None else stated.height_m,

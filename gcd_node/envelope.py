@@ -12,14 +12,14 @@ import uuid
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gcd_node.errors import ConfigError, MessageError
 from gcd_node.wire.class_colours import paint
-from gcd_node.wire.header import EndHeader, OriginHeader, ViewHeader, check_version
+from gcd_node.wire.header import Encoding, EndHeader, OriginHeader, ViewHeader, check_version
 from gcd_node.wire.record_json import dump, from_json, parse, to_json
 
 PREFIX = struct.Struct("<32s4sHHQQII")
@@ -38,13 +38,16 @@ PREVIEW_ID = "src"
 PREVIEW_TOPIC = f"{PREVIEW_ID}/frm"
 """The preview of the input."""
 
-ViewKind: TypeAlias = Literal["win", "frm", "std", "cls"]
+ViewKind: TypeAlias = Literal["win", "frm", "std", "cls", "vis", "depth"]
 NoteTopic: TypeAlias = Literal["status", "event", "meta"]
 Buffer: TypeAlias = bytes | memoryview
 
 _VIEW_ID = re.compile(r"[a-z0-9_]{1,16}")
-_VIEW_TOPIC = re.compile(r"view/([a-z0-9_]{1,16})/(?:win|frm|std|cls)|(src)/frm")
+_KINDS = "|".join(get_args(ViewKind))
+_VIEW_TOPIC = re.compile(rf"view/([a-z0-9_]{{1,16}})/(?:{_KINDS})|(src)/frm")
 _NOTES = ("status", "event", "meta")
+_ENCODINGS: Mapping[str, Encoding] = types.MappingProxyType({"cls": "class8", "vis": "class8", "depth": "invdepth16"})
+_MIDDLE_GREY = 0.1  # 1/m: what is 10 m away is shown at half brightness
 
 
 class Flags(enum.IntFlag):
@@ -60,9 +63,10 @@ _KNOWN_FLAGS = 7
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ViewMessage:
-    """Pixels of one view: a window of frames, single frames, their standard deviation, or the window's class map.
+    """Pixels of one view: a window of frames, single frames, their standard deviation, or the window's class map,
+    visibility or inverse depth.
 
-    topic: `view/<id>/win`, `/frm`, `/std` or `/cls`, or `src/frm`. payload: the bytes `header` describes.
+    topic: `view/<id>/` and a ViewKind, or `src/frm`. payload: the bytes `header` describes.
     sequence: number on this topic, counted by the publisher.
 
     Raises:
@@ -78,8 +82,11 @@ class ViewMessage:
         _check_view_topic(self.topic, self.header.view_id)
         if self.topic.endswith("/std") and self.header.scale is None:
             raise MessageError("a std message needs `scale` in its header")
-        if self.topic.endswith("/cls") and self.header.classes is None:
-            raise MessageError("a cls message needs encoding class8 and `classes` in its header")
+        encoding, expected = self.header.encoding, _ENCODINGS.get(kind_of(self.topic))
+        if expected != (encoding if encoding in _ENCODINGS.values() else None):
+            raise MessageError(f"{self.topic} is of encoding {expected or 'rgb8, jpeg or mono8'}, got {encoding}")
+        if encoding == "class8" and self.header.classes is None:
+            raise MessageError("a message of encoding class8 needs `classes` in its header")
         if self.header.offsets is not None:
             _check_offsets(self.header.offsets, self.header.shape[0])
         wanted, got = self.header.payload_bytes, len(self.payload)
@@ -186,10 +193,12 @@ def images(message: ViewMessage) -> NDArray[np.uint8]:
     copied.
 
     Raises:
-        MessageError: a JPEG frame is damaged or has another size.
+        MessageError: a JPEG frame is damaged or has another size, or the message is of kind depth: see inverse_depth().
         ConfigError: the view is JPEG and cv2 is not installed here.
     """
     header = message.header
+    if header.encoding == "invdepth16":
+        raise MessageError(f"{message.topic} holds no levels; read its inverse_depth")
     if header.offsets is None:
         return np.frombuffer(message.payload, np.uint8).reshape(header.shape)
     try:
@@ -200,12 +209,38 @@ def images(message: ViewMessage) -> NDArray[np.uint8]:
     return decode_frames(message.payload, header.offsets, header.shape)
 
 
-def colours(message: ViewMessage) -> NDArray[np.uint8]:
-    """The pixels to look at, u8 RGB [T, H, W, 3], read-only: a class map in its colours, grey levels as grey.
+def inverse_depth(message: ViewMessage) -> NDArray[np.float32]:
+    """Of a message of kind depth: inverse depth along the view's axis in 1/m, float32 [T, H, W]; 0: none, or infinitely
+    far. Under painted pixels it is a guess.
 
     Raises:
-        MessageError: a pixel holds a number that the header's `classes` do not name. Else as images().
+        MessageError: a message of another kind, or a value that is negative or not finite.
     """
+    if message.header.encoding != "invdepth16":
+        raise MessageError(f"{message.topic} holds no depth; subscribe to kind depth")
+    found = np.frombuffer(message.payload, "<f2").reshape(message.header.shape[:3]).astype(np.float32)
+    if not (np.isfinite(found) & (found >= 0)).all():
+        raise MessageError("inverse depth must be finite and not negative")
+    return found
+
+
+def depth_m(message: ViewMessage) -> NDArray[np.float32]:
+    """The same as depth in metres, NaN where there is none. Raises MessageError as inverse_depth()."""
+    inverse = inverse_depth(message)
+    return np.divide(1, inverse, out=np.full_like(inverse, np.nan), where=inverse > 0)
+
+
+def colours(message: ViewMessage) -> NDArray[np.uint8]:
+    """The pixels to look at, u8 RGB [T, H, W, 3], read-only: a class map in its colours, grey levels as grey, depth as
+    grey that is brighter the nearer it is.
+
+    Raises:
+        MessageError: a pixel holds a number that the header's `classes` do not name. Else as images(), inverse_depth().
+    """
+    if message.header.encoding == "invdepth16":
+        inverse = inverse_depth(message)[..., None]
+        grey = np.rint(255 * inverse / (inverse + _MIDDLE_GREY)).astype(np.uint8)
+        return np.broadcast_to(grey, (*grey.shape[:3], 3))
     pixels = images(message)
     if message.header.classes is not None:
         return paint(pixels[..., 0], message.header.classes)
@@ -232,10 +267,15 @@ def view_topic(view_id: str, kind: ViewKind) -> str:
     return f"view/{view_id}/{kind}"
 
 
+def kind_of(topic: str) -> str:
+    """The last part of a view's topic: its ViewKind."""
+    return topic.rpartition("/")[2]
+
+
 def topic_key(topic: str) -> bytes:
     """What to subscribe to for this topic alone: 32 bytes, NUL-padded, so no topic is a prefix of another."""
     if _VIEW_TOPIC.fullmatch(topic) is None and topic not in _NOTES:
-        raise MessageError(f"a topic is view/<id>/win|frm|std|cls, src/frm or {', '.join(_NOTES)}, got {topic[:40]!r}")
+        raise MessageError(f"a topic is view/<id>/{_KINDS}, src/frm or {', '.join(_NOTES)}, got {topic[:40]!r}")
     return topic.encode("ascii").ljust(TOPIC_BYTES, b"\0")
 
 
@@ -290,7 +330,7 @@ _ORIGIN_KEYS = frozenset({"proto", "node_id", "boot_id", "t_publish"})
 def _check_view_topic(topic: str, view_id: str) -> None:
     match = _VIEW_TOPIC.fullmatch(topic)
     if match is None:
-        raise MessageError(f"a view's topic is view/<id>/win|frm|std|cls or src/frm, got {topic[:40]!r}")
+        raise MessageError(f"a view's topic is view/<id>/{_KINDS} or src/frm, got {topic[:40]!r}")
     if view_id not in match.groups():
         raise MessageError(f"topic {topic} must carry view_id {match.group(1) or 'src'}, got {view_id[:40]!r}")
 

@@ -31,6 +31,7 @@ from gcd_node.envelope import (
     colours,
     decode,
     images,
+    inverse_depth,
     topic_key,
     view_topic,
 )
@@ -70,6 +71,11 @@ class ReceivedView:
         return images(self.message)
 
     @property
+    def inverse_depth(self) -> NDArray[np.float32]:
+        """Of kind depth: 1/m, float32 [T, H, W]; 0 for none. See envelope.inverse_depth()."""
+        return inverse_depth(self.message)
+
+    @property
     def colours(self) -> NDArray[np.uint8]:
         """The pixels to look at, u8 RGB [T, H, W, 3], read-only; see envelope.colours()."""
         return colours(self.message)
@@ -93,8 +99,9 @@ class ViewSubscriber:
     endpoint: "ipc" for the node on this machine, or ipc://PATH, tcp://HOST:PORT.
     view: the view's id, or "src" (of kind "frm") for the preview of the input; None for all views, which needs
         conflate=False.
-    kind: "win" for windows, "frm" for frames at the goal pose, "std" for standard deviations, "cls" for class maps;
-        None for all kinds, which needs conflate=False.
+    kind: "win" for windows, "frm" for frames at the goal pose, "std" for standard deviations, "cls" for class maps,
+        "vis" for what was seen and what is painted, "depth" for inverse depth. Several, or None for all kinds, need
+        conflate=False; those of one window come in the order win, cls, vis, depth.
     conflate: keep only the newest message, so that a slow reader never works on old ones.
     max_age_ms: what is older raises StaleError; None for no limit.
     max_payload: largest payload accepted, bytes.
@@ -109,19 +116,21 @@ class ViewSubscriber:
         self,
         endpoint: str = "ipc",
         view: str | None = None,
-        kind: ViewKind | None = "win",
+        kind: ViewKind | tuple[ViewKind, ...] | None = "win",
         *,
         conflate: bool = True,
         max_age_ms: float | None = None,
         max_payload: int = MAX_PAYLOAD,
         keys: ClientKeys | None = None,
     ) -> None:
-        if conflate and (view is None or kind is None):
+        kinds = kind if isinstance(kind, tuple) else (kind,)
+        if conflate and (view is None or len(kinds) > 1 or None in kinds):
             raise ConfigError(
                 "a conflated socket keeps one message of all topics: name a view and a kind, or set conflate=False"
             )
-        self._link = _Link(resolve_endpoint(endpoint, "data"), (_key(view, kind),), conflate, max_payload, keys)
-        self._suffix = "" if kind is None else f"/{kind}"
+        wanted = tuple({_key(view, each) for each in kinds})
+        self._link = _Link(resolve_endpoint(endpoint, "data"), wanted, conflate, max_payload, keys)
+        self._suffixes = tuple("" if each is None else f"/{each}" for each in kinds)
         self._max_age_ms = max_age_ms
         self._streams: dict[str, _Stream] = {}
         self._boot_id: str | None = None
@@ -143,7 +152,7 @@ class ViewSubscriber:
         """
         deadline = _deadline(timeout_ms)
         while (message := self._link.receive(deadline)) is not None:
-            if isinstance(message, NoteMessage) or not message.topic.endswith(self._suffix):
+            if isinstance(message, NoteMessage) or not message.topic.endswith(self._suffixes):
                 continue
             self._notice_boot(message.header.boot_id)
             if isinstance(message, EndMessage):

@@ -1,8 +1,9 @@
 """One clip, one view, offline: what `gcd-node synthesize` does between reading its input and writing its output."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,13 +17,14 @@ from gcd_model import (
     Trajectory,
     View,
     ViewSynthesizer,
+    visibility_of,
 )
 from gcd_node.config import SourcePose
 from gcd_node.errors import OutputError, SourceError, UsageError
 from gcd_node.offline_clip import OfflineClip
 from gcd_node.optics.source_pose import stated_sphere
 from gcd_node.pictures.array_file import read_npy, read_npz, write_npz
-from gcd_node.pictures.comparison import legend
+from gcd_node.pictures.comparison import hatched, legend
 from gcd_node.pictures.files import (
     Image,
     heat,
@@ -35,7 +37,7 @@ from gcd_node.pictures.files import (
     write_video,
 )
 from gcd_node.wire.class_colours import paint
-from gcd_node.wire.header import ClassRecord
+from gcd_node.wire.header import VISIBILITY, ClassRecord
 
 _STRIP_FRAMES = 7
 
@@ -118,15 +120,20 @@ def render(
     options: RenderOptions,
     augmentation: Augmentation,
 ) -> View:
-    """Encode the clip and render the view."""
-    return synthesizer.render(synthesizer.encode(source.clip, augmentation), [trajectory], options)[0]
+    """Encode the clip and render the view. Where the model does not tell what was seen, the clip's depth does."""
+    view = synthesizer.render(synthesizer.encode(source.clip, augmentation), [trajectory], options)[0]
+    if view.visibility is not None or source.clip.depth is None:
+        return view
+    return replace(view, visibility=visibility_of(source.clip, trajectory))
 
 
 def write_view(out: Path, source: OfflineClip, view: View, classes: Sequence[ClassRecord]) -> list[Path]:
-    """Write frames, videos, pictures and class numbers; gives the paths worth telling. Raises OutputError.
+    """Write frames, videos, pictures, class numbers, visibility and depth; gives the paths worth telling.
 
     classes: the ontology of the view's class map, empty if the model makes none.
     The first sample goes to frames/ and view.mp4, further ones to frames_s1/, view_s1.mp4, and so on.
+    Raises:
+        OutputError: it cannot be written.
     """
     written: list[Path] = []
     try:
@@ -141,7 +148,17 @@ def write_view(out: Path, source: OfflineClip, view: View, classes: Sequence[Cla
             class_map = paint(view.classes[0].numpy(), classes)
             save_classes(out / "classes.npz", view.classes.numpy(), classes)
             written.append(out / "classes.npz")
-        write_png(out / "strip.png", strip_picture(source.pictures, to_u8(view.video.numpy()), class_map, classes))
+        pictures, maps = to_u8(view.video.numpy()), [] if class_map is None else [class_map]
+        if view.visibility is not None:
+            seen = hatched(pictures, view.visibility.numpy())
+            write_npz(out / "visibility.npz", {"visibility": view.visibility.numpy(), **_ontology(VISIBILITY)})
+            write_video(out / "seen.mp4", list(seen), source.clip.fps)
+            written += [out / "visibility.npz", out / "seen.mp4"]
+            maps.insert(0, seen)
+        if view.inverse_depth is not None:
+            write_npz(out / "depth.npz", {"inverse_depth": view.inverse_depth.numpy()})
+            written.append(out / "depth.npz")
+        write_png(out / "strip.png", strip_picture(source.pictures, pictures, maps, classes))
         written.append(out / "strip.png")
         if view.std is not None:
             write_png(out / "uncertainty.png", uncertainty_picture(view.std.numpy()))
@@ -165,19 +182,21 @@ def save_classes(path: Path, numbers: NDArray[np.uint8], classes: Sequence[Class
 
     The file appears whole or not at all. Raises OutputError.
     """
-    ontology = {
+    write_npz(path, {"classes": numbers, **_ontology(classes)})
+
+
+def _ontology(classes: Sequence[ClassRecord]) -> dict[str, NDArray[Any]]:
+    return {
         "ids": np.array([each.id for each in classes], np.uint8),
         "names": np.array([each.name for each in classes]),
         "colours": np.array([each.colour for each in classes], np.uint8),
     }
-    write_npz(path, {"classes": numbers, **ontology})
 
 
-def strip_picture(inputs: Image, views: Image, class_map: Image | None, classes: Sequence[ClassRecord]) -> Image:
-    """Input above view, and if there is one the class map (in colours) and its legend, at a few moments."""
+def strip_picture(inputs: Image, views: Image, maps: Sequence[Image], classes: Sequence[ClassRecord]) -> Image:
+    """Input above view, what is known of the view below it, and the legend of its classes, at a few moments."""
     chosen = spread(len(views), _STRIP_FRAMES)
-    rows = [inputs, views] if class_map is None else [inputs, views, class_map]
-    picture = strip([[row[i] for i in chosen] for row in rows])
+    picture = strip([[row[i] for i in chosen] for row in (inputs, views, *maps)])
     return np.concatenate([picture, legend(classes, picture.shape[1])]) if classes else picture
 
 

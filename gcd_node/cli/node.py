@@ -42,10 +42,13 @@ Once: TypeAlias = Annotated[
 Endpoint: TypeAlias = Annotated[str, Argument(metavar="ENDPOINT", help="ipc, ipc://PATH or tcp://HOST:PORT.")]
 ViewName: TypeAlias = Annotated[str | None, Option("--view", help="One view's id; else all.")]
 Kind: TypeAlias = Annotated[
-    Literal["win", "frm", "std", "cls", "all"],
-    Option(help="Windows, frames at the goal pose, deviations, class maps, or all of these."),
+    Literal["win", "frm", "std", "cls", "vis", "depth", "all"],
+    Option(help="Windows, frames at the goal pose, deviations, class maps, what was seen, depth, or all of these."),
 ]
 Save: TypeAlias = Annotated[Path | None, Option(help="Folder for PNG files and a lossless MKV per view.")]
+Hatch: TypeAlias = Annotated[
+    bool, Option("--hatch", help="Save windows with lines over their painted pixels; over all where nobody says.")
+]
 Limit: TypeAlias = Annotated[int | None, Option(min=1, help="End after so many messages.")]
 Timeout: TypeAlias = Annotated[float | None, Option(help="End when nothing came for so many seconds.")]
 
@@ -124,18 +127,22 @@ def view(
     name: ViewName = None,
     kind: Kind = "win",
     save: Save = None,
+    hatch: Hatch = False,
     limit: Limit = None,
     timeout: Timeout = None,
     key_folder: KeyFolder = None,
     node_key: NodeKey = None,
 ) -> None:
     """Watch the views of a node: a live table, and with --save pictures on disk."""
-    wanted = None if kind == "all" else kind
+    if hatch and kind not in ("win", "all"):
+        raise typer.BadParameter("--hatch is for windows: --kind win or all")
+    wanted = None if kind == "all" else ("win", "vis") if hatch else kind
     request = WatchRequest(
         endpoint=endpoint,
         view=name,
         kind=wanted,
         save=save,
+        hatch=hatch,
         limit=limit,
         timeout_s=timeout,
         keys=client_keys(key_folder, node_key),

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated, Literal, TypeAlias
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -16,14 +16,16 @@ from gcd_model import (
     RenderOptions,
     SolverName,
     SphericalDelta,
+    Traits,
     ViewSynthesizer,
     load_synthesizer,
 )
 from gcd_node.cli.weights import FamilyOption, HeadWidth, ImageHeads
 from gcd_node.config import SourcePose
 from gcd_node.errors import UsageError
-from gcd_node.offline_clip import ClipRequest, read_clip
-from gcd_node.optics.source_pose import require_usable, stated_mount
+from gcd_node.offline_clip import ClipRequest, read_clip, with_depth
+from gcd_node.optics.source_pose import assumed_hfov_deg, require_usable, stated_mount
+from gcd_node.sources.depth import OnnxDepth
 from gcd_node.synthesize import (
     InjectedNoise,
     ViewRequest,
@@ -37,6 +39,7 @@ from gcd_node.synthesize import (
 from gcd_node.wire.view_message import ontology
 
 _VIEW, _CLIP, _SAMPLING, _MODEL = "The view", "The clip", "Sampling", "The model"
+_DEPTH = "Depth from elsewhere, for the live model; for others it tells what was seen"
 _MOUNT = "The camera's mount; what is left out is as the model was trained"
 
 Input: TypeAlias = Annotated[
@@ -78,6 +81,26 @@ MountTilt: TypeAlias = Annotated[
 ]
 FieldOfView: TypeAlias = Annotated[
     float | None, Option(help="Horizontal field of view of the input, degrees.", rich_help_panel=_MOUNT)
+]
+Depth: TypeAlias = Annotated[
+    Path | None,
+    Option(
+        help="Of the input's frames: a folder of 16-bit PNG in mm, or .npy of [T, H, W] metres.", rich_help_panel=_DEPTH
+    ),
+]
+DepthModel: TypeAlias = Annotated[Path | None, Option(help="A depth network instead, as ONNX.", rich_help_panel=_DEPTH)]
+DepthKind: TypeAlias = Annotated[
+    Literal["metric", "inverse"],
+    Option(help="What it gives: metres, or relative inverse depth (state the mount).", rich_help_panel=_DEPTH),
+]
+Right: TypeAlias = Annotated[
+    Path | None, Option(help="The right video of a stereo pair; INPUT is the left one.", rich_help_panel=_DEPTH)
+]
+Calibration: TypeAlias = Annotated[
+    Path | None, Option(help="Of the pair: JSON as DepthAI writes it.", rich_help_panel=_DEPTH)
+]
+Rectified: TypeAlias = Annotated[
+    bool, Option("--rectified", help="The device has rectified the pair.", rich_help_panel=_DEPTH)
 ]
 Start: TypeAlias = Annotated[int, Option(help="First frame of the input.", rich_help_panel=_CLIP)]
 Stride: TypeAlias = Annotated[int, Option(help="Take every so-many-th frame.", rich_help_panel=_CLIP)]
@@ -156,6 +179,12 @@ def synthesize(
     mount_left: MountLeft = None,
     mount_tilt: MountTilt = None,
     hfov_deg: FieldOfView = None,
+    right: Right = None,
+    calibration: Calibration = None,
+    rectified: Rectified = False,
+    depth: Depth = None,
+    depth_model: DepthModel = None,
+    depth_kind: DepthKind = "metric",
     start: Start = 0,
     stride: Stride = 1,
     fps: Fps = None,
@@ -183,9 +212,21 @@ def synthesize(
 ) -> None:
     """See one clip from another camera, offline.
 
-    Writes frames, a video, input above view, the class map if the model makes one, and where several samples differ.
+    Writes frames, a video, input above view, and what the model tells of it: class map, depth, which pixels were seen,
+    where several samples differ.
     """
-    clip = ClipRequest(start=start, stride=stride, fps=fps, height=height, width=width, hfov_deg=hfov_deg)
+    clip = ClipRequest(
+        start=start,
+        stride=stride,
+        fps=fps,
+        height=height,
+        width=width,
+        hfov_deg=hfov_deg,
+        depth=depth,
+        right=right,
+        calibration=calibration,
+        rectified=rectified,
+    )
     source = _pose((source_elevation_deg, source_radius), (mount_height, mount_forward, mount_left, mount_tilt))
     delta = _delta(azimuth_deg, elevation_deg, radius)
     wanted = ViewRequest(delta=delta, poses=poses, trajectory=trajectory, move_time=move_time, source=source)
@@ -194,11 +235,14 @@ def synthesize(
     sampler = replace(named, quality=quality)
     options = replace(sampler, samples=samples, seed=seed, motion_bucket=motion_bucket, initial_noise=injected.initial)
     _require_possible(input_path, save, samples)
+    if sum(each is not None for each in (right, depth, depth_model)) > 1:
+        raise UsageError("--right, --depth and --depth-model each say where depth comes from; give one of them")
     load = partial(load_synthesizer, weights, adapter=adapter, family=family, device=device, dtype=dtype, engine=engine)
     with Console(stderr=True, markup=False).status(f"loading {weights}"):
         model = load(head_width=head_width, image_heads=image_heads, providers=provider or ())
     augmentation = Augmentation(strength=cond_aug, seed=seed, noise=injected.augmentation)
-    _run(_Order(model, input_path, clip, wanted, options, augmentation), out, save)
+    network = None if depth_model is None else (depth_model, depth_kind)
+    _run(_Order(model, input_path, clip, wanted, options, augmentation, network), out, save)
 
 
 def _require_possible(input_path: Path, save: Path | None, samples: int) -> None:
@@ -216,16 +260,18 @@ class _Order:
     view: ViewRequest
     options: RenderOptions
     augmentation: Augmentation
+    depth_model: tuple[Path, Literal["metric", "inverse"]] | None
 
 
 def _run(order: _Order, out: Path, save: Path | None) -> None:
     traits = order.model.traits
     require_usable(order.view.source, traits)
-    if order.clip.hfov_deg is not None and traits.mount is None:
-        raise UsageError(f"{traits.name} has no use for --hfov-deg; leave it out")
-    source = read_clip(order.input_path, order.clip, traits)
+    source = read_clip(order.input_path, _with_field_of_view(order, traits), traits)
     mount = stated_mount(order.view.source, source.hfov_deg, traits)
     source = replace(source, clip=replace(source.clip, mount=mount))
+    if order.depth_model is not None:
+        network, kind = order.depth_model
+        source = with_depth(source, OnnxDepth(network, kind=kind, scale=mount if kind == "inverse" else None))
     path = plan(order.model, order.view, mount)
     with _progress() as progress:
         options = replace(order.options, progress=_Steps(progress))
@@ -238,6 +284,24 @@ def _run(order: _Order, out: Path, save: Path | None) -> None:
     if save is not None:
         save_arrays(save, view)
         console.print(f"wrote {save}", soft_wrap=True)
+
+
+def _with_field_of_view(order: _Order, traits: Traits) -> ClipRequest:
+    """The clip with the lens that its depth and the live model need: as stated, measured, or else as trained."""
+    clip = order.clip
+    measured = (clip.right, clip.depth, order.depth_model) != (None, None, None)
+    if measured and not traits.live and (traits.plane_warp is not None or not traits.knows_camera):
+        raise UsageError(f"{traits.name} takes no depth; leave --right, --depth and --depth-model out")
+    needed = measured or traits.live
+    if clip.hfov_deg is not None and not needed and traits.mount is None:
+        raise UsageError(f"{traits.name} has no use for --hfov-deg; leave it out")
+    if not needed or clip.right is not None or clip.hfov_deg is not None:
+        return clip
+    trained = None if traits.family is None else traits.family.hfov_deg
+    hfov_deg = assumed_hfov_deg(order.view.source) if traits.live else trained
+    if hfov_deg is None:
+        raise UsageError(f"nobody knows the field of view that depth needs, {traits.name} neither; give --hfov-deg")
+    return replace(clip, hfov_deg=hfov_deg)
 
 
 def _delta(azimuth_deg: float | None, elevation_deg: float | None, radius: float | None) -> SphericalDelta | None:

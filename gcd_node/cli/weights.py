@@ -8,7 +8,7 @@ from rich.progress import Progress
 from rich.table import Table
 from typer import Argument, Option, Typer
 
-from gcd_model import WeightsReport, convert_weights, inspect_weights
+from gcd_model import ModelConfig, WeightsReport, convert_weights, inspect_weights
 
 weights = Typer(no_args_is_help=True, help="Look into checkpoints, convert them.")
 
@@ -22,7 +22,7 @@ WeightsPath = Annotated[
 ]
 FamilyOption = Annotated[
     str | None,
-    Option(help="kubric90, kubric180, driving, driving-semantic, manipulation or svd; else told from the file."),
+    Option(help="kubric90, kubric180, driving, driving-semantic, manipulation, svd or live; else told from the file."),
 ]
 HeadWidth = Annotated[int | None, Option(help="Width of a U-Net attention head, for unpublished widths.")]
 ImageHeads = Annotated[int | None, Option(help="Attention heads of the image tower, for unpublished widths.")]
@@ -110,8 +110,7 @@ def _facts(report: WeightsReport) -> Table:
         ("camera control", config.camera),
         ("trajectory", path),
         ("frames, trained size", f"{config.frames}, {config.width}x{config.height}"),
-        ("U-Net widths", ", ".join(map(str, config.unet.widths))),
-        ("head width, image heads", f"{config.unet.head_width}, {_heads(report)}"),
+        *_widths(report),
         ("parameters used", f"{report.parameters:,}"),
         ("size on disk", f"{_mb(report.size)} MB"),
         ("digest", report.digest),
@@ -128,9 +127,17 @@ def _scale(report: WeightsReport) -> str:
     return "not measured" if scale is None else f"{scale:.3g}: the deviation over samples times this is calibrated"
 
 
-def _heads(report: WeightsReport) -> str:
-    tower = report.config.image_encoder
-    return "no image tower" if tower is None else str(tower.heads)
+def _widths(report: WeightsReport) -> tuple[tuple[str, str], ...]:
+    config = report.config
+    if not isinstance(config, ModelConfig):
+        depth, paint = (", ".join(map(str, each.widths)) for each in (config.depth, config.paint))
+        return ("depth widths", depth), ("paint widths", paint), ("paint steps", str(config.steps))
+    tower = config.image_encoder
+    heads = "no image tower" if tower is None else str(tower.heads)
+    return (
+        ("U-Net widths", ", ".join(map(str, config.unet.widths))),
+        ("head width, image heads", f"{config.unet.head_width}, {heads}"),
+    )
 
 
 def _left_out(report: WeightsReport) -> Table:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 import msgspec
 from msgspec import Meta
 
-from gcd_node.config import ViewConfig
+from gcd_node.config import Matrix, ViewConfig
 from gcd_node.security.keys import Role
 from gcd_node.wire.record_json import LARGEST_INTEGER
 
@@ -71,7 +71,8 @@ class Shutdown(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 class SetView(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Replace a view as a whole: as in a launch file, what is left out has its default, whatever it was before.
 
-    view: its id. kind, azimuth_deg, elevation_deg, radius, rate_deg_s, amplitude_deg: as in [view.*].
+    view: its id. kind, azimuth_deg, elevation_deg, radius, position_m, look_at_m, rate_deg_s, amplitude_deg: as in
+        [view.*].
     source_from_view: 16 numbers, row-major 4x4, rigid, instead of the three differences; `T_src_dst` on the wire.
     """
 
@@ -80,9 +81,9 @@ class SetView(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     azimuth_deg: float | None = None
     elevation_deg: float | None = None
     radius: float | None = None
-    source_from_view: Annotated[tuple[float, ...], Meta(min_length=16, max_length=16)] | None = msgspec.field(
-        default=None, name="T_src_dst"
-    )
+    position_m: tuple[float, float, float] | None = None
+    look_at_m: tuple[float, float, float] | None = None
+    source_from_view: Matrix | None = msgspec.field(default=None, name="T_src_dst")
     rate_deg_s: float | None = None
     amplitude_deg: Annotated[float, Meta(gt=0)] | None = None
 
@@ -103,6 +104,8 @@ class SetView(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
             azimuth_deg=self.azimuth_deg or 0.0,
             elevation_deg=self.elevation_deg or 0.0,
             radius=self.radius or 0.0,
+            position_m=self.position_m,
+            look_at_m=self.look_at_m,
             rate_deg_s=self.rate_deg_s,
             amplitude_deg=self.amplitude_deg,
         )

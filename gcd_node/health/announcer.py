@@ -12,7 +12,7 @@ from gcd_node.life.live_config import Settings
 from gcd_node.publishing.outbox import Outbox
 from gcd_node.wire.header import OriginHeader
 from gcd_node.wire.record_json import to_json
-from gcd_node.wire.view_message import Run, camera_matrix, source_pose
+from gcd_node.wire.view_message import Run, camera_matrix, published_kinds, source_pose
 
 _LOG = logging.getLogger(__name__)
 _PERIOD_S = 1.0
@@ -87,6 +87,7 @@ def metadata(run: Run, settings: Settings, fps: float) -> dict[str, object]:
         },
         "views": list(settings.revisions),
         "view_revs": dict(settings.revisions),
+        "kinds": list(published_kinds(run)),
         **calibration(run),
         "classes": [to_json(each) for each in run.classes],
         "size": [traits.config.width, traits.config.height],

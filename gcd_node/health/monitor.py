@@ -155,6 +155,16 @@ class Health:
         with self._lock:
             self._model.nan_windows += 1
 
+    def bad_depth(self) -> None:
+        """The depth of a frame could not be used."""
+        with self._lock:
+            self._model.bad_depths += 1
+
+    def ood_score(self, score: float | None) -> None:
+        """How unlike the training the last window looked to the model; None if it cannot tell."""
+        with self._lock:
+            self._model.ood_score = score
+
     def model_load(self, *, gpu_mem_mb: float | None = None, backoff_s: float = 0.0) -> None:
         """The device's memory in use, None on a CPU, and how long until the model is tried again, 0 if it works."""
         with self._lock:

@@ -64,13 +64,18 @@ class SourceHealth:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ModelHealth:
-    """The model. ooms, nan_windows: since the start. gpu_mem_mb: None on a CPU. backoff_s: until it is tried again."""
+    """The model. ooms, nan_windows, bad_depths: since the start; bad_depths are frames whose depth could not be used.
+    gpu_mem_mb: None on a CPU. backoff_s: until it is tried again. ood_score: of the last window, None for a model that
+    cannot tell.
+    """
 
     state: ModelState = "absent"
     gpu_mem_mb: float | None = None
     ooms: int = 0
     nan_windows: int = 0
+    bad_depths: int = 0
     backoff_s: float = 0.0
+    ood_score: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -227,6 +232,10 @@ class HealthReport:
             status |= {"ms_p50": _ms(render.p50_s), "ms_p99": _ms(render.p99_s)}
         if model.gpu_mem_mb is not None:
             status["gpu_mem_mb"] = round(model.gpu_mem_mb, 1)
+        if model.bad_depths:
+            status["bad_depths"] = model.bad_depths
+        if model.ood_score is not None:
+            status["ood_score"] = round(model.ood_score, 3)
         return status
 
 

@@ -79,8 +79,9 @@ class ModelTrack:
     def __init__(self) -> None:
         self.state: ModelState = "absent"
         self.gpu_mem_mb: float | None = None
-        self.ooms = self.nan_windows = 0
+        self.ooms = self.nan_windows = self.bad_depths = 0
         self.backoff_s = 0.0
+        self.ood_score: float | None = None
 
     def health(self) -> ModelHealth:
         """What is known now."""
@@ -89,5 +90,7 @@ class ModelTrack:
             gpu_mem_mb=self.gpu_mem_mb,
             ooms=self.ooms,
             nan_windows=self.nan_windows,
+            bad_depths=self.bad_depths,
             backoff_s=self.backoff_s,
+            ood_score=self.ood_score,
         )

@@ -117,7 +117,7 @@ class NodeCommands:
     def _views(self) -> dict[str, object]:
         settings = self._machinery.live.settings()
         return {
-            view_id: {**msgspec.to_builtins(settings.config.view[view_id]), "view_rev": rev}
+            view_id: {**settings.config.view[view_id].plain, "view_rev": rev}
             for view_id, rev in settings.revisions.items()
         }
 
@@ -143,16 +143,18 @@ class NodeCommands:
             raise _unknown(wanted.view, live.known_views)
         self._require_revision(wanted.view, command.if_view_rev)
         view, fit = wanted.to_config(), None
-        if wanted.source_from_view is not None:
+        if wanted.source_from_view is not None and traits.takes_any_pose:
+            view = replace(view, source_from_view=wanted.source_from_view)
+        elif wanted.source_from_view is not None:
             fit = self._fitted(wanted.source_from_view, traits)
             delta = fit.delta
             view = replace(
                 view, azimuth_deg=delta.azimuth_deg, elevation_deg=delta.elevation_deg, radius=delta.radius_m
             )
         self._check_view(wanted.view, view, traits)
-        told: dict[str, object] = {"view": wanted.view, "goal": msgspec.to_builtins(view)}
-        if fit is not None:
-            told["rotation_error_deg"] = round(fit.rotation_error_deg, 4)
+        told: dict[str, object] = {"view": wanted.view, "goal": view.plain}
+        if wanted.source_from_view is not None:
+            told["rotation_error_deg"] = 0.0 if fit is None else round(fit.rotation_error_deg, 4)
         if command.dry_run:
             return Outcome(message="it would be set", result=told)
         told["view_rev"] = live.set_view(wanted.view, view)

@@ -60,4 +60,6 @@ class KnownSource:
         run, fps = prepare_run(config, self._traits, info, changed=True)
         self._fit, self._lens = fit_of(config, self._traits, info, changed=True), lens_in_use(config, info)
         self._fps = fps
+        if run.mount == self.run.mount:
+            run = replace(run, depth=self.run.depth)
         self._runs = [*self._runs[1 - _KEPT :], (epoch, replace(run, boot_id=self._boot_id))]

@@ -18,7 +18,7 @@ from gcd_node.life.memory import give_back_memory
 from gcd_node.life.source_watch import Opener, Patience, SourceWatch
 from gcd_node.optics.calibration import LensModel
 from gcd_node.publishing.input_preview import InputPreview
-from gcd_node.rendering.model_worker import ModelWorker, WorkCounts, WorkerParts
+from gcd_node.rendering.model_worker import WORK_REASONS, ModelWorker, WorkCounts, WorkerParts
 from gcd_node.rendering.virtual_view import VirtualViews
 from gcd_node.window import Reason, WindowBuilder
 from gcd_node.wire.input_preview import Shot
@@ -127,7 +127,7 @@ class Stream:
     @property
     def reasons(self) -> tuple[str, ...]:
         """What it raised of the node's health, to be cleared when another source is used."""
-        return (*self.run.ood, *LASTING)
+        return (*self.run.ood, *WORK_REASONS, *LASTING)
 
     def start(self) -> None:
         """Begin. Frames are read while the model warms up: its first window is a new one, and no camera's own buffers

@@ -70,6 +70,13 @@ class Fit:
         how = cv2.INTER_AREA if self.resize == "area" and shrinks else cv2.INTER_LINEAR
         return np.asarray(cv2.resize(part, (self.width, self.height), interpolation=how), np.uint8)
 
+    def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The same of a depth picture, [H, W]; no depth between two surfaces is made up. Raises as `crop_box`."""
+        left, top, wide, high = self.crop_box(depth.shape[1], depth.shape[0])
+        part = np.ascontiguousarray(depth[top : top + high, left : left + wide])
+        size = (self.width, self.height)
+        return np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
+
     def intrinsics(self, source: Intrinsics) -> Intrinsics:
         """The camera of the fitted picture, from the camera of the whole. Raises ConfigError as `crop_box`."""
         return source.cropped(*self.crop_box(source.width, source.height)).resized(self.width, self.height)
@@ -88,6 +95,11 @@ def to_clip_tensor(images: Image) -> NDArray[np.float32]:
     for image, planes in zip(images, clip, strict=True):
         write_planes(image, planes)
     return clip
+
+
+def to_image(planes: NDArray[np.float32]) -> Image:
+    """Inverse of write_planes(): float32 [3, H, W] in [-1, 1] -> u8 [H, W, 3], at the nearest level."""
+    return np.rint((planes.transpose(1, 2, 0) + 1.0) * 127.5).clip(0, 255).astype(np.uint8)
 
 
 def write_planes(image: Image, planes: NDArray[np.float32]) -> None:

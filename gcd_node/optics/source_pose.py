@@ -1,6 +1,6 @@
 """Where the source camera stands: on a sphere around the scene, or mounted on a vehicle; which, the model decides."""
 
-from gcd_model import ASSUMED_SOURCE, CameraMount, OptionError, Spherical, Traits
+from gcd_model import ASSUMED_SOURCE, FAMILIES, CameraMount, OptionError, Spherical, Traits
 from gcd_node.config import SourcePose
 
 _MOUNT_TOLERANCE_M, _MOUNT_TOLERANCE_DEG = 0.05, 0.5
@@ -14,7 +14,7 @@ def require_usable(pose: SourcePose | None, traits: Traits) -> None:
             the ground, for a model that warps by it.
     """
     steered, warps = traits.config.camera != "none", traits.mount is not None
-    if pose is None:
+    if pose is None or traits.live:  # that one has a use for either
         return
     if pose.on_vehicle and not warps:
         reason = "is steered by angles" if steered else "sees nothing but the pictures"
@@ -39,14 +39,17 @@ def stated_sphere(pose: SourcePose | None) -> Spherical | None:
 
 
 def stated_mount(pose: SourcePose | None, hfov_deg: float | None, traits: Traits) -> CameraMount | None:
-    """The camera on its vehicle, for a model that warps; None if nothing was stated, or for other models.
+    """The camera on its vehicle, for a model that warps; None if nothing was stated, or for other models. For the live
+    model only where a mount was stated: it knows where the ground is then, and does without otherwise.
 
     hfov_deg: horizontal field of view of the picture the model is given, None if nobody knows.
     Raises:
         OptionError: numbers that no camera has.
     """
-    trained = traits.mount
+    trained = CameraMount(hfov_deg=assumed_hfov_deg(pose)) if traits.live else traits.mount
     if trained is None or (pose is None and hfov_deg is None):
+        return None
+    if traits.live and (pose is None or not pose.on_vehicle):
         return None
     stated = SourcePose() if pose is None else pose
     return CameraMount(
@@ -56,6 +59,13 @@ def stated_mount(pose: SourcePose | None, hfov_deg: float | None, traits: Traits
         tilt_deg=trained.tilt_deg if stated.tilt_deg is None else stated.tilt_deg,
         hfov_deg=trained.hfov_deg if hfov_deg is None else hfov_deg,
     )
+
+
+def assumed_hfov_deg(pose: SourcePose | None) -> float:
+    """Field of view that the live model takes a camera to have where nobody states one: of the orbits' training for a
+    camera on a sphere, else of the vehicle's."""
+    orbits = FAMILIES["kubric90"].hfov_deg
+    return orbits if pose is not None and pose.on_sphere and orbits is not None else CameraMount().hfov_deg
 
 
 def is_foreign(mount: CameraMount | None, traits: Traits) -> bool:
@@ -73,13 +83,13 @@ def is_foreign(mount: CameraMount | None, traits: Traits) -> bool:
 
 
 def in_words(mount: CameraMount | None, pose: SourcePose | None, traits: Traits) -> str:
-    """Where a model that warps by planes takes the source camera to stand, and whether that is assumed; empty for
-    other models, whose pictures do not depend on it.
+    """Where a model that warps by planes, or the live model, takes the source camera to stand, and whether that is
+    assumed; empty for other models, whose pictures do not depend on it, and for the live model where nothing is stated.
 
     mount: as `stated_mount` gives it.
     """
-    plane_warp, mount = traits.config.plane_warp, mount or traits.mount
-    if plane_warp is None:
+    mount = mount or traits.mount
+    if traits.plane_warp is None and not (traits.live and pose is not None):
         return ""
     if mount is not None:
         stated = pose is not None and pose.on_vehicle

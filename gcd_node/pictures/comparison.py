@@ -7,12 +7,13 @@ import cv2
 import numpy as np
 
 from gcd_node.pictures.files import Image, side_by_side
-from gcd_node.wire.header import ClassRecord
+from gcd_node.wire.header import PAINTED, ClassRecord
 
 _COLUMN_WIDTH = 320  # pixels; smaller pictures are enlarged by a whole factor to at least this
 _FONT, _SCALE, _THICKNESS = cv2.FONT_HERSHEY_SIMPLEX, 0.45, 1
 _LINE, _SWATCH, _GAP = 22, 14, 6
 _INK, _PAPER = (30, 30, 30), 255
+_HATCH_PERIOD, _HATCH_WIDTH, _HATCH = 6, 2, (245, 158, 11)  # the page's amber: what a model drew
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -46,6 +47,16 @@ def comparison(moments: Sequence[Moment], classes: Sequence[ClassRecord], headin
     if classes:
         parts.append(legend(classes, width))
     return np.concatenate(parts, axis=0)
+
+
+def hatched(pictures: Image, visibility: Image) -> Image:
+    """Pictures u8 [..., H, W, 3] with thin amber diagonals over painted pixels; what was seen stays as it is.
+
+    visibility: u8 [..., H, W], 0 for painted.
+    """
+    rows, columns = np.indices(visibility.shape[-2:])
+    lines = ((rows + columns) % _HATCH_PERIOD < _HATCH_WIDTH) & (visibility == PAINTED)
+    return np.where(lines[..., None], pictures // 2 + np.array(_HATCH, np.uint8) // 2, pictures)
 
 
 def heading_line(headings: Sequence[str], width: int) -> Image:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gcd_node.config import NodeConfig
 from gcd_node.control.verbs import VERBS
-from gcd_node.envelope import ViewMessage, images
+from gcd_node.envelope import ViewMessage, depth_m, images, kind_of
 from gcd_node.errors import MessageError
 from gcd_node.recording import messages, schemas
 from gcd_node.recording.diagnostics import to_diagnostics
@@ -83,7 +83,7 @@ class Translator:
 
     def _view(self, message: ViewMessage) -> Iterator[Entry]:
         header, place = message.header, f"/view/{message.header.view_id}"
-        kind = message.topic.rpartition("/")[2]
+        kind = kind_of(message.topic)
         if kind == "win":
             yield self._header(f"{place}/header", header)
             yield _entry(f"{place}/age_ms", schemas.FLOAT64, messages.float64(header.age_ms), header.t_publish_ns)
@@ -100,8 +100,9 @@ class Translator:
 
     def _pictures(self, message: ViewMessage) -> Iterator[tuple[Schema, bytes]]:
         header = message.header
-        if header.encoding in ("class8", "mono8"):
-            for index, pixels in enumerate(images(message)):
+        if header.encoding not in ("rgb8", "jpeg"):
+            is_depth = header.encoding == "invdepth16"
+            for index, pixels in enumerate(depth_m(message)[..., None] if is_depth else images(message)):
                 yield schemas.IMAGE, messages.image(_head(header, index), pixels)
             return
         payload, offsets = message.payload, header.offsets

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from gcd_node.envelope import NoteTopic, ViewMessage
+from gcd_node.envelope import NoteTopic, ViewMessage, kind_of
 from gcd_node.frame import Frame, SourceInfo
 from gcd_node.optics.calibration import LensModel
 from gcd_node.security.keys import Client
@@ -55,7 +55,7 @@ class InputItem:
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class ViewItem:
-    """A window of a view, its class map or its deviation."""
+    """A window of a view, its class map, visibility, depth or deviation."""
 
     message: ViewMessage
 
@@ -112,14 +112,14 @@ class CommandItem:
 
 Item: TypeAlias = SourceFacts | InputItem | ViewItem | NoteItem | CommandItem
 
-_VIEW_NAMES = {"win": "image", "cls": "classes", "std": "std"}
+_VIEW_NAMES = {"win": "image", "cls": "classes", "std": "std", "vis": "visibility", "depth": "depth"}
 
 
 def is_recorded(message: ViewMessage) -> bool:
     """Whether a view message has pixels that no other one of its window has."""
-    return message.topic.startswith("view/") and message.topic.rpartition("/")[2] in _VIEW_NAMES
+    return message.topic.startswith("view/") and kind_of(message.topic) in _VIEW_NAMES
 
 
 def view_topic(message: ViewMessage) -> str:
     """Where its pixels go."""
-    return f"/view/{message.header.view_id}/{_VIEW_NAMES[message.topic.rpartition('/')[2]]}"
+    return f"/view/{message.header.view_id}/{_VIEW_NAMES[kind_of(message.topic)]}"

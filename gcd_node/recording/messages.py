@@ -59,11 +59,12 @@ def compressed_image(head: Stamped, coded: bytes | memoryview) -> bytes:
     return CdrWriter().header(head.stamp_ns, head.frame_id).text("jpeg").blob(coded).done()
 
 
-def image(head: Stamped, pixels: NDArray[np.uint8]) -> bytes:
-    """sensor_msgs/Image of u8 pixels: [H, W, 3] as rgb8, [H, W, 1] as mono8."""
+def image(head: Stamped, pixels: NDArray[np.uint8] | NDArray[np.float32]) -> bytes:
+    """sensor_msgs/Image: u8 [H, W, 3] as rgb8 and [H, W, 1] as mono8; depth in metres [H, W, 1] as 32FC1 (REP 118)."""
     height, width, channels = pixels.shape
     writer = CdrWriter().header(head.stamp_ns, head.frame_id).number("I", height).number("I", width)
-    writer.text("rgb8" if channels == 3 else "mono8").number("B", 0).number("I", width * channels)
+    encoding = "32FC1" if pixels.dtype == np.float32 else "rgb8" if channels == 3 else "mono8"
+    writer.text(encoding).number("B", 0).number("I", width * channels * pixels.itemsize)
     return writer.blob(np.ascontiguousarray(pixels).data.cast("B")).done()
 
 

@@ -5,7 +5,7 @@ a time, always, because the last bits of a convolution may depend on how many th
 last bit whether its frames were encoded when they arrived, for the window before, or all at its end.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Set
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
@@ -13,8 +13,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gcd_model import Augmentation, CameraMount, Clip, SourceFeatures, ViewSynthesizer
+from gcd_model import Augmentation, CameraMount, Clip, Intrinsics, SourceFeatures, ViewSynthesizer
+from gcd_node.errors import DepthError
+from gcd_node.optics.preprocess import to_image
 from gcd_node.rendering.seeds import frame_seed
+from gcd_node.sources.depth import DepthSource, require_known
 
 _Key: TypeAlias = tuple[int, int]  # epoch and stamp: a builder never gives the same twice
 
@@ -22,11 +25,13 @@ _Key: TypeAlias = tuple[int, int]  # epoch and stamp: a builder never gives the 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class EncodeTerms:
     """What decides, beside the frames, how they are encoded. digest: see config_digest(). strength: of the noise, None
-    for the checkpoint's own. mount: of the source camera."""
+    for the checkpoint's own. mount, lens: of the source camera. depth: instead of the model's own."""
 
     digest: str
     strength: float | None
     mount: CameraMount | None
+    lens: Intrinsics | None = None
+    depth: DepthSource | None = None
 
 
 class PlacedFrames(Protocol):
@@ -62,19 +67,27 @@ class EncodedFrames:
     """Keeps what was encoded of the frames it was last asked for: never of more than a window. For one thread, and one
     model: `forget` where that is exchanged."""
 
-    def __init__(self, beat: Callable[[], None]) -> None:
-        """beat: called before every frame that is encoded."""
-        self._beat = beat
+    def __init__(self, beat: Callable[[], None], on_bad_depth: Callable[[DepthError], None] = lambda _: None) -> None:
+        """beat: called before every frame that is encoded. on_bad_depth: called where the depth of one cannot be used;
+        the model's own takes its place."""
+        self._beat, self._on_bad_depth = beat, on_bad_depth
         self._rows: dict[_Key, SourceFeatures] = {}
+        self._guessed: Set[_Key] = set()
         self._alike: tuple[EncodeTerms, float] | None = None
 
     def __len__(self) -> int:
         """How many frames are kept."""
         return len(self._rows)
 
+    @property
+    def guessed(self) -> int:
+        """Of how many of them the depth is the model's own, because the other could not be used."""
+        return len(self._guessed & self._rows.keys())
+
     def forget(self) -> None:
         """Keep nothing."""
         self._rows.clear()
+        self._guessed = set()
 
     def ahead(self, synthesizer: ViewSynthesizer, frames: PlacedFrames, terms: EncodeTerms) -> bool:
         """Encode one more of these frames, the oldest that is not yet. False, and nothing was done, if all are.
@@ -110,9 +123,23 @@ class EncodedFrames:
 
     def _encode(self, synthesizer: ViewSynthesizer, frames: PlacedFrames, place: int, terms: EncodeTerms) -> None:
         self._beat()
-        clip = Clip(video=torch.from_numpy(frames.clip[place : place + 1]), fps=frames.fps, mount=terms.mount)
+        video = torch.from_numpy(frames.clip[place : place + 1])
+        key, depth = _keys(frames)[place], None
+        if terms.depth is not None:
+            depth = self._depth(terms.depth, frames.clip[place])
+            self._guessed = self._guessed & self._rows.keys() | ({key} if depth is None else set())
+        clip = Clip(video=video, fps=frames.fps, mount=terms.mount, lens=terms.lens, depth=depth)
         noise = Augmentation(strength=terms.strength, seed=frame_seed(terms.digest, frames.seqs[place]))
-        self._rows[_keys(frames)[place]] = synthesizer.encode(clip, noise)
+        self._rows[key] = synthesizer.encode(clip, noise)
+
+    def _depth(self, source: DepthSource, planes: NDArray[np.float32]) -> torch.Tensor | None:
+        """Of one frame, [1, H, W]; None where it cannot be used."""
+        try:
+            _, depth = source(to_image(planes))
+            return torch.from_numpy(require_known(depth))[None]
+        except DepthError as error:
+            self._on_bad_depth(error)
+            return None
 
 
 def _keys(frames: PlacedFrames) -> list[_Key]:

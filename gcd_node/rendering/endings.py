@@ -18,6 +18,8 @@ class Endings:
     def __init__(self, live: LiveConfig, dispatcher: Dispatcher, run: Callable[[], Run]) -> None:
         """run: what is known of the source now."""
         self._live, self._dispatcher, self._run = live, dispatcher, run
+        self.carried: Set[ViewKind] = frozenset()
+        """What the last window's views held of themselves."""
 
     def announce_due(self, last_window_id: int) -> None:
         """End views that were taken out, and what is made of a view no more, such as deviations of a single sample."""
@@ -37,7 +39,7 @@ class Endings:
             self._end(view_id, rev, self._made(settings), last_window_id, delay_ms=delay_ms)
 
     def _made(self, settings: Settings) -> Set[ViewKind]:
-        return set(published_kinds(replace(self._run(), config=settings.config)))
+        return {*published_kinds(replace(self._run(), config=settings.config)), *self.carried}
 
     def _known(self, view_id: str, settings: Settings) -> Set[ViewKind]:
         """What is made of a view now, or was and has not ended."""

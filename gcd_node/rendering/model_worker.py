@@ -14,6 +14,8 @@ import torch
 
 from gcd_model import Cancelled, DeviceMemoryError, NonFiniteError, RenderOptions, View
 from gcd_node.capture import WindowSlot
+from gcd_node.envelope import ViewKind
+from gcd_node.errors import DepthError
 from gcd_node.health.announcer import Announcer
 from gcd_node.health.monitor import IDLE, Health
 from gcd_node.health.report import Level
@@ -32,10 +34,21 @@ from gcd_node.rendering.setbacks import Setbacks
 from gcd_node.rendering.virtual_view import VirtualView, VirtualViews
 from gcd_node.rendering.warm_up import render_grey
 from gcd_node.window import Filling, FrameWindow
-from gcd_node.wire.view_message import Rendered, Run, messages, newest_ns, utc_offset_ns
+from gcd_node.wire.view_message import (
+    Rendered,
+    Run,
+    carried_kinds,
+    messages,
+    newest_ns,
+    utc_offset_ns,
+    world_flags,
+)
 
 _LOG = logging.getLogger(__name__)
 _KEPT = 1000  # a node runs for weeks
+_BAD_DEPTH = "DEPTH_BAD"
+WORK_REASONS = ("world", _BAD_DEPTH)
+"""What a model thread raises of the node's health by what its windows show."""
 
 
 @dataclass(slots=True)
@@ -97,7 +110,8 @@ class ModelWorker:
         self._setbacks = Setbacks(parts.health, parts.announcer)
         self._cancel = threading.Event()
         self._beat_s: float | None = None
-        self._encoded = EncodedFrames(self._beat)
+        self._encoded = EncodedFrames(self._beat, self._count_bad_depth)
+        self._depth_is_bad = False
         self._may_encode_ahead = True
 
     @property
@@ -138,7 +152,10 @@ class ModelWorker:
             if not self._rests():
                 self._beat()
                 self._parts.health.stage("window", (time.monotonic_ns() - window.arrival_ns) / 1e9)
-                self._render_or_count(self._job(window))
+                try:
+                    self._render_or_count(self._job(window))
+                except DepthError:  # it is known already: see _count_bad_depth
+                    self._parts.health.drop("model")
             self._ready()
         self._endings.announce_due(self.counts.last_window_id)
 
@@ -273,6 +290,31 @@ class ModelWorker:
             }
         )
 
+    def _count_bad_depth(self, error: DepthError) -> None:
+        """Told when it begins, counted with every frame, and over with a window that has none."""
+        self._parts.health.bad_depth()
+        if not self._depth_is_bad:
+            self._depth_is_bad = True
+            self._parts.health.raise_reason(_BAD_DEPTH, Level.WARN)
+            self._parts.announcer.event(_BAD_DEPTH, Level.WARN, {"message": str(error)})
+
+    def _check_depth(self, run: Run) -> None:
+        """Of the window that was just encoded. Raises DepthError if one of its frames is not to be shown so."""
+        guessed = self._encoded.guessed
+        if guessed and run.config.model.on_bad_depth == "stop":
+            raise DepthError(f"the depth of {guessed} frames of this window cannot be used; it is not rendered")
+        if not guessed and self._depth_is_bad:
+            self._depth_is_bad = False
+            self._parts.health.clear_reason(_BAD_DEPTH)
+
+    def _tell_world(self, run: Run, view: View) -> None:
+        """Whether the source is of the kind that the model knows; the same for all views of a window."""
+        self._parts.health.ood_score(view.ood)
+        if world_flags(run.traits, view):
+            self._parts.health.raise_reason("world", Level.WARN)
+        else:
+            self._parts.health.clear_reason("world")
+
     def _asked_steps(self, job: _Job) -> int:
         return sampler_in_use(job.run.config.model, job.run.traits).steps
 
@@ -283,6 +325,9 @@ class ModelWorker:
         if self._cancel.is_set():  # a model that hears no cancel: nothing may follow the end
             raise Cancelled("the node was told to stop")
         ended_ns, offset_ns = time.monotonic_ns(), utc_offset_ns()
+        for view in drawn[:1]:
+            self._tell_world(job.run, view)
+        self._endings.carried = frozenset[ViewKind]().union(*map(carried_kinds, drawn))
         for virtual, view in zip(job.views, drawn, strict=True):
             rendered = Rendered(
                 window=job.window,
@@ -305,6 +350,7 @@ class ModelWorker:
         synthesizer, health = self._parts.model.synthesizer, self._parts.health
         started_s = time.monotonic()
         features = self._encoded.features(synthesizer, job.window, _terms(job.run))
+        self._check_depth(job.run)
         encoded_s = time.monotonic()
         health.stage("encode", encoded_s - started_s)
         self._beat()
@@ -331,4 +377,7 @@ class ModelWorker:
 
 
 def _terms(run: Run) -> EncodeTerms:
-    return EncodeTerms(digest=run.digest, strength=run.config.model.cond_aug, mount=run.mount)
+    lens = run.intrinsics if run.traits.live else None
+    return EncodeTerms(
+        digest=run.digest, strength=run.config.model.cond_aug, mount=run.mount, lens=lens, depth=run.depth
+    )

@@ -5,7 +5,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-from gcd_model import CameraMount, Intrinsics, OptionError, Traits
+from gcd_model import LIVE_LENS_DEG, CameraMount, Intrinsics, OptionError, Traits
 from gcd_node.config import NodeConfig
 from gcd_node.envelope import new_boot_id
 from gcd_node.errors import ConfigError
@@ -13,7 +13,8 @@ from gcd_node.frame import SourceInfo
 from gcd_node.optics.calibration import LensModel, load_lens
 from gcd_node.optics.preprocess import Fit
 from gcd_node.optics.rectify import Rectifier
-from gcd_node.optics.source_pose import is_foreign, require_usable, stated_mount
+from gcd_node.optics.source_pose import assumed_hfov_deg, is_foreign, require_usable, stated_mount
+from gcd_node.sources.depth import OnnxDepth
 from gcd_node.window import RATE_TOLERANCE, choose_fps
 from gcd_node.wire.view_message import Run
 
@@ -29,8 +30,8 @@ def prepare_run(config: NodeConfig, traits: Traits, source: SourceInfo, *, chang
         changed: see fit_of(); a calibration that is left out flags the field of view, which nobody knows then.
     Raises:
         ConfigError: a frame rate the source cannot give; a source pose in words the model does not know; pictures the
-            model cannot be given, see fit_of(); in strict mode, a rate, field of view or mount the model was not
-            trained for.
+            model cannot be given, see fit_of(); a depth network that cannot be used; in strict mode, a rate, field of
+            view or mount the model was not trained for.
     """
     fps, foreign_rate = config.window.fps, False
     if fps is None:
@@ -51,10 +52,11 @@ def prepare_run(config: NodeConfig, traits: Traits, source: SourceInfo, *, chang
         traits=traits,
         source=source,
         boot_id=new_boot_id(),
-        intrinsics=_view_camera(camera, traits),
+        intrinsics=_view_camera(config, camera, traits),
         mount=mount,
         ood=ood,
         resize=fit.resize,
+        depth=_depth_network(config, traits, mount),
     )
     return run, fps
 
@@ -78,6 +80,18 @@ def _mount(config: NodeConfig, traits: Traits, camera: Intrinsics | None) -> Cam
         raise ConfigError(f"[source.pose]: {error}") from error
 
 
+def _depth_network(config: NodeConfig, traits: Traits, mount: CameraMount | None) -> OnnxDepth | None:
+    path, kind = config.model.depth_model, config.model.depth_kind
+    if path is None:
+        return None
+    if not traits.live:
+        raise ConfigError(f"[model] depth_model: {traits.name} takes no depth; leave it out, or use the live model")
+    try:
+        return OnnxDepth(Path(path).expanduser(), kind=kind, scale=mount if kind == "inverse" else None)
+    except ConfigError as error:
+        raise ConfigError(f"[model] depth_model: {error}") from error
+
+
 def _source_camera(config: NodeConfig, source: SourceInfo, fit: Fit | Rectifier) -> Intrinsics | None:
     """The camera of the picture the model is given; None if nobody states a field of view."""
     if isinstance(fit, Rectifier):
@@ -88,23 +102,27 @@ def _source_camera(config: NodeConfig, source: SourceInfo, fit: Fit | Rectifier)
     return fit.intrinsics(Intrinsics.from_hfov(stated, source.width, source.height))
 
 
-def _view_camera(camera: Intrinsics | None, traits: Traits) -> Intrinsics | None:
+def _view_camera(config: NodeConfig, camera: Intrinsics | None, traits: Traits) -> Intrinsics | None:
     """The generated picture's camera: the source's again, or the trained one if that is unknown, or if the model draws
-    for one camera whatever the source is."""
-    trained = _trained_hfov_deg(traits)
-    if camera is not None and traits.config.plane_warp is None:
+    for one camera whatever the source is. The live model takes an unknown one to be as `assumed_hfov_deg` says."""
+    trained = assumed_hfov_deg(config.source.pose) if traits.live else _trained_hfov_deg(traits)
+    if camera is not None and traits.plane_warp is None:
         return camera
     return None if trained is None else Intrinsics.from_hfov(trained, traits.config.width, traits.config.height)
 
 
 def _is_foreign_field(camera: Intrinsics | None, traits: Traits) -> bool:
     trained = _trained_hfov_deg(traits)
-    return camera is not None and trained is not None and abs(camera.hfov_deg - trained) > _HFOV_TOLERANCE_DEG
+    if camera is None:
+        return False
+    if traits.live:
+        return not LIVE_LENS_DEG[0] - _HFOV_TOLERANCE_DEG <= camera.hfov_deg <= LIVE_LENS_DEG[1] + _HFOV_TOLERANCE_DEG
+    return trained is not None and abs(camera.hfov_deg - trained) > _HFOV_TOLERANCE_DEG
 
 
 def _trained_hfov_deg(traits: Traits) -> float | None:
-    if traits.config.plane_warp is not None:
-        return traits.config.plane_warp.hfov_deg
+    if traits.plane_warp is not None:
+        return traits.plane_warp.hfov_deg
     return None if traits.family is None else traits.family.hfov_deg
 
 

@@ -2,7 +2,9 @@
 
 from dataclasses import replace
 
-from gcd_model import CameraMount, Orbit, SphericalDelta, Traits, Trajectory
+import torch
+
+from gcd_model import CameraMount, OptionError, Orbit, SphericalDelta, Traits, Trajectory
 from gcd_node.config import NodeConfig, ViewConfig
 from gcd_node.life.live_config import Settings
 from gcd_node.optics.source_pose import stated_sphere
@@ -22,13 +24,14 @@ class VirtualView:
         """Check that the checkpoint can give it. mount: of the source camera, None for the trained one.
 
         Raises:
-            ViewRangeError, ViewFixedError: it cannot. OptionError: an impossible orbit, or the motion number cannot
-            be worked out and was not given.
+            ViewRangeError, ViewFixedError: it cannot. PoseError: no camera has that pose. OptionError: an impossible
+            orbit, or the motion number cannot be worked out and was not given; or places on a vehicle for a camera that
+            is declared on a sphere.
         """
         self.view_id, self.rev = view_id, rev
         self._traits, self._mount, self._source = traits, mount, stated_sphere(config.source.pose)
         self._move_time = traits.move_time if config.model.move_time is None else config.model.move_time
-        wanted = config.view[view_id]
+        wanted = self._wanted = config.view[view_id]
         self._goal = SphericalDelta(
             azimuth_deg=wanted.azimuth_deg, elevation_deg=wanted.elevation_deg, radius_m=wanted.radius
         )
@@ -61,7 +64,21 @@ class VirtualView:
         return self._goal if orbit is None else replace(self._goal, azimuth_deg=orbit.azimuth_deg)
 
     def _plan(self, goal: SphericalDelta) -> Trajectory:
-        return self._traits.plan_view(goal, source=self._source, move_time=self._move_time, mount=self._mount)
+        wanted, traits = self._wanted, self._traits
+        if wanted.position_m is not None and wanted.look_at_m is not None:
+            if self._source is not None:
+                raise OptionError(
+                    f"[view.{self.view_id}] position_m is counted from what the camera is mounted on: in [source.pose] "
+                    "state height_m and tilt_deg instead of elevation_deg and radius"
+                )
+            return traits.plan_placed(wanted.position_m, wanted.look_at_m, mount=self._mount)
+        if wanted.source_from_view is not None:
+            pose = torch.tensor(wanted.source_from_view, dtype=torch.float64).view(4, 4)
+            return traits.plan_poses(pose.repeat(traits.config.frames, 1, 1), source=self._source)
+        own = traits.live and self._orbit is None and wanted.at_source
+        return traits.plan_view(
+            None if own else goal, source=self._source, move_time=self._move_time, mount=self._mount
+        )
 
     def _check_reach(self) -> None:
         """Raises ViewRangeError or ViewFixedError before the first window rather than in the middle of a run."""

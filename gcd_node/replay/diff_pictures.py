@@ -72,7 +72,7 @@ def side_by_side_picture(
     gain = gain_for(0 if distance is None else distance.largest)
     rows = [_row(pictures_a[i], pictures_b[i], _amplified(pictures_a[i], pictures_b[i], gain)) for i in chosen]
     head = f"window {view.window_id}, frames {' '.join(map(str, chosen))}"
-    maps = a.classes.get(view.view_id), b.classes.get(view.view_id)
+    maps = a.maps[view.view_id].get("cls"), b.maps[view.view_id].get("cls")
     if maps[0] is not None and maps[1] is not None:
         at = 0 if distance is None else distance.worst_class_frame
         rows.append(_class_row(maps[0][at], maps[1][at], classes))

@@ -5,7 +5,7 @@ from typing import Any
 
 from rich.table import Table
 
-from gcd_node.replay.run_diff import Distance, Missing, RunComparison, Tolerance, ViewComparison
+from gcd_node.replay.run_diff import MAP_NAMES, Distance, Missing, RunComparison, Tolerance, ViewComparison
 
 _ROWS = 40
 _LINES = 10
@@ -119,9 +119,8 @@ def _apart(distance: Distance) -> list[str]:
             f"{distance.psnr_db:.2f} dB, frame {distance.worst_frame} {distance.worst_psnr_db:.2f} dB, "
             f"up to {distance.largest} levels"
         )
-    if distance.class_share:
-        parts.append(f"{distance.class_share:.3%} of the class pixels")
-    return parts
+    names = {**MAP_NAMES, "cls": "class"}
+    return parts + [f"{share:.3%} of the {names[kind]} pixels" for kind, share in distance.shares if share]
 
 
 def _row(each: ViewComparison | Missing) -> tuple[str, ...]:
@@ -136,7 +135,12 @@ def _row(each: ViewComparison | Missing) -> tuple[str, ...]:
 
 
 def _facts(each: ViewComparison | Missing) -> str:
-    return "" if isinstance(each, Missing) else ", ".join(f"other {fact}" for fact in each.facts)
+    """What the other columns do not say."""
+    if isinstance(each, Missing):
+        return ""
+    shares = () if each.distance is None else each.distance.shares
+    maps = [f"{share:.3%} of {MAP_NAMES[kind]}" for kind, share in shares if share and kind != "cls"]
+    return ", ".join([*maps, *(f"other {fact}" for fact in each.facts)])
 
 
 def _plain_view(view: ViewComparison, tolerance: Tolerance) -> dict[str, Any]:
@@ -158,6 +162,7 @@ def _plain_view(view: ViewComparison, tolerance: Tolerance) -> dict[str, Any]:
         "worst_psnr_db": _finite(distance.worst_psnr_db),
         "largest": distance.largest,
         "class_share": distance.class_share,
+        "shares": dict(distance.shares),
     }
 
 

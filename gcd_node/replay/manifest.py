@@ -17,6 +17,9 @@ MAX_WINDOW = 2**28
 Digest: TypeAlias = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$(?!\n)")]
 """SHA-256, 64 hex digits."""
 
+MapKind: TypeAlias = Literal["vis", "depth"]
+"""Kinds of maps that a run keeps beside pictures and class maps."""
+
 Stamp: TypeAlias = tuple[int, Annotated[int, Meta(ge=0, lt=1_000_000_000)]]
 """[sec, nanosec]: one number of nanoseconds would be changed by readers that hold numbers as doubles."""
 
@@ -107,17 +110,25 @@ class ViewEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     """One view of one window.
 
     sha256: of its pixels, u8 [T, H, W, 3] RGB, before any JPEG. classes_sha256: of its class map, u8 [T, H, W]; None
-    for a model that makes none. seed, steps: of the sampler. ood: what lay outside the trained domain.
+    for a model that makes none. maps_sha256: of its visibility, u8 [T, H, W], and of its inverse depth, f16 [T, H, W],
+    where it has them. seed, steps: of the sampler. ood: what lay outside the trained domain.
     nan_frames: frames with non-finite values; always 0 of a view that came out.
     """
 
     view_rev: int
     sha256: Digest
     classes_sha256: Digest | None = None
+    maps_sha256: dict[MapKind, Digest] = {}
     seed: int
     steps: int
     ood: tuple[str, ...]
     nan_frames: int
+
+    @property
+    def digests(self) -> dict[str, Digest]:
+        """Of every map it has, by kind."""
+        classes = {} if self.classes_sha256 is None else {"cls": self.classes_sha256}
+        return {**classes, **self.maps_sha256}
 
 
 class WindowEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from gcd_node.errors import UsageError
 from gcd_node.replay.manifest import ViewEntry, WindowEntry
@@ -14,7 +15,11 @@ from gcd_node.replay.pixel_file import Pixels
 from gcd_node.replay.run_facts import Fact, different_facts
 from gcd_node.replay.run_folder import RunFolder, WindowPixels, read_windows
 
+MAP_NAMES = {"cls": "class map", "vis": "visibility", "depth": "depth"}
+"""Of each kind of map, for people."""
+
 _TOP = 255.0
+_DEPTH_SLACK = 0.01  # ten times what f16 rounds away, a tenth of what depth networks err
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -22,7 +27,8 @@ class Tolerance:
     """How far apart two runs may be.
 
     min_psnr_db: what each frame of each view must reach; None demands identical pixels.
-    max_class_share: of the pixels of a view's class maps in a window, how many may be of another class, 0 to 1.
+    max_class_share: of the pixels of each map of a view in a window, how many may be of another class or visibility, or
+        have a depth more than 1 % away, 0 to 1.
     Raises UsageError for numbers out of range.
     """
 
@@ -41,24 +47,34 @@ class Distance:
     """How far the pictures of one view of one window are apart.
 
     psnr_db: of all T frames together, infinite if they are identical. worst_frame, worst_psnr_db: of the frame that
-    differs most. largest: difference of any level, 0 to 255. class_share: of the class map's pixels, how many differ;
-    None if there is none. worst_class_frame: where most do.
+    differs most. largest: difference of any level, 0 to 255. shares: of the pixels of each kind of map that there is,
+    how many differ. worst_class_frame: where most of the class map's do.
     """
 
     psnr_db: float
     worst_frame: int
     worst_psnr_db: float
     largest: int
-    class_share: float | None = None
+    shares: tuple[tuple[str, float], ...] = ()
     worst_class_frame: int = 0
+
+    @property
+    def class_share(self) -> float | None:
+        """Of the class map's pixels, how many differ; None if there is none."""
+        return dict(self.shares).get("cls")
+
+    @property
+    def worst_share(self) -> float:
+        """Of the map that differs most."""
+        return max((share for _, share in self.shares), default=0.0)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ViewComparison:
     """One view of one window that is in both runs.
 
-    facts: what must agree and does not: "stamps", "seqs", "epoch", "ood", "size", "class map". distance: None if the
-    pictures have different sizes. same_input, same_seed: the model was given the same pictures, and the same seed.
+    facts: what must agree and does not: "stamps", "seqs", "epoch", "ood", "size", the name of a map. distance: None if
+    the pictures have different sizes. same_input, same_seed: the model was given the same pictures, and the same seed.
     """
 
     window_id: int
@@ -79,7 +95,7 @@ class ViewComparison:
         if self.facts or distance is None:
             return False
         least_db = math.inf if tolerance.min_psnr_db is None else tolerance.min_psnr_db
-        return distance.worst_psnr_db >= least_db and (distance.class_share or 0.0) <= tolerance.max_class_share
+        return distance.worst_psnr_db >= least_db and distance.worst_share <= tolerance.max_class_share
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -165,9 +181,9 @@ def psnr_db(squares: float, count: int) -> float:
 def _compare_view(view_id: str, a: WindowPixels, b: WindowPixels, *, same_size: bool) -> ViewComparison:
     entry_a, entry_b = a.entry.views[view_id], b.entry.views[view_id]
     facts = [*_different(a.entry, b.entry, ("stamps", "seqs", "epoch")), *_different(entry_a, entry_b, ("ood",))]
-    maps = a.classes.get(view_id), b.classes.get(view_id)
+    maps = a.maps[view_id], b.maps[view_id]
     facts += [] if same_size else ["size"]
-    facts += ["class map"] if (maps[0] is None) != (maps[1] is None) else []
+    facts += [MAP_NAMES[kind] for kind in MAP_NAMES if (kind in maps[0]) != (kind in maps[1])]
     return ViewComparison(
         window_id=a.entry.window_id,
         view_id=view_id,
@@ -182,27 +198,34 @@ def _different(a: WindowEntry | ViewEntry, b: WindowEntry | ViewEntry, names: tu
     return [name for name in names if getattr(a, name) != getattr(b, name)]
 
 
-def _distance(a: Pixels, b: Pixels, maps: tuple[Pixels | None, Pixels | None]) -> Distance:
+def _distance(a: Pixels, b: Pixels, maps: tuple[dict[str, Pixels], dict[str, Pixels]]) -> Distance:
     squares = [float(cv2.norm(one, other, cv2.NORM_L2SQR)) for one, other in zip(a, b, strict=True)]
     worst = int(np.argmax(squares))
-    shares: list[float] = []
-    if maps[0] is not None and maps[1] is not None:
-        shares = [float(share) for share in (maps[0] != maps[1]).mean(axis=(1, 2))]
+    shares = {kind: _shares(kind, maps[0][kind], maps[1][kind]) for kind in MAP_NAMES if all(kind in m for m in maps)}
     return Distance(
         psnr_db=psnr_db(sum(squares), a.size),
         worst_frame=worst,
         worst_psnr_db=psnr_db(squares[worst], a[worst].size),
         largest=max(int(cv2.absdiff(one, other).max()) for one, other in zip(a, b, strict=True)),
-        class_share=sum(shares) / len(shares) if shares else None,
-        worst_class_frame=int(np.argmax(shares)) if shares else 0,
+        shares=tuple((kind, float(frames.mean())) for kind, frames in shares.items()),
+        worst_class_frame=int(np.argmax(shares["cls"])) if "cls" in shares else 0,
     )
 
 
+def _shares(kind: str, a: Pixels, b: Pixels) -> NDArray[np.float64]:
+    """Of each frame's pixels, how many differ: [T]. A frame whose depth differs by less than 1 % counts one pixel."""
+    if kind != "depth":
+        return (a != b).mean(axis=(1, 2))
+    one, other = (np.ascontiguousarray(each).view("<f2").astype(np.float32) for each in (a, b))
+    far = (np.abs(one - other) > _DEPTH_SLACK * np.maximum(one, other)).mean(axis=(1, 2))
+    return np.maximum(far, (a != b).any(axis=(1, 2)) / one[0].size)
+
+
 def _same(distance: Distance) -> bool:
-    return distance.largest == 0 and not distance.class_share
+    return distance.largest == 0 and distance.worst_share == 0
 
 
 def _badness(view: ViewComparison) -> tuple[float, float, int]:
     distance = view.distance
     assert distance is not None, "only views with pictures of one size are put in order"
-    return distance.worst_psnr_db, -(distance.class_share or 0.0), view.window_id
+    return distance.worst_psnr_db, -distance.worst_share, view.window_id

@@ -13,6 +13,7 @@ from gcd_node.replay.manifest import Manifest, WindowEntry, encode_manifest, par
 from gcd_node.replay.pixel_file import PixelReader, Pixels
 
 MANIFEST = "manifest.json"
+_NAMES = {"cls": "classes", "vis": "visibility", "depth": "depth"}
 _MAX_MANIFEST = 64 * 2**20  # a day of windows
 
 
@@ -21,9 +22,9 @@ def pictures_path(folder: Path, view_id: str) -> Path:
     return folder / f"{view_id}.mkv"
 
 
-def classes_path(folder: Path, view_id: str) -> Path:
-    """Where the class maps of a view are, if the model makes any."""
-    return folder / f"{view_id}.classes.mkv"
+def map_path(folder: Path, view_id: str, kind: str) -> Path:
+    """Where the maps of a kind of a view are, if the model makes any; of depth the two bytes of each value."""
+    return folder / f"{view_id}.{_NAMES[kind]}.mkv"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -36,11 +37,12 @@ class RunFolder:
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class WindowPixels:
-    """A window with its pixels by view: u8 [T, H, W, 3] RGB. classes: its class maps by view, u8 [T, H, W]."""
+    """A window with its pixels by view: u8 [T, H, W, 3] RGB. maps: of each view by kind: class numbers and visibility
+    u8 [T, H, W]; inverse depth u8 [T, H, 2 W], the bytes of its values."""
 
     entry: WindowEntry
     pictures: dict[str, Pixels]
-    classes: dict[str, Pixels]
+    maps: dict[str, dict[str, Pixels]]
 
 
 def open_run(path: Path) -> RunFolder:
@@ -89,26 +91,27 @@ def read_windows(run: RunFolder) -> Iterator[WindowPixels]:
         DamagedRunError: see PixelReader.
     """
     size = run.manifest.size
-    shape = size.frames, size.height, size.width
     readers: dict[Path, PixelReader] = {}
     with ExitStack() as stack:
 
-        def reader(path: Path, *, grey: bool) -> PixelReader:
+        def reader(path: Path, *, grey: bool, scale: int = 1) -> PixelReader:
             if path not in readers:
+                shape = size.frames, size.height, scale * size.width
                 readers[path] = PixelReader(path, shape=shape, grey=grey)
                 stack.callback(readers[path].close)
             return readers[path]
 
         for window in run.manifest.windows:
             pictures: dict[str, Pixels] = {}
-            classes: dict[str, Pixels] = {}
+            maps: dict[str, dict[str, Pixels]] = {}
             for view_id, view in window.views.items():
                 source = reader(pictures_path(run.path, view_id), grey=False)
                 pictures[view_id] = source.read(window.window_id, view.sha256)
-                if view.classes_sha256 is not None:
-                    source = reader(classes_path(run.path, view_id), grey=True)
-                    classes[view_id] = source.read(window.window_id, view.classes_sha256)
-            yield WindowPixels(entry=window, pictures=pictures, classes=classes)
+                maps[view_id] = {}
+                for kind, digest in view.digests.items():
+                    source = reader(map_path(run.path, view_id, kind), grey=True, scale=2 if kind == "depth" else 1)
+                    maps[view_id][kind] = source.read(window.window_id, digest)
+            yield WindowPixels(entry=window, pictures=pictures, maps=maps)
         for each in readers.values():
             each.require_end()
 

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from gcd_node.envelope import EndMessage, NoteTopic, ViewMessage
+from gcd_node.envelope import EndMessage, NoteTopic, ViewMessage, kind_of
 from gcd_node.publishing.options import PublisherStats
 from gcd_node.rendering.model_worker import WindowReport
-from gcd_node.replay.manifest import ClassEntry, SizeEntry, TroubleEntry, ViewEntry, WindowEntry, to_stamp
+from gcd_node.replay.manifest import ClassEntry, MapKind, SizeEntry, TroubleEntry, ViewEntry, WindowEntry, to_stamp
 from gcd_node.replay.pixel_file import Pixels, PixelWriter, pixel_digest
-from gcd_node.replay.run_folder import classes_path, pictures_path
+from gcd_node.replay.run_folder import map_path, pictures_path
 from gcd_node.wire.header import ClassRecord, OriginHeader, ViewHeader
 
 _TROUBLES = ("MODEL_NAN", "GPU_OOM")
@@ -20,11 +20,12 @@ _TROUBLES = ("MODEL_NAN", "GPU_OOM")
 
 @dataclass(slots=True)
 class _Arrived:
-    """What has come of a view of the window in work: its header, the digests of its pixels and of its class map."""
+    """What has come of a view of the window in work: its header, the digests of its pixels and of its maps by kind."""
 
     header: ViewHeader
     sha256: str
     classes_sha256: str | None = None
+    maps: dict[MapKind, str] = field(default_factory=dict[MapKind, str])
 
 
 @dataclass(slots=True)
@@ -39,7 +40,7 @@ class Kept:
 
 
 class RunWriter:
-    """An Outbox that needs no reader: takes the rgb8 messages of a lockstep node and keeps windows and class maps.
+    """An Outbox that needs no reader: takes the rgb8 messages of a lockstep node and keeps windows and their maps.
 
     Single frames are part of their window, and deviations of its samples: neither is kept. Use it as a context
     manager; at its end the videos are finished.
@@ -62,16 +63,19 @@ class RunWriter:
     def send(self, message: ViewMessage) -> bool:
         """Take a view; see Outbox. Raises OutputError if its video cannot be begun."""
         self._sent += 1
-        header, kind = message.header, message.topic.rpartition("/")[2]
+        header, kind = message.header, kind_of(message.topic)
         if kind == "win":
             pixels = _pixels(message)
             self._append(pictures_path(self._folder, header.view_id), header, pixels)
             self._arrived[header.view_id] = _Arrived(header=header, sha256=pixel_digest(pixels))
-        elif kind == "cls":
-            numbers = _pixels(message)[..., 0]
-            self._append(classes_path(self._folder, header.view_id), header, numbers)
-            self._arrived[header.view_id].classes_sha256 = pixel_digest(numbers)
-            self.kept.classes = tuple(_class_entry(each) for each in header.classes or ())
+        elif kind in ("cls", "vis", "depth"):
+            numbers, arrived = _pixels(message), self._arrived[header.view_id]
+            self._append(map_path(self._folder, header.view_id, kind), header, numbers)
+            if kind == "cls":
+                arrived.classes_sha256 = pixel_digest(numbers)
+                self.kept.classes = tuple(_class_entry(each) for each in header.classes or ())
+            else:
+                arrived.maps[kind] = pixel_digest(numbers)
         return True
 
     def finish_window(self, report: WindowReport) -> None:
@@ -111,14 +115,16 @@ class RunWriter:
 
     def _append(self, path: Path, header: ViewHeader, pixels: Pixels) -> None:
         if path not in self._videos:
-            _, height, width, _ = header.shape
+            _, height, width = pixels.shape[:3]
             self._videos[path] = PixelWriter(path, height=height, width=width, fps=header.src.fps_cond)
         self._videos[path].write(pixels)
 
 
 def _pixels(message: ViewMessage) -> Pixels:
-    """As the header describes them: [T, H, W, C]."""
-    return np.frombuffer(message.payload, np.uint8).reshape(message.header.shape)
+    """Pictures [T, H, W, 3]; of maps the bytes of each row, [T, H, W] or of depth [T, H, 2 W]."""
+    frames, height, width, channels = message.header.shape
+    bytes_ = np.frombuffer(message.payload, np.uint8)
+    return bytes_.reshape((frames, height, width, 3) if channels == 3 else (frames, height, -1))
 
 
 def _view_entry(arrived: _Arrived) -> ViewEntry:
@@ -127,6 +133,7 @@ def _view_entry(arrived: _Arrived) -> ViewEntry:
         view_rev=header.view_rev,
         sha256=arrived.sha256,
         classes_sha256=arrived.classes_sha256,
+        maps_sha256=arrived.maps,
         seed=header.quality.seed,
         steps=header.quality.steps,
         ood=header.quality.ood,

@@ -92,6 +92,13 @@ def known_share(depth: DepthPicture) -> float:
     return float(np.count_nonzero(depth) / depth.size)
 
 
+def require_known(depth: DepthPicture) -> DepthPicture:
+    """The same depth. Raises DepthError if it is all holes: nothing can be seen by that."""
+    if not depth.any():
+        raise DepthError(f"a depth of {depth.shape[1]} x {depth.shape[0]} is all holes: look at what measures it")
+    return depth
+
+
 def require_picture(picture: Image, name: str) -> Image:
     """The picture as u8 [H, W, 3]; a grey one, [H, W] or [H, W, 1], is repeated. Raises DepthError for others."""
     if picture.ndim == 3 and picture.shape[2] == 1:

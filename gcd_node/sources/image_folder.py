@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from gcd_node.errors import SourceError
 from gcd_node.frame import MAX_FPS, Frame, Image, SourceInfo
@@ -114,6 +115,21 @@ def read_picture(path: Path) -> Image:
     if picture is None:
         raise _damaged(path)
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def read_depth(path: Path) -> NDArray[np.uint16]:
+    """One depth picture, u16 [H, W] millimetres. Raises SourceError as read_picture(), and for another type."""
+    _checked_header(path)
+    try:
+        picture = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    except (cv2.error, OSError) as error:
+        raise _damaged(path) from error
+    if picture is None:
+        raise _damaged(path)
+    if picture.dtype != np.uint16 or picture.ndim != 2:
+        found = f"{picture.dtype} {list(picture.shape)}"
+        raise SourceError(f"{path} must hold millimetres in one channel of 16 bits, got {found}; write uint16 PNG")
+    return np.asarray(picture, np.uint16)
 
 
 def _checked_header(path: Path) -> PictureHeader:

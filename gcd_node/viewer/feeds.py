@@ -4,6 +4,7 @@ import logging
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import get_args
 
 from gcd_node.envelope import PREVIEW_ID, ViewKind
 from gcd_node.errors import MessageError, NodeError
@@ -33,7 +34,7 @@ def wanted_of(view: str | None) -> frozenset[Wanted]:
     """What a browser needs that looks at a view; None for the input alone."""
     if view is None or view == PREVIEW_ID:
         return frozenset({INPUT})
-    return frozenset({INPUT, *(Wanted(view=view, kind=kind) for kind in ("win", "cls", "std"))})
+    return frozenset({INPUT, *(Wanted(view=view, kind=kind) for kind in get_args(ViewKind) if kind != "frm")})
 
 
 class Feed:

@@ -16,7 +16,7 @@ from typing import Annotated, Any, TypeAlias
 import msgspec
 from msgspec import Meta
 
-from gcd_node.envelope import ViewMessage, images
+from gcd_node.envelope import ViewMessage, colours, images, kind_of
 from gcd_node.errors import MessageError
 from gcd_node.subscriber import ReceivedView
 from gcd_node.wire.header import ViewHeader
@@ -111,13 +111,14 @@ class Picture:
 
 
 def picture(view: ReceivedView) -> Picture:
-    """What a browser is sent of a message: pictures as JPEG, class maps and deviations packed without loss (zlib).
+    """What a browser is sent of a message: pictures as JPEG; class maps, visibility and deviations packed without loss,
+    depth as grey levels (zlib).
 
     Raises:
         MessageError: pixels that do not fit the header.
     """
     message, header = view.message, view.header
-    kind = "src" if header.view_id == "src" else message.topic.rpartition("/")[2]
+    kind = "src" if header.view_id == "src" else kind_of(message.topic)
     payload, offsets = _packed(message)
     since_ms = view.age_ms - header.age_ms
     head = {
@@ -138,7 +139,8 @@ def _packed(message: ViewMessage) -> tuple[bytes, tuple[int, ...] | None]:
         return bytes(message.payload), header.offsets
     if header.encoding == "rgb8":
         return encode_frames(images(message), _QUALITY)
-    return zlib.compress(message.payload, 1), None
+    levels = colours(message)[..., 0].tobytes() if header.encoding == "invdepth16" else message.payload
+    return zlib.compress(levels, 1), None
 
 
 def _told(header: ViewHeader) -> dict[str, Any]:

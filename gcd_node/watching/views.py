@@ -9,18 +9,19 @@ from pathlib import Path
 from types import TracebackType
 
 import cv2
+import numpy as np
 from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from gcd_node.envelope import ViewKind
+from gcd_node.envelope import ViewKind, kind_of
 from gcd_node.errors import MessageError, OutputError
 from gcd_node.pictures.array_file import write_npy
-from gcd_node.pictures.comparison import legend
-from gcd_node.pictures.files import video_writer, write_png
+from gcd_node.pictures.comparison import hatched, legend
+from gcd_node.pictures.files import Image, video_writer, write_png
 from gcd_node.security.keys import ClientKeys
 from gcd_node.subscriber import ReceivedView, ViewSubscriber
-from gcd_node.wire.header import ClassRecord, ViewHeader
+from gcd_node.wire.header import ViewHeader
 
 _REFRESH_MS = 250
 _RATE_SPAN = 10
@@ -52,14 +53,16 @@ class WatchRequest:
     """What to watch.
 
     view: one view's id, None for all. kind: as in ViewSubscriber, None for all. save: folder for pictures, or None.
+    hatch: see ViewSaver; needs the kinds win and vis.
     limit: stop after this many messages. timeout_s: stop when nothing came for so long. None for no bound.
     keys: for a node that asks for them.
     """
 
     endpoint: str = "ipc"
     view: str | None = None
-    kind: ViewKind | None = "win"
+    kind: ViewKind | tuple[ViewKind, ...] | None = "win"
     save: Path | None = None
+    hatch: bool = False
     limit: int | None = None
     timeout_s: float | None = None
     keys: ClientKeys | None = None
@@ -102,22 +105,44 @@ class ViewSaver:
 
     What is no window goes to a folder of its kind: `<view>/<kind>/<window>_<frame>.png`, `<view>/<kind>.mkv`. Single
     frames, of which a window may give many, are numbered as the source did. Class maps are shown in the colours of
-    their ontology, with a `legend.png`; the class numbers themselves are in `<window>.npy`, u8 [T, H, W].
+    their ontology, with a `legend.png`; the class numbers themselves are in `<window>.npy`, u8 [T, H, W]. So is
+    visibility; of depth the file has float32 [T, H, W], 1/m.
+
+    hatch: draw lines over the painted pixels of windows. A window whose visibility did not come is hatched all over.
 
     Raises:
         OutputError: a file cannot be written, or a view changes its size.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, *, hatch: bool = False) -> None:
+        self._folder, self._hatch = folder, hatch
+        self._held: dict[str, tuple[ReceivedView, Image]] = {}  # windows that wait for their visibility, which is next
         self._videos: dict[Path, tuple[cv2.VideoWriter, tuple[int, ...]]] = {}
         self._legends: set[Path] = set()
         self.files = 0
 
     def add(self, view: ReceivedView) -> None:
-        """Write one message's frames."""
-        header, frames = view.header, view.colours
-        kind = view.message.topic.rpartition("/")[2]
+        """Write one message's frames; of a window to be hatched, once its visibility is here."""
+        view_id, kind, frames = view.header.view_id, kind_of(view.message.topic), view.colours
+        if self._hatch and kind == "win":
+            self._write_held(view_id, None)
+            self._held[view_id] = view, frames
+            return
+        if kind == "vis":
+            self._write_held(view_id, view)
+        self._write(view, frames)
+
+    def _write_held(self, view_id: str, visibility: ReceivedView | None) -> None:
+        if view_id not in self._held:
+            return
+        held, frames = self._held.pop(view_id)
+        seen = np.zeros(frames.shape[:3], np.uint8)
+        if visibility is not None and _moment(visibility.header) == _moment(held.header):
+            seen = visibility.images[..., 0]
+        self._write(held, hatched(frames, seen))
+
+    def _write(self, view: ReceivedView, frames: Image) -> None:
+        header, kind = view.header, kind_of(view.message.topic)
         folder = self._folder / header.view_id
         folder = folder if kind == "win" else folder / kind
         single = kind == "frm"  # many of these share a window
@@ -125,14 +150,16 @@ class ViewSaver:
             number = f"{header.src.seq[0]:06d}" if single else f"{index:02d}"
             write_png(folder / f"{header.window_id:06d}_{number}.png", frame)
         self.files += len(frames)
-        if header.classes is not None:
-            self._keep_classes(folder, view, header.classes)
+        if kind == "depth" or header.classes is not None:
+            self._keep_numbers(folder, view)
         video = self._video(folder.with_suffix(".mkv"), header)
         for frame in frames:
             video.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
 
     def close(self) -> None:
         """Finish the videos; until then they may lack their end."""
+        for view_id in tuple(self._held):
+            self._write_held(view_id, None)
         for video, _ in self._videos.values():
             video.release()
         self._videos.clear()
@@ -143,11 +170,13 @@ class ViewSaver:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         self.close()
 
-    def _keep_classes(self, folder: Path, view: ReceivedView, classes: Sequence[ClassRecord]) -> None:
-        write_npy(folder / f"{view.header.window_id:06d}.npy", view.images[..., 0])
+    def _keep_numbers(self, folder: Path, view: ReceivedView) -> None:
+        classes = view.header.classes
+        numbers = view.inverse_depth if classes is None else view.images[..., 0]
+        write_npy(folder / f"{view.header.window_id:06d}.npy", numbers)
         self.files += 1
         path = folder / "legend.png"
-        if path not in self._legends:
+        if classes is not None and path not in self._legends:
             write_png(path, legend(classes, _LEGEND_WIDTH))
             self._legends.add(path)
             self.files += 1
@@ -174,7 +203,7 @@ def watch(request: WatchRequest, on_change: Callable[[Sequence[ViewRow]], None])
     with ViewSubscriber(request.endpoint, request.view, request.kind, conflate=False, keys=request.keys) as views:
         if request.save is None:
             return _Watch(request, views, None).run(on_change)
-        with ViewSaver(request.save) as saver:
+        with ViewSaver(request.save, hatch=request.hatch) as saver:
             return _Watch(request, views, saver).run(on_change)
 
 
@@ -193,6 +222,10 @@ def render(rows: Sequence[ViewRow]) -> Table:
         state = Text(row.state, style=_STYLES[row.state])
         table.add_row(row.topic, str(row.window_id), shape, *numbers, state)
     return table
+
+
+def _moment(header: ViewHeader) -> tuple[object, ...]:
+    return header.boot_id, header.view_rev, header.window_id, header.shape[:3]
 
 
 class _Watch:

@@ -14,14 +14,19 @@ from gcd_node.errors import MessageError
 from gcd_node.wire.record_json import StampNs, short, wire
 
 PROTO = "gcd/1.0"
-"""What this package speaks: readers take any minor of the same major."""
+"""The lowest minor that describes a message is what it states: readers take any minor of the same major."""
+
+MAPS_PROTO = "gcd/1.1"
+"""Of messages of the kinds `vis` and `depth`, which came with it."""
 
 Clock: TypeAlias = Literal["realtime", "ptp", "replay"]
 FrameRole: TypeAlias = Literal["in_transit", "at_goal"]
-Encoding: TypeAlias = Literal["rgb8", "jpeg", "class8", "mono8"]
+Encoding: TypeAlias = Literal["rgb8", "jpeg", "class8", "mono8", "invdepth16"]
 
-CHANNELS: Mapping[str, int] = types.MappingProxyType({"rgb8": 3, "jpeg": 3, "class8": 1, "mono8": 1})
+CHANNELS: Mapping[str, int] = types.MappingProxyType({"rgb8": 3, "jpeg": 3, "class8": 1, "mono8": 1, "invdepth16": 1})
 """Last entry of `shape` for each encoding."""
+
+_HALVES = "invdepth16"  # the one encoding whose values are no bytes
 
 _HEX = re.compile(r"[0-9a-f]+")
 _VERSION = re.compile(r"gcd/(\d{1,4})\.(\d{1,4})")
@@ -67,12 +72,14 @@ class SourcePoseRecord:
 @dataclass(frozen=True, kw_only=True, slots=True)
 class QualityRecord:
     """nan_frames: frames with non-finite values (always 0 when published); ood: what lies outside the trained domain,
-    of "fps", "hfov", "view", "exposure", "static"; steps and seed of the sampler (seed at most 2^53 - 1)."""
+    of "fps", "hfov", "view", "exposure", "static", "world"; steps and seed of the sampler (seed at most 2^53 - 1);
+    ood_score: how unlike the training the source looks to the model, 0 to 1, None for one that cannot tell."""
 
     nan_frames: int
     ood: tuple[str, ...]
     steps: int
     seed: int
+    ood_score: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -103,6 +110,17 @@ class ClassRecord:
             raise MessageError(
                 f"a class has an id and three colour levels of 0 to 255, got {self.id}, {short(self.colour)}"
             )
+
+
+PAINTED, SEEN_BEFORE, SEEN_NOW = 0, 1, 2
+"""What a pixel of a `vis` message says of the view's pixel."""
+
+VISIBILITY = (
+    ClassRecord(id=PAINTED, name="painted", colour=(245, 158, 11)),
+    ClassRecord(id=SEEN_BEFORE, name="seen_before", colour=(147, 197, 253)),
+    ClassRecord(id=SEEN_NOW, name="seen_now", colour=(29, 78, 216)),
+)
+"""The classes of every `vis` message."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -144,7 +162,8 @@ class ViewHeader(OriginHeader):
         the model cannot say. intrinsics (wire name K): 9 numbers, pixels of the generated image; None if unknown.
     shape: [T, H, W, C] with C by `encoding`; offsets: T+1 byte positions in a JPEG payload; scale: of `std`,
         value = u8 * scale. range: lowest and highest level, of a class map the lowest and highest class number.
-    classes: of a class map (class8) and there alone: what the numbers mean. None elsewhere.
+    dtype: "f16" (IEEE 754, little-endian) with encoding "invdepth16" and there alone.
+    classes: of a class map or a visibility (class8) and there alone: what the numbers mean. None elsewhere.
     synthetic: the pixels are generated; never evidence of free space.
     cfg_digest: 12 hex digits naming the node's configuration.
 
@@ -178,7 +197,7 @@ class ViewHeader(OriginHeader):
     intrinsics: tuple[float, ...] | None = field(default=None, metadata=wire("K"))
     distortion: Literal["none"] = "none"
     layout: Literal["THWC"] = "THWC"
-    dtype: Literal["u8"] = "u8"
+    dtype: Literal["u8", "f16"] = "u8"
     range: tuple[int, ...] = (0, 255)
     offsets: tuple[int, ...] | None = None
     scale: float | None = None
@@ -206,6 +225,8 @@ class ViewHeader(OriginHeader):
             raise MessageError(f"shape of {self.encoding} must be [T, H, W, {channels}], got {list(self.shape)}")
         if (self.offsets is not None) != (self.encoding == "jpeg"):
             raise MessageError(f"offsets belong to jpeg and to jpeg alone, got encoding {self.encoding}")
+        if (self.dtype == "f16") != (self.encoding == _HALVES):
+            raise MessageError(f"dtype f16 belongs to {_HALVES} and to it alone, got {self.dtype} of {self.encoding}")
         if self.classes is not None:
             self._check_classes(self.classes)
 
@@ -219,7 +240,9 @@ class ViewHeader(OriginHeader):
     @property
     def payload_bytes(self) -> int:
         """Bytes of the payload, by shape and dtype, or by the offsets of a JPEG."""
-        return math.prod(self.shape) if self.offsets is None else self.offsets[-1]
+        if self.offsets is not None:
+            return self.offsets[-1]
+        return math.prod(self.shape) * (2 if self.encoding == _HALVES else 1)
 
 
 def check_version(proto: object) -> None:

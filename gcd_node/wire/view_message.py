@@ -4,6 +4,7 @@ import functools
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +17,11 @@ from gcd_node.frame import Image, SourceInfo
 from gcd_node.optics.preprocess import ResizePath
 from gcd_node.optics.source_pose import stated_sphere
 from gcd_node.pictures.files import to_u8
+from gcd_node.sources.depth import DepthSource
 from gcd_node.window import FrameWindow
 from gcd_node.wire.header import (
+    MAPS_PROTO,
+    VISIBILITY,
     ClassRecord,
     EndHeader,
     FrameRole,
@@ -32,6 +36,8 @@ from gcd_node.wire.header import (
 from gcd_node.wire.jpeg import encode_frames
 
 _PATHS = 32  # most views stand still: their path is the same in every window
+_LARGEST_HALF = 65504  # of finite f16
+_Header = TypeVar("_Header", ViewHeader, EndHeader)
 _HALF_PIXEL = 0.5  # ours counts from the corner of the first pixel, the wire and OpenCV from its centre
 
 
@@ -43,6 +49,7 @@ class Run:
     mount: of the source camera, for a model that uses it; None if nothing was stated.
     ood: what lies outside the trained domain from the start: "fps", "hfov", "view".
     resize: how source pictures become the model's, published as `src.resize`.
+    depth: what takes the place of the live model's own depth; None for that.
     """
 
     config: NodeConfig
@@ -53,6 +60,7 @@ class Run:
     mount: CameraMount | None
     ood: tuple[str, ...]
     resize: ResizePath
+    depth: DepthSource | None = None
 
     @property
     def digest(self) -> str:
@@ -92,17 +100,20 @@ def newest_ns(run: Run, window: FrameWindow) -> int:
 
 
 def messages(run: Run, rendered: Rendered) -> list[ViewMessage]:
-    """The window, its class map if the model makes one, its frames at the goal pose, and with several samples their
-    deviation."""
+    """The window, its class map, visibility and depth if the model makes them, its frames at the goal pose, and its
+    deviation: of several samples, or of one what the model states."""
     pixels = to_u8(rendered.view.video.numpy())
     header = _header(run, rendered)
     window = _message(run, header, pixels, "win")
     at_goal = _at_goal(rendered.view.trajectory) if run.traits.knows_camera else []
     goal = [_message(run, _one_frame(header, i), pixels[i : i + 1], "frm") for i in at_goal]
-    classes, std = rendered.view.classes, rendered.view.std
+    view = rendered.view
+    std = view.uncertainty if view.std is None else view.std
     return [
         window,
-        *([] if classes is None else [_class_map(header, classes[0].numpy(), run.classes)]),
+        *([] if view.classes is None else [_class_map(header, "cls", view.classes[0].numpy(), run.classes)]),
+        *([] if view.visibility is None else [_class_map(header, "vis", view.visibility.numpy(), VISIBILITY)]),
+        *([] if view.inverse_depth is None else [_depth(header, view.inverse_depth.numpy())]),
         *goal,
         *([] if std is None else [_deviation(header, std.numpy())]),
     ]
@@ -121,16 +132,24 @@ def end_messages(
         window_id=last_window_id,
         clock=run.source.clock,
     )
-    return [EndMessage(topic=view_topic(view_id, kind), header=header) for kind in kinds]
+    return [EndMessage(topic=view_topic(view_id, kind), header=_of_kind(header, kind)) for kind in kinds]
 
 
 def published_kinds(run: Run) -> Iterator[ViewKind]:
-    """What is published of each view."""
+    """What is published of each view, as far as it is known before there is one; see carried_kinds()."""
     yield from ("win", "frm")
     if run.classes:
         yield "cls"
-    if run.config.model.samples > 1:
+    if run.traits.live:
+        yield from ("vis", "depth")
+    if run.traits.live or run.config.model.samples > 1:
         yield "std"
+
+
+def carried_kinds(view: View) -> frozenset[ViewKind]:
+    """What is published of a view because it holds it."""
+    held: dict[ViewKind, object] = {"vis": view.visibility, "depth": view.inverse_depth, "std": view.log_variance}
+    return frozenset(kind for kind, values in held.items() if values is not None)
 
 
 def origin(run: Run) -> OriginHeader:
@@ -154,12 +173,33 @@ def _deviation(header: ViewHeader, std: NDArray[np.float32]) -> ViewMessage:
     return ViewMessage(topic=view_topic(header.view_id, "std"), header=described, payload=payload_of(pixels))
 
 
-def _class_map(header: ViewHeader, numbers: NDArray[np.uint8], classes: tuple[ClassRecord, ...]) -> ViewMessage:
+def _class_map(
+    header: ViewHeader, kind: ViewKind, numbers: NDArray[np.uint8], classes: tuple[ClassRecord, ...]
+) -> ViewMessage:
     pixels = numbers[..., None]  # [T, H, W, 1]
     described = replace(
-        header, shape=pixels.shape, encoding="class8", classes=classes, range=(0, max(each.id for each in classes))
+        _of_kind(header, kind),
+        shape=pixels.shape,
+        encoding="class8",
+        classes=classes,
+        range=(0, max(each.id for each in classes)),
     )
-    return ViewMessage(topic=view_topic(header.view_id, "cls"), header=described, payload=payload_of(pixels))
+    return ViewMessage(topic=view_topic(header.view_id, kind), header=described, payload=payload_of(pixels))
+
+
+def _depth(header: ViewHeader, inverse: NDArray[np.float32]) -> ViewMessage:
+    """What is no depth becomes 0, none: the door for numbers of a model or a sensor."""
+    halves = np.where(np.isfinite(inverse), inverse, 0).clip(0, _LARGEST_HALF).astype("<f2")[..., None]
+    described = replace(
+        _of_kind(header, "depth"), shape=halves.shape, encoding="invdepth16", dtype="f16", range=(0, _LARGEST_HALF)
+    )
+    payload = payload_of(halves.view(np.uint8))
+    return ViewMessage(topic=view_topic(header.view_id, "depth"), header=described, payload=payload)
+
+
+def _of_kind(header: _Header, kind: ViewKind) -> _Header:
+    """A header that states the minor version in which the kind came."""
+    return replace(header, proto=MAPS_PROTO) if kind in ("vis", "depth") else header
 
 
 def _header(run: Run, rendered: Rendered) -> ViewHeader:
@@ -188,7 +228,11 @@ def _header(run: Run, rendered: Rendered) -> ViewHeader:
         shape=(path.frames, *rendered.view.video.shape[-2:], 3),
         encoding="rgb8",
         quality=QualityRecord(
-            nan_frames=0, ood=(*run.ood, *_input_flags(window.images)), steps=rendered.steps, seed=rendered.seed
+            nan_frames=0,
+            ood=(*run.ood, *_input_flags(window.images), *world_flags(run.traits, rendered.view)),
+            steps=rendered.steps,
+            seed=rendered.seed,
+            ood_score=rendered.view.ood,
         ),
         model=_model(run.traits),
         cfg_digest=run.digest,
@@ -241,8 +285,8 @@ def _source(run: Run, window: FrameWindow) -> SourceRecord:
 
 
 def source_pose(run: Run) -> SourcePoseRecord | None:
-    """Where the source camera of a steered model stands; None for a model with a fixed view."""
-    if run.traits.config.camera == "none":
+    """Where the source camera of a steered model stands; None for a model with a fixed view, and on a vehicle."""
+    if run.traits.config.camera == "none" or run.mount is not None:
         return None  # a fixed path states its rigid transforms itself
     stated = stated_sphere(run.config.source.pose)
     source = stated or ASSUMED_SOURCE
@@ -279,6 +323,12 @@ def _role(at_goal: bool) -> FrameRole:
 
 def _at_goal(path: Trajectory) -> Sequence[int]:
     return [index for index, at_goal in enumerate(path.at_goal) if at_goal]
+
+
+def world_flags(traits: Traits, view: View) -> tuple[str, ...]:
+    """Whether the source shows another world than the model's training did; never for a model that cannot tell."""
+    threshold = traits.ood_threshold
+    return ("world",) if threshold is not None and view.ood is not None and view.ood > threshold else ()
 
 
 def _input_flags(images: Image) -> tuple[str, ...]:

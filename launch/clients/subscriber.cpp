@@ -8,8 +8,8 @@
 //   view=topdown kind=win window=3 seq=4 rev=1 skipped=0 age_ms=912.4 shape=14x256x384x3 encoding=rgb8
 //   mean=101.20,98.75,93.10 hash=89ab... roles=in_transit*13,at_goal*1 synthetic=true     (one line, broken here)
 //
-// `mean` is the mean of each channel over the whole message, `hash` FNV-1a (64 bits) of its last frame; both are `-`
-// for JPEG, which this file does not decode. What was dropped, and by which rule, goes to stderr. Exit codes: 0 at the
+// `mean` is the mean of each channel over the whole message (of kind depth in 1/m), `hash` FNV-1a (64 bits) of its last
+// frame; both are `-` for JPEG, which this file does not decode. What was dropped, and by which rule, goes to stderr. Exit codes: 0 at the
 // end of the stream, 64 a wrong option, 69 the node was silent for --timeout seconds, 70 libzmq failed, 73 a picture
 // could not be written. No CURVE keys: it reads from this machine, or through a tunnel.
 //
@@ -17,6 +17,7 @@
 
 #include <zmq.h>
 
+#include <algorithm>
 #include <array>
 #include <cerrno>
 #include <chrono>
@@ -312,7 +313,7 @@ std::uint32_t crc32(Bytes bytes) {
 
 struct Topic {
   std::string view_id;
-  std::string kind;  // win, frm, std, cls; of the input, "src", there is frm alone
+  std::string kind;  // win, frm, std, cls, vis, depth; of the input, "src", there is frm alone
 
   /// All 32 bytes: ZeroMQ matches prefixes.
   std::string padded() const {
@@ -400,13 +401,23 @@ Origin read_origin(const Envelope& envelope, const Header& header, const Topic& 
 
 std::uint64_t channels_of(std::string_view encoding) {
   if (encoding == "rgb8" || encoding == "jpeg") return 3;
-  require(encoding == "mono8" || encoding == "class8", "6: unknown encoding");
+  require(encoding == "mono8" || encoding == "class8" || encoding == "invdepth16", "6: unknown encoding");
   return 1;
+}
+
+/// 1/m along the camera's axis, 0 for none: an IEEE 754 half, little-endian, with 5 bits of exponent and 10 of fraction.
+float inverse_depth(const unsigned char* bytes) {
+  const unsigned bits = bytes[0] | static_cast<unsigned>(bytes[1]) << 8;
+  const int exponent = bits >> 10 & 31;
+  const auto fraction = static_cast<float>(bits & 1023);
+  require(exponent != 31 && bits <= 0x8000, "7: inverse depth is negative or not finite");  // 0x8000 is -0
+  return exponent == 0 ? std::ldexp(fraction, -24) : std::ldexp(1024 + fraction, exponent - 25);
 }
 
 /// Raw frames are of one size, one after another without padding.
 std::vector<Bytes> split_evenly(Bytes payload, const Frames& frames) {
-  const std::uint64_t size = frames.height * frames.width * frames.channels;  // below 2^48
+  const std::uint64_t bytes = frames.encoding == "invdepth16" ? 2 : 1;
+  const std::uint64_t size = frames.height * frames.width * frames.channels * bytes;  // below 2^48
   require(size * frames.count == payload.size(), "7: shape and payload do not fit");
   std::vector<Bytes> parts;
   for (std::uint64_t i = 0; i < frames.count; ++i) parts.push_back(payload.part(i * size, size));
@@ -438,9 +449,14 @@ Frames read_frames(const Header& header, const Topic& topic, Bytes payload) {
   }
   Frames frames{sizes[0], sizes[1], sizes[2], sizes[3], std::string(to_string(header["encoding"])), {}};
   require(frames.channels == channels_of(frames.encoding), "7: encoding and channels do not fit");
-  require((topic.kind == "cls") == (frames.encoding == "class8"), "7: encoding and topic do not fit");
+  const bool classes = topic.kind == "cls" || topic.kind == "vis";
+  require(classes == (frames.encoding == "class8"), "7: encoding and topic do not fit");
+  require((topic.kind == "depth") == (frames.encoding == "invdepth16"), "7: encoding and topic do not fit");
   header.expect("layout", "THWC");
-  header.expect("dtype", "u8");
+  if (topic.kind == "depth")
+    require(to_string(header["dtype"]) == "f16", "7: encoding and dtype do not fit");
+  else
+    header.expect("dtype", "u8");
   const bool jpeg = frames.encoding == "jpeg";
   require(jpeg == header.has("offsets"), "7: offsets belong to jpeg and only there");
   frames.payloads = jpeg ? split_at(payload, header.list("offsets"), frames.count) : split_evenly(payload, frames);
@@ -517,13 +533,15 @@ struct Options {
 std::string mean_of(const Frames& frames) {
   if (frames.encoding == "jpeg") return "-";
   std::array<double, 3> sums{};
+  const bool depth = frames.encoding == "invdepth16";
   for (const Bytes frame : frames.payloads)
-    for (std::size_t i = 0; i < frame.size(); ++i) sums[i % frames.channels] += frame[i];
+    for (std::size_t i = 0; i < frame.size(); i += depth ? 2 : 1)
+      sums[i % frames.channels] += depth ? inverse_depth(frame.begin() + i) : frame[i];
   std::string text;
   for (std::size_t channel = 0; channel < frames.channels; ++channel) {
     char number[32];
     const double pixels = static_cast<double>(frames.count * frames.height * frames.width);
-    std::snprintf(number, sizeof number, "%s%.2f", channel == 0 ? "" : ",", sums[channel] / pixels);
+    std::snprintf(number, sizeof number, "%s%.*f", channel == 0 ? "" : ",", depth ? 5 : 2, sums[channel] / pixels);
     text += number;
   }
   return text;
@@ -563,18 +581,30 @@ struct CannotWrite : std::runtime_error {
   using std::runtime_error::runtime_error;
 };
 
-/// PPM for colour, PGM for one channel; JPEG stays as it came. All parts of the name have been checked.
+/// Inverse depth as PFM: floats, the last row first.
+void write_pfm(std::ofstream& file, const Frames& frames, Bytes frame) {
+  file << "Pf\n" << frames.width << ' ' << frames.height << "\n-1.0\n";  // little-endian, as the machines this runs on
+  for (std::uint64_t y = frames.height; y > 0; --y)
+    for (std::uint64_t x = 0; x < frames.width; ++x) {
+      const float value = inverse_depth(frame.begin() + 2 * ((y - 1) * frames.width + x));
+      file.write(reinterpret_cast<const char*>(&value), sizeof value);
+    }
+}
+
+/// PPM for colour, PGM for one channel, PFM for depth; JPEG stays as it came. All parts of the name have been checked.
 void write_pictures(const View& view, const Options& options) {
   const Frames& frames = view.frames;
   const bool jpeg = frames.encoding == "jpeg";
-  const char* suffix = jpeg ? "jpg" : frames.channels == 3 ? "ppm" : "pgm";
+  const bool depth = frames.encoding == "invdepth16";
+  const char* suffix = jpeg ? "jpg" : depth ? "pfm" : frames.channels == 3 ? "ppm" : "pgm";
   for (std::size_t i = 0; i < frames.payloads.size(); ++i) {
     char name[96];
     std::snprintf(name, sizeof name, "/%s_%s_%06" PRId64 "_%02zu.%s", options.topic.view_id.c_str(),
                   options.topic.kind.c_str(), view.origin.window_id, i, suffix);
     std::ofstream file(options.pictures + name, std::ios::binary);
-    if (!jpeg) file << (frames.channels == 3 ? "P6\n" : "P5\n") << frames.width << ' ' << frames.height << "\n255\n";
-    file.write(frames.payloads[i].text(), static_cast<std::streamsize>(frames.payloads[i].size()));
+    if (depth) write_pfm(file, frames, frames.payloads[i]);
+    else if (!jpeg) file << (frames.channels == 3 ? "P6\n" : "P5\n") << frames.width << ' ' << frames.height << "\n255\n";
+    if (!depth) file.write(frames.payloads[i].text(), static_cast<std::streamsize>(frames.payloads[i].size()));
     file.close();
     if (!file) throw CannotWrite("cannot write " + options.pictures + name + ": does the folder exist, is there room?");
   }
@@ -700,8 +730,9 @@ int run(const Options& options) {
 // ---- options ------------------------------------------------------------------------------------------------------
 
 constexpr char kUsage[] =
-    "usage: gcd-subscriber [--endpoint ipc://... | tcp://...] [--view ID] [--kind win|frm|std|cls] [--every]\n"
-    "                      [--limit N] [--max-age-ms MS] [--timeout S] [--ppm DIR]\n";
+    "usage: gcd-subscriber [--endpoint ipc://... | tcp://...] [--view ID] [--kind KIND] [--every]\n"
+    "                      [--limit N] [--max-age-ms MS] [--timeout S] [--ppm DIR]\n"
+    "KIND is win, frm, std, cls, vis or depth.\n";
 
 std::string runtime_folder() {
   const char* own = std::getenv("RUNTIME_DIRECTORY");
@@ -723,8 +754,9 @@ void check_topic(const Topic& topic) {
   const bool plain = topic.view_id.find_first_not_of("abcdefghijklmnopqrstuvwxyz0123456789_") == std::string::npos;
   if (topic.view_id.empty() || topic.view_id.size() > 16 || !plain)
     throw std::invalid_argument("--view wants 1 to 16 of a-z, 0-9, _, got " + topic.view_id);
-  if (topic.kind != "win" && topic.kind != "frm" && topic.kind != "std" && topic.kind != "cls")
-    throw std::invalid_argument("--kind wants win, frm, std or cls, got " + topic.kind);
+  constexpr std::array kinds{"win", "frm", "std", "cls", "vis", "depth"};
+  if (std::find(kinds.begin(), kinds.end(), topic.kind) == kinds.end())
+    throw std::invalid_argument("--kind wants win, frm, std, cls, vis or depth, got " + topic.kind);
 }
 
 Options read_options(const std::vector<std::string>& words) {

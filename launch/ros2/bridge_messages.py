@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_node.envelope import NoteMessage
+from gcd_node.envelope import NoteMessage, ViewKind, depth_m
 from gcd_node.errors import ConfigError
 from gcd_node.subscriber import ReceivedView
 from gcd_node.wire.header import ViewHeader
@@ -52,6 +52,19 @@ class CompressedImage:
     header: Header
     data: "array[int]"
     format: str = "jpeg"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Image:
+    """sensor_msgs/Image. data: an array of bytes, as above. step: bytes of a row."""
+
+    header: Header
+    height: int
+    width: int
+    encoding: str
+    step: int
+    data: "array[int]"
+    is_bigendian: int = 0
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -142,6 +155,7 @@ PACKAGES: Mapping[str, str] = {
     "Time": "builtin_interfaces.msg",
     "Header": "std_msgs.msg",
     "CompressedImage": "sensor_msgs.msg",
+    "Image": "sensor_msgs.msg",
     "CameraInfo": "sensor_msgs.msg",
     "Vector3": "geometry_msgs.msg",
     "Quaternion": "geometry_msgs.msg",
@@ -167,6 +181,7 @@ class Settings:
     max_age_ms: older pictures are not published; 0 for no limit but the node's own `valid_for_ms`.
     source_frame: TF frame the source camera has on this robot (x right, y down, z ahead); "": as the node names it.
     metres_per_unit: of the scene units of kubric checkpoints; 0: their virtual cameras get no TF.
+    maps: which kinds to publish beside the pictures, of "vis" and "depth".
     """
 
     data: str = "ipc"
@@ -176,6 +191,7 @@ class Settings:
     max_age_ms: float = 0.0
     source_frame: str = ""
     metres_per_unit: float = 0.0
+    maps: tuple[ViewKind, ...] = ()
 
 
 def to_time(stamp_ns: int) -> Time:
@@ -207,6 +223,20 @@ def to_compressed_image(view: ReceivedView, index: int) -> CompressedImage:
     else:
         coded = _jpeg(view.images[index])
     return CompressedImage(header=to_header(header, index), data=array("B", coded))
+
+
+def to_image(view: ReceivedView, index: int) -> Image:
+    """One frame of a map: depth in metres as 32FC1 with NaN where there is none (REP 118), visibility as mono8."""
+    is_depth = view.header.encoding == "invdepth16"
+    pixels = depth_m(view.message)[index] if is_depth else view.images[index, ..., 0]
+    return Image(
+        header=to_header(view.header, index),
+        height=pixels.shape[0],
+        width=pixels.shape[1],
+        encoding="32FC1" if is_depth else "mono8",
+        step=pixels.strides[0],
+        data=array("B", pixels.tobytes()),
+    )
 
 
 def to_camera_info(header: ViewHeader, index: int) -> CameraInfo:

@@ -15,6 +15,7 @@ from launch import LaunchDescription  # noqa: TID251  ROS's package, not our fol
 ARGUMENTS = {
     "name": ("topdown", "Instance of gcd-node@.service: its sockets are in /run/gcd/<name>."),
     "views": ("topdown", "Ids of the views, separated by commas."),
+    "maps": ("", "Kinds to publish beside the pictures, of vis and depth, separated by commas."),
     "source_frame": ("", "TF frame of the source camera on this robot; left out, as the node names it."),
 }
 
@@ -26,6 +27,7 @@ def generate_launch_description() -> LaunchDescription:
         "data": ["ipc:///run/gcd/", name, "/data"],
         "status": ["ipc:///run/gcd/", name, "/status"],
         "views": LaunchConfiguration("views"),
+        "maps": LaunchConfiguration("maps"),
         "source_frame": LaunchConfiguration("source_frame"),
     }
     bridge = Node(

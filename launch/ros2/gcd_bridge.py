@@ -8,11 +8,14 @@ are tested against stand-ins of the calls they make.
         -p data:=ipc:///run/gcd/topdown/data -p status:=ipc:///run/gcd/topdown/status
 
     gcd/<view>/image/compressed   sensor_msgs/CompressedImage    newest frame at the goal pose; best effort, depth 1
+    gcd/<view>/depth              sensor_msgs/Image              with maps:=vis,depth: metres as 32FC1, NaN for none;
+    gcd/<view>/vis                sensor_msgs/Image              mono8, 2 seen now, 1 seen before, 0 painted
     gcd/<view>/camera_info        sensor_msgs/CameraInfo         the same stamp; zeros if nobody knows the field of view
     /tf                           the virtual camera, seen from the source camera, at the stamp of the picture
     /diagnostics                  diagnostic_msgs/DiagnosticArray, once a second; STALE when the node is silent for 3 s
 
-Every pixel is generated: never evidence of free space. `header.stamp` is when the real camera took the frame, so
+Every pixel is generated: never evidence of free space; depth under painted pixels is a guess.
+`header.stamp` is when the real camera took the frame, so
 pictures come seconds old; what is past its `valid_for_ms` is not published. From a recording, stamps are its own time.
 
 Needs Python 3.10, numpy, pyzmq and the folder that holds gcd_node on PYTHONPATH. The node should publish
@@ -38,6 +41,7 @@ from bridge_messages import (
     DiagnosticArray,
     DiagnosticStatus,
     Header,
+    Image,
     KeyValue,
     Settings,
     TFMessage,
@@ -45,11 +49,12 @@ from bridge_messages import (
     to_camera_info,
     to_compressed_image,
     to_diagnostic,
+    to_image,
     to_time,
     to_transform,
 )
 
-from gcd_node.envelope import NoteMessage
+from gcd_node.envelope import NoteMessage, ViewKind
 from gcd_node.errors import AuthError, MessageError, NodeError, StaleError
 from gcd_node.subscriber import NoteSubscriber, ReceivedView, ViewSubscriber
 
@@ -71,10 +76,12 @@ class Counts:
 
 @dataclass(kw_only=True, slots=True)
 class ViewFeed:
-    """One view: its reader, which is made anew with each start of the node, and what became of what it read."""
+    """One kind of one view: its reader, which is made anew with each start of the node, and what became of what it
+    read."""
 
     view_id: str
     settings: Settings
+    kind: ViewKind = "win"
     counts: Counts = field(default_factory=Counts)
     _reader: ViewSubscriber | None = None
     _rest_until_s: float = 0.0
@@ -108,7 +115,7 @@ class ViewFeed:
         values = [KeyValue(key=each.name, value=str(getattr(counts, each.name))) for each in fields(counts)]
         return DiagnosticStatus(
             level=bytes([WARN if counts.trouble else OK]),
-            name=f"gcd: bridge {self.view_id}",
+            name=f"gcd: bridge {self.view_id}" + ("" if self.kind == "win" else f" {self.kind}"),
             message=counts.trouble or "OK",
             hardware_id="",
             values=tuple(values),
@@ -120,7 +127,7 @@ class ViewFeed:
     def _opened(self) -> ViewSubscriber:
         if self._reader is None:
             limit_ms = self.settings.max_age_ms or None
-            self._reader = ViewSubscriber(self.settings.data, self.view_id, max_age_ms=limit_ms)
+            self._reader = ViewSubscriber(self.settings.data, self.view_id, self.kind, max_age_ms=limit_ms)
         return self._reader
 
     def _usable(self, view: ReceivedView) -> ReceivedView | None:
@@ -140,7 +147,10 @@ class Bridge:
     def __init__(self, settings: Settings, publish: Callable[[str, Any], None]) -> None:
         """publish: takes a topic and one of the records above."""
         self._settings, self._publish = settings, publish
-        self.feeds = tuple(ViewFeed(view_id=each, settings=settings) for each in settings.views)
+        kinds: tuple[ViewKind, ...] = ("win", *settings.maps)
+        self.feeds = tuple(
+            ViewFeed(view_id=each, settings=settings, kind=kind) for each in settings.views for kind in kinds
+        )
         self._notes = NoteSubscriber(settings.status, ("status",))
         self._status: NoteMessage | None = None
         self._heard_s = -math.inf
@@ -177,16 +187,19 @@ class Bridge:
             feed.counts.trouble = "no frame of this view is at its goal pose"
             return
         try:
-            picture = to_compressed_image(view, index)
+            picture = to_compressed_image(view, index) if feed.kind == "win" else to_image(view, index)
         except NodeError as error:
             feed.counts.trouble = str(error)
+            return
+        feed.counts.published, feed.counts.trouble = feed.counts.published + 1, ""
+        if feed.kind != "win":
+            self._publish(f"{base}/{feed.kind}", picture)
             return
         transform = to_transform(view.header, index, self._settings)
         if transform is not None:  # before the picture: who looks up its frame then finds it
             self._publish("/tf", TFMessage(transforms=(transform,)))
         self._publish(f"{base}/camera_info", to_camera_info(view.header, index))
         self._publish(f"{base}/image/compressed", picture)
-        feed.counts.published, feed.counts.trouble = feed.counts.published + 1, ""
 
     def _listen(self) -> None:
         try:
@@ -210,7 +223,7 @@ class Ros:
         self._reliable = qos.QoSProfile(depth=10, reliability=qos.ReliabilityPolicy.RELIABLE)
 
     def settings(self) -> Settings:
-        """Each setting from the parameter of the same name; `views` separated by commas."""
+        """Each setting from the parameter of the same name; `views` and `maps` separated by commas."""
         return Settings(
             data=self._parameter("data", "ipc"),
             status=self._parameter("status", "ipc"),
@@ -219,13 +232,14 @@ class Ros:
             max_age_ms=self._parameter("max_age_ms", 0.0),
             source_frame=self._parameter("source_frame", ""),
             metres_per_unit=self._parameter("metres_per_unit", 0.0),
+            maps=tuple(each.strip() for each in self._parameter("maps", "").split(",") if each.strip()),
         )
 
     def publish(self, topic: str, record: Any) -> None:
         """Send a record as the ROS message of its name. Pictures and their cameras: the newest, or none."""
         message = self.to_message(record)
         if topic not in self._publishers:
-            newest_only = isinstance(record, CompressedImage | CameraInfo)
+            newest_only = isinstance(record, CompressedImage | Image | CameraInfo)
             qos = self._best_effort if newest_only else self._reliable
             self._publishers[topic] = self._node.create_publisher(type(message), topic, qos)
         self._publishers[topic].publish(message)

@@ -33,7 +33,7 @@ from gcd_model.errors import (
     ViewFixedError,
     ViewRangeError,
 )
-from gcd_model.families import FAMILIES, Family, ViewLimits
+from gcd_model.families import FAMILIES, LIVE_LENS_DEG, Family, ViewLimits
 from gcd_model.geometry import (
     CameraMount,
     DeltaFit,
@@ -49,6 +49,7 @@ from gcd_model.geometry import (
     pose_trajectory,
     spherical_trajectory,
 )
+from gcd_model.live.synthesizer import visibility_of
 from gcd_model.loading import ENGINES, EngineName, load_synthesizer
 from gcd_model.measuring import (
     IMPLEMENTATIONS,
@@ -82,6 +83,7 @@ __all__ = [
     "ENGINES",
     "FAMILIES",
     "IMPLEMENTATIONS",
+    "LIVE_LENS_DEG",
     "OBJECTS_SMALL",
     "QUALITIES",
     "SMALL",
@@ -151,4 +153,5 @@ __all__ = [
     "save_random",
     "spherical_trajectory",
     "synthesize",
+    "visibility_of",
 ]

@@ -89,7 +89,7 @@ def adapted(networks: Networks, adapter: Adapter) -> Networks:
             f"the adapter stands on the base {adapter.base}, these weights are {digest}; give the file it was "
             "trained from"
         )
-    config = adapter.card.config
+    config = adapter.card.diffusion
     base = carried_over(networks, config)
     state = merged(base.weights, adapter)
     lacking = [name for name in base.fresh if name not in state]
@@ -112,7 +112,7 @@ def merged(weights: Mapping[str, Tensor], adapter: Adapter) -> dict[str, Tensor]
             )
         state[f"{layer}.weight"] = added(weight, up, down, scale)
     whole = {name: tensor for name, tensor in adapter.tensors.items() if not name.endswith((UP, DOWN))}
-    known = empty_networks(adapter.card.config).state_dict()
+    known = empty_networks(adapter.card.diffusion).state_dict()
     for name, tensor in whole.items():
         if name not in known or known[name].shape != tensor.shape:
             raise CheckpointError(f"the adapter holds {name} {list(tensor.shape)}, which the model does not have")

@@ -10,9 +10,9 @@ Longer than other files because reading is allowed nowhere else; naming, matchin
 import hashlib
 import logging
 import zipfile
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, cast
 
@@ -32,42 +32,23 @@ from gcd_model.examination import (
     leftover_reports,
     network_reports,
 )
-from gcd_model.families import FAMILIES, Family, family_named
+from gcd_model.families import FAMILIES, family_named
 from gcd_model.file_kind import FETCH_AGAIN, HEAD, FileKind, check_archive, file_kind
 from gcd_model.gcd_layout import CARRIED
 from gcd_model.lightning import Contents, contents
-from gcd_model.networks import Networks, weights_digest
+from gcd_model.live.view import LiveNetworks
+from gcd_model.networks import LoadedWeights, Networks, weights_digest
 from gcd_model.own_format import CONFIG_KEY, Card, Entry, precision
 from gcd_model.packed import divided
 from gcd_model.restricted_pickle import RestrictedPickle, check_storages
 from gcd_model.weights_export import Report, own_content, write_published, write_safetensors, written_dtype
-from gcd_model.weights_report import Layout, WeightsReport
+from gcd_model.weights_report import WeightsReport
 
 _log = logging.getLogger(__name__)
 
 _LARGEST_YAML = 1 << 18
 _SAMPLED_ABOVE = 512 << 20  # bytes; larger files are digested by samples
 _SAMPLE, _SAMPLES, _END = 64 << 10, 64, 1 << 20
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class LoadedWeights:
-    """Networks with their weights, still in the mapped file, in the stored precision, on the CPU.
-
-    family: None if nobody could tell. move_time: frame in which the goal pose is reached.
-    sha256_12: first 12 digits of `digest`. uncertainty_scale: see `Traits`. layout: of the file.
-    carried: leftovers of a published file that its next owner may want, by published name; see `gcd_layout.CARRIED`.
-    """
-
-    name: str
-    networks: Networks
-    family: Family | None
-    move_time: int
-    trained: bool
-    sha256_12: str
-    uncertainty_scale: float | None = None
-    layout: Layout = "gcd-node"
-    carried: Mapping[str, Tensor] = field(default_factory=dict[str, Tensor])
 
 
 def load_weights(
@@ -122,7 +103,7 @@ def load_adapted(base: LoadedWeights, adapter: Adapter) -> LoadedWeights:
     return replace(
         base,
         name=card.name,
-        networks=adapted(base.networks, adapter),
+        networks=adapted(base.diffusion, adapter),
         family=family,
         move_time=card.move_time,
         trained=base.trained and card.trained,
@@ -233,7 +214,7 @@ def convert_weights(
     return inspect_weights(out)
 
 
-def save_weights(networks: Networks, out: str | Path, card: Card, *, overwrite: bool = False) -> None:
+def save_weights(networks: Networks | LiveNetworks, out: str | Path, card: Card, *, overwrite: bool = False) -> None:
     """Write networks as they are, for example after training.
 
     Raises: OptionError if `out` exists and `overwrite` is not set; CheckpointError if it cannot be written.

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from gcd_model.errors import OptionError, ShapeError
-from gcd_model.geometry import CameraMount, Trajectory
+from gcd_model.geometry import CameraMount, Intrinsics, Trajectory
+from gcd_model.geometry.pose import require_rigid
 
 SolverName = Literal["euler", "dpmpp_2m"]
 """How the probability-flow ODE is followed: one network evaluation a step, of first or of second order."""
@@ -31,13 +32,22 @@ class Clip:
 
     video: float32 [T, 3, H, W], RGB in [-1, 1].
     fps: frames per second of the clip itself, not of the camera; the network is told this number.
-    mount: how the camera sits on its vehicle, for models that warp by the planes of a road; None for the mount of their
-        training. Where the source camera of an orbit stands, the path says.
+    mount: how the camera sits on its vehicle, for models that warp by the planes of a road and for the live model; None
+        for the mount of their training, for the live model: not known. Where the source camera of an orbit stands, the
+        path says.
+    lens, depth, odometry: for the live model, which makes up for what is left out; lens and depth also for
+        `visibility_of`.
+    lens: of these pictures; None: of the mount's field of view.
+    depth: float32 [T, H, W], metres along the axis, instead of the depth network's; 0, negative or not finite: a hole.
+    odometry: float64 [T, 4, 4], world_from_camera of any world that stays; None: from the pictures.
     """
 
     video: Tensor
     fps: float
     mount: CameraMount | None = None
+    lens: Intrinsics | None = None
+    depth: Tensor | None = None
+    odometry: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.video.ndim != 4 or self.video.shape[1] != 3:
@@ -46,6 +56,18 @@ class Clip:
             raise ShapeError(f"video must be float32 in [-1, 1], got {self.video.dtype}")
         if not (self.fps > 0 and math.isfinite(self.fps)):
             raise OptionError(f"fps must be a positive number, got {self.fps}")
+        frames, _, height, width = self.video.shape
+        if self.lens is not None and (self.lens.height, self.lens.width) != (height, width):
+            raise ShapeError(f"the lens is of {self.lens.width} x {self.lens.height}, the video of {width} x {height}")
+        depth, odometry = self.depth, self.odometry
+        if depth is not None and (depth.dtype != torch.float32 or depth.shape != (frames, height, width)):
+            found = f"{depth.dtype} {list(depth.shape)}"
+            raise ShapeError(f"depth must be float32 [{frames}, {height}, {width}] as the video is, got {found}")
+        if odometry is not None:
+            if odometry.dtype != torch.float64 or odometry.shape != (frames, 4, 4):
+                found = f"{odometry.dtype} {list(odometry.shape)}"
+                raise ShapeError(f"odometry must be float64 [{frames}, 4, 4], got {found}")
+            require_rigid(odometry, "odometry")
 
     @property
     def frames(self) -> int:
@@ -64,6 +86,14 @@ class View:
     motion_bucket: the motion number the network was told.
     classes: uint8 [S, T, H, W], class ids of `Traits.classes`, on the CPU; None for models that make none.
     uncertainty_scale: see `Traits`.
+    visibility: uint8 [T, H, W], the same for every draw: 2 where the source camera sees the surface now, 1 where it saw
+        it before, 0 where the pixel is painted. None where nobody knows.
+    inverse_depth: float32 [T, H, W], 1/m along the view's axis; 0 for the sky and where there is none. A guess under
+        painted pixels. None for models that make none.
+    log_variance: float32 [T, H, W], log of the variance of the truth about the mean picture, mean over the channels, of
+        pictures in [0, 1]. None for models that do not state their own spread.
+    ood: how unlike the training the source looks to the model, 0 to 1, mean over the frames. None for models that
+        cannot tell.
     """
 
     samples: Tensor
@@ -72,6 +102,10 @@ class View:
     motion_bucket: float
     classes: Tensor | None = None
     uncertainty_scale: float | None = None
+    visibility: Tensor | None = None
+    inverse_depth: Tensor | None = None
+    log_variance: Tensor | None = None
+    ood: float | None = None
 
     @property
     def video(self) -> Tensor:
@@ -90,10 +124,13 @@ class View:
     def uncertainty(self) -> Tensor | None:
         """How far the truth lies from the mean of the samples, as a standard deviation: [T, H, W], in parts of 1.
 
-        `std` times the scale that was measured on held-out clips. None with one sample, or where nobody measured it.
+        `std` times the scale that was measured on held-out clips, None where nobody measured it; with one sample what
+        the model states of itself, None where it does not.
         """
         std = self.std
-        return None if std is None or self.uncertainty_scale is None else std * self.uncertainty_scale
+        if std is None:
+            return None if self.log_variance is None else (self.log_variance / 2).exp()
+        return None if self.uncertainty_scale is None else std * self.uncertainty_scale
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -1,6 +1,7 @@
 """Clip, relative camera, frame rate, motion and noise strength become everything the U-Net takes, once a window."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Self
 
 import torch
@@ -8,8 +9,25 @@ from torch import Tensor, nn
 
 from gcd_model.config import CAMERA_FEATURES, CameraControl
 from gcd_model.errors import ShapeError
-from gcd_model.geometry import CameraMount, Trajectory
+from gcd_model.geometry import CameraMount, Intrinsics, Trajectory
 from gcd_model.layers import sinusoid
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SourceGeometry:
+    """What T source frames show in metres, for the live model.
+
+    metres: float32 [T, H, W], 0 for a hole. labels: uint8 [T, H, W]. static: bool [T, H, W], what stands still.
+    entropy: float32 [T], how unsure the depth network was, 0 to 1. odometry: float64 [T, 4, 4], world_from_camera, or
+    None. lens: of all of them.
+    """
+
+    metres: Tensor
+    labels: Tensor
+    static: Tensor
+    entropy: Tensor
+    odometry: Tensor | None
+    lens: Intrinsics
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -18,10 +36,12 @@ class SourceFeatures:
 
     So several views, samples and overlapping windows can share it.
 
-    tokens: [T, D] from the image tower, or None without one. latents: [T, C, h, w], not scaled.
+    tokens: [T, D] from the image tower, or None without one. latents: [T, C, h, w], not scaled; C is 0 for the live
+    model, which has none.
     extra: [T, C', h, w], further condition channels, or None. fps: what the network is told.
     augmentation: strength of the noise the VAE saw.
-    video: float32 [T, 3, H, W] in [-1, 1] and mount: what plane warps are made of; None for models without.
+    video: float32 [T, 3, H, W] in [-1, 1] and mount: what plane warps are made of, and the live model's points; None
+    for models without. geometry: of the live model; None for others.
     """
 
     tokens: Tensor | None
@@ -31,44 +51,47 @@ class SourceFeatures:
     augmentation: float
     video: Tensor | None = None
     mount: CameraMount | None = None
+    geometry: SourceGeometry | None = None
 
     @property
     def frames(self) -> int:
         """T."""
         return self.latents.shape[0]
 
-    def _kind(self) -> tuple[float, float, bool, bool, bool, CameraMount | None]:
-        absent = (self.tokens is None, self.extra is None, self.video is None)
-        return self.fps, self.augmentation, *absent, self.mount
+    def _kind(self) -> tuple[object, ...]:
+        """What must agree where features are joined: numbers, and which rows there are."""
+        geometry = self.geometry
+        stated = () if geometry is None else (geometry.lens, frozenset(_rows(geometry)))
+        return self.fps, self.augmentation, self.mount, frozenset(_rows(self)), stated
 
     def rows(self, start: int, stop: int) -> Self:
         """The features of frames start..stop-1."""
-        return replace(
-            self,
-            tokens=None if self.tokens is None else self.tokens[start:stop],
-            latents=self.latents[start:stop],
-            extra=None if self.extra is None else self.extra[start:stop],
-            video=None if self.video is None else self.video[start:stop],
-        )
+        geometry = self.geometry
+        if geometry is not None:
+            geometry = replace(geometry, **{name: each[start:stop] for name, each in _rows(geometry).items()})
+        return replace(self, geometry=geometry, **{name: each[start:stop] for name, each in _rows(self).items()})
 
     def followed_by(self, *later: Self) -> Self:
         """These frames and then the later ones, in the order given. Raises ShapeError unless all were encoded alike."""
         if any(self._kind() != each._kind() for each in later):
             raise ShapeError(
-                "features of another frame rate, augmentation, mount or model cannot be joined; encode them alike"
+                "features of another frame rate, augmentation, mount, lens or model cannot be joined; encode them alike"
             )
-        return replace(
-            self,
-            tokens=_joined([self.tokens, *(each.tokens for each in later)]),
-            latents=torch.cat([self.latents, *(each.latents for each in later)]),
-            extra=_joined([self.extra, *(each.extra for each in later)]),
-            video=_joined([self.video, *(each.video for each in later)]),
-        )
+        geometry, parts = self.geometry, [self, *later]
+        if geometry is not None:
+            geometry = replace(geometry, **_joined([each.geometry for each in parts if each.geometry is not None]))
+        return replace(self, geometry=geometry, **_joined(parts))
 
 
-def _joined(parts: list[Tensor | None]) -> Tensor | None:
-    there = [part for part in parts if part is not None]
-    return torch.cat(there) if there else None
+def _rows(of: SourceFeatures | SourceGeometry) -> dict[str, Tensor]:
+    """Its tensors that are there, by field; every one has a row a frame."""
+    named = {field.name: getattr(of, field.name) for field in fields(of)}
+    return {name: value for name, value in named.items() if isinstance(value, Tensor)}
+
+
+def _joined(parts: Sequence[SourceFeatures] | Sequence[SourceGeometry]) -> dict[str, Tensor]:
+    rows = [_rows(part) for part in parts]
+    return {name: torch.cat([each[name] for each in rows]) for name in rows[0]}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -13,6 +13,8 @@ from gcd_model.architecture import Hints, Naming, Shapes, diffusers_levels, gcd_
 from gcd_model.config import ModelConfig
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.families import Family, family_named
+from gcd_model.live.config import LiveConfig
+from gcd_model.live.view import LiveNetworks
 from gcd_model.matching import Match, match_weights
 from gcd_model.networks import Networks, empty_networks
 from gcd_model.own_format import CONFIG_KEY, Card
@@ -21,6 +23,7 @@ from gcd_model.provenance import Provenance, at_trained_size, checked_family, co
 from gcd_model.weight_names import GCD_UNET, Levels, assembled, diffusers_source, gcd_source, own_source
 from gcd_model.weights_report import Layout, Leftover, NetworkReport
 
+_NO_LEVELS = Levels(attention=(), unet_blocks=0, vae_levels=0, vae_blocks=0, image_layers=0)
 _USABLE = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
 _NAMINGS: dict[Layout, Naming] = {
     "gcd-ckpt": gcd_source,
@@ -111,7 +114,7 @@ class Examined:
 
     name: str
     file: WeightsFile
-    networks: Networks
+    networks: Networks | LiveNetworks
     match: Match
     family: Family | None
     told_by: str | None
@@ -144,11 +147,12 @@ def examine(file: WeightsFile, options: Options) -> Examined:
     )
     config = _inferred(file, told, options) if card is None else _with_options(card.config, options)
     family = checked_family(told, config)
-    if card is None:
+    if isinstance(config, ModelConfig) and card is None:
         config = at_trained_size(config, family)
     networks = _empty(config, len(file.tensors))
     expected = {name: tuple(tensor.shape) for name, tensor in networks.state_dict().items()}
-    match = match_weights(expected, file.shapes, _NAMINGS[file.layout], Levels.of(config))
+    levels = Levels.of(config) if isinstance(config, ModelConfig) else _NO_LEVELS
+    match = match_weights(expected, file.shapes, _NAMINGS[file.layout], levels)
     _require_usable(file, match)
     last = config.frames - 1
     return Examined(
@@ -177,11 +181,13 @@ def _inferred(file: WeightsFile, told: Provenance, options: Options) -> ModelCon
     return infer_config(file.shapes, _NAMINGS[file.layout], levels, options.over(hints))
 
 
-def _with_options(config: ModelConfig, options: Options) -> ModelConfig:
+def _with_options(config: ModelConfig | LiveConfig, options: Options) -> ModelConfig | LiveConfig:
     """Our files state their heads; only the number of frames may be changed."""
-    stated = {"head_width": config.unet.head_width}
-    if config.image_encoder is not None:
-        stated["image_heads"] = config.image_encoder.heads
+    stated: dict[str, int] = {}
+    if isinstance(config, ModelConfig):
+        stated["head_width"] = config.unet.head_width
+        if config.image_encoder is not None:
+            stated["image_heads"] = config.image_encoder.heads
     for name, value in stated.items():
         given = getattr(options, name)
         if given is not None and given != value:
@@ -189,13 +195,14 @@ def _with_options(config: ModelConfig, options: Options) -> ModelConfig:
     return config if options.frames is None else msgspec.structs.replace(config, frames=options.frames)
 
 
-def _empty(config: ModelConfig, tensors: int) -> Networks:
+def _empty(config: ModelConfig | LiveConfig, tensors: int) -> Networks | LiveNetworks:
     """Networks without storage. A config that is out of proportion to its file is refused before it is built."""
-    tower = 0 if config.image_encoder is None else config.image_encoder.layers
-    blocks = config.unet.blocks_per_level * len(config.unet.multipliers)
-    blocks += config.vae.blocks_per_level * len(config.vae.multipliers)
-    if tower + blocks > tensors:
-        raise CheckpointError(f"describes {tower + blocks} blocks and holds {tensors} tensors; it is damaged")
+    if isinstance(config, ModelConfig):
+        tower = 0 if config.image_encoder is None else config.image_encoder.layers
+        blocks = config.unet.blocks_per_level * len(config.unet.multipliers)
+        blocks += config.vae.blocks_per_level * len(config.vae.multipliers)
+        if tower + blocks > tensors:
+            raise CheckpointError(f"describes {tower + blocks} blocks and holds {tensors} tensors; it is damaged")
     try:
         return empty_networks(config)
     except (ArithmeticError, RuntimeError, TypeError, ValueError) as error:

@@ -10,7 +10,7 @@ from gcd_model.config import CameraControl
 from gcd_model.errors import OptionError
 from gcd_model.geometry import Interpolation, Spherical
 
-FamilyName = Literal["kubric90", "kubric180", "driving", "driving-semantic", "manipulation", "svd"]
+FamilyName = Literal["kubric90", "kubric180", "driving", "driving-semantic", "manipulation", "svd", "live"]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -98,8 +98,22 @@ MANIPULATION = Family(
 )
 """Ours: a camera anywhere about a robot's cell, told as a rigid transform."""
 SVD = Family(name="svd", camera="none", rates=(), fps=7.0, hfov_deg=None, height=576, width=1024, motion_bucket=127.0)
+LIVE = Family(
+    name="live",
+    camera="relative_pose",
+    rates=(),
+    fps=10.0,
+    hfov_deg=None,
+    height=128,
+    width=192,
+    motion_bucket=127.0,
+    pose_units="m",
+)
+"""Ours: see `gcd_model.live`; any rigid pose, any lens of LIVE_LENS_DEG."""
+LIVE_LENS_DEG = (40.0, 120.0)
+"""Horizontal fields of view of the live model's training."""
 
-_ALL = (KUBRIC90, KUBRIC180, DRIVING, DRIVING_SEMANTIC, MANIPULATION, SVD)
+_ALL = (KUBRIC90, KUBRIC180, DRIVING, DRIVING_SEMANTIC, MANIPULATION, SVD, LIVE)
 
 FAMILIES: dict[str, Family] = {family.name: family for family in _ALL}
 

@@ -1,20 +1,23 @@
 """From the name of a checkpoint to a synthesizer on a device."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
 
 import msgspec
 import torch
 
-from gcd_model.checkpoints import LoadedWeights, load_adapted, load_weights, read_adapter
+from gcd_model.checkpoints import load_adapted, load_weights, read_adapter
 from gcd_model.config import SMALL
 from gcd_model.engine import Engine
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.examination import Options
-from gcd_model.families import family_named
-from gcd_model.networks import Networks, random_networks, weights_digest
+from gcd_model.families import LIVE, Family, family_named
+from gcd_model.live.config import LIVE_TINY
+from gcd_model.live.synthesizer import LiveSynthesizer
+from gcd_model.live.view import LiveNetworks
+from gcd_model.networks import LoadedWeights, Networks, random_networks, weights_digest
 from gcd_model.onnx_export import is_export
 from gcd_model.onnx_loading import load_export
 from gcd_model.own_format import FULL_PRECISION, precision
@@ -41,7 +44,7 @@ def load_synthesizer(
     adapter: str | Path | None = None,
     engine: EngineName | None = None,
     providers: Sequence[str] = (),
-) -> Synthesizer:
+) -> Synthesizer | LiveSynthesizer:
     """A checkpoint, ready to run.
 
     Args:
@@ -49,7 +52,8 @@ def load_synthesizer(
             whose views are noise. The folder of an export is run by onnxruntime, anything else by torch.
         family: see `load_weights`. device: "auto" (CUDA where there is one), "cpu", "cuda" or "cuda:N".
         dtype: "float32", "bfloat16" or "float16"; else float32 on the CPU, bfloat16 on CUDA. The VAE decoder
-            stays float32 (on CUDA torch may use TF32 in its convolutions, see torch.backends.cudnn).
+            stays float32 (on CUDA torch may use TF32 in its convolutions, see torch.backends.cudnn). The live model
+            computes in float32 alone.
         head_width, image_heads, frames: see `load_weights`.
         adapter: file of a low-rank adapter that was trained on these weights; family and path are then the adapter's.
         engine: what computes the networks: "torch" as they are, or "cuda", compiled and as CUDA graphs, for a GPU; it
@@ -68,6 +72,8 @@ def load_synthesizer(
     loaded = loaded_weights(
         source, family=family, head_width=head_width, image_heads=image_heads, frames=frames, adapter=adapter
     )
+    if isinstance(loaded.networks, LiveNetworks):
+        return _live_synthesizer(loaded, loaded.networks, place, asked=dtype)
     return _synthesizer(loaded, place)
 
 
@@ -122,17 +128,25 @@ def random_weights(family: str, *, frames: int | None = None) -> LoadedWeights:
     """Small random networks with the camera control of a family; always the same ones."""
     Options(frames=frames)  # checks it
     chosen = family_named(family)
-    unet = SMALL.unet if chosen.camera != "none" else msgspec.structs.replace(SMALL.unet, camera_width=0)
-    config = msgspec.structs.replace(SMALL, camera=chosen.camera, unet=unet, frames=frames or SMALL.frames)
-    networks = random_networks(config, seed=0)
+    networks = _random_networks(chosen, frames)
     return LoadedWeights(
         name=f"random-{family}",
         networks=networks,
         family=chosen,
-        move_time=config.frames - 1,
+        move_time=0 if chosen is LIVE else networks.config.frames - 1,
         trained=False,
         sha256_12=weights_digest(networks.state_dict()),
     )
+
+
+def _random_networks(family: Family, frames: int | None) -> Networks | LiveNetworks:
+    if family is LIVE:
+        return random_networks(
+            LIVE_TINY if frames is None else msgspec.structs.replace(LIVE_TINY, frames=frames), seed=0
+        )
+    unet = SMALL.unet if family.camera != "none" else msgspec.structs.replace(SMALL.unet, camera_width=0)
+    config = msgspec.structs.replace(SMALL, camera=family.camera, unet=unet, frames=frames or SMALL.frames)
+    return random_networks(config, seed=0)
 
 
 def _require_no_overrides(source: str, *given: object) -> None:
@@ -191,8 +205,21 @@ def _device(name: str) -> torch.device:
     return torch.device(name)
 
 
+def _live_synthesizer(
+    loaded: LoadedWeights, networks: LiveNetworks, place: _Place, *, asked: str | None
+) -> LiveSynthesizer:
+    if asked not in (None, "float32"):
+        raise OptionError(f"{loaded.name} is the live model, which computes in float32; leave dtype {asked} out")
+    if place.engine != "torch":
+        raise OptionError(
+            f"{loaded.name} is the live model, which torch runs as it is; leave engine {place.engine} out"
+        )
+    place = replace(place, dtype=torch.float32, precision="float32")
+    return LiveSynthesizer(networks.to(place.device, place.dtype), _traits(loaded, place))
+
+
 def _synthesizer(loaded: LoadedWeights, place: _Place) -> Synthesizer:
-    networks = _moved(loaded.networks, place)
+    networks = _moved(loaded.diffusion, place)
     engine = _cuda_engine(networks) if place.engine == "cuda" else None
     return Synthesizer(networks, _traits(loaded, place), engine)
 

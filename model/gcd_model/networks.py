@@ -2,6 +2,8 @@
 
 import hashlib
 from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import overload
 
 import torch
 from torch import Tensor, nn
@@ -9,10 +11,16 @@ from torch import Tensor, nn
 from gcd_model.class_head import ClassHead
 from gcd_model.conditioning import CameraEmbedder
 from gcd_model.config import ModelConfig
+from gcd_model.errors import CheckpointError
+from gcd_model.families import Family
 from gcd_model.image_encoder import ImageEncoder
+from gcd_model.live.config import LiveConfig
+from gcd_model.live.view import LiveNetworks
+from gcd_model.own_format import NO_DIFFUSION
 from gcd_model.plane_mix import PlaneMix
 from gcd_model.unet import VideoUNet
 from gcd_model.vae import Encoder, TemporalDecoder
+from gcd_model.weights_report import Layout
 
 
 class Networks(nn.Module):
@@ -42,6 +50,33 @@ class Networks(nn.Module):
         return self.target_encoder if self.own_condition_encoder is None else self.own_condition_encoder
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class LoadedWeights:
+    """Networks with their weights, still in the mapped file, in the stored precision, on the CPU.
+
+    family: None if nobody could tell. move_time: frame in which the goal pose is reached.
+    sha256_12: first 12 digits of `digest`. uncertainty_scale: see `Traits`. layout: of the file.
+    carried: leftovers of a published file that its next owner may want, by published name; see `gcd_layout.CARRIED`.
+    """
+
+    name: str
+    networks: Networks | LiveNetworks
+    family: Family | None
+    move_time: int
+    trained: bool
+    sha256_12: str
+    uncertainty_scale: float | None = None
+    layout: Layout = "gcd-node"
+    carried: Mapping[str, Tensor] = field(default_factory=dict[str, Tensor])
+
+    @property
+    def diffusion(self) -> Networks:
+        """The networks of a diffusion model. Raises CheckpointError for the live model."""
+        if isinstance(self.networks, LiveNetworks):
+            raise CheckpointError(f"{self.name} {NO_DIFFUSION}")
+        return self.networks
+
+
 def _plane_mix(config: ModelConfig) -> PlaneMix | None:
     if config.plane_mix is None or config.plane_warp is None:
         return None
@@ -49,17 +84,25 @@ def _plane_mix(config: ModelConfig) -> PlaneMix | None:
     return PlaneMix(config.plane_mix, config.plane_warp.layers, config.vae.latent_channels, classes)
 
 
-def empty_networks(config: ModelConfig) -> Networks:
+@overload
+def empty_networks(config: ModelConfig) -> Networks: ...
+@overload
+def empty_networks(config: LiveConfig) -> LiveNetworks: ...
+def empty_networks(config: ModelConfig | LiveConfig) -> Networks | LiveNetworks:
     """Networks without storage, on the meta device, to be filled from a checkpoint."""
     with torch.device("meta"):
-        return Networks(config)
+        return Networks(config) if isinstance(config, ModelConfig) else LiveNetworks(config)
 
 
-def random_networks(config: ModelConfig, seed: int) -> Networks:
+@overload
+def random_networks(config: ModelConfig, seed: int) -> Networks: ...
+@overload
+def random_networks(config: LiveConfig, seed: int) -> LiveNetworks: ...
+def random_networks(config: ModelConfig | LiveConfig, seed: int) -> Networks | LiveNetworks:
     """Freshly initialised networks; layers that start at zero get random values too, so that every path is live."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        networks = Networks(config)
+        networks = Networks(config) if isinstance(config, ModelConfig) else LiveNetworks(config)
         for parameter in networks.parameters():
             if not parameter.any():
                 nn.init.normal_(parameter, std=0.02)

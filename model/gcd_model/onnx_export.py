@@ -18,8 +18,9 @@ from typing import Any
 import msgspec
 import torch
 
-from gcd_model.checkpoints import LoadedWeights, digest
+from gcd_model.checkpoints import digest
 from gcd_model.errors import CheckpointError, OptionError
+from gcd_model.networks import LoadedWeights
 from gcd_model.onnx_graphs import Graph, graphs
 from gcd_model.onnx_manifest import (
     FORMAT,
@@ -129,7 +130,7 @@ def _require_intact(folder: Path, file: FileRecord) -> None:
 
 def _at_size(loaded: LoadedWeights, height: int | None, width: int | None) -> LoadedWeights:
     """The weights in float32, with the size they are exported for as their config's."""
-    networks = loaded.networks
+    networks = loaded.diffusion
     config, factor = networks.config, networks.config.size_factor
     height, width = height or config.height, width or config.width
     if height % factor or width % factor:
@@ -142,7 +143,7 @@ def _at_size(loaded: LoadedWeights, height: int | None, width: int | None) -> Lo
 def _card(loaded: LoadedWeights) -> Card:
     return Card(
         name=loaded.name,
-        config=loaded.networks.config,
+        config=loaded.diffusion.config,
         family=None if loaded.family is None else loaded.family.name,
         move_time=loaded.move_time,
         trained=loaded.trained,
@@ -155,7 +156,7 @@ def _written(
     loaded: LoadedWeights, folder: Path, precision: ExportPrecision, apart_above: int, progress: Report | None
 ) -> dict[GraphName, GraphRecord]:
     records: dict[GraphName, GraphRecord] = {}
-    wanted = graphs(loaded.networks)
+    wanted = graphs(loaded.diffusion)
     for graph in wanted:
         if progress is not None:
             progress(graph.name, len(records), len(wanted))

@@ -36,8 +36,8 @@ def load_export(folder: str | Path, *, device: str = "auto", providers: Sequence
     if TENSORRT_PROVIDER in chosen.names:
         (folder / _TENSORRT_CACHE).mkdir(exist_ok=True)
     files: dict[GraphName, Path] = {name: folder / record.files[0].name for name, record in manifest.graphs.items()}
-    engine = OnnxEngine(Sessions(files, chosen), card.config)
-    return Synthesizer(empty_networks(card.config), _traits(card, manifest), engine)
+    engine = OnnxEngine(Sessions(files, chosen), card.diffusion)
+    return Synthesizer(empty_networks(card.diffusion), _traits(card, manifest), engine)
 
 
 def _providers(device: str, names: Sequence[str]) -> Providers:

@@ -11,12 +11,14 @@ import torch
 
 from gcd_model.config import ModelConfig
 from gcd_model.errors import CheckpointError, OptionError
+from gcd_model.live.config import LiveConfig
 
 FORMAT, PACKED_FORMAT = "1", "2"
 """Of files whose weights are numbers as they are, and of those that hold some in eight bits."""
 CONFIG_KEY = "gcd.config"
 LINE = 64
 """Bytes of a cache line, and of what torch aligns memory to."""
+NO_DIFFUSION = "is the live model, which has no U-Net and no VAE: this is for diffusion models"
 _SCALE_KEY = "gcd.uncertainty_scale"
 
 PRECISIONS: dict[str, torch.dtype] = {
@@ -49,7 +51,7 @@ class Card:
     """
 
     name: str
-    config: ModelConfig
+    config: ModelConfig | LiveConfig
     family: str | None
     move_time: int
     trained: bool = True
@@ -60,6 +62,13 @@ class Card:
         scale = self.uncertainty_scale
         if scale is not None and not 0 < scale < math.inf:
             raise OptionError(f"the uncertainty scale must be a positive number, got {scale:g}; measure it again")
+
+    @property
+    def diffusion(self) -> ModelConfig:
+        """The config of a diffusion model. Raises CheckpointError for the live model's."""
+        if isinstance(self.config, LiveConfig):
+            raise CheckpointError(f"{self.name or 'it'} {NO_DIFFUSION}")
+        return self.config
 
     def to_metadata(self, *, packed: bool = False) -> dict[str, str]:
         """As safetensors metadata: text to text. packed: whether weights are stored in eight bits."""
@@ -86,7 +95,7 @@ class Card:
         try:
             return cls(
                 name=metadata.get("gcd.name", ""),
-                config=msgspec.json.decode(metadata[CONFIG_KEY], type=ModelConfig),
+                config=_config(metadata[CONFIG_KEY]),
                 family=metadata.get("gcd.family") or None,
                 move_time=int(metadata["gcd.move_time"]),
                 trained=metadata.get("gcd.trained", "true") != "false",
@@ -95,6 +104,16 @@ class Card:
             )
         except (msgspec.DecodeError, KeyError, ValueError, ArithmeticError) as error:
             raise CheckpointError(f"its metadata cannot be used ({error}); convert the weights again") from error
+
+
+class _Kind(msgspec.Struct):
+    kind: str = ""
+
+
+def _config(text: str) -> ModelConfig | LiveConfig:
+    if msgspec.json.decode(text, type=_Kind).kind == "live":
+        return msgspec.json.decode(text, type=LiveConfig)
+    return msgspec.json.decode(text, type=ModelConfig)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,8 @@ import msgspec
 
 from gcd_model.config import ModelConfig, SamplingConfig
 from gcd_model.errors import CheckpointError
-from gcd_model.families import Family, FamilyName, family_named
+from gcd_model.families import LIVE, Family, FamilyName, family_named
+from gcd_model.live.config import LiveConfig
 
 SVD_GUIDANCE = (1.0, 2.5)
 """Guidance of the first and last frame Stable Video Diffusion was published with; GCD uses 1.0 to 1.5."""
@@ -104,8 +105,8 @@ def combined(*told: Provenance) -> Provenance:
     )
 
 
-def checked_family(told: Provenance, config: ModelConfig) -> Family | None:
-    """The family, if it can be: steered weights need a steered family, fixed ones a fixed one.
+def checked_family(told: Provenance, config: ModelConfig | LiveConfig) -> Family | None:
+    """The family, if it can be: steered weights need a steered family, fixed ones a fixed one, the live model its own.
 
     Relative poses may stand in for angles and radius.
     Raises: CheckpointError on a contradiction, OptionError for an unknown name.
@@ -113,6 +114,12 @@ def checked_family(told: Provenance, config: ModelConfig) -> Family | None:
     if told.family is None:
         return None
     family = family_named(told.family)
+    live = family is LIVE, isinstance(config, LiveConfig)
+    if live[0] != live[1]:
+        raise CheckpointError(
+            f"family {family.name} (told by: {told.told_by}) and these weights do not belong together: one is the live "
+            "model, the other is not; leave --family out"
+        )
     if (family.camera == "none") != (config.camera == "none"):
         raise CheckpointError(
             f"family {family.name} (told by: {told.told_by}) wants camera control {family.camera!r}, "

@@ -67,7 +67,7 @@ def synthesize(
     return synthesizer.render(synthesizer.encode(clip), [trajectory], options)[0]
 
 
-def _out_of_memory_is_our_error(method: Callable[Given, Made]) -> Callable[Given, Made]:
+def out_of_memory_is_our_error(method: Callable[Given, Made]) -> Callable[Given, Made]:
     """The method, with torch's out-of-memory error as DeviceMemoryError and the device's cache given back."""
 
     @wraps(method)
@@ -92,7 +92,7 @@ class Synthesizer:
     def __init__(self, networks: Networks, traits: Traits, engine: Engine | None = None) -> None:
         """engine: what computes the networks; torch itself where none is given."""
         self._networks, self._traits = networks, traits
-        config = traits.config
+        self._config = config = networks.config
         self._warps = None if config.plane_warp is None else PathWarpCache(config.plane_warp, config.vae.down_factor)
         networks.requires_grad_(False)
         prepare(networks)
@@ -108,7 +108,7 @@ class Synthesizer:
         """The networks themselves, for measuring and exporting."""
         return self._networks
 
-    @_out_of_memory_is_our_error
+    @out_of_memory_is_our_error
     @torch.inference_mode()
     def encode(
         self, clip: Clip, augmentation: Augmentation | None = None, extra: Tensor | None = None
@@ -119,7 +119,7 @@ class Synthesizer:
         """
         augmentation = Augmentation() if augmentation is None else augmentation
         told = augmentation.strength
-        strength = self._traits.config.sampling.augmentation if told is None else told
+        strength = self._config.sampling.augmentation if told is None else told
         self._traits.check_size(*clip.video.shape[-2:])
         self._check_extra(extra)
         noise = augmentation.noise
@@ -138,7 +138,7 @@ class Synthesizer:
             mount=self._mount(clip),
         )
 
-    @_out_of_memory_is_our_error
+    @out_of_memory_is_our_error
     @torch.inference_mode()
     def render(
         self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
@@ -169,12 +169,12 @@ class Synthesizer:
         return self._engine.like
 
     def _check_extra(self, extra: Tensor | None) -> None:
-        wanted, given = self._traits.config.extra_condition_channels, 0 if extra is None else extra.shape[1]
+        wanted, given = self._config.extra_condition_channels, 0 if extra is None else extra.shape[1]
         if wanted != given:
             raise ShapeError(f"{self._traits.name} wants {wanted} extra condition channels, got {given}")
 
     def _check_lengths(self, features: SourceFeatures, trajectories: Sequence[Trajectory]) -> None:
-        frames = self._traits.config.frames
+        frames = self._config.frames
         if not trajectories:
             raise ShapeError("at least one trajectory is wanted, got none")
         for length in (features.frames, *(path.frames for path in trajectories)):
@@ -204,7 +204,7 @@ class Synthesizer:
         return self._warps.warps(features.mount, trajectory, height, width, self._like.device)
 
     def _denoise(self, job: "_Job") -> Denoised:
-        config, options = self._traits.config, job.options
+        config, options = self._config, job.options
         schedule = Schedule.of(config, options)
         given = self._condition(job, unconditional=schedule.branches == 2)
         noise = job.noise(config.frames, shared=config.sampling.shared_noise)  # [S, T, C, h, w]
@@ -222,7 +222,7 @@ class Synthesizer:
 
     def _condition(self, job: "_Job", *, unconditional: bool) -> Conditioning:
         """Rows are ordered view by view, sample by sample."""
-        samples, width = job.options.samples, self._traits.config.unet.vector_width
+        samples, width = job.options.samples, self._config.unet.vector_width
         vectors = [
             micro_conditioning(job.features.fps, bucket, job.features.augmentation, width) for bucket in job.buckets
         ]
@@ -239,9 +239,9 @@ class Synthesizer:
         )
 
     def _decode(self, job: "_Job", denoised: Denoised) -> list[Pictures]:
-        mixes = self._traits.config.plane_mix is not None
+        mixes = self._config.plane_mix is not None
         stacks = [job.layers(warps) if mixes else None for warps in job.warps]
-        scale = self._traits.config.vae.scale
+        scale = self._config.vae.scale
         finish = Finish(painted=self._traits.painted_classes, whole_levels=job.options.whole_levels)
         pictures = decode(self._engine, scale, denoised, stacks, finish)
         if not all(view.finite for view in pictures):

@@ -1,12 +1,13 @@
 """One loaded checkpoint as its users need to know it: its family, its own facts, and the views it can give."""
 
 import logging
+import math
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from gcd_model.config import ModelConfig, SemanticClass
+from gcd_model.config import ModelConfig, PlaneWarpConfig, SemanticClass
 from gcd_model.errors import OptionError, PoseError, ViewFixedError, ViewRangeError
 from gcd_model.families import Family
 from gcd_model.geometry import (
@@ -18,10 +19,14 @@ from gcd_model.geometry import (
     Trajectory,
     driving_trajectory,
     fitted_trajectory,
+    look_at,
     motion_bucket,
     pose_trajectory,
+    relative_pose,
     spherical_trajectory,
 )
+from gcd_model.live.config import LiveConfig
+from gcd_model.own_format import NO_DIFFUSION
 from gcd_model.plane_warp import orbit_mount, trained_mount
 
 _LOG = logging.getLogger(__name__)
@@ -44,7 +49,7 @@ class Traits:
     """
 
     name: str
-    config: ModelConfig
+    config: ModelConfig | LiveConfig
     family: Family | None
     move_time: int
     sha256_12: str
@@ -52,6 +57,28 @@ class Traits:
     device: str
     trained: bool = True
     uncertainty_scale: float | None = None
+
+    @property
+    def live(self) -> bool:
+        """Whether it is the live model, which needs to know the lens and takes a mount, depth and odometry."""
+        return isinstance(self.config, LiveConfig)
+
+    @property
+    def ood_threshold(self) -> float | None:
+        """`View.ood` above which the source shows another world than the training's; None for models without."""
+        return self.config.ood_threshold if isinstance(self.config, LiveConfig) else None
+
+    @property
+    def takes_any_pose(self) -> bool:
+        """Whether views may stand anywhere and look anywhere."""
+        return self.config.camera == "relative_pose" and (self.family is None or self.family.limits is None)
+
+    @property
+    def diffusion(self) -> ModelConfig:
+        """The config of a diffusion model. Raises OptionError for the live model, which has none."""
+        if isinstance(self.config, LiveConfig):
+            raise OptionError(f"{self.name} {NO_DIFFUSION}")
+        return self.config
 
     @property
     def fps(self) -> float:
@@ -71,18 +98,25 @@ class Traits:
     @property
     def classes(self) -> tuple[SemanticClass, ...]:
         """Ontology of the views' class maps, by id; empty for a model that makes none."""
+        if isinstance(self.config, LiveConfig):
+            return self.config.classes
         return self.painted_classes if self.config.class_head is None else self.config.class_head.classes
 
     @property
     def painted_classes(self) -> tuple[SemanticClass, ...]:
         """The classes whose colours the pictures are painted in; empty for a model of photographs."""
         paints = self.family is not None and self.family.output == "semantic"
-        return self.config.semantic_classes if paints else ()
+        return self.config.semantic_classes if paints and isinstance(self.config, ModelConfig) else ()
+
+    @property
+    def plane_warp(self) -> PlaneWarpConfig | None:
+        """The known planes that a model warps by; None for others."""
+        return None if isinstance(self.config, LiveConfig) else self.config.plane_warp
 
     @property
     def mount(self) -> CameraMount | None:
         """The camera mount a model that warps by the planes of a road was trained with; None for others."""
-        plane_warp = self.config.plane_warp
+        plane_warp = self.plane_warp
         return trained_mount(plane_warp) if plane_warp is not None and plane_warp.frame == "vehicle" else None
 
     def check_size(self, height: int, width: int) -> None:
@@ -96,7 +130,7 @@ class Traits:
 
     def check_source(self, source: Spherical) -> None:
         """Raises OptionError if the source camera cannot stand there: below the ground that a model warps by."""
-        plane_warp = self.config.plane_warp
+        plane_warp = self.plane_warp
         if plane_warp is not None and plane_warp.frame == "stage":
             orbit_mount(plane_warp, source)
 
@@ -129,18 +163,23 @@ class Traits:
         """The camera path to a goal given as differences of angles and radius.
 
         Args:
-            delta: destination minus source; None for the checkpoint's own fixed view.
+            delta: destination minus source; None for the checkpoint's own fixed view. The live model's is the one above
+                and behind the vehicle, unless `source` is given.
             source: where the source camera stands, if known; absolute limits are checked only then.
             move_time: frame in which the goal is reached, instead of the checkpoint's.
-            mount: how the source camera sits on its vehicle, for the fixed driving view; None as trained. The clip
-                must name the same.
+            mount: how the source camera sits on its vehicle, for the fixed driving view and for the live model, which
+                orbits about what the camera looks at; None as trained. The clip must name the same.
         Raises:
             ViewFixedError: the checkpoint takes no camera command.
             ViewRangeError: the goal lies outside the family's limits.
             OptionError: a mount was given to a checkpoint whose view hangs on no vehicle; or as `check_source`.
         """
         frames, move_time = self.config.frames, self.move_time if move_time is None else move_time
-        if mount is not None and not (self.config.camera == "none" and self.knows_camera):
+        if self.live and source is None and delta is None:
+            return driving_trajectory(frames=frames, move_time=move_time, mount=mount or CameraMount())
+        if self.live:
+            source = source or _orbit_of(mount)
+        elif mount is not None and not (self.config.camera == "none" and self.knows_camera):
             raise OptionError(f"{self.name} has no vehicle's view to place a camera mount in; leave the mount out")
         if self.config.camera == "none":
             return self._fixed_view(delta, move_time, mount)
@@ -151,6 +190,24 @@ class Traits:
         start = source or ASSUMED_SOURCE
         self.check_source(start)
         return spherical_trajectory(start, delta, frames=frames, move_time=move_time, interpolation=interpolation)
+
+    def plan_placed(
+        self, position_m: tuple[float, ...], look_at_m: tuple[float, ...], *, mount: CameraMount | None = None
+    ) -> Trajectory:
+        """The path of a camera that stands at a point and looks at another, upright, in every frame.
+
+        Args:
+            position_m, look_at_m: (x, y, z) in the frame of what the source camera is mounted on: x ahead, y left, z
+                up, the ground at z = 0.
+            mount: of the source camera; None for CameraMount().
+        Raises:
+            OptionError: the checkpoint does not take any pose. PoseError: not finite, or it looks straight up or down.
+        """
+        if not self.takes_any_pose:
+            raise OptionError(f"{self.name} takes no position_m and look_at_m; give azimuth, elevation and radius")
+        points = (torch.tensor(point, dtype=torch.float64) for point in (position_m, look_at_m))
+        pose = relative_pose((mount or CameraMount()).vehicle_from_camera, look_at(*points))
+        return self.plan_poses(pose.repeat(self.config.frames, 1, 1))
 
     def plan_poses(self, source_from_target: Tensor, *, source: Spherical | None = None) -> Trajectory:
         """A camera path given as rigid transforms [T, 4, 4].
@@ -203,6 +260,17 @@ class Traits:
                     "choose a view inside, or another checkpoint",
                     allowed,
                 )
+
+
+def _orbit_of(mount: CameraMount | None) -> Spherical:
+    """The sphere that a camera on a vehicle orbits on: about the point of the ground that it looks at, at most as far
+    away as ASSUMED_SOURCE's; that one without a mount."""
+    if mount is None:
+        return ASSUMED_SOURCE
+    falling = math.sin(math.radians(mount.tilt_deg))
+    reach_m = ASSUMED_SOURCE.radius_m
+    radius_m = min(reach_m, mount.height_m / falling) if falling > 0 else reach_m
+    return Spherical(azimuth_deg=0.0, elevation_deg=mount.tilt_deg, radius_m=radius_m)
 
 
 def _warn_of_residual(fits: list[DeltaFit]) -> None:

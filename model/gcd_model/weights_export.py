@@ -98,8 +98,8 @@ def write_published(
         weights: by our names. carried: see `gcd_state`. updates: of the optimizer, for `global_step`.
     Raises: as `write_safetensors`; OptionError if the published layout cannot hold such networks.
     """
-    state = {name: _alone(value) for name, value in gcd_state(weights, card.config, carried).items()}
-    card = replace(card, config=published_config(card.config))
+    state = {name: _alone(value) for name, value in gcd_state(weights, card.diffusion, carried).items()}
+    card = replace(card, config=published_config(card.diffusion))
     with _whole_or_nothing(out, ".ckpt", overwrite=overwrite) as file:
         torch.save(lightning_checkpoint(state, card, updates), file)
 

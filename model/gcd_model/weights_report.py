@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from gcd_model.config import ModelConfig
+from gcd_model.live.config import LiveConfig
 
 Layout = Literal["gcd-ckpt", "sgm-safetensors", "diffusers", "gcd-node"]
 """Lightning checkpoint of GCD; `svd.safetensors` and its like; diffusers folder; our own format."""
@@ -42,7 +43,7 @@ class WeightsReport:
     path: str
     name: str
     layout: Layout
-    config: ModelConfig
+    config: ModelConfig | LiveConfig
     family: str | None
     told_by: str | None
     move_time: int

@@ -14,6 +14,7 @@ from gcd_model.config import SMALL
 from gcd_model.errors import CheckpointError, OptionError, ViewFixedError
 from gcd_model.families import FAMILIES
 from gcd_model.geometry import SphericalDelta
+from gcd_model.live.config import LIVE_TINY
 from gcd_model.loading import load_synthesizer
 from gcd_model.own_format import Card
 from gcd_model.synthesizer import Synthesizer, synthesize
@@ -85,9 +86,11 @@ def test_a_float16_folder_computes_in_float32_on_the_cpu(tmp_path: Path) -> None
 @pytest.mark.parametrize("family", list(FAMILIES))
 def test_random_networks_have_their_familys_control(family: str) -> None:
     traits = load_synthesizer(f"random:{family}", device="cpu").traits
-    assert (traits.name, traits.trained, traits.move_time) == (f"random-{family}", False, 13)
+    direct = family == "live"
+    assert (traits.name, traits.trained, traits.move_time) == (f"random-{family}", False, 0 if direct else 13)
     assert traits.config.camera == FAMILIES[family].camera
-    assert (traits.config.height, traits.config.width) == (SMALL.height, SMALL.width)
+    size = (LIVE_TINY.height, LIVE_TINY.width) if traits.live else (SMALL.height, SMALL.width)
+    assert (traits.config.height, traits.config.width) == size
     if traits.config.camera == "none":
         with pytest.raises(ViewFixedError):
             traits.plan_view(SphericalDelta(azimuth_deg=10.0))

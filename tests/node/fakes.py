@@ -1,5 +1,6 @@
 """A model, a source and an outbox that do what a test tells them."""
 
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -80,11 +81,27 @@ def fake_classes(made: Traits, samples: int) -> torch.Tensor | None:
     return ((s + t + x) % len(made.classes)).to(torch.uint8)
 
 
-class FakeSynthesizer:
-    """Gives the source back, darker by the seed's last bits; `act` is called before every render."""
+def fake_maps(frames: int = 14, height: int = HEIGHT, width: int = WIDTH) -> dict[str, torch.Tensor]:
+    """What a view may hold beside its picture, [T, H, W]: every state, every depth from 0.3 to 200 m and none, a spread
+    of a tenth."""
+    numbers = torch.arange(frames * height * width).reshape(frames, height, width)
+    depth_m = 0.3 * (200 / 0.3) ** (numbers / numbers.max())
+    return {
+        "visibility": (numbers % 3).to(torch.uint8),
+        "inverse_depth": torch.where(numbers % 7 == 0, torch.zeros(()), 1 / depth_m),
+        "log_variance": torch.full((frames, height, width), 2 * math.log(0.1)),
+    }
 
-    def __init__(self, made: Traits, act: Callable[[RenderOptions], None] | None = None) -> None:
+
+class FakeSynthesizer:
+    """Gives the source back, darker by the seed's last bits; `act` is called before every render. holds: the names of
+    what its views hold, of fake_maps()."""
+
+    def __init__(
+        self, made: Traits, act: Callable[[RenderOptions], None] | None = None, holds: Sequence[str] = ()
+    ) -> None:
         self.traits = made
+        self.holds = holds
         self.asked: list[tuple[list[Trajectory], RenderOptions]] = []
         self.clips: list[Clip] = []
         self._act = act
@@ -112,6 +129,7 @@ class FakeSynthesizer:
                 trajectory=path,
                 motion_bucket=127.0,
                 classes=fake_classes(self.traits, options.samples),
+                **{name: fake_maps()[name] for name in self.holds},
             )
             for path in trajectories
         ]

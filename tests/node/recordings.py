@@ -95,10 +95,12 @@ def recorder_config(
     return parse_config(text.encode(), "test")
 
 
-def recorded(config: NodeConfig, source: FrameSource | None = None, made: Traits | None = None) -> tuple[Node, Box]:
-    """A node that recorded a whole run."""
+def recorded(
+    config: NodeConfig, source: FrameSource | None = None, made: Traits | None = None, holds: Sequence[str] = ()
+) -> tuple[Node, Box]:
+    """A node that recorded a whole run. holds: see FakeSynthesizer."""
     box = Box()
-    node = made_node(config, FakeSynthesizer(made or traits()), source or FakeSource(30), box)
+    node = made_node(config, FakeSynthesizer(made or traits(), holds=holds), source or FakeSource(30), box)
     node.run()
     return node, box
 

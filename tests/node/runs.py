@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -35,8 +36,9 @@ class LevelModel(FakeSynthesizer):
         lower: Mapping[tuple[int, int], int] | None = None,
         classes: Mapping[int, int] | None = None,
         act: Callable[[RenderOptions], None] | None = None,
+        holds: Sequence[str] = (),
     ) -> None:
-        super().__init__(made, act)
+        super().__init__(made, act, holds)
         self._lower, self._classes = lower or {}, classes or {}
 
     def render(
@@ -54,13 +56,7 @@ class LevelModel(FakeSynthesizer):
         if classes is not None:
             columns = self._classes.get(window, 0)
             classes[:, 0, :, :columns] = (classes[:, 0, :, :columns] + 1) % len(self.traits.classes)
-        return View(
-            samples=(video / 255)[None],
-            latents=view.latents,
-            trajectory=view.trajectory,
-            motion_bucket=view.motion_bucket,
-            classes=classes,
-        )
+        return replace(view, samples=(video / 255)[None])
 
 
 def nan_model(windows: set[int]) -> FakeSynthesizer:

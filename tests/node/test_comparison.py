@@ -8,7 +8,7 @@ from wire_messages import CLASSES, numbers
 
 from gcd_node.demo import demo_weights, moments
 from gcd_node.errors import NodeError
-from gcd_node.pictures.comparison import Moment, comparison, legend
+from gcd_node.pictures.comparison import Moment, comparison, hatched, legend
 from gcd_node.pictures.files import Image
 from gcd_node.wire.class_colours import paint
 
@@ -52,6 +52,20 @@ def test_without_class_maps_there_are_two_columns_and_no_legend() -> None:
 def test_large_pictures_keep_their_size() -> None:
     large = Moment(source=np.zeros((256, 384, 3), np.uint8), view=np.zeros((256, 384, 3), np.uint8))
     assert comparison([large], (), HEADINGS[:2]).shape[1] == 2 * 384 + 4
+
+
+def test_hatching_touches_painted_pixels_alone_and_leaves_most_of_them() -> None:
+    pictures = np.random.default_rng(0).integers(0, 256, (2, HEIGHT, WIDTH, 3), np.uint8)
+    seen = np.random.default_rng(1).integers(0, 3, (2, HEIGHT, WIDTH), np.uint8)
+    changed = (hatched(pictures, seen) != pictures).any(axis=-1)
+    assert not changed[seen > 0].any()
+    assert 0.2 < changed[seen == 0].mean() < 0.5
+    assert np.array_equal(hatched(pictures[0], seen[0]), hatched(pictures, seen)[0])
+
+
+def test_hatching_is_diagonal_and_continuous() -> None:
+    lines = hatched(flat(0), np.zeros((HEIGHT, WIDTH), np.uint8)).any(axis=-1)
+    assert np.array_equal(lines[1:, :-1], lines[:-1, 1:])
 
 
 @pytest.mark.parametrize("width", [80, 150, 1000])

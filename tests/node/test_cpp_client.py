@@ -20,10 +20,10 @@ from fakes import HEIGHT, WIDTH, FakeSynthesizer, made_node, traits
 from media import write_video
 from mutations import BYTE_PIECES, ROUNDS, TEXT_PIECES, Mutator
 from numpy.typing import NDArray
-from wire_messages import OTHER_BOOT, class_map, end, pixels, window
+from wire_messages import OTHER_BOOT, class_map, depth, end, pixels, visibility, window
 
 from gcd_node.config import NodeConfig, parse_config
-from gcd_node.envelope import MAGIC, PREFIX, ViewMessage, decode, encode
+from gcd_node.envelope import MAGIC, PREFIX, ViewMessage, decode, encode, inverse_depth
 from gcd_node.errors import MessageError
 from gcd_node.publisher import Publisher
 from gcd_node.session import publisher_options
@@ -256,6 +256,41 @@ def test_a_class_map_is_written_as_grey(client: Path, sender: Sender, tmp_path: 
     assert (tmp_path / "top_cls_000005_01.pgm").read_bytes() == b"P5\n6 4\n255\n" + bytes(message.payload[24:])
 
 
+def read_map(client: Path, sender: Sender, message: ViewMessage, folder: Path) -> list[str]:
+    """What the client says of one message of its kind."""
+    kind = message.topic.rpartition("/")[2]
+    process = start(client, sender.endpoint, "--every", "--kind", kind, "--timeout", "1", "--ppm", str(folder))
+    assert sender.socket.poll(1000 * PATIENCE_S)
+    assert sender.socket.recv() == b"\1" + message.topic.encode().ljust(32, b"\0")
+    sender.send(encode(message))
+    return lines_of(process, 69)
+
+
+def test_visibility_is_written_as_grey(client: Path, sender: Sender, tmp_path: Path) -> None:
+    message = visibility(5)
+    told = fields_of(read_map(client, sender, message, tmp_path)[0])
+    assert (told["shape"], told["encoding"]) == ("2x4x6x1", "class8")
+    assert (tmp_path / "top_vis_000005_01.pgm").read_bytes() == b"P5\n6 4\n255\n" + bytes(message.payload[24:])
+
+
+def test_every_depth_is_read_as_in_python(client: Path, sender: Sender, tmp_path: Path) -> None:
+    every = np.arange(0x7C00, dtype="<u2").view("<f2").reshape(2, 128, 124)  # all halves that are finite and positive
+    message = depth(5, inverse=every)
+    told = fields_of(read_map(client, sender, message, tmp_path)[0])
+    assert float(told["mean"]) == pytest.approx(inverse_depth(message).mean(dtype=np.float64), abs=1e-5)
+    for index in range(2):
+        head, pixels = (tmp_path / f"top_depth_000005_0{index}.pfm").read_bytes().split(b"-1.0\n", 1)
+        assert head == b"Pf\n124 128\n"
+        assert np.array_equal(np.frombuffer(pixels, "<f4").reshape(128, 124)[::-1], inverse_depth(message)[index])
+
+
+@pytest.mark.parametrize("value", [-0.5, np.nan, np.inf])
+def test_a_depth_that_is_none_is_dropped(client: Path, sender: Sender, tmp_path: Path, value: float) -> None:
+    message = depth(inverse=np.array([[[0.5, value]]], "<f2"))
+    (line, _) = read_map(client, sender, message, tmp_path)
+    assert line.endswith("rule=7: inverse depth is negative or not finite")
+
+
 def test_a_picture_that_cannot_be_written_ends_it(client: Path, sender: Sender, tmp_path: Path) -> None:
     process = start(client, sender.endpoint, "--every", "--ppm", str(tmp_path / "missing"))
     sender.wait_for_readers()
@@ -323,6 +358,8 @@ BROKEN = {
     "7: offsets do not rise": edited({"encoding": "jpeg", "offsets": [0, 144, 144]}),
     "7: offsets do not start": edited({"encoding": "jpeg", "offsets": [1, 10, 144]}),
     "7: encoding and channels": edited({"encoding": "mono8"}),
+    "7: encoding and topic": edited({"encoding": "invdepth16", "dtype": "f16", "shape": [1, 12, 6, 1]}),
+    "6: unknown dtype": edited({"dtype": "f16"}),
     "7: an end of stream with": edited({}, flags=6),
 }
 

@@ -30,9 +30,9 @@ from doc_pages import (
     said_texts,
     wrong_commands,
 )
-from fakes import FakeSynthesizer, warping_traits
+from fakes import FakeSynthesizer, fake_maps, warping_traits
 from rig import Rig
-from wire_messages import class_map
+from wire_messages import class_map, depth, visibility
 
 from gcd_node.config import parse_config
 from gcd_node.errors import ConfigError, MessageError, StaleError
@@ -146,9 +146,9 @@ def test_a_python_block_is_python(block: Block) -> None:
     assert compile(block.text, block.place, "exec", flags=ast.PyCF_ALLOW_TOP_LEVEL_AWAIT) is not None
 
 
-def planner() -> dict[str, Any]:
-    """What the program of the guide defines."""
-    (block,) = [block for block in BLOCKS if block.mark == "planner"]
+def planner(mark: str = "planner") -> dict[str, Any]:
+    """What a program of the guide defines."""
+    (block,) = [block for block in BLOCKS if block.mark == mark]
     defined: dict[str, Any] = {"__name__": "planner"}
     exec(compile(block.text, block.place, "exec"), defined)
     return defined
@@ -250,3 +250,74 @@ def test_the_planner_of_the_guide_does_not_believe_what_lies_outside_the_trained
     assert caution(None) == 0.0
     assert caution(received(quality=replace(quality, ood=()))) > 0.0
     assert caution(received(quality=replace(quality, ood=("fps",)))) == 0.0
+
+
+def seen_by(vis: np.ndarray, inverse: np.ndarray, **header: object) -> tuple[ReceivedView, ReceivedView]:
+    """Both maps of one window, whose camera stands 2 m ahead of the source camera."""
+    pose = np.eye(4)
+    pose[2, 3] = 2.0
+    messages = visibility(seen=vis), depth(inverse=inverse.astype("<f2"))
+    changes = {"source_from_view": (tuple(pose.ravel().tolist()),) * 2, "pose_units": "m", **header}
+    quality = replace(messages[0].header.quality, ood=())
+    how = {"age_ms": 0.0, "expired": False, "skipped": 0, "restarted": False}
+    made = [replace(each, header=replace(each.header, **{"quality": quality, **changes})) for each in messages]
+    return ReceivedView(message=made[0], **how), ReceivedView(message=made[1], **how)
+
+
+def test_the_obstacles_of_the_guide_are_what_was_seen_now_and_stand_where_it_was() -> None:
+    defined = planner("obstacles")
+    chance = np.random.default_rng(0)
+    vis = chance.integers(0, 3, (2, 4, 6), np.uint8)
+    inverse = np.where(chance.random((2, 4, 6)) < 0.2, 0.0, 1 / chance.uniform(1, 50, (2, 4, 6)))
+    seen, far = seen_by(vis, inverse)
+    points = defined["seen_points"](seen, far)
+    shown = (vis[-1] == 2) & (inverse[-1] > 0)
+    assert len(points) == shown.sum() > 0
+    x, y, z = points.T - np.array([[0.0], [0.0], [2.0]])  # back in the view's axes
+    fx, _, cx, _, fy, cy, *_ = far.header.intrinsics
+    assert np.allclose((fx * x / z + cx, fy * y / z + cy), np.nonzero(shown)[::-1])
+    assert np.allclose(1 / z, inverse[-1][shown], rtol=5e-4)
+    for change in ({"pose_units": "scene"}, {"intrinsics": None}, {"source_from_view": None}):
+        assert len(defined["seen_points"](*seen_by(vis, inverse, **change))) == 0
+    unusual = replace(far.header.quality, ood=("fps",))
+    assert len(defined["seen_points"](*seen_by(vis, inverse, quality=unusual))) == 0
+
+
+def test_the_guide_brakes_for_what_is_seen_and_for_nothing_painted() -> None:
+    defined = planner("obstacles")
+    inverse = np.full((2, 4, 6), 1 / 8.0)
+    assert (
+        defined["nearest_ahead_m"](defined["seen_points"](*seen_by(np.full((2, 4, 6), 2, np.uint8), inverse))) == 10.0
+    )
+    for never in (0, 1):
+        points = defined["seen_points"](*seen_by(np.full((2, 4, 6), never, np.uint8), inverse))
+        assert defined["nearest_ahead_m"](points) == float("inf")
+
+
+def test_the_obstacles_of_the_guide_follow_a_node(tmp_path: Path) -> None:
+    obstacles = planner("obstacles")["SeenObstacles"](f"ipc://{tmp_path}/data", "main", max_age_ms=1e9)
+    model = FakeSynthesizer(warping_traits(), holds=("visibility", "inverse_depth"))
+    found: list[Any] = []
+    stamps = itertools.count(time.monotonic_ns() - 1_000_000_000_000, 100_000_000)
+    with Rig(tmp_path, Bench(camera := Camera(fps=10.0)), model, views="[view.main]", watched=False):
+
+        def look() -> bool:
+            camera.shoot(stamp_ns=next(stamps))
+            found.append(obstacles.poll(wait_ms=10.0))
+            return found[-1] is not None
+
+        until(look)
+    maps = fake_maps()
+    assert len(found[-1]) == ((maps["visibility"] == 2) & (maps["inverse_depth"] > 0))[-1].sum()
+    until(lambda: obstacles.poll(wait_ms=10.0) is None and obstacles.maps.ended)
+    obstacles.maps.close()
+
+
+def test_the_obstacles_of_the_guide_never_join_two_windows(tmp_path: Path) -> None:
+    obstacles = planner("obstacles")["SeenObstacles"](f"ipc://{tmp_path}/data", "main")
+    obstacles.maps.close()
+    seen, far = seen_by(np.full((2, 4, 6), 2, np.uint8), np.full((2, 4, 6), 0.1))
+    later = replace(far, message=replace(far.message, header=replace(far.header, window_id=1)))
+    late = replace(far, expired=True)
+    obstacles.maps = Scripted(far, seen, later, far, seen, MessageError("damaged"), late, seen, far)
+    assert [obstacles.poll() is None for _ in range(9)] == [True] * 8 + [False]

@@ -2,7 +2,9 @@
 
 import ast
 import dataclasses
+import hashlib
 import json
+import math
 import random
 import struct
 import zlib
@@ -10,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from wire_messages import CLASSES, class_map, end, numbers, origin, pixels, view_header, window
+from wire_messages import CLASSES, class_map, depth, end, numbers, origin, pixels, view_header, visibility, window
 
 import gcd_node
 from gcd_node.envelope import (
@@ -22,8 +24,10 @@ from gcd_node.envelope import (
     ViewMessage,
     colours,
     decode,
+    depth_m,
     encode,
     images,
+    inverse_depth,
     payload_of,
     topic_key,
     view_topic,
@@ -81,6 +85,73 @@ def test_a_class_map_survives_the_round_trip_with_what_its_numbers_mean() -> Non
     assert decoded == message
     assert decoded.header.classes == CLASSES
     assert np.array_equal(images(decoded), numbers(5)[..., None])
+
+
+def test_visibility_survives_the_round_trip_and_says_what_its_numbers_mean() -> None:
+    message = dataclasses.replace(visibility(5), sequence=4)
+    decoded = decode(encode(message))
+    assert decoded == message
+    assert [(each.id, each.name) for each in decoded.header.classes] == [
+        (0, "painted"),
+        (1, "seen_before"),
+        (2, "seen_now"),
+    ]
+    assert images(decoded).tobytes() == bytes(message.payload)
+
+
+def test_inverse_depth_survives_the_round_trip() -> None:
+    message = dataclasses.replace(depth(5), sequence=4)
+    decoded = decode(encode(message))
+    assert decoded == message
+    assert np.array_equal(inverse_depth(decoded), np.frombuffer(message.payload, "<f2").reshape(2, 4, 6))
+    assert np.array_equal(np.isnan(depth_m(decoded)), inverse_depth(decoded) == 0)
+    assert np.allclose((depth_m(decoded) * inverse_depth(decoded))[inverse_depth(decoded) > 0], 1)
+    with pytest.raises(MessageError, match="holds no levels"):
+        images(decoded)
+    with pytest.raises(MessageError, match="holds no depth"):
+        inverse_depth(window())
+
+
+def test_nearer_is_brighter_and_no_depth_is_black() -> None:
+    shown = colours(depth(inverse=np.array([[[0, 0.005, 0.1, 1, 65504]]], "<f2")))[0, 0, :, 0]
+    assert (np.diff(shown.astype(int)) > 0).all()
+    assert shown[0] == 0
+
+
+@pytest.mark.parametrize("value", [-1.0, math.nan, math.inf])
+def test_a_depth_that_is_none_is_refused_by_who_reads_it(value) -> None:
+    message = decode(encode(depth(inverse=np.array([[[0.5, value]]], "<f2"))))
+    with pytest.raises(MessageError, match="finite and not negative"):
+        inverse_depth(message)
+
+
+@pytest.mark.parametrize("message", [window(), class_map(), visibility(), depth()], ids=lambda message: message.topic)
+@pytest.mark.parametrize("kind", ["win", "frm", "cls", "vis", "depth"])
+def test_pixels_of_one_kind_are_never_taken_for_another(message, kind) -> None:
+    alike = [{"win", "frm"}, {"cls", "vis"}, {"depth"}]  # by encoding
+    fits = any({message.topic.rpartition("/")[2], kind} <= kinds for kinds in alike)
+    part = encode(message)
+    part = f"view/top/{kind}".encode().ljust(32, b"\0") + part[32:]
+    assert fits != is_refused(part)
+
+
+@pytest.mark.parametrize(
+    ("kind", "sha256"),
+    [
+        ("win", "e4564807ad18c6fc688933f2957e2fd64ba91c727e5c063915a40615060d649d"),
+        ("frm", "04c90adf59bea5033d3a08609a2880f3bb195205c535b3359aa66d1a3a6ce306"),
+        ("std", "695a60e300d9f50a121a4bdac249135e80c812b5b64fecb521a31ba2cf73049c"),
+        ("cls", "2c03da8265fd94e136b634c75ad7062444738b5452da7b45fded4bfb5030fbc5"),
+    ],
+)
+def test_messages_of_protocol_1_0_stay_as_they_were_to_the_byte(kind, sha256) -> None:
+    """Recorded from the last commit that knew these four kinds alone (a5c0278)."""
+    grey = pixels(channels=1)
+    header = dataclasses.replace(view_header(shape=grey.shape), scale=0.125)
+    std = ViewMessage(topic="view/top/std", header=header, payload=payload_of(grey))
+    message = {"cls": class_map(), "std": std}.get(kind) or window(kind=kind)
+    header = dataclasses.replace(message.header, t_publish_ns=1_700_000_002_000_000_000)
+    assert hashlib.sha256(encode(dataclasses.replace(message, header=header))).hexdigest() == sha256
 
 
 def test_what_the_model_cannot_say_survives_as_none() -> None:
@@ -242,7 +313,7 @@ def test_a_class_number_without_a_name_is_refused_when_shown() -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"classes": None}, "cls message needs encoding class8 and `classes`"),
+        ({"classes": None}, "of encoding class8 needs `classes`"),
         ({"classes": []}, "name each number once"),
         ({"classes": [{"id": 1, "name": "a", "colour": [0, 0, 0]}] * 2}, "name each number once"),
         ({"classes": [{"id": 256, "name": "a", "colour": [0, 0, 0]}]}, "0 to 255"),

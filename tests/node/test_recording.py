@@ -28,7 +28,7 @@ from recordings import (
 from wire_messages import window
 
 from gcd_node.config import parse_config
-from gcd_node.envelope import images
+from gcd_node.envelope import depth_m, images
 from gcd_node.health.report import Level
 from gcd_node.recording import messages, schemas
 from gcd_node.recording.diagnostics import to_diagnostics
@@ -187,6 +187,21 @@ def test_pictures_are_what_was_seen_and_published(run: tuple[list[Said], Box, Pa
     for each, pixels in zip(of(heard, "/view/main/image"), shown, strict=True):
         picture = cv2.imdecode(np.frombuffer(each.value.data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
         assert np.abs(picture.astype(int) - pixels).max() <= 3
+
+
+def test_visibility_and_depth_come_back_as_they_were_published(tmp_path: Path) -> None:
+    _, box = recorded(recorder_config(tmp_path), FakeSource(28), holds=("visibility", "inverse_depth"))
+    heard = said(files(tmp_path)[0])
+    seen = np.concatenate([images(message) for message in box.of("vis")])
+    metres = np.concatenate([depth_m(message) for message in box.of("depth")])
+    for topic, encoding, dtype, wanted in (
+        ("visibility", "mono8", np.uint8, seen[..., 0]),
+        ("depth", "32FC1", np.float32, metres),
+    ):
+        found = [each.value for each in of(heard, f"/view/main/{topic}")]
+        assert {(each.encoding, each.height, each.step) for each in found} == {(encoding, 64, 96 * dtype().nbytes)}
+        pixels = np.stack([np.frombuffer(each.data, dtype).reshape(64, 96) for each in found])
+        assert np.array_equal(pixels, wanted, equal_nan=dtype is np.float32)
 
 
 def test_headers_are_the_wire_s_own(run: tuple[list[Said], Box, Path]) -> None:

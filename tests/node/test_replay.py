@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 import zmq
-from fakes import HEIGHT, WIDTH, FakeSource, FakeSynthesizer, traits, warping_traits
+from fakes import HEIGHT, WIDTH, FakeSource, FakeSynthesizer, fake_maps, traits, warping_traits
 from media import ramp, write_video
 from runs import FRAMES, WINDOWS, LevelModel, copied, launch, made_run, nan_model, parts
 
@@ -72,7 +72,17 @@ def test_what_is_on_disk_is_what_the_model_drew(run: RunFolder) -> None:
         assert np.array_equal(window.pictures["main"], wanted)
         assert pixel_digest(wanted) == window.entry.views["main"].sha256 == window.entry.input_sha256
         columns = (np.arange(FRAMES)[:, None] + np.arange(WIDTH)) % len(run.manifest.classes)
-        assert np.array_equal(window.classes["main"], np.repeat(columns[:, None], HEIGHT, axis=1))
+        assert np.array_equal(window.maps["main"]["cls"], np.repeat(columns[:, None], HEIGHT, axis=1))
+
+
+def test_visibility_and_depth_are_on_disk_to_the_bit(tmp_path: Path) -> None:
+    model = LevelModel(traits(), holds=("visibility", "inverse_depth"))
+    made = made_run(tmp_path / "run", model)
+    for window in read_windows(made):
+        maps, wanted = window.maps["main"], fake_maps()
+        assert np.array_equal(maps["vis"], wanted["visibility"].numpy())
+        assert np.array_equal(maps["depth"].view("<f2"), wanted["inverse_depth"].numpy().astype("<f2"))
+        assert set(window.entry.views["main"].maps_sha256) == {"vis", "depth"}
 
 
 def test_noise_of_every_level_survives_the_disk(tmp_path: Path) -> None:

@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 import pytest
 import zmq
-from wire_messages import OTHER_BOOT, origin, pixels, window
+from wire_messages import OTHER_BOOT, depth, origin, pixels, visibility, window
 
 import gcd_node
-from gcd_node.envelope import Message, NoteMessage, ViewMessage, encode
+from gcd_node.envelope import Message, NoteMessage, ViewMessage, encode, inverse_depth
 from gcd_node.errors import AuthError, ConfigError
 from gcd_node.subscriber import ReceivedView
 from gcd_node.wire.jpeg import encode_frames
@@ -339,6 +339,10 @@ MESSAGES: dict[str, dict[str, dict[str, type | tuple[type, ...]]]] = {
     "std_msgs.msg": {"Header": {"stamp": object, "frame_id": str}},
     "sensor_msgs.msg": {
         "CompressedImage": {"header": object, "format": str, "data": array},
+        "Image": {
+            "header": object, "height": int, "width": int, "encoding": str, "is_bigendian": int, "step": int,
+            "data": array,
+        },
         "CameraInfo": {
             "header": object, "height": int, "width": int, "distortion_model": str, "d": list, "k": list, "r": list,
             "p": list, "binning_x": int, "binning_y": int, "roi": object,
@@ -473,10 +477,48 @@ def test_every_record_has_the_fields_of_its_ros_message() -> None:
         assert {each.name for each in fields(getattr(ros, name))} == wanted
 
 
+def test_depth_is_metres_with_nan_for_none_and_visibility_its_own_numbers() -> None:
+    for index in range(2):
+        message = depth(3)
+        made, inverse = ros.to_image(received(message), index), inverse_depth(message)[index]
+        assert (made.encoding, made.height, made.width, made.step) == ("32FC1", 4, 6, 24)
+        metres = np.frombuffer(made.data, np.float32).reshape(4, 6)
+        assert np.array_equal(np.isnan(metres), inverse == 0)
+        assert np.allclose(metres[inverse > 0] * inverse[inverse > 0], 1)
+        seen = ros.to_image(received(visibility(3)), index)
+        assert (seen.encoding, seen.step) == ("mono8", 6)
+        assert seen.data.tobytes() == visibility(3).payload[24 * index : 24 * (index + 1)]
+
+
+def test_maps_are_published_where_they_are_asked_for(fake_ros: FakeRos, tmp_path: Path) -> None:
+    sender = Sender(tmp_path)
+    fake_ros.parameters = {"data": f"ipc://{tmp_path}/data", "status": f"ipc://{tmp_path}/status", "views": "top"}
+    fake_ros.parameters["maps"] = "vis, depth"
+    sequence = iter(range(10**6))
+
+    def enough() -> bool:
+        for message in (visibility(), depth()):
+            sender.send(message, next(sequence))
+        return {"gcd/top/vis", "gcd/top/depth", "/diagnostics"} <= {
+            topic for topic, sent in fake_ros.published.items() if sent
+        }
+
+    fake_ros.enough = enough
+    gcd_bridge.main(["gcd_bridge", "--ros-args"])
+    sender.context.destroy(linger=0)
+    assert set(fake_ros.publishers) == {"gcd/top/vis", "gcd/top/depth", "/diagnostics"}
+    assert fake_ros.publishers["gcd/top/depth"][1] == (1, "best effort")
+    assert [each.name for each in fake_ros.published["/diagnostics"][-1].status[1:]] == [
+        "gcd: bridge top",
+        "gcd: bridge top vis",
+        "gcd: bridge top depth",
+    ]
+
+
 def test_settings_come_from_parameters(fake_ros: FakeRos) -> None:
-    fake_ros.parameters = {"views": "a", "metres_per_unit": 0.2, "source_frame": "oak"}
+    fake_ros.parameters = {"views": "a", "metres_per_unit": 0.2, "source_frame": "oak", "maps": "depth"}
     made = gcd_bridge.Ros(fake_ros).settings()
-    assert made == Settings(views=("a",), metres_per_unit=0.2, source_frame="oak")
+    assert made == Settings(views=("a",), metres_per_unit=0.2, source_frame="oak", maps=("depth",))
 
 
 def test_the_launch_file_starts_the_bridge_with_parameters_it_knows(monkeypatch: pytest.MonkeyPatch) -> None:

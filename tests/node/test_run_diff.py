@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import msgspec
@@ -13,14 +14,15 @@ from fakes import FakeSource, traits, warping_traits
 from rich.console import Console
 from runs import FRAMES, WINDOWS, LevelModel, copied, made_run, nan_model
 
+from gcd_model import View
 from gcd_node.cli.main import run_app
 from gcd_node.errors import DamagedRunError, UsageError
 from gcd_node.replay.diff_pictures import WORST, gain_for, write_report
-from gcd_node.replay.diff_report import divergence, facts_table, report_text, to_plain, verdict, views_table
+from gcd_node.replay.diff_report import describe, divergence, facts_table, report_text, to_plain, verdict, views_table
 from gcd_node.replay.manifest import Manifest, SizeEntry, WindowEntry
 from gcd_node.replay.pixel_file import PixelWriter, pixel_digest
 from gcd_node.replay.run_diff import Missing, RunComparison, Tolerance, ViewComparison, compare, psnr_db
-from gcd_node.replay.run_folder import MANIFEST, RunFolder, classes_path, open_run, pictures_path, write_manifest
+from gcd_node.replay.run_folder import MANIFEST, RunFolder, map_path, open_run, pictures_path, write_manifest
 
 pytestmark = pytest.mark.timeout(60)
 EXACT = Tolerance()
@@ -53,7 +55,7 @@ def resized(run: RunFolder, folder: Path, *, honest: bool, kind: str = "pictures
     copied(run, folder)
     grey = kind == "classes"
     pixels = np.zeros((frames, height, width) if grey else (frames, height, width, 3), np.uint8)
-    path = (classes_path if grey else pictures_path)(folder, "main")
+    path = map_path(folder, "main", "cls") if grey else pictures_path(folder, "main")
     path.unlink()
     writer = PixelWriter(path, height=height, width=width, fps=10.0)
     digest = {"classes_sha256" if grey else "sha256": pixel_digest(pixels)}
@@ -134,6 +136,40 @@ def test_class_pixels_have_a_bound_of_their_own(tmp_path: Path) -> None:
     assert not view.within(Tolerance(min_psnr_db=10.0))
     assert not view.within(Tolerance(max_class_share=0.9 * share))
     assert view.within(Tolerance(max_class_share=1.1 * share))
+
+
+class MovedMaps(LevelModel):
+    """Its inverse depth is so many times the usual one, and `columns` of its visibility are painted instead."""
+
+    def __init__(self, factor: float, columns: int) -> None:
+        super().__init__(traits(), holds=("visibility", "inverse_depth"))
+        self._factor, self._columns = factor, columns
+
+    def render(self, *asked: Any) -> list[View]:
+        views = super().render(*asked)
+        for view in views:
+            assert view.visibility is not None
+            assert view.inverse_depth is not None
+            view.inverse_depth.mul_(self._factor)
+            view.visibility[..., : self._columns] = 0
+        return views
+
+
+def test_depth_and_visibility_count_like_class_pixels(tmp_path: Path) -> None:
+    usual = made_run(tmp_path / "usual", MovedMaps(1.0, 0))
+    assert compare(usual, made_run(tmp_path / "again", MovedMaps(1.0, 0))).first_divergence is None
+    near = compare(usual, made_run(tmp_path / "near", MovedMaps(1.005, 0))).views[0]
+    assert not near.identical
+    assert near.within(Tolerance(max_class_share=0.001))
+    far = compare(usual, made_run(tmp_path / "far", MovedMaps(1.05, 24))).views[0]
+    assert far.distance is not None
+    shares = dict(far.distance.shares)
+    assert shares["depth"] == pytest.approx(6 / 7, abs=0.01)  # the others have none
+    assert shares["vis"] == pytest.approx(24 / 96 * 2 / 3, abs=0.01)
+    assert not far.within(Tolerance(max_class_share=0.8))
+    assert "of the depth pixels" in describe(far)
+    plain = compare(usual, made_run(tmp_path / "plain")).views[0]
+    assert plain.facts == ("visibility", "depth")
 
 
 def test_windows_that_only_one_run_has_always_fail(golden: RunFolder, tmp_path: Path) -> None:

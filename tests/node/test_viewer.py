@@ -22,10 +22,10 @@ from viewer_clients import (
     received,
     taken_apart,
 )
-from wire_messages import class_map, window
+from wire_messages import class_map, depth, visibility, window
 
 from gcd_node.config import ViewerConfig, parse_config
-from gcd_node.envelope import images
+from gcd_node.envelope import colours, images
 from gcd_node.errors import ConfigError, EndpointError, MessageError
 from gcd_node.viewer import browser as browser_module
 from gcd_node.viewer.access import Access, security_headers, viewer_address
@@ -146,6 +146,13 @@ def test_a_class_map_is_sent_without_loss_and_with_its_names() -> None:
     assert head["kind"] == "cls"
     assert zlib.decompress(payload) == bytes(message.payload)
     assert [each["name"] for each in head["classes"]] == [each.name for each in message.header.classes or ()]
+
+
+def test_visibility_is_sent_without_loss_and_depth_as_grey_levels() -> None:
+    head, payload = taken_apart(picture(received(visibility(3))).part(1, time.monotonic()))
+    assert (head["kind"], zlib.decompress(payload)) == ("vis", bytes(visibility(3).payload))
+    head, payload = taken_apart(picture(received(depth(3))).part(1, time.monotonic()))
+    assert (head["kind"], zlib.decompress(payload)) == ("depth", colours(depth(3))[..., 0].tobytes())
 
 
 def test_the_age_of_a_window_is_the_sum_of_where_it_comes_from() -> None:

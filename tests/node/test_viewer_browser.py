@@ -287,7 +287,7 @@ def test_a_fixed_view_has_its_classes_and_says_why_it_cannot_be_steered(page: Pa
     ):
         rig.await_state("active")
         page.open(viewer.operator_url)
-        until(lambda: rig.publisher.stats.subscribers == 4)
+        until(lambda: rig.publisher.stats.subscribers == 6)
         shots = threading.Thread(target=camera.run, args=(16,), daemon=True)
         shots.start()
         page.wait(lambda: page.run("return !document.getElementById('class-tool').hidden"))

@@ -56,7 +56,7 @@ def test_pictures_come_only_while_somebody_looks(tmp_path: Path) -> None:
         assert rig.publisher.stats.subscribers == 0
         with open_feed(viewer) as feed:
             say(feed, type="watch", view="main")
-            until(lambda: rig.publisher.stats.subscribers == 4)  # src/frm, win, cls, std
+            until(lambda: rig.publisher.stats.subscribers == 6)  # src/frm, win, std, cls, vis, depth
             threading.Thread(target=camera.run, args=(60,), daemon=True).start()
             seen = hear(feed, "picture", lambda head: head["kind"] == "src")
             assert (seen["synthetic"], seen["frames"]) == (False, 1)
@@ -108,7 +108,7 @@ def test_a_page_that_never_reads_slows_neither_node_nor_others_and_is_given_up(
             for number in range(1, 40):  # it even says that it has seen everything
                 send_raw(each, {"type": "got", "number": number})
         say(healthy, type="watch", view="top")
-        until(lambda: publisher.stats.subscribers == 4 and viewer.browsers == 4)
+        until(lambda: publisher.stats.subscribers == 6 and viewer.browsers == 4)
         for number in range(12):
             started_s = time.monotonic()
             publisher.send(window(number, images=noise))
@@ -126,7 +126,7 @@ def test_a_class_map_reaches_the_page_of_a_model_that_draws_one(tmp_path: Path) 
         rig.await_state("active")
         with open_feed(viewer) as feed:
             say(feed, type="watch", view="main")
-            until(lambda: rig.publisher.stats.subscribers == 4)
+            until(lambda: rig.publisher.stats.subscribers == 6)
             threading.Thread(target=camera.run, args=(40,), kwargs={"pause_s": 0.02}, daemon=True).start()
             drawn = hear(feed, "picture", lambda head: head["kind"] == "cls")
             assert len(drawn["classes"]) == 13

@@ -8,15 +8,17 @@ import cv2
 import numpy as np
 import pytest
 from rich.console import Console
-from wire_messages import CLASSES, class_map, end, numbers, pixels, view_header, window
+from wire_messages import CLASSES, class_map, depth, end, numbers, pixels, view_header, visibility, window
 
 from gcd_node.envelope import ViewMessage
 from gcd_node.errors import OutputError
+from gcd_node.pictures.comparison import hatched
 from gcd_node.publisher import Publisher, PublisherOptions
 from gcd_node.subscriber import ReceivedView
 from gcd_node.watching.views import ViewSaver, ViewTable, WatchReport, WatchRequest, render, watch
 
 pytestmark = pytest.mark.timeout(30)
+SEEN = np.random.default_rng(0).integers(0, 3, (2, 16, 16), np.uint8)
 
 
 def received(message: ViewMessage, *, skipped: int = 0, expired: bool = False) -> ReceivedView:
@@ -156,6 +158,62 @@ def test_class_maps_are_saved_in_colour_with_a_legend_and_as_numbers(tmp_path) -
     legend = cv2.cvtColor(cv2.imread(str(folder / "legend.png")), cv2.COLOR_BGR2RGB).reshape(-1, 3)
     assert {each.colour for each in CLASSES} <= {tuple(pixel) for pixel in legend.tolist()}
     assert len(read_video(tmp_path / "top.mkv")) == 4  # windows stay apart from class maps
+
+
+def test_visibility_is_saved_as_numbers_in_colour_and_depth_in_floats(tmp_path) -> None:
+    with ViewSaver(tmp_path) as saver:
+        saver.add(received(visibility(2, seen=SEEN)))
+        saver.add(received(depth(2, inverse=np.full((2, 16, 16), 0.1, "<f2"))))
+        assert saver.files == len([path for path in tmp_path.rglob("*.*") if path.is_file()])
+    assert np.array_equal(np.load(tmp_path / "top" / "vis" / "000002.npy"), SEEN)
+    assert (tmp_path / "top" / "vis" / "legend.png").exists()
+    metres = 1 / np.load(tmp_path / "top" / "depth" / "000002.npy")
+    assert metres.dtype == np.float32
+    assert np.allclose(metres, 10, rtol=1e-3)
+    assert abs(read_video(tmp_path / "top" / "depth.mkv").astype(int) - 127).max() <= 1
+
+
+def test_saved_windows_are_hatched_where_they_are_painted_and_all_over_where_nobody_says(tmp_path) -> None:
+    shown = [pixels(i, height=16, width=16) for i in range(3)]
+    with ViewSaver(tmp_path, hatch=True) as saver:
+        saver.add(received(window(0, images=shown[0])))
+        saver.add(received(visibility(0, seen=SEEN)))
+        saver.add(received(window(1, images=shown[1])))
+        saver.add(received(visibility(5, seen=SEEN)))  # of another window
+        saver.add(received(window(2, images=shown[2])))
+    saved = read_video(tmp_path / "top.mkv")
+    blank = np.zeros_like(SEEN)
+    wanted = [hatched(image, seen) for image, seen in zip(shown, (SEEN, blank, blank), strict=True)]
+    assert np.array_equal(saved, np.concatenate(wanted))
+
+
+def test_a_visibility_of_another_size_hatches_all(tmp_path) -> None:
+    with ViewSaver(tmp_path, hatch=True) as saver:
+        saver.add(received(window(0, images=pixels(0, height=16, width=16))))
+        saver.add(received(visibility(0, seen=SEEN[:, :8])))
+    wanted = hatched(pixels(0, height=16, width=16), np.zeros_like(SEEN))
+    assert np.array_equal(read_video(tmp_path / "top.mkv"), wanted)
+
+
+def test_a_watch_for_hatching_takes_windows_with_their_visibility(tmp_path) -> None:
+    kinds = ("win", "vis")
+    request = WatchRequest(
+        endpoint=f"ipc://{tmp_path}/data", view="top", kind=kinds, save=tmp_path / "out", hatch=True, timeout_s=10
+    )
+    options = PublisherOptions(
+        data=request.endpoint, status=None, lockstep=True, min_subscribers=2, end_delay_ms=0, drain_ms=3000
+    )
+    reports: list[WatchReport] = []
+    with Publisher(options) as publisher:
+        thread = threading.Thread(target=lambda: reports.append(watch(request, lambda rows: None)), daemon=True)
+        thread.start()
+        for message in (window(0, images=pixels(0, height=16, width=16)), class_map(0), visibility(0, seen=SEEN)):
+            publisher.send(message)
+        for kind in kinds:
+            publisher.end(end(kind=kind))
+        thread.join(15)
+    assert [row.topic for row in reports[0].rows] == ["view/top/vis", "view/top/win"]
+    assert np.array_equal(read_video(tmp_path / "out" / "top.mkv"), hatched(pixels(0, height=16, width=16), SEEN))
 
 
 def test_a_watch_of_all_kinds_ends_when_all_have(tmp_path) -> None:

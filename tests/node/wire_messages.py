@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 import gcd_node
 from gcd_node.envelope import EndMessage, ViewKind, ViewMessage, payload_of, view_topic
 from gcd_node.wire.header import (
+    MAPS_PROTO,
+    VISIBILITY,
     ClassRecord,
     EndHeader,
     ModelRecord,
@@ -117,6 +119,24 @@ def class_map(window_id: int = 0, *, view_id: str = "top", drawn: NDArray[np.uin
     header = view_header(view_id=view_id, window_id=window_id, shape=(*drawn.shape, 1))
     header = replace(header, encoding="class8", classes=CLASSES, range=(0, 7))
     return ViewMessage(topic=view_topic(view_id, "cls"), header=header, payload=payload_of(drawn))
+
+
+def visibility(window_id: int = 0, *, seen: NDArray[np.uint8] | None = None) -> ViewMessage:
+    """Of view top; drawn by chance."""
+    seen = np.random.default_rng(window_id).integers(0, 3, (2, 4, 6), np.uint8) if seen is None else seen
+    header = replace(view_header(window_id=window_id, shape=(*seen.shape, 1)), proto=MAPS_PROTO)
+    header = replace(header, encoding="class8", classes=VISIBILITY, range=(0, 2))
+    return ViewMessage(topic="view/top/vis", header=header, payload=payload_of(seen))
+
+
+def depth(window_id: int = 0, *, inverse: NDArray[np.float16] | None = None) -> ViewMessage:
+    """Of view top; drawn by chance, with holes."""
+    if inverse is None:
+        chance = np.random.default_rng(window_id)
+        inverse = (chance.uniform(0.005, 3.3, (2, 4, 6)) * (chance.random((2, 4, 6)) > 0.2)).astype("<f2")
+    header = replace(view_header(window_id=window_id, shape=(*inverse.shape, 1)), proto=MAPS_PROTO)
+    header = replace(header, encoding="invdepth16", dtype="f16", range=(0, 65504))
+    return ViewMessage(topic="view/top/depth", header=header, payload=payload_of(inverse.view(np.uint8)))
 
 
 def end(*, view_id: str = "top", window_id: int = 0, boot_id: str = BOOT, kind: ViewKind = "win") -> EndMessage:

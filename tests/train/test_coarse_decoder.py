@@ -22,7 +22,7 @@ from gcd_train.errors import RecipeError
 from gcd_train.model_setup import digest_of
 
 DECODER = {**STAGE, "clips": 1, "batch": 2, "run": 2, "finetune_vae": True, "vae_rate": 1.0, "imitate": 1.0}
-ALONE: dict[str, object] = {"paired": None, "matching": None, "student": {"coarse": 1}, "decoder": DECODER}
+ALONE: dict[str, object] = {"paired": None, "student": {"coarse": 1}, "decoder": DECODER}
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""A student of few steps: its sampler, its losses, its critic, and whole distillations at a tiny size."""
+"""A student of few steps: its sampler, its losses, and whole distillations at a tiny size."""
 
 import json
 from copy import deepcopy
@@ -19,10 +19,8 @@ from gcd_model.own_format import Card
 from gcd_train.batches import PixelBatches
 from gcd_train.checkpoint import load_state
 from gcd_train.datasets.clip_source import to_network
-from gcd_train.distillation.critic import Critic, fooling_loss, heard, looked_at, telling_loss
 from gcd_train.distillation.distiller import Distiller, DistillInputs
 from gcd_train.distillation.recipe import (
-    CriticRecipe,
     DistillRecipe,
     SampleLossRecipe,
     StudentRecipe,
@@ -33,7 +31,6 @@ from gcd_train.distillation.sample_losses import SampleLoss, colour_loss
 from gcd_train.distillation.student import Sampled, sampled, schedule_of
 from gcd_train.distillation.teacher import student_config, teacher_of
 from gcd_train.draws import Draws
-from gcd_train.engine.blocks import recompute_blocks
 from gcd_train.errors import Interrupted, RecipeError
 from gcd_train.objective import Batch, Weights, denoiser_of
 from gcd_train.precision import Precision
@@ -61,8 +58,7 @@ def tiny(teacher: Path, **changes: object) -> DistillRecipe:
         "log": {"valid_clips": 1},
         "latents": {},
         "batches": {"clip_batch": 1},
-        "paired": {**STAGE, "loss": LOSS, "steps": [1, 2]},
-        "matching": {**STAGE, "loss": LOSS, "critic": {"width": 8}, "ema": {"limit": 0.9}},
+        "paired": {**STAGE, "loss": LOSS, "steps": [1, 2], "ema": {"limit": 0.9}},
     }
     return checked_recipe({**table, **changes}, "tiny", DistillRecipe)
 
@@ -153,52 +149,6 @@ def test_a_student_has_its_own_steps_and_no_guidance() -> None:
         student_config(config, StudentRecipe(steps=2, sigma_min=900.0))
 
 
-def test_what_the_student_hears_of_the_critic_teaches_the_critic_nothing(networks: Networks, batch: Batch) -> None:
-    critic = Critic(networks, 8, trained=True).train()
-    noise, sigma = looked_at(batch, CriticRecipe(), Draws(0, "look", 0, CPU.device))
-    latents = batch.target.clone().requires_grad_(True)
-    words = heard(critic, latents, noise, sigma, batch)
-    fooling_loss(words).backward()
-    assert latents.grad is not None
-    assert latents.grad.abs().max() > 0
-    assert all(parameter.grad is None for parameter in critic.parameters())
-    assert torch.equal(words, critic(latents, noise, sigma, batch))
-
-
-def test_a_critic_that_only_trains_its_heads_leaves_the_teachers_features_alone(
-    networks: Networks, batch: Batch
-) -> None:
-    critic = Critic(networks, 8, trained=False)
-    assert {name.split(".")[0] for name, p in critic.named_parameters() if p.requires_grad} == {"heads"}
-    assert len(networks.unet.up) == len(networks.config.unet.multipliers)
-    assert len(critic.unet.up) == 0
-    shared = {id(p) for p in networks.parameters()} & {id(p) for p in critic.parameters()}
-    assert not shared
-
-
-def test_a_critic_whose_blocks_are_computed_anew_teaches_the_same(networks: Networks, batch: Batch) -> None:
-    noise, sigma = looked_at(batch, CriticRecipe(), Draws(0, "look", 0, CPU.device))
-    taught = list[torch.Tensor]()
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        critic = Critic(networks, 8, trained=False).train()
-    for anew in (False, True):
-        if anew:
-            recompute_blocks(critic, 1)
-        latents = batch.target.clone().requires_grad_(True)
-        fooling_loss(heard(critic, latents, noise, sigma, batch)).backward()
-        assert latents.grad is not None
-        taught.append(latents.grad)
-    assert torch.allclose(taught[0], taught[1])
-
-
-def test_the_critic_wants_true_latents_above_one_and_samples_below_minus_one() -> None:
-    high, low = torch.full((1, 5), 1.5), torch.full((1, 5), -1.5)
-    assert telling_loss(high, low) == 0
-    assert telling_loss(low, high) == pytest.approx(5.0)
-    assert fooling_loss(high) < fooling_loss(low)
-
-
 def test_a_colour_between_two_classes_costs_more_than_either() -> None:
     colours = torch.tensor([kind.colour for kind in DRIVING_CLASSES]) / 255
     road, car = (colours[i].view(1, 3, 1, 1) * 2 - 1 for i in (1, 8))
@@ -231,47 +181,33 @@ def test_a_distillation_ends_in_a_weight_file_that_takes_the_students_steps(run:
     assert synthesizer.traits.trained
 
 
-def test_every_stage_learns_on_from_the_one_before(run: Path) -> None:
-    paired, matched = (load_state(run / stage / "state.pt", stage).best for stage in ("paired", "matching"))
-    factors = [name for name in paired if name.endswith(".up")]
-    assert all(paired[name].any() for name in factors)
-    assert not any(torch.equal(paired[name], matched[name]) for name in factors)
-    far = max((paired[name] - matched[name]).abs().max().item() for name in factors)
-    assert far < 3e-3  # two updates of 1e-3 each, not four from zero
-
-
 def test_a_distillation_says_what_it_measures(run: Path) -> None:
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     measured = {line["stage"]: line for line in lines if line["kind"] == "measured"}
-    assert set(measured) == {"paired", "matching", "export"}
+    assert set(measured) == {"paired", "export"}
     assert all(5 < line["psnr"] < 60 for line in measured.values())
-    said = next(line for line in lines if line["kind"] == "loss" and line["stage"] == "matching")
-    assert {"latent", "l1", "class_map", "fooling", "telling", "word_of_true", "word_of_made"} <= set(said)
+    said = next(line for line in lines if line["kind"] == "loss" and line["stage"] == "paired")
+    assert {"latent", "l1", "class_map"} <= set(said)
 
 
 @pytest.mark.slow
 def test_a_stopped_distillation_goes_on_to_the_same_weights(run: Path, teacher: Path, tmp_path: Path) -> None:
-    for part in ("latents", "paired"):
-        (tmp_path / part).symlink_to(run / part)
+    (tmp_path / "latents").symlink_to(run / "latents")
     with pytest.raises(Interrupted):
-        distiller(tiny(teacher), tmp_path, After(1)).run("matching")
-    assert load_state(tmp_path / "matching" / "state.pt", "matching").updates == 1
-    distiller(tiny(teacher), tmp_path).run("matching")
-    ended, whole = (load_state(path / "matching" / "state.pt", "matching") for path in (tmp_path, run))
+        distiller(tiny(teacher), tmp_path, After(1)).run("paired")
+    assert load_state(tmp_path / "paired" / "state.pt", "paired").updates == 1
+    distiller(tiny(teacher), tmp_path).run("paired")
+    ended, whole = (load_state(path / "paired" / "state.pt", "paired") for path in (tmp_path, run))
     assert_same(ended.best, whole.best)
     assert_same(ended.optimiser, whole.optimiser)
 
 
-@pytest.mark.slow
-def test_the_kept_student_is_exported_as_weights_and_as_an_adapter(run: Path, teacher: Path, tmp_path: Path) -> None:
-    for part in ("latents", "paired"):
-        (tmp_path / part).symlink_to(run / part)
-    distiller(tiny(teacher, student={**STUDENT, "keep": "paired"}), tmp_path).run("export")
-    paired = load_state(tmp_path / "paired" / "state.pt", "paired").best
-    adapter = read_adapter(tmp_path / "tiny-student-adapter.safetensors")
+def test_the_student_is_exported_as_weights_and_as_an_adapter(run: Path, teacher: Path) -> None:
+    paired = load_state(run / "paired" / "state.pt", "paired").best
+    adapter = read_adapter(run / "tiny-student-adapter.safetensors")
     assert adapter.tensors.keys() == paired.keys()
     assert all(torch.equal(adapter.tensors[name], paired[name]) for name in paired)
-    shipped = load_weights(tmp_path / "tiny-student.safetensors").networks.state_dict()
+    shipped = load_weights(run / "tiny-student.safetensors").networks.state_dict()
     start = loaded_base(str(teacher)).networks.state_dict()
     changed = {name for name, value in shipped.items() if not torch.equal(value, start[name].half())}
     assert changed == {f"{name.removesuffix('.up')}.weight" for name in paired if name.endswith(".up")}
@@ -279,21 +215,18 @@ def test_the_kept_student_is_exported_as_weights_and_as_an_adapter(run: Path, te
 
 @pytest.mark.slow
 def test_whole_students_and_the_plane_mix_learn_too(tmp_path: Path) -> None:
-    student, matching = {"steps": 1}, {**STAGE, "loss": LOSS, "critic": {"width": 8, "trained": True}}
-    changes = {"student": student, "matching": matching, "decoder": {**STAGE, "clips": 1, "batch": 2}}
-    distiller(tiny(write_untrained(tmp_path), **changes), tmp_path / "run").run()
+    decoder = {**STAGE, "clips": 1, "batch": 2}
+    distiller(tiny(write_untrained(tmp_path), student={"steps": 1}, decoder=decoder), tmp_path / "run").run()
     shipped = load_weights(tmp_path / "run" / "tiny-student.safetensors").networks.state_dict()
-    for stage, name in (("matching", "unet.conv_out.weight"), ("decoder", "plane_mix.choice.weight")):
+    for stage, name in (("paired", "unet.conv_out.weight"), ("decoder", "plane_mix.choice.weight")):
         assert torch.equal(shipped[name], load_state(tmp_path / "run" / stage / "state.pt", stage).best[name].half())
 
 
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"paired": None, "matching": None}, "learns in"),
-        ({"matching": None, "student": {"keep": "matching"}}, "no table"),
+        ({"paired": None}, "learns in"),
         ({"latents": None, "decoder": None}, "go together"),
-        ({"matching": {**STAGE, "critic": {"trained": True}}, "compute": {"checkpoint_activations": True}}, "anew"),
     ],
 )
 def test_a_recipe_that_cannot_be_run_says_what_is_wrong(teacher: Path, changes: dict[str, object], said: str) -> None:

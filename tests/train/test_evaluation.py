@@ -59,6 +59,7 @@ class Oracle:
 class FakeTraits:
     """The part of Traits that evaluation asks for."""
 
+    live = False
     config: ModelConfig
     family: Family = FAMILIES["driving"]
     name: str = "fake-small"

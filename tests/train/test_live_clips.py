@@ -4,8 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from headless import needs_egl
 from hypothesis import given
 from hypothesis import strategies as st
+from live_clips import HFOV_DEG, cast, looking_ahead, write_clip
 
 from gcd_train.errors import DataError
 from gcd_train.live.clips import (
@@ -20,9 +22,6 @@ from gcd_train.live.clips import (
 )
 from gcd_train.live.draws import live_scene
 from gcd_train.scenes.renderer import Rendering
-
-from headless import needs_egl
-from live_clips import HFOV_DEG, cast, looking_ahead, write_clip
 
 
 @given(st.floats(0.03, 900.0))

@@ -31,7 +31,6 @@ _PREFIXES: dict[AnyStageName, tuple[str, ...]] = {
     "vae": ("target_encoder.", "decoder."),
     "unet": _DENOISER,
     "paired": _DENOISER,
-    "matching": _DENOISER,
     "decoder": ("plane_mix.",),
 }
 

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from gcd_model import ModelConfig
 from gcd_model.carry_over import DIFFUSION, carried_over
-from gcd_model.checkpoints import LoadedWeights, load_weights
+from gcd_model.checkpoints import load_weights
 from gcd_model.errors import CheckpointError
 from gcd_model.loading import packaged_weights
-from gcd_model.networks import Networks
+from gcd_model.networks import LoadedWeights, Networks
 from gcd_train.errors import RecipeError
 from gcd_train.recipe import ModelRecipe
 
@@ -41,7 +41,7 @@ def start_networks(recipe: ModelRecipe, config: ModelConfig, seed: int) -> Netwo
     networks = fresh_networks(config, seed)
     loaded = loaded_base(recipe.weights)
     try:
-        over = carried_over(loaded.networks, config, anew=DIFFUSION if recipe.scratch else ())
+        over = carried_over(loaded.diffusion, config, anew=DIFFUSION if recipe.scratch else ())
     except CheckpointError as error:
         raise RecipeError(
             f"{recipe.weights} {error}; change [model], or give a file of the model it describes"

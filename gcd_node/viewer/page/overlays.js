@@ -1,4 +1,4 @@
-// What can be laid over a view: its class map, and where several samples of the model differ.
+// What can be laid over a view: its class map, what of it is painted, its depth, and where samples of the model differ.
 
 const element = (id) => document.getElementById(id);
 
@@ -10,29 +10,27 @@ export function sized(canvas, width, height) {
   return canvas.getContext("2d");
 }
 
-// The class map of the window on the screen, in the colours of its ontology.
-export class ClassOverlay {
-  constructor() {
-    this.canvas = element("class-picture");
-    this.hidden = new Set();
+// One byte for each pixel of the window on the screen; `palette` says how each looks.
+class MapOverlay {
+  constructor(name, legend) {
+    this.name = name;
+    this.canvas = element(`${name}-picture`);
+    this.palette = new Uint32Array(256);
     this.forget();
-    slider("class", this.canvas, element("legend"), () => this.redraw());
+    slider(name, this.canvas, legend, () => this.redraw());
   }
 
   forget() {
     this.maps = new Map(); // by window id; the newest two
     this.drawn = null;
-    this.names = "";
-    element("class-tool").hidden = element("legend").hidden = true;
+    element(`${this.name}-tool`).hidden = true; // and with it its legend
     this.canvas.getContext("2d").clearRect(0, 0, this.canvas.width, this.canvas.height);
   }
 
   take(head, numbers) {
     this.maps.set(head.window_id, { head, numbers });
     for (const id of [...this.maps.keys()].slice(0, -2)) this.maps.delete(id);
-    const names = JSON.stringify(head.classes);
-    if (names !== this.names) this.legend(head.classes, names);
-    element("class-tool").hidden = false;
+    element(`${this.name}-tool`).hidden = false;
   }
 
   // Whether nothing is left to wait for before this window is shown.
@@ -54,8 +52,12 @@ export class ClassOverlay {
     const size = view.width * view.height;
     const picture = context.createImageData(view.width, view.height);
     const pixels = new Uint32Array(picture.data.buffer);
-    for (let i = 0, from = index * size; i < size; i++) pixels[i] = this.palette[map.numbers[from + i]];
+    this.fill(pixels, map.numbers.subarray(index * size, (index + 1) * size), view.width);
     context.putImageData(picture, 0, 0);
+  }
+
+  fill(pixels, numbers) {
+    for (let i = 0; i < pixels.length; i++) pixels[i] = this.palette[numbers[i]];
   }
 
   redraw() {
@@ -65,9 +67,58 @@ export class ClassOverlay {
   at(x, y) {
     if (!this.drawn) return "";
     const { map, index } = this.drawn;
-    const { width, height, classes } = map.head;
-    const number = map.numbers[index * width * height + y * width + x];
-    return classes.find((each) => each.id === number)?.name ?? `class ${number}`;
+    const { width, height } = map.head;
+    return this.text(map.numbers[index * width * height + y * width + x], map.head);
+  }
+
+  // What a number means.
+  text(number, head) {
+    return head.classes.find((each) => each.id === number)?.name.replaceAll("_", " ") ?? `class ${number}`;
+  }
+}
+
+// What was never seen is painted: thin amber diagonals over it, as `gcd-node view --hatch` draws them.
+export class VisibilityOverlay extends MapOverlay {
+  constructor() {
+    super("vis", element("vis-legend"));
+  }
+
+  fill(pixels, numbers, width) {
+    for (let i = 0; i < pixels.length; i++) {
+      const line = ((i % width) + Math.floor(i / width)) % 6 < 2;
+      pixels[i] = line && numbers[i] === 0 ? rgba(245, 158, 11) : 0;
+    }
+  }
+}
+
+// Brighter is nearer: a level is 255 v / (v + 0.1) of an inverse depth of v 1/m.
+export class DepthOverlay extends MapOverlay {
+  constructor() {
+    super("depth", element("depth-legend"));
+    this.palette = this.palette.map((_, level) => rgba(level, level, level));
+  }
+
+  text(level) {
+    return level === 0 ? "no depth" : `${((10 * (255 - level)) / level).toFixed(1)} m`;
+  }
+}
+
+// The class map, in the colours of its ontology.
+export class ClassOverlay extends MapOverlay {
+  constructor() {
+    super("class", element("legend"));
+    this.hidden = new Set();
+  }
+
+  forget() {
+    super.forget();
+    this.names = "";
+  }
+
+  take(head, numbers) {
+    super.take(head, numbers);
+    const names = JSON.stringify(head.classes);
+    if (names !== this.names) this.legend(head.classes, names);
   }
 
   legend(classes, names) {
@@ -93,7 +144,7 @@ export class ClassOverlay {
   colour(classes) {
     this.palette = new Uint32Array(256);
     for (const { id, colour: [red, green, blue] } of classes) {
-      if (!this.hidden.has(id)) this.palette[id] = ((255 << 24) | (blue << 16) | (green << 8) | red) >>> 0;
+      if (!this.hidden.has(id)) this.palette[id] = rgba(red, green, blue);
     }
   }
 }
@@ -136,6 +187,10 @@ export class DeviationOverlay {
     if (x >= head.width || y >= head.height) return "";
     return `± ${(levels[(head.frames - 1) * head.width * head.height + y * head.width + x] * head.scale).toFixed(1)}`;
   }
+}
+
+function rgba(red, green, blue) {
+  return ((255 << 24) | (blue << 16) | (green << 8) | red) >>> 0;
 }
 
 export function swatch(colour) {

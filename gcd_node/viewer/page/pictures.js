@@ -1,11 +1,11 @@
 // The two pictures: decoding, playing windows at their rate, overlays, and how old everything is.
 
 import { seconds } from "./link.js";
-import { ClassOverlay, DeviationOverlay, sized } from "./overlays.js";
+import { ClassOverlay, DepthOverlay, DeviationOverlay, VisibilityOverlay, sized } from "./overlays.js";
 
 const REMEMBERED_MS = 120000; // previews kept, to show the input of the view's moment
 const SILENT_MS = 2000; // no preview for so much longer than it is valid: the input has stopped
-const PATIENCE_MS = 250; // how long a window waits for its class map
+const PATIENCE_MS = 250; // how long a window waits for its maps
 const CLOSE_S = 0.35; // a preview of "the same moment" is at most so far from it
 const element = (id) => document.getElementById(id);
 
@@ -101,7 +101,7 @@ export class ViewPicture {
   constructor() {
     this.stage = new Stage("view");
     this.reset("");
-    this.classes = new ClassOverlay();
+    this.maps = { cls: new ClassOverlay(), vis: new VisibilityOverlay(), depth: new DepthOverlay() };
     this.std = new DeviationOverlay();
     this.stage.box.addEventListener("pointermove", (event) => this.probe(event));
     this.stage.box.addEventListener("pointerdown", (event) => this.probe(event));
@@ -111,10 +111,10 @@ export class ViewPicture {
   reset(view) {
     this.view = view;
     this.now = null; // the window on the screen
-    this.next = null; // one that waits for its class map
+    this.next = null; // one that waits for its maps
     this.index = -1;
     this.last = null; // the last frame shown: {captured_s, epoch, boot_id}
-    this.classes?.forget();
+    Object.values(this.maps ?? {}).forEach((each) => each.forget());
     this.std?.forget();
     element("played").style.width = "0";
     this.stage.clear("no view yet");
@@ -122,7 +122,7 @@ export class ViewPicture {
   }
 
   async take(head, bytes, at) {
-    if (head.kind === "cls") return this.classes.take(head, await unpacked(bytes));
+    if (head.kind in this.maps) return this.maps[head.kind].take(head, await unpacked(bytes));
     if (head.kind === "std") return this.std.take(head, await unpacked(bytes));
     const bitmaps = await frames(head, bytes);
     if (head.view !== this.view) return bitmaps.forEach((each) => each.close());
@@ -136,7 +136,8 @@ export class ViewPicture {
   }
 
   refresh(now, isDead) {
-    if (this.next && (this.classes.has(this.next.head) || now - this.next.decoded > PATIENCE_MS)) this.begin(now);
+    const isWhole = this.next && Object.values(this.maps).every((each) => each.has(this.next.head));
+    if (this.next && (isWhole || now - this.next.decoded > PATIENCE_MS)) this.begin(now);
     if (!this.now) return;
     const { head, at } = this.now;
     const played = this.first + Math.floor(((now - this.started) * head.fps) / 1000);
@@ -173,7 +174,7 @@ export class ViewPicture {
       epoch: head.epoch, boot_id: head.boot_id, clock: head.clock,
     };
     this.stage.draw(bitmaps[index]);
-    this.classes.draw(head, index);
+    Object.values(this.maps).forEach((each) => each.draw(head, index));
     element("played").style.width = `${(100 * (index + 1)) / head.frames}%`;
     const flags = head.quality.ood.length ? ` · outside training: ${head.quality.ood.join(", ")}` : "";
     element("view-note").textContent = `window ${head.window_id} · revision ${head.rev}${flags}`;
@@ -185,7 +186,7 @@ export class ViewPicture {
     const x = Math.floor(((event.clientX - place.left) / place.width) * canvas.width);
     const y = Math.floor(((event.clientY - place.top) / place.height) * canvas.height);
     const inside = x >= 0 && y >= 0 && x < canvas.width && y < canvas.height;
-    const text = inside && this.now ? [this.classes.at(x, y), this.std.at(x, y)].filter(Boolean).join(", ") : "";
+    const text = inside && this.now ? [...Object.values(this.maps), this.std].map((each) => each.at(x, y)).filter(Boolean).join(", ") : "";
     const probe = element("probe");
     probe.hidden = text === "";
     probe.textContent = text;

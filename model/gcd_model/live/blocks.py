@@ -66,7 +66,9 @@ class Trunk(nn.Module):
         )
         self.attention = Attention(third)
         self.middle = Block(third, third, e)
-        self.up = Layers[Block]([Block(third + second, second, e), Block(second, second, e), Block(second + first, first, e)])
+        self.up = Layers[Block](
+            [Block(third + second, second, e), Block(second, second, e), Block(second + first, first, e)]
+        )
         self.last = Block(first, first, e)
 
     def forward(self, pictures: Tensor, embedding: Tensor | None = None) -> Tensor:

@@ -5,29 +5,39 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from gcd_model.config import SemanticClass
+from gcd_model.config import CameraControl, SamplingConfig, SemanticClass
+from gcd_model.config.switches import require_ontology
+from gcd_model.errors import OptionError
 from gcd_model.live.ontology import LIVE_CLASSES
 
 Widths = tuple[int, int, int]
 """Channels at a quarter, an eighth and a sixteenth of the picture's size."""
+SIZE_FACTOR = 32
+"""Height and width of pictures must be multiples of this."""
+_Side = Annotated[int, Meta(ge=SIZE_FACTOR, le=8192, multiple_of=SIZE_FACTOR)]
+_Channels = Annotated[int, Meta(ge=8, le=4096)]
 
 
 class DepthConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The depth network. bins are even in the logarithm from nearest_m to farthest_m; the last one is the sky."""
 
     widths: Widths = (48, 96, 160)
-    fine_width: int = 24
-    bins: Annotated[int, Meta(ge=4)] = 32
-    nearest_m: float = 0.25
+    fine_width: _Channels = 24
+    bins: Annotated[int, Meta(ge=4, le=1024)] = 32
+    nearest_m: Annotated[float, Meta(gt=0)] = 0.25
     farthest_m: float = 256.0
+
+    def __post_init__(self) -> None:
+        if not self.farthest_m > self.nearest_m:
+            raise OptionError(f"depth goes from near to far, got {self.nearest_m:g} to {self.farthest_m:g} m")
 
 
 class PaintConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The paint network. embedding_width: of the noise level."""
 
     widths: Widths = (56, 104, 160)
-    fine_width: int = 16
-    embedding_width: int = 128
+    fine_width: _Channels = 16
+    embedding_width: _Channels = 128
 
 
 class LiveConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -35,19 +45,56 @@ class LiveConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     height, width: of the training; any multiples of 32 work. frames: of a window. memory: remembered surfels at most.
     memory_frames: for how long. steps, sigma_max, sigma_min: of the paint sampler; one step paints the mean.
+    ood_threshold: a source whose `View.ood` is above it shows another world than the training's.
     """
 
     kind: Literal["live"] = "live"
-    frames: int = 14
-    height: int = 128
-    width: int = 192
+    frames: Annotated[int, Meta(ge=1, le=1000)] = 14
+    height: _Side = 128
+    width: _Side = 192
     classes: tuple[SemanticClass, ...] = LIVE_CLASSES
     depth: DepthConfig = DepthConfig()
     paint: PaintConfig = PaintConfig()
-    memory: Annotated[int, Meta(ge=0)] = 60_000
+    memory: Annotated[int, Meta(ge=0, le=10_000_000)] = 60_000
     memory_frames: Annotated[int, Meta(ge=0)] = 50
-    steps: Annotated[int, Meta(ge=1)] = 1
-    sigma_max: float = 80.0
-    sigma_start: float = 2.0
-    sigma_min: float = 0.05
+    steps: Annotated[int, Meta(ge=1, le=1000)] = 1
+    sigma_max: Annotated[float, Meta(gt=0)] = 80.0
+    sigma_start: Annotated[float, Meta(gt=0)] = 2.0
+    sigma_min: Annotated[float, Meta(gt=0)] = 0.05
     spread_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ood_threshold: Annotated[float, Meta(ge=0, le=1)] = 0.35
+
+    def __post_init__(self) -> None:
+        require_ontology("the live model", self.classes)
+
+    @property
+    def size_factor(self) -> int:
+        """Height and width in pixels must be multiples of this."""
+        return SIZE_FACTOR
+
+    @property
+    def camera(self) -> CameraControl:
+        """How the views' camera is told."""
+        return "relative_pose"
+
+    @property
+    def sampling(self) -> SamplingConfig:
+        """How it paints, in the words of the diffusion models: no guidance, no noise on the source."""
+        return SamplingConfig(
+            steps=self.steps,
+            sigma_max=self.sigma_max,
+            sigma_min=self.sigma_min,
+            guidance=(1.0, 1.0),
+            shared_noise=True,
+            augmentation=0.0,
+        )
+
+
+LIVE_TINY = LiveConfig(
+    height=64,
+    width=96,
+    depth=DepthConfig(widths=(8, 16, 16), fine_width=8, bins=8),
+    paint=PaintConfig(widths=(8, 16, 16), fine_width=8, embedding_width=16),
+    memory=20_000,
+)
+"""For tests, and for random weights."""

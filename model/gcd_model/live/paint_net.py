@@ -38,9 +38,9 @@ _LOG_VARIANCE = -3.0
 class Seen:
     """What is known of N views before anything is painted, all float32.
 
-    colour: [N, 3, H, W] in [-1, 1]. coverage, now_share, age: [N, H, W] (age in frames). log_depth: [N, H, W], of metres;
-    0 where nothing is. votes: [N, K, H, W]. painted: [N, 3, H, W] and painted_coverage: [N, H, W], what was painted a
-    frame ago. rays: [N, 2, H, W], x / z and y / z. ground_m: [N, H, W], depth of the floor, 0 without.
+    colour: [N, 3, H, W] in [-1, 1]. coverage, now_share, age: [N, H, W] (age in frames). log_depth: [N, H, W], of
+    metres; 0 where nothing is. votes: [N, K, H, W]. painted: [N, 3, H, W] and painted_coverage: [N, H, W], what was
+    painted a frame ago. rays: [N, 2, H, W], x / z and y / z. ground_m: [N, H, W], depth of the floor, 0 without.
     """
 
     colour: Tensor
@@ -114,7 +114,13 @@ class PaintNet(nn.Module):
         known = (seen.coverage > 0).float()
         ground_known = (seen.ground_m > 0).float()
         ground = torch.where(seen.ground_m > 0, seen.ground_m.clamp(0.05, 200.0), 1.0).log() / 3.0
-        facts = [seen.coverage, seen.now_share, seen.age.clamp(max=_AGE_FRAMES) / _AGE_FRAMES, seen.log_depth / 3.0, known]
+        facts = [
+            seen.coverage,
+            seen.now_share,
+            seen.age.clamp(max=_AGE_FRAMES) / _AGE_FRAMES,
+            seen.log_depth / 3.0,
+            known,
+        ]
         return torch.cat(
             [
                 seen.colour,

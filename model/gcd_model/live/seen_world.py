@@ -11,7 +11,9 @@ from gcd_model.live.splat import Splat, Surfels, splat, unproject
 class SeenWorld:
     """Frame by frame: `look`, then `splat` from as many targets as there are. Poses refer to one world throughout."""
 
-    def __init__(self, *, classes: int, capacity: int, oldest_frames: float, device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self, *, classes: int, capacity: int, oldest_frames: float, device: torch.device | str = "cpu"
+    ) -> None:
         """classes: of the labels. capacity, oldest_frames: of the memory, see SurfelMemory; 0 for none."""
         self._classes, self._device = classes, device
         self._memory = SurfelMemory(capacity, oldest_frames=oldest_frames, device=device) if capacity else None

@@ -61,7 +61,7 @@ def bench_model(
     bare = options.without_camera or any(is_peer(name) for name in names)
     networks, traits = comparable(synthesizer, bare=bare)
     work = Work.of(
-        traits.config, height=options.height, width=options.width, steps=options.steps, guidance=options.guidance
+        traits.diffusion, height=options.height, width=options.width, steps=options.steps, guidance=options.guidance
     )
     subjects = [Subject(name, engine_named(name, networks), traits, work, options.stages) for name in names]
     rounds = _Rounds(subjects, options.stages, networks.unet.stem.weight.device)

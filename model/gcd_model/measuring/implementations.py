@@ -67,7 +67,7 @@ def engine_named(name: ImplementationName, networks: Networks) -> Engine:
 def counted_flops(name: ImplementationName, traits: Traits, work: Work) -> dict[StageName, int]:
     """See `window_flops`; compiling changes nothing in it."""
     plain: ImplementationName = "diffusers" if is_peer(name) else "ours"
-    return window_flops(engine_named(plain, empty_networks(traits.config)), traits.config, work)
+    return window_flops(engine_named(plain, empty_networks(traits.diffusion)), traits.diffusion, work)
 
 
 def _peer(networks: Networks, *, compiled: bool) -> Engine:

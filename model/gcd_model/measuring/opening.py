@@ -5,13 +5,14 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from gcd_model.checkpoints import LoadedWeights
 from gcd_model.config import SVD_14, ModelConfig
+from gcd_model.errors import OptionError
 from gcd_model.families import KUBRIC90
+from gcd_model.live.synthesizer import LiveSynthesizer
 from gcd_model.loading import load_synthesizer, placed_synthesizer, random_weights
 from gcd_model.measuring.report import STAGES, StageName
-from gcd_model.networks import random_networks
-from gcd_model.own_format import Card, Entry
+from gcd_model.networks import LoadedWeights, random_networks
+from gcd_model.own_format import NO_DIFFUSION, Card, Entry
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.weights_export import Content, write_safetensors
 
@@ -28,7 +29,10 @@ def load_measured(
     Raises: CheckpointError, OptionError as `load_synthesizer`.
     """
     if weights != FULL:
-        return load_synthesizer(weights, device=device, dtype=dtype)
+        made = load_synthesizer(weights, device=device, dtype=dtype)
+        if isinstance(made, LiveSynthesizer):
+            raise OptionError(f"{made.traits.name} {NO_DIFFUSION}")
+        return made
     return placed_synthesizer(_full_size(stages), device=device, dtype=dtype)
 
 

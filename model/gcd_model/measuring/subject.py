@@ -84,7 +84,7 @@ class Subject:
 
     def __init__(self, name: str, engine: Engine, traits: Traits, work: Work, stages: Collection[StageName]) -> None:
         """traits: of the networks that `engine` computes."""
-        config = traits.config
+        config = traits.diffusion
         self.name, self._work, self._traits = name, work, traits
         self.probe = Probe(engine, config, stages)
         self._synthesizer = Synthesizer(empty_networks(config), traits, self.probe)

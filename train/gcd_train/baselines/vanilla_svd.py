@@ -69,7 +69,7 @@ class VanillaSVD:
 
     def __post_init__(self) -> None:
         traits = self.synthesizer.traits
-        if traits.config.camera != "none" or traits.config.plane_warp is not None:
+        if traits.config.camera != "none" or traits.plane_warp is not None:
             raise DataError(
                 f"{self.name} wants weights that make a video out of a picture, {traits.name} is told a camera path; "
                 "give svd.safetensors"

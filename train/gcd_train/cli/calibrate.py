@@ -12,7 +12,7 @@ from gcd_train.cli.progress_bar import progress_bar
 from gcd_train.errors import DataError, RecipeError
 
 if TYPE_CHECKING:
-    from gcd_model import Synthesizer
+    from gcd_model import ViewSynthesizer
     from gcd_train.baselines import Predictor
     from gcd_train.evaluation.calibration import Distances
     from gcd_train.evaluation.choosing import Choice
@@ -81,7 +81,7 @@ def _say(line: str) -> None:
     _LOG.print(line, markup=False, soft_wrap=True)
 
 
-def _clips(data: Sequence[Path], choice: "Choice", model: "Synthesizer", seed: int) -> "EvaluationSet":
+def _clips(data: Sequence[Path], choice: "Choice", model: "ViewSynthesizer", seed: int) -> "EvaluationSet":
     """The clips; of whole scenes four each, with goals drawn by the seed as the model was trained."""
     from gcd_train.evaluation.opening import SceneCuts, data_kind, open_pairs, open_scenes
 

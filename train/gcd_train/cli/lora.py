@@ -36,7 +36,7 @@ def merge(
         wanted = None if dtype is None else precision(dtype)
         start = load_weights(base, ask_family=False)
         joined = load_adapted(start, read_adapter(adapter))
-        networks = joined.networks if wanted is None else joined.networks.to(wanted)
+        networks = joined.diffusion if wanted is None else joined.diffusion.to(wanted)
         family = None if joined.family is None else joined.family.name
         card = Card(name=joined.name, config=networks.config, family=family, move_time=joined.move_time)
         if layout == "gcd-ckpt":

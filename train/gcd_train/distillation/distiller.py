@@ -18,10 +18,8 @@ from gcd_train.batches import BatchSource, EncodedBatches, PixelBatches
 from gcd_train.datasets.clip_source import KeptClips, numbers_of
 from gcd_train.datasets.latents import EncodedClips
 from gcd_train.datasets.predictions import Predictions, PredictionsMeta, write_predictions
-from gcd_train.distillation.critic import Critic
-from gcd_train.distillation.matching import MatchingTask
 from gcd_train.distillation.paired import PairedTask
-from gcd_train.distillation.recipe import DistillRecipe, MatchingRecipe, PairedRecipe, SampleLossRecipe, StudentStage
+from gcd_train.distillation.recipe import DistillRecipe, PairedRecipe, SampleLossRecipe
 from gcd_train.distillation.sample_losses import SampleLoss
 from gcd_train.distillation.teacher import Teacher, as_training, coarser_config, student_config
 from gcd_train.draws import Draws
@@ -66,7 +64,7 @@ class Distiller:
         self._inputs, self._recipe, self._folder = inputs, inputs.recipe, inputs.folder
         self._updates = 0  # of the stage that was filled in last
         self._shared = as_training(inputs.recipe, inputs.teacher)
-        taught = bool(inputs.recipe.student_stages)
+        taught = inputs.recipe.paired is not None
         self._config = student_config(inputs.teacher.config, inputs.recipe.student, taught=taught)
         coarser_config(self._config, inputs.recipe.student.coarse)
         if inputs.recipe.decoder is not None and self._config.plane_mix is None:
@@ -97,7 +95,6 @@ class Distiller:
         steps = {
             "latents": lambda: self._encodings.encode(self._teacher()),
             "paired": self._train_paired,
-            "matching": self._train_matching,
             "decoder": self._train_decoder,
             "export": self._export,
         }
@@ -118,44 +115,28 @@ class Distiller:
         """The teacher's weights under the student's sampler."""
         return deepcopy(self._read)
 
-    def _student(self, *stages: StudentStage) -> Networks:
-        """The student with what those stages taught it, ready to learn; adapters beside their layers."""
+    def _learner(self) -> Networks:
+        """The student before it learned anything, ready to; adapters beside their layers."""
         networks = self._teacher()
         let_train(networks, self._shared.model, self._recipe.seed)
-        for stage in stages:
-            self._updates = fill(networks, self._folder, stage, self._identity(stage, networks))
         return networks
 
-    def _identity(self, stage: StudentStage, networks: Networks) -> str:
-        """What a stage's state belongs to; `networks` hold what was learned before it."""
+    def _student(self) -> Networks:
+        """The same with what [paired] taught it."""
+        networks = self._learner()
+        if self._recipe.paired is not None:
+            self._updates = fill(networks, self._folder, "paired", self._identity)
+        return networks
+
+    @property
+    def _identity(self) -> str:
+        """What the state of [paired] belongs to; runs that have begun hold the teacher's name and the last digest."""
         student, seed, sampling = self._recipe.student, self._recipe.seed, self._config.sampling
-        learned = {name: value for name, value in networks.named_parameters() if value.requires_grad}
-        before = weights_digest(learned) if stage == "matching" and self._recipe.paired is not None else "teacher"
-        critic = None if stage == "paired" else self._matching.critic
-        built = () if critic is None else (critic.width, critic.trained)
-        return f"{self._base}-{before}-{digest_of(seed, sampling, student.train, student.lora, built)}"
-
-    @property
-    def _before_matching(self) -> tuple[StudentStage, ...]:
-        return () if self._recipe.paired is None else ("paired",)
-
-    @property
-    def _kept_stages(self) -> tuple[StudentStage, ...]:
-        """What taught the student that is exported."""
-        if self._recipe.kept is None:
-            return ()
-        return ("paired",) if self._recipe.kept == "paired" else (*self._before_matching, "matching")
-
-    @property
-    def _matching(self) -> MatchingRecipe:
-        recipe = self._recipe.matching
-        assert recipe is not None, "a stage runs only if the recipe has its table"
-        return recipe
+        return f"{self._base}-teacher-{digest_of(seed, sampling, student.train, student.lora, ())}"
 
     def _train_paired(self) -> None:
-        recipe, networks = self._recipe.paired, self._student()
+        recipe, networks = self._recipe.paired, self._learner()
         assert recipe is not None, "a stage runs only if the recipe has its table"
-        identity = self._identity("paired", networks)
         batches, weights = self._ready(networks, recipe.loss)
         loss = SampleLoss(networks, recipe.loss, weights, self._precision)
         task = PairedTask(
@@ -168,30 +149,7 @@ class Distiller:
             self._precision,
             self._recipe.seed,
         )
-        self._loop(task, "paired", recipe, identity)
-
-    def _train_matching(self) -> None:
-        recipe, networks = self._matching, self._student(*self._before_matching)
-        identity = self._identity("matching", networks)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(self._recipe.seed)
-            critic = Critic(self._teacher(), recipe.critic.width, trained=recipe.critic.trained)
-        if self._recipe.compute.frozen == "bfloat16":
-            halve_frozen(critic)
-        batches, weights = self._ready(networks, recipe.loss)
-        loss = SampleLoss(networks, recipe.loss, weights, self._precision)
-        task = MatchingTask(
-            networks,
-            critic,
-            batches,
-            self._validation(),
-            recipe,
-            self._recipe.batches,
-            loss,
-            self._precision,
-            self._recipe.seed,
-        )
-        self._loop(task, "matching", recipe, identity)
+        self._loop(task, "paired", recipe, self._identity)
 
     def _ready(self, networks: Networks, loss: SampleLossRecipe) -> tuple[BatchSource, Weights]:
         """Batches for networks that are placed to learn, and the constant weights of their loss."""
@@ -263,7 +221,7 @@ class Distiller:
 
     def _merged(self) -> Networks:
         """The student that is exported as plain networks, as far as the decoder stage."""
-        networks = self._student(*self._kept_stages)
+        networks = self._student()
         merge_lora(networks)
         thaw(networks)
         return networks
@@ -289,15 +247,13 @@ class Distiller:
 
     def _adapter(self, card: Card) -> Adapter:
         """What the student learned, apart from its teacher."""
-        return adapter_of(self._student(*self._kept_stages), self._recipe.student.lora, card, self._base)
+        return adapter_of(self._student(), self._recipe.student.lora, card, self._base)
 
     def _validation(self) -> Validation:
         count = self._recipe.log.valid_clips
         return Validation(self._inputs.data.valid, self._inputs.teacher.family, count=count, plane_mix=True)
 
-    def _loop(
-        self, task: Task, stage: AnyStageName, recipe: PairedRecipe | MatchingRecipe | DecoderRecipe, identity: str
-    ) -> None:
+    def _loop(self, task: Task, stage: AnyStageName, recipe: PairedRecipe | DecoderRecipe, identity: str) -> None:
         options = LoopOptions(
             stage=stage,
             identity=identity,

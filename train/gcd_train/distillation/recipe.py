@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
@@ -30,8 +30,6 @@ from gcd_train.recipe.values import Budget, DistillStageName
 PACKAGED = Path(__file__).parents[1] / "recipes" / "distillation"
 """Where the recipes that ship with the package lie."""
 
-StudentStage: TypeAlias = Literal["paired", "matching"]
-
 
 class TeacherRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Whom to learn from.
@@ -48,9 +46,8 @@ class StudentRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     steps: of the sampler that ships; the teacher's own where its U-Net stays. sigma_max, sigma_min: its first and last
     noise level; left out as the teacher has them. train: all of the U-Net and what steers it, or adapters beside it, as
-    [student.lora] says. keep: the stage whose student is exported, left out the last one there is.
-    coarse: so many more of its finest levels the decoder leaves out, see `VAEConfig`; [decoder] trains what is left,
-    with finetune_vae.
+    [student.lora] says. coarse: so many more of its finest levels the decoder leaves out, see `VAEConfig`; [decoder]
+    trains what is left, with finetune_vae.
     """
 
     steps: Count = 1
@@ -58,7 +55,6 @@ class StudentRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     sigma_min: Positive | None = None
     train: Literal["all", "lora"] = "all"
     lora: LoraRecipe = LoraRecipe()
-    keep: StudentStage | None = None
     coarse: Annotated[int, Meta(ge=0)] = 0
 
     @property
@@ -124,37 +120,6 @@ class PairedRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     loss: SampleLossRecipe = SampleLossRecipe()
 
 
-class CriticRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The network that tells samples from true latents: the teacher's encoder half and small heads on it.
-
-    log_mean, log_std: noise levels, log-normal, at which it looks. width: of the heads. rate: its learning rate, in
-    rates of the student. trained: let the encoder half learn, too; a teacher that only ever saw its first noise level
-    has learned to overlook the latents it is to judge. start: updates before the student listens to it.
-    """
-
-    log_mean: float = -0.7
-    log_std: NotNegative = 1.2
-    width: Count = 64
-    rate: Positive = 2.0
-    trained: bool = False
-    start: Annotated[int, Meta(ge=0)] = 0
-
-
-class MatchingRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Adversarial matching of the distribution of latents, held by the paired loss.
-
-    weight: of the critic's word beside the paired loss, whose own weights are `loss`. steps: as in [paired].
-    """
-
-    budget: Budget
-    optimiser: OptimiserRecipe
-    ema: EmaRecipe | None = None
-    steps: tuple[Count, ...] | None = None
-    weight: NotNegative = 0.05
-    loss: SampleLossRecipe = SampleLossRecipe()
-    critic: CriticRecipe = CriticRecipe()
-
-
 class DistillRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A whole recipe of a distillation; a table that is left out leaves its stage out.
 
@@ -172,16 +137,14 @@ class DistillRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     latents: LatentsRecipe | None = None
     batches: BatchRecipe = BatchRecipe()
     paired: PairedRecipe | None = None
-    matching: MatchingRecipe | None = None
     decoder: DecoderRecipe | None = None
     export: ExportRecipe = ExportRecipe()
 
     def __post_init__(self) -> None:
         coarser = self.student.coarse > 0
-        if not self.student_stages and not coarser:
+        if self.paired is None and not coarser:
             raise ValueError(
-                "a student learns in [paired], in [matching] or in both, or gets a coarser decoder: give one of these "
-                "tables, or student.coarse"
+                "a student learns in [paired], or gets a coarser decoder: give this table, or student.coarse"
             )
         if coarser and (self.decoder is None or not self.decoder.finetune_vae):
             raise ValueError(
@@ -189,40 +152,21 @@ class DistillRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
             )
         if coarser and self.student.train == "lora":
             raise ValueError('student.coarse changes what an adapter would lie beside: give student.train = "all"')
-        if not self.student_stages and self.student.sampled_otherwise:
+        if self.paired is None and self.student.sampled_otherwise:
             raise ValueError(
-                "without [paired] and [matching] nothing teaches other steps or noise levels than the teacher's: leave "
-                "student.steps, sigma_max and sigma_min out"
+                "without [paired] nothing teaches other steps or noise levels than the teacher's: leave student.steps, "
+                "sigma_max and sigma_min out"
             )
-        if self.student.keep is not None and self.student.keep not in self.student_stages:
-            raise ValueError(f'student.keep is "{self.student.keep}", but there is no table [{self.student.keep}]')
         if (self.batches.source == "latents") != (self.latents is not None):
             raise ValueError('batches.source "latents" and a table [latents] go together: give both or neither')
         if self.decoder is not None and self.latents is None:
             raise ValueError("[decoder] works on encoded clips and needs a [latents] table")
-        if self.compute.checkpoint_activations and self.matching is not None and self.matching.critic.trained:
-            raise ValueError(
-                "matching.critic.trained cannot compute blocks anew, as they would then learn from the student's "
-                "losses, too; leave it or compute.checkpoint_activations out"
-            )
-
-    @property
-    def student_stages(self) -> tuple[StudentStage, ...]:
-        """The stages in which the student learns, in their order."""
-        there: dict[StudentStage, bool] = {"paired": self.paired is not None, "matching": self.matching is not None}
-        return tuple(name for name, wanted in there.items() if wanted)
-
-    @property
-    def kept(self) -> StudentStage | None:
-        """The stage whose student is exported; None if only its decoder learns."""
-        return self.student.keep or (self.student_stages[-1] if self.student_stages else None)
 
     @property
     def stages(self) -> tuple[DistillStageName, ...]:
         """The steps of a run, in their order."""
-        encoded: tuple[DistillStageName, ...] = () if self.latents is None else ("latents",)
-        mixed: tuple[DistillStageName, ...] = () if self.decoder is None else ("decoder",)
-        return (*encoded, *self.student_stages, *mixed, "export")
+        tables: tuple[DistillStageName, ...] = ("latents", "paired", "decoder", "export")
+        return tuple(name for name in tables if getattr(self, name) is not None)
 
 
 def packaged_distillations() -> list[str]:

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import msgspec
 
 from gcd_model import FAMILIES, Family, ModelConfig
-from gcd_model.checkpoints import LoadedWeights
 from gcd_model.errors import OptionError
+from gcd_model.networks import LoadedWeights
 from gcd_train.distillation.recipe import DistillRecipe, StudentRecipe
 from gcd_train.errors import RecipeError
-from gcd_train.recipe import ClassWeightsName, LossRecipe, ModelRecipe, OptimiserRecipe, Recipe, UNetRecipe
+from gcd_train.recipe import LossRecipe, ModelRecipe, OptimiserRecipe, Recipe, UNetRecipe
 from gcd_train.recipe.values import Budget
 from gcd_train.start import loaded_base
 
@@ -31,7 +31,7 @@ def teacher_of(recipe: DistillRecipe) -> Teacher:
         CheckpointError: the file is missing or cannot be read.
     """
     loaded = loaded_base(recipe.teacher.weights)
-    teacher = Teacher(config=loaded.networks.config, family=_family(recipe, loaded), move_time=loaded.move_time)
+    teacher = Teacher(config=loaded.diffusion.config, family=_family(recipe, loaded), move_time=loaded.move_time)
     goal = recipe.data.goal_frame(teacher.config.frames)
     if teacher.move_time != goal:
         raise RecipeError(
@@ -73,10 +73,6 @@ def as_training(recipe: DistillRecipe, teacher: Teacher) -> Recipe:
     Raises RecipeError for what a training would refuse, too.
     """
     batches, told = recipe.batches, recipe.batches.augmentation
-    losses = [stage.loss for stage in (recipe.paired, recipe.matching) if stage is not None]
-    painted: set[ClassWeightsName] = {loss.class_weights for loss in losses} or {"none"}
-    if len(painted) > 1:
-        raise RecipeError("paired.loss and matching.loss weigh classes differently; clips are encoded once: say one")
     unet = UNetRecipe(
         budget=Budget(updates=1),
         optimiser=OptimiserRecipe(rate=1.0),
@@ -87,7 +83,7 @@ def as_training(recipe: DistillRecipe, teacher: Teacher) -> Recipe:
         augmentation=teacher.config.sampling.augmentation if told is None else told,
         fps=batches.fps,
         motion_bucket=batches.motion_bucket,
-        loss=LossRecipe(class_weights=painted.pop()),
+        loss=LossRecipe(class_weights="none" if recipe.paired is None else recipe.paired.loss.class_weights),
     )
     try:
         return Recipe(

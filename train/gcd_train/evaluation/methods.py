@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 
-from gcd_model import RenderOptions, Synthesizer, inspect_weights, load_synthesizer, sampler_of
+from gcd_model import RenderOptions, ViewSynthesizer, inspect_weights, load_synthesizer, sampler_of
 from gcd_model.config import CameraControl, SemanticClass
 from gcd_model.loading import packaged_weights
 from gcd_train.baselines import (
@@ -74,7 +74,7 @@ class Weights:
     device: str = "auto"
     dtype: str | None = None
 
-    def open(self) -> Synthesizer:
+    def open(self) -> ViewSynthesizer:
         """The model, opened once in each process. Raises CheckpointError."""
         return _opened(self)
 
@@ -206,7 +206,7 @@ def _synthesized(weights: Weights, form: Form, options: RenderOptions) -> Predic
 
 
 @lru_cache(maxsize=1)
-def _opened(weights: Weights) -> Synthesizer:
+def _opened(weights: Weights) -> ViewSynthesizer:
     return load_synthesizer(weights.path, device=weights.device, dtype=weights.dtype)
 
 

@@ -69,9 +69,11 @@ class SynthesizedViews:
     def drawer(self, clip: SourceClip) -> Callable[[RenderOptions], View]:
         """Draws the clip's view, encoded once, with any options. Raises DataError as `predict`."""
         synthesizer, mount = self.synthesizer, clip.cameras.mount
-        declared = None if mount == (synthesizer.traits.mount or CameraMount()) else mount
+        live, video = synthesizer.traits.live, to_network(clip.source)
+        declared = None if mount == (synthesizer.traits.mount or CameraMount()) and not live else mount
         path = self._path(clip.cameras, declared)
-        features = synthesizer.encode(Clip(video=to_network(clip.source), fps=clip.fps, mount=declared))
+        lens = clip.cameras.source if live else None
+        features = synthesizer.encode(Clip(video=video, fps=clip.fps, mount=declared, lens=lens))
         return lambda options: synthesizer.render(features, [path], options)[0]
 
     def shown(self, view: View) -> Prediction:
@@ -87,6 +89,8 @@ class SynthesizedViews:
 
     def _path(self, cameras: CameraPair, declared: CameraMount | None) -> Trajectory:
         traits, asked = self.synthesizer.traits, cameras.trajectory
+        if traits.live:
+            return asked
         if traits.config.camera == "none":
             planned = traits.plan_view(mount=declared)
             same = planned.at_goal == asked.at_goal
@@ -118,10 +122,11 @@ def _require_fit(synthesizer: ViewSynthesizer, clips: ClipFacts) -> None:
     given = (clips.frames, clips.height, clips.width)
     if wanted != given:
         raise DataError(f"{traits.name} was trained on clips of T, H, W = {wanted}, got {given}; generate such ones")
-    if (traits.config.camera == "none") != (clips.camera == "none"):
+    if not traits.live and (traits.config.camera == "none") != (clips.camera == "none"):
         raise DataError(
             f"{traits.name} has camera control {traits.config.camera!r}, the clips {clips.camera!r}; evaluate "
             "driving models on `generate driving`, others on clips of an orbit"
         )
-    if traits.classes and clips.classes and names_of(traits.classes) != names_of(clips.classes):
+    known = traits.classes[: len(clips.classes)] if traits.live else traits.classes  # its first ones are the streets'
+    if known and clips.classes and names_of(known) != names_of(clips.classes):
         raise DataError(f"{traits.name} has classes {names_of(traits.classes)}, the clips {names_of(clips.classes)}")

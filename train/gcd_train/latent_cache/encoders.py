@@ -101,9 +101,9 @@ def _parts(networks: Networks) -> dict[str, nn.Module]:
 def _networks(choice: EncoderChoice) -> Networks:
     kind, _, name = choice.weights.partition(":")
     if kind == "random":
-        return random_weights(name).networks
+        return random_weights(name).diffusion
     path = packaged_weights(name) if kind == "package" else Path(choice.weights)
-    return load_weights(path, family=choice.family).networks
+    return load_weights(path, family=choice.family).diffusion
 
 
 def _device(name: str) -> torch.device:

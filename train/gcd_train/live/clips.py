@@ -219,7 +219,7 @@ def _rays(hfov_deg: float, height: int, width: int) -> Array:
     return np.stack([(u - width / 2) / focal, (v - height / 2) / focal, np.ones_like(u)], -1).reshape(-1, 3)
 
 
-def _transformed(a_from_b: Poses, points: Array) -> Array:
+def _transformed(a_from_b: Array, points: Array) -> Array:
     return points @ a_from_b[:3, :3].T + a_from_b[:3, 3]
 
 

@@ -13,7 +13,6 @@ from typing import Any
 
 import msgspec
 import torch
-from torch import nn
 
 from gcd_model.live.depth_net import DepthNet
 from gcd_model.live.synthesizer import save_live
@@ -144,9 +143,9 @@ def _shares(paths: Sequence[Path], size: int = 16) -> Iterator[list[Path]]:
 
 def _inputs_of(out: Path, state: dict[str, Any] | None, recipe: LiveRecipe, paths: list[Path]) -> None:
     torch.set_num_threads(1)
-    net: nn.Module | None = None
+    net: DepthNet | None = None
     if state is not None:
         net = DepthNet(recipe.model.depth, len(recipe.model.classes))
         net.load_state_dict(state)
-        net.eval().to(memory_format=torch.channels_last)
-    make_inputs(out, paths, net, recipe.model, recipe.seed)  # pyright: ignore[reportArgumentType]
+        net.eval()
+    make_inputs(out, paths, net, recipe.model, recipe.seed)

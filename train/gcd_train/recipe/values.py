@@ -10,8 +10,8 @@ NotNegative: TypeAlias = Annotated[float, Meta(ge=0)]
 Count: TypeAlias = Annotated[int, Meta(ge=1)]
 Share: TypeAlias = Annotated[float, Meta(ge=0, le=1)]
 StageName: TypeAlias = Literal["vae", "latents", "unet", "decoder", "export"]
-DistillStageName: TypeAlias = Literal["latents", "paired", "matching", "decoder", "export"]
-LiveStageName: TypeAlias = Literal["depth", "paint", "export"]
+DistillStageName: TypeAlias = Literal["latents", "paired", "decoder", "export"]
+LiveStageName: TypeAlias = Literal["depth", "paint", "detail"]
 AnyStageName: TypeAlias = StageName | DistillStageName | LiveStageName
 
 

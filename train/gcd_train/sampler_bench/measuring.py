@@ -108,7 +108,7 @@ def bench_of(
         torch=str(torch.__version__),
         weights=traits.name,
         sha256_12=traits.sha256_12,
-        prediction=traits.config.prediction,
+        prediction=traits.diffusion.prediction,
         sigma_max=traits.config.sampling.sigma_max,
         sigma_min=traits.config.sampling.sigma_min,
         data=tuple(data),
@@ -117,7 +117,7 @@ def bench_of(
         seed=views.options.seed,
         references=tuple(map(told, found.references)),
         ways=tuple(
-            _figures(way, Schedule.of(traits.config, _options(way, 0)).evaluations, apart, truth, found.truth[0])
+            _figures(way, Schedule.of(traits.diffusion, _options(way, 0)).evaluations, apart, truth, found.truth[0])
             for way, apart, truth in zip(found.ways, found.apart, found.truth, strict=True)
         ),
     )

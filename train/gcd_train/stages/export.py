@@ -55,7 +55,7 @@ def export(networks: Networks, folder: RunFolder, job: ExportJob, validation: Va
         loaded = load_weights(path)
     except ModelError as error:
         raise RunError(f"cannot export to {path}: {error}") from error
-    values = validation.measure(loaded.networks.float(), folder.stage("export") / "samples.png")
+    values = validation.measure(loaded.diffusion.float(), folder.stage("export") / "samples.png")
     size = {"bytes": path.stat().st_size, "sha256_12": loaded.sha256_12}
     folder.record("export", "measured", {**size, **values})
     _log.info("wrote %s", ", ".join([str(path), *(str(other) for other in others)]))

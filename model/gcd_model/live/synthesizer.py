@@ -1,0 +1,248 @@
+"""The live model behind the door of all models: clips of T frames in, views of T frames out."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gcd_model.clip import Augmentation, Clip, RenderOptions, View
+from gcd_model.conditioning import SourceFeatures, SourceGeometry
+from gcd_model.decoding import whole_levels
+from gcd_model.errors import Cancelled, NonFiniteError, ShapeError
+from gcd_model.families import LIVE
+from gcd_model.geometry import CameraMount, Intrinsics, Trajectory
+from gcd_model.live.splat import splat, unproject
+from gcd_model.live.view import COVERED, PAINTED, SEEN_NOW, Floor, FrameGeometry, LiveNetworks, LiveView, ViewFrame
+from gcd_model.own_format import Card, Entry
+from gcd_model.synthesizer import out_of_memory_is_our_error
+from gcd_model.traits import Traits
+from gcd_model.weights_export import own_content, write_safetensors
+
+_SEED_STEP, _SEEDS = 0x9E3779B97F4A7C15, 1 << 63  # neighbouring seeds of samples would meet those of other windows
+
+
+class LiveSynthesizer:
+    """A ViewSynthesizer: `encode` is one `LiveView.look` a frame, `render` resets and takes one `step` a frame.
+
+    Where a view stands is seen from the source camera of the same frame, which may move: `source_from_target[t]`. One
+    that stands still is the case of all other models.
+    """
+
+    def __init__(self, networks: LiveNetworks, traits: Traits) -> None:
+        self._networks, self._traits = networks.requires_grad_(False), traits
+        self._look = LiveView(networks).look
+
+    @property
+    def traits(self) -> Traits:
+        """Family, sizes and identity of the weights."""
+        return self._traits
+
+    @property
+    def networks(self) -> LiveNetworks:
+        """The networks themselves, for measuring."""
+        return self._networks
+
+    @out_of_memory_is_our_error
+    def encode(
+        self, clip: Clip, augmentation: Augmentation | None = None, extra: Tensor | None = None
+    ) -> SourceFeatures:
+        """See ViewSynthesizer. Frames are independent of each other; any number of them may be given.
+
+        The lens is the clip's, else of its mount's field of view, else of CameraMount()'s, 85 degrees. The ground is
+        known where the clip states a mount. Augmentation is for diffusion models and means nothing here.
+        Raises:
+            OptionError: height or width is no multiple of 32. ShapeError: there are extra condition channels.
+        """
+        self._traits.check_size(*clip.video.shape[-2:])
+        if extra is not None:
+            raise ShapeError(f"{self._traits.name} wants no extra condition channels, got {extra.shape[1]}")
+        lens, floor = lens_of(clip), _floor(clip.mount)
+        depth: Sequence[Tensor | None] = [None] * clip.frames if clip.depth is None else list(clip.depth)
+        seen = [self._look(frame, lens, depth=d, floor=floor) for frame, d in zip(clip.video, depth, strict=True)]
+        return SourceFeatures(
+            tokens=None,
+            latents=clip.video.new_zeros(clip.frames, 0, 1, 1),
+            extra=None,
+            fps=clip.fps,
+            augmentation=0.0,
+            video=clip.video,
+            mount=clip.mount,
+            geometry=SourceGeometry(
+                metres=torch.stack([each.metres for each in seen]),
+                labels=torch.stack([each.labels for each in seen]),
+                static=torch.stack([each.static for each in seen]),
+                entropy=torch.tensor([each.entropy for each in seen]),
+                odometry=clip.odometry,
+                lens=lens,
+            ),
+        )
+
+    @out_of_memory_is_our_error
+    def render(
+        self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
+    ) -> list[View]:
+        """See ViewSynthesizer. Nothing is known of frames before the first; `cancel` is asked between two frames.
+
+        Several samples differ where several steps draw; one step paints the mean, the same every time. Of the options,
+        solver, guidance, motion number and initial noise are for diffusion models and mean nothing here.
+        """
+        options = RenderOptions() if options is None else options
+        window = self._window(features, trajectories)
+        steps = options.steps or self._traits.config.sampling.steps
+        draws = options.samples if steps > 1 else 1
+        step_done = _Counter(options, draws * features.frames)
+        drawn = [
+            window.drawn(LiveView(self._networks, steps=steps, seed=s), step_done) for s in _seeds(options.seed, draws)
+        ]
+        drawn += drawn[:1] * (options.samples - draws)
+        ood = window.entropy
+        views = [self._view([draw[v] for draw in drawn], path, options, ood) for v, path in enumerate(trajectories)]
+        if not all(_is_finite(frame) for draw in drawn for frames in draw for frame in frames) or ood != ood:
+            raise NonFiniteError(
+                f"{self._traits.name} produced NaN or Inf; look at the weights with `gcd-node weights inspect`"
+            )
+        return views
+
+    def _window(self, features: SourceFeatures, trajectories: Sequence[Trajectory]) -> "_Window":
+        frames, video, geometry = self._traits.config.frames, features.video, features.geometry
+        if video is None or geometry is None:
+            raise ShapeError(
+                f"{self._traits.name} needs points of the source, which these features lack; encode it here"
+            )
+        if not trajectories:
+            raise ShapeError("at least one trajectory is wanted, got none")
+        for length in (features.frames, *(path.frames for path in trajectories)):
+            if length != frames:
+                raise ShapeError(f"{self._traits.name} works on {frames} frames, got {length}")
+        return _Window(video, geometry, _floor(features.mount), tuple(trajectories))
+
+    def _view(self, draws: "list[list[ViewFrame]]", path: Trajectory, options: RenderOptions, ood: float) -> View:
+        """One view of all draws; what is no draw, such as depth, is the first one's."""
+        pixels = torch.stack([torch.stack([(each.picture + 1) / 2 for each in frames]) for frames in draws])
+        first = draws[0]
+        return View(
+            samples=(whole_levels(pixels) if options.whole_levels else pixels).cpu(),
+            latents=torch.zeros(*pixels.shape[:2], 0, 1, 1),
+            trajectory=path,
+            motion_bucket=self._traits.motion_bucket(path) if options.motion_bucket is None else options.motion_bucket,
+            classes=torch.stack([torch.stack([each.classes for each in frames]) for frames in draws]).cpu(),
+            uncertainty_scale=self._traits.uncertainty_scale,
+            visibility=torch.stack([each.visibility for each in first]).cpu(),
+            inverse_depth=torch.stack([each.inverse_depth for each in first]).float().cpu(),
+            log_variance=torch.stack([each.log_variance for each in first]).float().cpu(),
+            ood=ood,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Window:
+    """What one call of `render` was asked for."""
+
+    video: Tensor
+    geometry: SourceGeometry
+    floor: Floor | None
+    trajectories: tuple[Trajectory, ...]
+
+    @property
+    def entropy(self) -> float:
+        """Mean over the frames."""
+        return float(self.geometry.entropy.mean())
+
+    def drawn(self, live: LiveView, step_done: Callable[[], None]) -> list[list[ViewFrame]]:
+        """All frames of all views: V lists of T. step_done: called before each frame, may raise Cancelled."""
+        views: list[list[ViewFrame]] = [[] for _ in self.trajectories]
+        geometry, odometry = self.geometry, self.geometry.odometry
+        for t, frame in enumerate(self.video):
+            step_done()
+            made = live.step(
+                frame,
+                [path.source_from_target[t] for path in self.trajectories],
+                lens=geometry.lens,
+                odometry=None if odometry is None else odometry[t],
+                floor=self.floor,
+                geometry=FrameGeometry(
+                    metres=geometry.metres[t],
+                    labels=geometry.labels[t],
+                    static=geometry.static[t],
+                    entropy=float(geometry.entropy[t]),
+                ),
+            )
+            for frames, view in zip(views, made.views, strict=True):
+                frames.append(view)
+        return views
+
+
+class _Counter:
+    """Asks for a cancel and tells the progress, frame by frame."""
+
+    def __init__(self, options: RenderOptions, frames: int) -> None:
+        self._options, self._frames, self._done = options, frames, 0
+
+    def __call__(self) -> None:
+        if self._options.cancel is not None and self._options.cancel.is_set():
+            raise Cancelled(f"stopped before frame {self._done} of {self._frames}, as was asked")
+        self._done += 1
+        if self._options.progress is not None:
+            self._options.progress(self._done, self._frames)
+
+
+def lens_of(clip: Clip) -> Intrinsics:
+    """The lens that a clip's pictures are taken to be of; see `LiveSynthesizer.encode`."""
+    if clip.lens is not None:
+        return clip.lens
+    height, width = clip.video.shape[-2:]
+    return Intrinsics.from_hfov((clip.mount or CameraMount()).hfov_deg, width, height)
+
+
+@torch.inference_mode()
+def visibility_of(clip: Clip, path: Trajectory) -> Tensor:
+    """What of a view the source camera sees in the same frame, for models that do not tell: `View.visibility`.
+
+    No network, and so no memory: which things stand still is not known, and what moved on was not seen where it was.
+    A view has the clip's lens, see `lens_of`. The path counts in the units of the clip's depth.
+    Returns:
+        uint8 [T, H, W], SEEN_NOW or PAINTED.
+    Raises:
+        ShapeError: the clip has no depth, or the path another length.
+    """
+    if clip.depth is None or path.frames != clip.frames:
+        found = "no depth" if clip.depth is None else f"{path.frames} poses for {clip.frames} frames"
+        raise ShapeError(f"what a view sees follows from depth and a pose for every frame, got {found}")
+    lens, here = lens_of(clip), torch.eye(4, dtype=torch.float64)
+    labels = torch.zeros(lens.height, lens.width, dtype=torch.uint8)
+    frames = zip(clip.video, clip.depth, path.source_from_target, strict=True)
+    splats = [
+        splat(unproject(metres, frame, labels, lens, here, 0.0), pose, lens, 1, 0.0) for frame, metres, pose in frames
+    ]
+    return torch.stack([torch.where(each.coverage >= COVERED, SEEN_NOW, PAINTED).to(torch.uint8) for each in splats])
+
+
+def _floor(mount: CameraMount | None) -> Floor | None:
+    """The ground that a camera on a vehicle knows."""
+    if mount is None:
+        return None
+    return Floor(up=mount.vehicle_from_camera[2, :3].float(), height_m=mount.height_m)
+
+
+def _seeds(seed: int, draws: int) -> list[int]:
+    return [(seed + s * _SEED_STEP) % _SEEDS for s in range(draws)]
+
+
+def _is_finite(frame: ViewFrame) -> bool:
+    pictures = (frame.picture, frame.inverse_depth, frame.log_variance)
+    return all(bool(each.isfinite().all()) for each in pictures)
+
+
+def save_live(
+    path: str | Path, networks: LiveNetworks, name: str, *, trained: bool = True, overwrite: bool = False
+) -> None:
+    """Write a live model as one of our files, in half precision.
+
+    Raises: OptionError if `path` exists and `overwrite` is not set; CheckpointError if it cannot be written.
+    """
+    state: dict[str, Tensor] = networks.state_dict()
+    entries = {each: Entry(tuple(tensor.shape), torch.float16) for each, tensor in state.items()}
+    card = Card(name=name, config=networks.config, family=LIVE.name, move_time=0, trained=trained)
+    write_safetensors(Path(path), own_content(entries, state.__getitem__, card), overwrite=overwrite)

@@ -1,0 +1,411 @@
+"""The live model behind the door: features frame by frame, views of windows, weights in our own files."""
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import pytest
+import torch
+from live_room import FRAMES, HEIGHT, WIDTH, path, room
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+from torch.testing import assert_close
+
+from gcd_model import (
+    CameraMount,
+    Cancelled,
+    CheckpointError,
+    Clip,
+    Intrinsics,
+    NonFiniteError,
+    OptionError,
+    PoseError,
+    RenderOptions,
+    ShapeError,
+    Spherical,
+    SphericalDelta,
+    View,
+    convert_weights,
+    driving_trajectory,
+    inspect_weights,
+    load_synthesizer,
+)
+from gcd_model.checkpoints import load_weights
+from gcd_model.live.config import LIVE_TINY
+from gcd_model.live.synthesizer import LiveSynthesizer, save_live
+from gcd_model.live.view import LiveNetworks
+from gcd_model.networks import random_networks
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def live() -> LiveSynthesizer:
+    made = load_synthesizer("random:live", device="cpu")
+    assert isinstance(made, LiveSynthesizer)
+    return made
+
+
+def same(a: View, b: View, tolerance: float = 0.0) -> None:
+    for name in ("samples", "classes", "visibility", "inverse_depth", "log_variance"):
+        mine, other = getattr(a, name), getattr(b, name)
+        if mine.is_floating_point():
+            assert_close(mine, other, rtol=tolerance, atol=tolerance)
+        else:
+            assert torch.equal(mine, other), name
+
+
+# Encoding.
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_features_joined_frame_by_frame_are_those_encoded_at_once(live: LiveSynthesizer, known: bool) -> None:
+    clip = room() if known else room(depth=None, odometry=None)
+    whole = live.encode(clip)
+    parts = [
+        live.encode(
+            replace(
+                clip,
+                video=clip.video[t : t + 1],
+                depth=None if clip.depth is None else clip.depth[t : t + 1],
+                odometry=None if clip.odometry is None else clip.odometry[t : t + 1],
+            )
+        )
+        for t in range(FRAMES)
+    ]
+    joined = parts[0].followed_by(*parts[1:])
+    assert whole.geometry is not None
+    assert joined.geometry is not None
+    for name in ("metres", "labels", "static", "entropy"):
+        assert torch.equal(getattr(whole.geometry, name), getattr(joined.geometry, name))
+    assert joined.frames == FRAMES
+    options = RenderOptions(seed=3)
+    same(live.render(whole, [path()], options)[0], live.render(joined, [path()], options)[0])
+    same(live.render(whole, [path()])[0], live.render(whole.rows(0, 7).followed_by(whole.rows(7, 14)), [path()])[0])
+
+
+def test_features_of_other_lenses_or_without_odometry_are_not_joined(live: LiveSynthesizer) -> None:
+    first = live.encode(room(1))
+    for other in (room(1, lens=Intrinsics.from_hfov(80.0, WIDTH, HEIGHT)), room(1, odometry=None)):
+        with pytest.raises(ShapeError):
+            first.followed_by(live.encode(other))
+
+
+def test_the_lens_is_the_clips_then_the_mounts_then_the_forward_cameras(live: LiveSynthesizer) -> None:
+    bare = room(1, lens=None)
+    for clip, wanted in ((room(1), 70.0), (replace(bare, mount=CameraMount(hfov_deg=60.0)), 60.0), (bare, 85.0)):
+        geometry = live.encode(clip).geometry
+        assert geometry is not None
+        assert geometry.lens.hfov_deg == pytest.approx(wanted)
+
+
+def test_a_mount_tells_where_the_ground_is(live: LiveSynthesizer) -> None:
+    plain = live.encode(room(1, depth=None)).geometry
+    mounted = live.encode(room(1, depth=None, mount=CameraMount(height_m=0.8, tilt_deg=20.0))).geometry
+    assert plain is not None
+    assert mounted is not None
+    assert not torch.equal(plain.metres, mounted.metres)
+
+
+# Bad input at the door.
+
+
+@pytest.mark.parametrize(
+    ("wrong", "error"),
+    [
+        ({"depth": torch.ones(FRAMES, HEIGHT, WIDTH + 1)}, ShapeError),
+        ({"depth": torch.ones(FRAMES, HEIGHT, WIDTH, dtype=torch.float64)}, ShapeError),
+        ({"odometry": torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)}, ShapeError),
+        ({"odometry": 2 * torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1)}, PoseError),
+        ({"lens": Intrinsics.from_hfov(70.0, 96, 64)}, ShapeError),
+    ],
+)
+def test_what_does_not_belong_to_the_video_is_refused_in_one_line(
+    wrong: dict[str, object], error: type[Exception]
+) -> None:
+    with pytest.raises(error) as raised:
+        room(**wrong)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), -2.0, float("inf"), 0.0])
+def test_depth_that_is_none_is_a_hole_and_nothing_in_it_is_seen(live: LiveSynthesizer, bad: float) -> None:
+    depth = torch.full((FRAMES, HEIGHT, WIDTH), bad)
+    features = live.encode(room(depth=depth, odometry=None))
+    assert features.geometry is not None
+    assert bool(
+        ((features.geometry.metres == 0) | (features.geometry.metres > 500)).all()
+    )  # a hole in the sky is the sky
+    view = live.render(features, [path(0.0)])[0]
+    assert view.visibility is not None
+    sky = features.geometry.metres > 500
+    assert not bool((view.visibility[~sky] == 2).any())
+
+
+@pytest.mark.parametrize("size", [(32, 32), (64, 96)])
+def test_any_size_in_multiples_of_32(live: LiveSynthesizer, size: tuple[int, int]) -> None:
+    clip = Clip(video=torch.rand(FRAMES, 3, *size) - 0.5, fps=10.0)
+    view = live.render(live.encode(clip), [path()])[0]
+    assert view.samples.shape == (1, FRAMES, 3, *size)
+
+
+@pytest.mark.parametrize("size", [(32, 40), (33, 64), (16, 64)])
+def test_other_sizes_are_refused_in_one_line(live: LiveSynthesizer, size: tuple[int, int]) -> None:
+    with pytest.raises(OptionError) as raised:
+        live.encode(Clip(video=torch.zeros(1, 3, *size), fps=10.0))
+    assert "\n" not in str(raised.value)
+
+
+def test_windows_of_another_length_are_refused(live: LiveSynthesizer) -> None:
+    with pytest.raises(ShapeError):
+        live.render(live.encode(room(3)), [path(frames=3)])
+    with pytest.raises(ShapeError):
+        live.render(live.encode(room()), [])
+
+
+# Rendering.
+
+
+def test_a_view_is_what_its_type_says(live: LiveSynthesizer) -> None:
+    view = live.render(live.encode(room()), [path()])[0]
+    assert view.samples.dtype == torch.float32
+    assert 0.0 <= float(view.samples.min()) <= float(view.samples.max()) <= 1.0
+    each = {"classes": view.classes, "visibility": view.visibility}
+    assert {name: value.dtype for name, value in each.items() if value is not None} == dict.fromkeys(each, torch.uint8)
+    assert view.classes is not None
+    assert view.classes.shape == (1, FRAMES, HEIGHT, WIDTH)
+    for map_ in (view.visibility, view.inverse_depth, view.log_variance):
+        assert map_ is not None
+        assert map_.shape == (FRAMES, HEIGHT, WIDTH)
+    assert view.visibility is not None
+    assert set(view.visibility.unique().tolist()) <= {0, 1, 2}
+    assert view.ood is not None
+    assert 0.0 <= view.ood <= 1.0
+    assert view.uncertainty is not None
+    assert bool((view.uncertainty > 0).all())
+
+
+def test_two_views_in_one_call_are_each_alone(live: LiveSynthesizer) -> None:
+    features, options = live.encode(room()), RenderOptions(steps=2, seed=5)
+    both = live.render(features, [path(0.4), path(-0.9)], options)
+    for view, x in zip(both, (0.4, -0.9), strict=True):
+        same(view, live.render(features, [path(x)], options)[0])
+
+
+def test_the_same_call_twice_gives_the_same_bits(live: LiveSynthesizer) -> None:
+    clip = room(depth=None, odometry=None)
+    first, again = (live.render(live.encode(clip), [path()], RenderOptions(steps=3, seed=1))[0] for _ in range(2))
+    same(first, again)
+
+
+def test_samples_are_drawn_in_several_steps_and_the_mean_in_one(live: LiveSynthesizer) -> None:
+    features = live.encode(room())
+    drawn = live.render(features, [path()], RenderOptions(steps=3, samples=2))[0]
+    assert drawn.std is not None
+    assert float(drawn.std.max()) > 0
+    same(
+        replace(drawn, samples=drawn.samples[:1], classes=None if drawn.classes is None else drawn.classes[:1]),
+        live.render(features, [path()], RenderOptions(steps=3))[0],
+    )
+    mean = live.render(features, [path()], RenderOptions(steps=1, samples=2))[0]
+    assert mean.std is not None
+    assert float(mean.std.max()) == 0
+
+
+def test_whole_levels_are_the_nearest(live: LiveSynthesizer) -> None:
+    features = live.encode(room())
+    plain = live.render(features, [path()])[0].samples
+    whole = live.render(features, [path()], RenderOptions(whole_levels=True))[0].samples
+    assert torch.equal(whole, (plain * 255).round().to(torch.uint8))
+
+
+def test_odometry_that_jumps_costs_the_memory_and_nothing_else(live: LiveSynthesizer) -> None:
+    """After the jump the view is that of a clip that begins there."""
+    clip = room()
+    assert clip.odometry is not None
+    jumped = clip.odometry.clone()
+    jumped[7:, 0, 3] += 100.0
+    networks = random_networks(LIVE_TINY, seed=0)
+    moves = networks.depth.head.out.bias
+    assert moves is not None
+    moves.data[-1] = -1e6  # everything stands still, so everything is remembered
+    still = LiveSynthesizer(networks, live.traits)
+    view = still.render(still.encode(replace(clip, odometry=jumped)), [path(-1.0)])[0]
+    kept = still.render(still.encode(clip), [path(-1.0)])[0]
+    assert view.visibility is not None
+    assert kept.visibility is not None
+    assert int((kept.visibility[7] == 1).sum()) > 0
+    assert int((view.visibility[7] == 1).sum()) == 0
+    assert torch.equal(view.visibility[:7], kept.visibility[:7])
+
+
+def test_cancel_is_noticed_between_two_frames(live: LiveSynthesizer) -> None:
+    cancel, done = threading.Event(), []
+
+    def progress(frame: int, frames: int) -> None:
+        done.append((frame, frames))
+        if frame == 3:
+            cancel.set()
+
+    with pytest.raises(Cancelled):
+        live.render(live.encode(room()), [path()], RenderOptions(cancel=cancel, progress=progress))
+    assert done == [(1, FRAMES), (2, FRAMES), (3, FRAMES)]
+
+
+@pytest.mark.parametrize("network", ["depth", "paint"])
+def test_nan_in_the_weights_is_an_error_and_no_view(network: str) -> None:
+    networks = random_networks(LIVE_TINY, seed=0)
+    for parameter in getattr(networks, network).parameters():
+        parameter.data.fill_(torch.nan)
+    broken = LiveSynthesizer(networks, load_synthesizer("random:live", device="cpu").traits)
+    clip = room(depth=None, odometry=None)
+    with pytest.raises(NonFiniteError):
+        broken.render(broken.encode(clip), [path()])
+
+
+# Views.
+
+
+def test_the_default_view_is_the_papers_from_above_and_stands_at_its_goal(live: LiveSynthesizer) -> None:
+    mount = CameraMount(height_m=1.2, tilt_deg=5.0)
+    for given in (None, mount):
+        planned = live.traits.plan_view(mount=given)
+        assert all(planned.at_goal)
+        wanted = driving_trajectory(frames=FRAMES, move_time=0, mount=given)
+        assert_close(planned.source_from_target, wanted.source_from_target)
+    assert not all(live.traits.plan_view(move_time=13).at_goal)
+
+
+def test_differences_of_angles_have_physical_limits_only(live: LiveSynthesizer) -> None:
+    source = Spherical(azimuth_deg=0.0, elevation_deg=20.0, radius_m=2.0)
+    delta = SphericalDelta(azimuth_deg=170.0, elevation_deg=60.0, radius_m=9.0)
+    planned = live.traits.plan_view(delta, source=source)
+    assert all(planned.at_goal)
+    assert_close(planned.source_from_target[0], planned.source_from_target[-1])
+    with pytest.raises(PoseError):
+        live.traits.plan_view(SphericalDelta(elevation_deg=80.0), source=source)
+
+
+def test_a_camera_on_a_vehicle_orbits_upright_about_what_it_looks_at(live: LiveSynthesizer) -> None:
+    mount = CameraMount(height_m=1.0, forward_m=0.0, tilt_deg=30.0)
+    around = live.traits.plan_view(SphericalDelta(azimuth_deg=90.0), mount=mount)
+    vehicle_from_view = mount.vehicle_from_camera @ around.source_from_target[0]
+    assert float(vehicle_from_view[2, 3]) == pytest.approx(1.0)  # as high as before
+    assert float(vehicle_from_view[2, 0]) == pytest.approx(0.0, abs=1e-12)  # level
+    assert vehicle_from_view[:2, 3].tolist() == pytest.approx([3**0.5, -(3**0.5)])
+
+
+def test_a_placed_view_stands_where_it_says_on_the_vehicle(live: LiveSynthesizer) -> None:
+    mount = CameraMount(height_m=0.6, forward_m=0.2, left_m=0.1, tilt_deg=15.0)
+    planned = live.traits.plan_placed((-1.0, 0.5, 2.0), (2.0, 0.0, 0.0), mount=mount)
+    vehicle_from_view = mount.vehicle_from_camera @ planned.source_from_target[5]
+    assert_close(vehicle_from_view[:3, 3], torch.tensor([-1.0, 0.5, 2.0], dtype=torch.float64))
+    with pytest.raises(PoseError):
+        live.traits.plan_placed((0.0, 0.0, 2.0), (0.0, 0.0, 0.0))
+    with pytest.raises(OptionError):
+        load_synthesizer("random:kubric90", device="cpu").traits.plan_placed((0.0, 0.0, 2.0), (1.0, 0.0, 0.0))
+
+
+# Weights.
+
+
+def test_weights_survive_their_file(tmp_path: Path) -> None:
+    networks = random_networks(LIVE_TINY, seed=4)
+    save_live(tmp_path / "mine.safetensors", networks, "mine")
+    loaded = load_synthesizer(tmp_path / "mine.safetensors", device="cpu")
+    assert isinstance(loaded, LiveSynthesizer)
+    assert (loaded.traits.name, loaded.traits.move_time, loaded.traits.config) == ("mine", 0, LIVE_TINY)
+    assert {each.dtype for each in loaded.networks.parameters()} == {torch.float32}
+    for name, tensor in networks.state_dict().items():
+        assert torch.equal(loaded.networks.state_dict()[name], tensor.half().float())
+    report = inspect_weights(tmp_path / "mine.safetensors")
+    assert (report.family, report.config, report.trained) == ("live", LIVE_TINY, True)
+    assert [each.name for each in report.networks] == ["depth", "paint"]
+    assert report.parameters == sum(each.numel() for each in networks.parameters())
+    converted = convert_weights(tmp_path / "mine.safetensors", tmp_path / "wide.safetensors", dtype="float32")
+    assert converted.networks[0].dtypes == ("float32",)
+
+
+def resaved(path: Path, change: Callable[[dict[str, str], dict[str, Tensor]], None]) -> Path:
+    save_live(path, LiveNetworks(LIVE_TINY), "mine", overwrite=True)
+    tensors = load_file(path)
+    with path.open("rb") as file:
+        length = int.from_bytes(file.read(8), "little")
+        metadata: dict[str, str] = json.loads(file.read(length))["__metadata__"]
+    change(metadata, tensors)
+    save_file(tensors, path, metadata=metadata)
+    return path
+
+
+HOSTILE: dict[str, object] = {
+    "bins": {"depth": {"bins": 10**9}},
+    "widths": {"paint": {"widths": [10**15, 8, 8]}},
+    "odd widths": {"paint": {"widths": [9, 16, 16]}},
+    "negative widths": {"depth": {"widths": [-8, 16, 16]}},
+    "no widths": {"depth": {"widths": [0, 0, 0]}},
+    "frames": {"frames": -3},
+    "size": {"height": 33},
+    "memory": {"memory": 10**12},
+    "classes": {"classes": []},
+    "far": {"depth": {"farthest_m": 0.1}},
+    "unknown": {"teleport": True},
+    "kind": {"kind": "dead"},
+    "other": {"unet": {}},
+    "text": "live",
+}
+
+
+@pytest.mark.parametrize("hostile", HOSTILE.values(), ids=HOSTILE.keys())
+def test_a_hostile_config_is_refused_in_one_line(tmp_path: Path, hostile: object) -> None:
+    def change(metadata: dict[str, str], tensors: dict[str, Tensor]) -> None:
+        own = json.loads(metadata["gcd.config"])
+        stated = {
+            name: {**own[name], **value} if isinstance(value, dict) and name in own else value
+            for name, value in (hostile.items() if isinstance(hostile, dict) else ())
+        }
+        metadata["gcd.config"] = json.dumps(own | stated if isinstance(hostile, dict) else hostile)
+
+    file = resaved(tmp_path / "bad.safetensors", change)
+    for read in (load_synthesizer, inspect_weights):
+        with pytest.raises(CheckpointError) as raised:
+            read(file)
+        assert "\n" not in str(raised.value)
+
+
+def test_missing_unknown_and_misshapen_weights_are_refused(tmp_path: Path) -> None:
+    def drop(_: dict[str, str], tensors: dict[str, Tensor]) -> None:
+        del tensors["depth.trunk.stem.weight"]
+
+    def add(_: dict[str, str], tensors: dict[str, Tensor]) -> None:
+        tensors["extra"] = torch.zeros(1)
+
+    def bend(_: dict[str, str], tensors: dict[str, Tensor]) -> None:
+        tensors["paint.votes.bias"] = torch.zeros(99)
+
+    def rename(metadata: dict[str, str], _: dict[str, Tensor]) -> None:
+        metadata["gcd.family"] = "driving"
+
+    for change in (drop, add, bend, rename):
+        with pytest.raises(CheckpointError):
+            load_synthesizer(resaved(tmp_path / "bad.safetensors", change), device="cpu")
+
+
+def test_a_live_file_is_no_diffusion_model_and_says_so(tmp_path: Path) -> None:
+    save_live(tmp_path / "mine.safetensors", LiveNetworks(LIVE_TINY), "mine")
+    loaded = load_weights(tmp_path / "mine.safetensors")
+    with pytest.raises(CheckpointError):
+        loaded.diffusion  # noqa: B018
+    for options in ({"dtype": "bfloat16"}, {"frames": 0}):
+        with pytest.raises(OptionError):
+            load_synthesizer(tmp_path / "mine.safetensors", device="cpu", **options)  # type: ignore[arg-type]
+    fewer = load_synthesizer(tmp_path / "mine.safetensors", device="cpu", frames=5)
+    assert fewer.traits.config == msgspec.structs.replace(LIVE_TINY, frames=5)

@@ -1,0 +1,157 @@
+"""The live view frame by frame: state, reset, lenses, and what may be called seen."""
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from live_room import FRAMES, HEIGHT, LENS, WIDTH, path, room
+from torch import Tensor
+from torch.testing import assert_close
+
+from gcd_model import Intrinsics, OptionError, PoseError, RenderOptions, ShapeError, load_synthesizer
+from gcd_model.live.config import LIVE_TINY
+from gcd_model.live.depth_net import SKY_M
+from gcd_model.live.seen_world import SeenWorld
+from gcd_model.live.synthesizer import LiveSynthesizer
+from gcd_model.live.view import LiveFrame, LiveNetworks, LiveView
+from gcd_model.networks import random_networks
+
+HERE = torch.eye(4, dtype=torch.float64)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def networks() -> LiveNetworks:
+    return random_networks(LIVE_TINY, seed=0)
+
+
+def aside(x: float) -> Tensor:
+    pose = HERE.clone()
+    pose[0, 3] = x
+    return pose
+
+
+def steps(view: LiveView, frames: range, *, x: float = 0.5) -> list[LiveFrame]:
+    clip = room()
+    assert clip.depth is not None
+    assert clip.odometry is not None
+    return [
+        view.step(clip.video[t], [aside(x)], lens=LENS, depth=clip.depth[t], odometry=clip.odometry[t]) for t in frames
+    ]
+
+
+def assert_same(a: LiveFrame, b: LiveFrame, tolerance: float = 0.0) -> None:
+    for mine, other in zip(a.views, b.views, strict=True):
+        assert torch.equal(mine.visibility, other.visibility)
+        assert torch.equal(mine.classes, other.classes)
+        for name in ("picture", "inverse_depth", "log_variance"):
+            assert_close(getattr(mine, name), getattr(other, name), rtol=tolerance, atol=tolerance)
+
+
+def test_a_window_is_its_frames_one_by_one(networks: LiveNetworks) -> None:
+    synthesizer = LiveSynthesizer(networks, load_synthesizer("random:live", device="cpu").traits)
+    window = synthesizer.render(synthesizer.encode(room()), [path(0.5)], RenderOptions(seed=2))[0]
+    assert window.visibility is not None
+    assert window.inverse_depth is not None
+    assert window.classes is not None
+    for t, frame in enumerate(steps(LiveView(networks, seed=2), range(FRAMES))):
+        (view,) = frame.views
+        assert_close(window.samples[0, t], (view.picture + 1) / 2, rtol=0, atol=1e-5)
+        assert_close(window.inverse_depth[t], view.inverse_depth, rtol=0, atol=1e-5)
+        assert torch.equal(window.visibility[t], view.visibility)
+        assert torch.equal(window.classes[0, t], view.classes)
+
+
+def test_after_a_reset_nothing_is_known_of_what_was_before(networks: LiveNetworks) -> None:
+    used, fresh = LiveView(networks), LiveView(networks)
+    steps(used, range(4))
+    used.reset()
+    for again, first in zip(steps(used, range(3)), steps(fresh, range(3)), strict=True):
+        assert_same(again, first)
+
+
+def test_looking_ahead_changes_no_state(networks: LiveNetworks) -> None:
+    looks, plain = LiveView(networks), LiveView(networks)
+    clip = room()
+    for t in range(3):
+        looks.look(clip.video[13 - t], LENS)
+        assert_same(*(steps(each, range(t, t + 1))[0] for each in (looks, plain)))
+
+
+@pytest.mark.parametrize("hfov_deg", [40.0, 85.0, 120.0])
+def test_a_view_from_the_source_shows_the_source_through_any_lens(hfov_deg: float) -> None:
+    """Untrained, the paint network adds nothing to the splat."""
+    torch.manual_seed(0)
+    view = LiveView(LiveNetworks(LIVE_TINY))
+    lens = Intrinsics.from_hfov(hfov_deg, WIDTH, HEIGHT)
+    frame = room().video[0]
+    (seen,) = view.step(frame, [HERE], lens=lens, depth=torch.full((HEIGHT, WIDTH), 4.0), odometry=HERE).views
+    inside = (slice(1, -1), slice(1, -1))
+    assert bool((seen.visibility[inside] == 2).all())
+    assert_close(seen.picture[:, *inside], frame[:, *inside], rtol=0, atol=1e-3)
+    assert_close(seen.inverse_depth[inside], torch.full_like(seen.inverse_depth[inside], 0.25), rtol=1e-3, atol=0)
+
+
+def test_what_points_do_not_cover_is_never_marked_seen(networks: LiveNetworks) -> None:
+    """Whatever the network says: its visibility head is made to vote for seen everywhere."""
+    torch.manual_seed(1)
+    voting = LiveNetworks(LIVE_TINY)
+    bias = voting.paint.head.out.bias
+    assert bias is not None
+    bias.data[-3:] = torch.tensor([-1e6, 0.0, 1e6])
+    clip = room()
+    depth = torch.where(torch.arange(WIDTH) < WIDTH // 2, 3.0, 0.0).expand(HEIGHT, WIDTH).contiguous()
+    view = LiveView(voting)
+    world = SeenWorld(classes=len(LIVE_TINY.classes), capacity=20_000, oldest_frames=50)
+    for t in range(3):
+        target = aside(0.3)
+        (made,) = view.step(clip.video[t], [target], lens=LENS, depth=depth, odometry=HERE).views
+        seen = view.look(clip.video[t], LENS, depth=depth)
+        world.look(clip.video[t], seen.metres, seen.labels, seen.static, LENS, HERE)
+        covered = world.splat(target, LENS).coverage >= 0.5
+        assert bool((made.visibility[covered] == 2).all())
+        assert bool((made.visibility[~covered] == 0).all())
+        assert bool((~covered).any())
+
+
+def test_holes_are_filled_by_nobody_but_the_sky(networks: LiveNetworks) -> None:
+    depth = torch.full((HEIGHT, WIDTH), torch.nan)
+    seen = LiveView(networks).look(room().video[0], LENS, depth=depth)
+    assert torch.equal(seen.metres, torch.where(seen.labels == 0, SKY_M, 0.0))
+
+
+def test_a_jump_drops_the_memory_says_so_and_goes_on(networks: LiveNetworks) -> None:
+    view, clip = LiveView(networks), room()
+    assert clip.odometry is not None
+    assert clip.depth is not None
+    steps(view, range(5))
+    jump = clip.odometry[5].clone()
+    jump[:3, 3] += 500.0
+    lost = view.step(clip.video[5], [aside(1.5)], lens=LENS, depth=clip.depth[5], odometry=jump)
+    assert lost.lost is not None
+    assert not bool((lost.views[0].visibility == 1).any())
+    after = jump.clone()
+    after[0, 3] += 0.1
+    goes_on = view.step(clip.video[6], [aside(1.5)], lens=LENS, depth=clip.depth[6], odometry=after)
+    assert goes_on.lost is None
+
+
+def test_what_cannot_be_is_refused(networks: LiveNetworks) -> None:
+    view, frame = LiveView(networks), room().video[0]
+    with pytest.raises(ShapeError):
+        view.look(frame, Intrinsics.from_hfov(70.0, 96, 64))
+    with pytest.raises(ShapeError):
+        view.look(frame, LENS, depth=torch.ones(HEIGHT, WIDTH + 32))
+    with pytest.raises(ShapeError):
+        view.look(frame[:, :, :40], Intrinsics.from_hfov(70.0, 40, HEIGHT))
+    with pytest.raises(PoseError):
+        view.step(frame, [2 * HERE], lens=LENS)
+    with pytest.raises(OptionError):
+        LiveView(networks, steps=0)

@@ -1,0 +1,352 @@
+"""Depth from elsewhere in views: of a recording, of a stereo pair, of a network beside the model; and a source that is
+unlike the training."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, made_node, traits
+
+from gcd_model import RenderOptions, SourceFeatures, Trajectory, View, load_synthesizer
+from gcd_node.cli.main import run_app
+from gcd_node.config import NodeConfig, parse_config
+from gcd_node.errors import ConfigError, DepthError, SourceError, TooShortError, UsageError
+from gcd_node.frame import Image
+from gcd_node.offline_clip import ClipRequest, OfflineClip, read_clip
+from gcd_node.pictures.files import write_video
+from gcd_node.wire.record_json import to_json
+
+LIVE = load_synthesizer("random:live", device="cpu").traits
+FRAMES = 14
+FX, BASELINE_M, DISPARITY = 300.0, 0.09, 10
+PAIR_SIZE = (384, 256)
+
+
+# --- recorded depth --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    """Twice as wide as the model's shape: the middle half is used."""
+    pictures = [np.full((HEIGHT, 2 * WIDTH, 3), 5 * i, np.uint8) for i in range(30)]
+    write_video(tmp_path / "v.mkv", pictures, 10.0)
+    return tmp_path / "v.mkv"
+
+
+def numbered_depth(frames: int = 30) -> np.ndarray:
+    """Metres: the number of the frame, plus a hundredth of the column."""
+    return (np.arange(1, frames + 1)[:, None, None] + np.zeros((HEIGHT, 1)) + np.arange(2 * WIDTH) / 100).astype(
+        np.float32
+    )
+
+
+def read(path: Path, **request: Any) -> OfflineClip:
+    return read_clip(path, ClipRequest(**request), LIVE)
+
+
+def as_folder(folder: Path, depth: np.ndarray) -> Path:
+    folder.mkdir()
+    for i, each in enumerate(depth):
+        cv2.imwrite(str(folder / f"{i}.png"), np.rint(each * 1000).astype(np.uint16))
+    return folder
+
+
+def test_depth_takes_the_way_of_its_pictures_from_a_file_as_from_a_folder(video: Path, tmp_path: Path) -> None:
+    np.save(tmp_path / "d.npy", numbered_depth())
+    folder = as_folder(tmp_path / "d", numbered_depth())
+    wanted = numbered_depth()[1 : 1 + 2 * FRAMES : 2, :, WIDTH // 2 : 3 * WIDTH // 2]
+    for path in (tmp_path / "d.npy", folder):
+        clip = read(video, depth=path, start=1, stride=2).clip
+        assert clip.depth is not None
+        assert np.allclose(clip.depth.numpy(), wanted, atol=6e-4)
+
+
+def test_what_is_no_distance_in_a_recording_is_a_hole(video: Path, tmp_path: Path) -> None:
+    depth = numbered_depth()
+    depth[:, :8] = np.array([np.nan, np.inf, -np.inf, -3.0] * 2)[:, None]
+    np.save(tmp_path / "d.npy", depth)
+    clip = read(video, depth=tmp_path / "d.npy").clip
+    assert clip.depth is not None
+    assert not clip.depth[:, :8].any()
+    assert (clip.depth[:, 8:] > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("depth", "error"),
+    [
+        (np.full((30, HEIGHT, 2 * WIDTH), np.nan, np.float32), DepthError),
+        (np.ones((30, HEIGHT, WIDTH), np.float32), DepthError),
+        (np.ones((30, HEIGHT, 2 * WIDTH), np.uint8), DepthError),
+        (np.ones((HEIGHT, 2 * WIDTH), np.float32), SourceError),
+        (np.ones((13, HEIGHT, 2 * WIDTH), np.float32), TooShortError),
+    ],
+    ids=["holes", "shape", "u8", "one frame", "short"],
+)
+def test_depth_that_does_not_belong_to_the_pictures_is_refused(
+    video: Path, tmp_path: Path, depth: np.ndarray, error: type[Exception]
+) -> None:
+    np.save(tmp_path / "d.npy", depth)
+    with pytest.raises(error) as raised:
+        read(video, depth=tmp_path / "d.npy")
+    assert "\n" not in str(raised.value)
+
+
+def test_pictures_of_eight_bits_and_files_that_are_missing_are_refused(video: Path, tmp_path: Path) -> None:
+    (tmp_path / "p").mkdir()
+    for i in range(FRAMES):
+        cv2.imwrite(str(tmp_path / "p" / f"{i}.png"), np.ones((HEIGHT, 2 * WIDTH), np.uint8))
+    for path in (tmp_path / "p", tmp_path / "missing.npy", tmp_path / "missing.png"):
+        with pytest.raises(SourceError):
+            read(video, depth=path)
+
+
+# --- stereo pairs ----------------------------------------------------------------------------------------------------
+
+
+def camera(step_cm: float, onward: int) -> dict[str, Any]:
+    return {
+        "width": PAIR_SIZE[0],
+        "height": PAIR_SIZE[1],
+        "cameraType": 0,
+        "intrinsicMatrix": [[FX, 0.0, 191.5], [0.0, FX, 127.5], [0.0, 0.0, 1.0]],
+        "distortionCoeff": [0.0] * 14,
+        "extrinsics": {
+            "rotationMatrix": np.eye(3).tolist(),
+            "translation": {"x": step_cm, "y": 0.0, "z": 0.0},
+            "toCameraSocket": onward,
+        },
+    }
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """left.mkv, right.mkv and calib.json of a camera before a wall."""
+    folder = tmp_path_factory.mktemp("pair")
+    wall = np.random.default_rng(1).integers(0, 256, (256, 384 + DISPARITY, 3)).astype(np.float32)
+    wall = cv2.normalize(cv2.GaussianBlur(wall, (0, 0), 2.0), np.empty(0), 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    write_video(folder / "left.mkv", [np.ascontiguousarray(wall[:, :384])] * FRAMES, 10.0)
+    write_video(folder / "right.mkv", [np.ascontiguousarray(wall[:, DISPARITY:])] * FRAMES, 10.0)
+    left, right = camera(-100 * BASELINE_M, 2), camera(0.0, -1)
+    (folder / "calib.json").write_text(json.dumps({"boardName": "made up", "cameraData": [[1, left], [2, right]]}))
+    return folder
+
+
+@pytest.mark.parametrize("rectified", [False, True])
+def test_a_stereo_pair_gives_its_rectified_left_picture_with_lens_and_depth(pair: Path, rectified: bool) -> None:
+    source = read(pair / "left.mkv", right=pair / "right.mkv", calibration=pair / "calib.json", rectified=rectified)
+    depth, lens = source.clip.depth, source.clip.lens
+    assert depth is not None
+    assert lens is not None
+    assert (lens.width, lens.height) == (WIDTH, HEIGHT)
+    assert source.hfov_deg == lens.hfov_deg
+    known = depth[depth > 0]
+    assert len(known) > 0.6 * depth.numel()
+    assert float(known.median()) == pytest.approx(FX * BASELINE_M / DISPARITY, rel=0.06)
+
+
+def test_a_pair_that_is_none_is_refused_in_one_line(pair: Path, tmp_path: Path) -> None:
+    left, right, calibration = (pair / name for name in ("left.mkv", "right.mkv", "calib.json"))
+    with pytest.raises(DepthError):
+        read(right, right=left, calibration=calibration)
+    with pytest.raises(ConfigError):
+        read(left, right=right, calibration=tmp_path / "missing.json")
+    write_video(tmp_path / "short.mkv", [np.zeros((256, 384, 3), np.uint8)] * 5, 10.0)
+    with pytest.raises(TooShortError):
+        read(left, right=tmp_path / "short.mkv", calibration=calibration)
+    for half in ({"right": right}, {"calibration": calibration}, {"rectified": True}):
+        with pytest.raises(UsageError):
+            ClipRequest(**half)
+
+
+# --- the command -----------------------------------------------------------------------------------------------------
+
+
+def synthesize(source: Path, weights: str, out: Path, *options: object) -> int:
+    return run_app(["synthesize", str(source), "--weights", weights, "--out", str(out), *map(str, options)])
+
+
+@pytest.fixture
+def still_clip(tmp_path: Path) -> Path:
+    np.save(tmp_path / "clip.npy", np.random.default_rng(0).random((FRAMES, HEIGHT, WIDTH, 3), np.float32))
+    depth = np.full((FRAMES, HEIGHT, WIDTH), 3.0, np.float32)
+    depth[:, :, :20] = np.nan
+    np.save(tmp_path / "depth.npy", depth)
+    return tmp_path / "clip.npy"
+
+
+def test_a_live_view_is_written_with_all_it_tells(pair: Path, tmp_path: Path) -> None:
+    calibration = ("--right", pair / "right.mkv", "--calibration", pair / "calib.json")
+    orbit = ("--source-radius", 2.7, "--azimuth-deg", 10)
+    assert synthesize(pair / "left.mkv", "random:live", tmp_path, *calibration, *orbit) == 0
+    seen = np.load(tmp_path / "visibility.npz")
+    assert seen["visibility"].shape == (FRAMES, HEIGHT, WIDTH)
+    assert seen["names"][seen["ids"] == 0].tolist() == ["painted"]
+    assert np.load(tmp_path / "depth.npz")["inverse_depth"].shape == (FRAMES, HEIGHT, WIDTH)
+    assert np.load(tmp_path / "classes.npz")["classes"].shape == (1, FRAMES, HEIGHT, WIDTH)
+    assert (tmp_path / "seen.mp4").stat().st_size > 0
+
+
+def test_with_depth_a_published_model_tells_what_was_seen(still_clip: Path, tmp_path: Path) -> None:
+    options = ("--depth", tmp_path / "depth.npy", "--azimuth-deg", 0, "--steps", 1, "--source-radius", 15)
+    assert synthesize(still_clip, "random:kubric90", tmp_path / "a", *options) == 0
+    seen = np.load(tmp_path / "a" / "visibility.npz")["visibility"]
+    assert (seen[:, :, :20] == 0).all()  # a hole is painted, whatever the model drew there
+    assert (seen[:, :, 21:] == 2).all()
+    assert synthesize(still_clip, "random:kubric90", tmp_path / "b", "--azimuth-deg", 0, "--steps", 1) == 0
+    assert not (tmp_path / "b" / "visibility.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("weights", "options", "code"),
+    [
+        ("random:svd", ["--depth", "depth.npy"], 64),
+        ("random:live", ["--depth", "depth.npy", "--depth-model", "net.onnx"], 64),
+        ("random:live", ["--depth-model", "missing.onnx"], 78),
+        ("random:live", ["--depth-model", "clip.npy", "--depth-kind", "inverse"], 78),
+        ("random:live", ["--depth-model", "clip.npy"], 78),
+    ],
+)
+def test_depth_that_cannot_be_used_is_refused_in_one_line(
+    still_clip: Path, capsys: pytest.CaptureFixture[str], weights: str, options: Sequence[str], code: int
+) -> None:
+    if options[0] == "--depth-model":
+        pytest.importorskip("onnxruntime", reason="needs the extra `onnx`")
+    placed = [still_clip.parent / each if "." in each else each for each in options]
+    assert synthesize(still_clip, weights, still_clip.parent / "out", *placed) == code
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+# --- a node ----------------------------------------------------------------------------------------------------------
+
+
+def config(more: str = "") -> NodeConfig:
+    text = f"""
+        [source]
+        kind = "synthetic"
+        pace = "lockstep"
+        [model]
+        weights = "fake"
+        {more}
+        [view.main]
+    """
+    return parse_config(text.encode(), "test")
+
+
+@pytest.fixture
+def bad(monkeypatch: pytest.MonkeyPatch) -> set[int]:
+    """A depth network that gives a frame's number in metres, and fails on the frames of this set."""
+    failing: set[int] = set()
+
+    class Network:
+        def __init__(self, path: Path, *, kind: str, scale: object) -> None:
+            assert (kind, scale) == ("metric", None)
+
+        def __call__(self, *pictures: Image) -> tuple[Image, np.ndarray]:
+            number = int(pictures[0][0, 0, 0]) - 20
+            if number in failing:
+                raise DepthError("no depth today")
+            return pictures[0], np.full((HEIGHT, WIDTH), number, np.float32)
+
+    monkeypatch.setattr("gcd_node.rendering.preparation.OnnxDepth", Network)
+    return failing
+
+
+def run(model: FakeSynthesizer, more: str, frames: int = 28) -> Box:
+    box = Box()
+    made_node(config(more), model, FakeSource(frames, fps=10.0), box).run()
+    return box
+
+
+def statuses(box: Box) -> list[dict[str, Any]]:
+    return [dict(fields) for topic, fields in box.notes if topic == "status"]
+
+
+def test_a_network_beside_the_model_gives_every_frame_its_depth(bad: set[int]) -> None:
+    model = FakeSynthesizer(LIVE)
+    bad |= {0, 3}  # and frame 0 is 0 m everywhere: all holes
+    box = run(model, 'depth_model = "net.onnx"')
+    depths = [None if clip.depth is None else int(clip.depth.unique().item()) for clip in model.clips]
+    assert depths == [None, 1, 2, None, *range(4, 28)]
+    assert [message.header.window_id for message in box.of("win")] == [0, 1]
+    events = [fields for topic, fields in box.notes if topic == "event" and fields["code"] == "DEPTH_BAD"]
+    assert [event["message"] for event in events] == ["no depth today"]
+    assert statuses(box)[-1]["model"]["bad_depths"] == 2
+    assert "DEPTH_BAD" not in statuses(box)[-1]["reasons"]  # the second window had none
+
+
+def test_all_holes_are_no_depth(bad: set[int]) -> None:
+    model = FakeSynthesizer(LIVE)
+    run(model, 'depth_model = "net.onnx"', frames=14)
+    assert model.clips[0].depth is None
+    assert all(clip.depth is not None for clip in model.clips[1:])
+
+
+def test_windows_without_the_right_depth_are_dropped_where_that_is_asked_for(bad: set[int]) -> None:
+    bad.add(5)
+    box = run(FakeSynthesizer(LIVE), 'depth_model = "net.onnx"\non_bad_depth = "stop"', frames=42)
+    assert [message.header.window_id for message in box.of("win")] == [1, 2]
+    assert statuses(box)[-1]["drops"]["model"] == 1
+
+
+def test_a_node_refuses_depth_that_it_cannot_use(tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime", reason="needs the extra `onnx`")
+    (tmp_path / "junk.onnx").write_bytes(b"junk")
+    for made, path, kind in (
+        (traits(), tmp_path / "junk.onnx", "metric"),
+        (LIVE, tmp_path / "junk.onnx", "metric"),
+        (LIVE, tmp_path / "missing.onnx", "metric"),
+        (LIVE, tmp_path / "junk.onnx", "inverse"),
+    ):
+        with pytest.raises(ConfigError) as raised:
+            run(FakeSynthesizer(made), f'depth_model = "{path}"\ndepth_kind = "{kind}"')
+        assert "\n" not in str(raised.value)
+
+
+def test_the_kinds_of_a_live_view_are_announced_before_the_first_window() -> None:
+    for made, kinds in ((LIVE, ["win", "frm", "cls", "vis", "depth", "std"]), (traits(), ["win", "frm"])):
+        box = run(FakeSynthesizer(made), "", frames=0)
+        assert next(fields for topic, fields in box.notes if topic == "meta")["kinds"] == kinds
+
+
+# --- a source unlike the training ------------------------------------------------------------------------------------
+
+
+class Doubting(FakeSynthesizer):
+    """Says of its windows how unlike the training they are."""
+
+    def __init__(self, scores: Sequence[float], act: Callable[[RenderOptions], None] | None = None) -> None:
+        super().__init__(LIVE, act)
+        self._scores = list(scores)
+
+    def render(
+        self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
+    ) -> list[View]:
+        score = self._scores.pop(0)
+        return [replace(view, ood=score) for view in super().render(features, trajectories, options)]
+
+
+def test_a_source_of_another_world_is_flagged_as_long_as_it_lasts() -> None:
+    assert LIVE.ood_threshold is not None
+    above, below = LIVE.ood_threshold + 0.2, LIVE.ood_threshold - 0.2
+    box = run(Doubting([below, above]), "")
+    headers = [message.header for message in box.of("win")]
+    assert [header.quality.ood_score for header in headers] == [below, above]
+    assert ["world" in header.quality.ood for header in headers] == [False, True]
+    status = statuses(box)[-1]
+    assert "world" in status["reasons"]
+    assert status["model"]["ood_score"] == round(above, 3)
+    again = statuses(run(Doubting([above, below]), ""))[-1]
+    assert "world" not in again["reasons"]
+
+
+def test_a_model_that_cannot_tell_says_nothing_of_it() -> None:
+    box = run(FakeSynthesizer(traits()), "")
+    header = box.of("win")[0].header
+    assert set(to_json(header)["quality"]) == {"nan_frames", "ood", "steps", "seed"}
+    assert "world" not in header.quality.ood
+    assert "ood_score" not in statuses(box)[-1]["model"]

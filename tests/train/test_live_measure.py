@@ -1,0 +1,247 @@
+"""What the live view is measured by: laws on pictures whose figures are known beforehand."""
+
+import json
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from gcd_model.geometry import Intrinsics
+from gcd_model.live.config import LiveConfig
+from gcd_train.errors import DataError
+from gcd_train.live.clips import LiveClip
+from gcd_train.live.judge import Moments, frechet_distance, random_judge
+from gcd_train.live.measure import SetResult, differences, hatched, methods_of, open_networks, to_json, to_markdown
+from gcd_train.live.measure_figures import (
+    BEFORE,
+    NEVER,
+    NOW,
+    MethodViews,
+    SpreadHistogram,
+    Tally,
+    Truth,
+    fit_spread,
+    scene_interval,
+    surface_motion,
+)
+from gcd_train.live.measure_methods import BestHomography, Kept
+from gcd_train.metrics.pictures import gradient_map
+
+FRAMES, HEIGHT, WIDTH = 4, 64, 96
+LENS = Intrinsics.from_hfov(70.0, WIDTH, HEIGHT)
+JUDGES = {"random": random_judge()}
+
+
+def truth(seed: int = 0) -> Truth:
+    """Noise in front of a camera that stands; the left half was never seen, a stripe was seen before."""
+    generator = torch.Generator().manual_seed(seed)
+    video = torch.rand(FRAMES, 3, HEIGHT, WIDTH, generator=generator)
+    visibility = torch.full((FRAMES, HEIGHT, WIDTH), NOW, dtype=torch.uint8)
+    visibility[..., : WIDTH // 2], visibility[..., WIDTH // 2 : WIDTH // 2 + 16] = NEVER, BEFORE
+    metres = torch.full((FRAMES, HEIGHT, WIDTH), 5.0)
+    poses = torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1)
+    before, static = surface_motion(metres, torch.zeros_like(metres, dtype=torch.bool), poses, LENS)
+    return Truth(
+        video=video,
+        labels=torch.randint(0, 12, (FRAMES, HEIGHT, WIDTH), generator=generator, dtype=torch.uint8),
+        visibility=visibility,
+        metres=metres,
+        before=before,
+        static=static,
+        gradient=gradient_map(video[1:]),
+        features=tuple(judge.cells(video[1:]) for judge in JUDGES.values()),
+    )
+
+
+def perfect(of: Truth) -> MethodViews:
+    return MethodViews(
+        video=of.video,
+        classes=of.labels,
+        visibility=of.visibility,
+        log_variance=torch.full(of.metres.shape, -8.0),
+        inverse_depth=1 / of.metres,
+    )
+
+
+def figures(views: MethodViews, of: Truth) -> dict[str, float]:
+    tally = Tally(LiveConfig().classes, JUDGES)
+    for _ in range(12):  # enough cells for a covariance
+        tally.add("scene", of, views, torch.zeros_like(of.video))
+    return tally.figures()
+
+
+def test_the_truth_itself_has_perfect_figures() -> None:
+    made = figures(perfect(truth()), truth())
+    for name in ("psnr", "psnr_last", "psnr_seen", "psnr_now", "psnr_never"):
+        assert made[name] == pytest.approx(100.0)
+    pictures = ("ssim", "ssim_seen", "gradient_energy", "flicker", "jump")
+    for name in (*pictures, "miou", "person", "car", "iou_painted", "iou_before", "iou_now", "depth_within_10_seen"):
+        assert made[name] == pytest.approx(1.0), name
+    assert made["frechet_random"] == pytest.approx(0.0, abs=1e-6)
+    assert made["error_ratio_seen"] == pytest.approx(0.0)
+    assert made["share_never"] == pytest.approx(0.5)
+    assert [made[f"inside_90_{state}"] for state in ("painted", "before", "now")] == [1.0, 1.0, 1.0]
+
+
+def test_fog_has_no_gradients_and_another_distribution() -> None:
+    of = truth()
+    fog = figures(replace(perfect(of), video=torch.full_like(of.video, 0.5)), of)
+    assert fog["gradient_energy"] == pytest.approx(0.0, abs=1e-3)
+    assert fog["frechet_random"] > 1.0
+    assert fog["psnr"] == pytest.approx(10 * math.log10(12.0), abs=0.1)  # noise in [0, 1] has a variance of 1/12
+
+
+def test_what_a_method_does_not_say_is_not_a_number() -> None:
+    made = figures(MethodViews(video=truth().video), truth())
+    assert all(math.isnan(made[name]) for name in ("miou", "iou_now", "inside_90_now", "depth_within_10_seen"))
+
+
+def test_the_splat_has_an_error_ratio_of_one() -> None:
+    of = truth()
+    views = MethodViews(video=of.video.flip(-1))
+    tally = Tally(LiveConfig().classes, {})
+    tally.add("scene", replace(of, features=()), views, views.video)
+    assert tally.figures()["error_ratio_now"] == pytest.approx(1.0)
+
+
+def test_fit_spread_holds_ninety_per_cent_of_gaussian_errors_in_every_state() -> None:
+    generator = torch.Generator().manual_seed(3)
+    state = torch.arange(3).repeat_interleave(40).view(1, 1, -1).expand(8, 60, -1).to(torch.uint8)
+    deviation = torch.tensor([0.2, 0.05, 0.01])[state.long()]
+    error = torch.randn(8, 3, 60, 120, generator=generator) * deviation[:, None]
+    stated = torch.full((8, 60, 120), -5.0)
+    before, after = SpreadHistogram(), SpreadHistogram()
+    before.add(error, stated, state)
+    shifts = torch.tensor(fit_spread(before))
+    after.add(error, stated + shifts[state.long()], state)
+    torch.testing.assert_close(torch.tensor(after.coverage), torch.full((3,), 0.9), atol=0.005, rtol=0)
+    torch.testing.assert_close(
+        ((stated[0, 0, 0] + shifts) / 2).exp(), torch.tensor([0.2, 0.05, 0.01]), atol=0, rtol=0.03
+    )
+
+
+def test_a_surface_is_found_where_it_was_a_frame_before() -> None:
+    metres = torch.full((2, HEIGHT, WIDTH), 4.0)
+    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    poses[1, 0, 3] = 4.0 / LENS.fx * 5  # five pixels to the right
+    moves = torch.zeros(2, HEIGHT, WIDTH, dtype=torch.bool)
+    moves[1, :8] = True
+    before, static = surface_motion(metres, moves, poses, LENS)
+    columns = (before[0, 20, :, 0] + 1) * WIDTH / 2 - 0.5
+    torch.testing.assert_close(columns, torch.arange(WIDTH) + 5.0, atol=1e-4, rtol=0)
+    assert not static[0, :8].any()
+    assert static[0, 8:, : WIDTH - 5].all()
+    assert not static[0, :, WIDTH - 5 :].any()
+
+
+def test_a_shimmering_view_flickers_more_than_its_truth() -> None:
+    of = truth()
+    still = replace(of, video=of.video[:1].repeat(FRAMES, 1, 1, 1) + torch.rand(FRAMES, 1, 1, 1) * 0.01)
+    made = figures(MethodViews(video=of.video), still)
+    assert made["flicker"] > 10
+
+
+def test_frechet_distance_is_that_of_the_means_where_the_spread_is_the_same() -> None:
+    features = torch.randn(4000, 64, generator=torch.Generator().manual_seed(1))
+    views, truths = Moments.none(), Moments.none()
+    truths.add(features)
+    views.add(features + 0.5)
+    assert frechet_distance(views, truths) == pytest.approx(64 * 0.25, rel=0.06)
+    assert math.isnan(frechet_distance(Moments.none(), truths))
+
+
+def turned_clip() -> LiveClip:
+    """A smooth wall filmed by a camera and by one turned away from it by some degrees, as seen through a homography."""
+    turn = math.radians(4.0)
+    target = np.eye(4)
+    target[:3, :3] = [[math.cos(turn), 0, math.sin(turn)], [0, 1, 0], [-math.sin(turn), 0, math.cos(turn)]]
+    v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    rays = np.stack([(u - LENS.cx) / LENS.fx, (v - LENS.cy) / LENS.fy, np.ones_like(u)], axis=-1)
+    there = rays @ target[:3, :3].T
+    pictures = {"source": _painted(rays), "target": _painted(there)}
+    edge = math.tan(math.radians(35.0))
+    seen = (np.abs(there[..., 0] / there[..., 2]) < edge) & (
+        np.abs(there[..., 1] / there[..., 2]) < edge * HEIGHT / WIDTH
+    )
+    arrays = {
+        **{f"{name}.rgb": np.repeat(picture[None], 2, axis=0) for name, picture in pictures.items()},
+        **{f"{name}.labels": np.zeros((2, HEIGHT, WIDTH), np.uint8) for name in pictures},
+        "source.pose": np.tile(np.eye(4), (2, 1, 1)),
+        "target.pose": np.tile(target, (2, 1, 1)),
+        "target.depth": np.full((2, HEIGHT, WIDTH), 30000, np.uint16),
+        "target.visibility": np.where(seen, NOW, NEVER).astype(np.uint8)[None].repeat(2, axis=0),
+    }
+    return LiveClip(name="wall/0-0", arrays=arrays, facts={"source_hfov_deg": 70.0, "target_hfov_deg": 70.0})
+
+
+def _painted(rays: np.ndarray) -> np.ndarray:
+    x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
+    waves = [np.sin(9 * x + k) * np.cos(7 * y - k) for k in range(3)]
+    return (127.5 + 100 * np.stack(waves, axis=-1)).round().astype(np.uint8)
+
+
+def test_the_homography_of_a_turn_is_exact() -> None:
+    clip = turned_clip()
+    views = BestHomography().views(clip)
+    seen = torch.from_numpy(clip.arrays["target.visibility"] == NOW)
+    error = (views.video * 255 - torch.from_numpy(clip.arrays["target.rgb"]).permute(0, 3, 1, 2)).abs()
+    assert float(error.permute(0, 2, 3, 1)[seen].mean()) < 1.0
+
+
+def test_kept_views_are_made_once_and_are_the_same_to_a_level(tmp_path: Path) -> None:
+    of, calls = perfect(truth()), []
+
+    @dataclass
+    class Counting:
+        name: str = "counting"
+
+        def views(self, clip: LiveClip) -> MethodViews:
+            calls.append(clip.name)
+            return replace(of, classes=None, within=False)
+
+    kept = Kept(method=Counting(), folder=tmp_path)
+    first, again = kept.views(turned_clip()), kept.views(turned_clip())
+    assert len(calls) == 1
+    torch.testing.assert_close(first.video, of.video, atol=0.5001 / 255, rtol=0)
+    assert torch.equal(again.video, first.video)
+    assert torch.equal(again.visibility, of.visibility)
+    assert (again.classes, again.within, again.cpu_s) == (None, False, first.cpu_s)
+
+
+def test_an_interval_over_scenes_holds_their_mean() -> None:
+    low, high = scene_interval([0.1, 0.4, 0.7, 0.2, 0.5])
+    assert low < 0.38 < high
+    assert all(math.isnan(bound) for bound in scene_interval([]))
+
+
+def test_reports_hold_every_method_and_the_lead_of_the_live_one() -> None:
+    tallies = {name: Tally(LiveConfig().classes, JUDGES) for name in ("live", "old")}
+    of = truth()
+    tallies["live"].add("a", of, perfect(of), of.video)
+    tallies["old"].add("a", of, MethodViews(video=of.video * 0.9, within=False), of.video)
+    result = SetResult(name="tiny", clips=1, tallies=tallies)
+    lead = differences(result)["live - old"]
+    assert lead["psnr"] > 10
+    assert lead["scenes_within"] == 0
+    assert "|old|" in to_markdown([result])
+    assert set(json.loads(json.dumps(to_json([result])))["tiny"]["methods"]) == {"live", "old"}
+
+
+def test_only_painted_pixels_are_hatched() -> None:
+    of = truth()
+    never = of.visibility == NEVER
+    changed = (hatched(of.video, never) != of.video).any(dim=1)
+    assert changed[never].any()
+    assert not changed[~never].any()
+
+
+def test_unknown_methods_and_other_weights_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError):
+        methods_of(["telepathy"], "init", tmp_path)
+    save_file({"x": torch.zeros(1)}, tmp_path / "other.safetensors")
+    with pytest.raises(DataError):
+        open_networks(str(tmp_path / "other.safetensors"))

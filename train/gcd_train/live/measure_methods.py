@@ -1,0 +1,380 @@
+"""Everything that is measured beside the live model, and the live model itself: a clip in, its target views out."""
+
+import json
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from gcd_model import Clip, Trajectory, ViewRangeError, ViewSynthesizer, load_synthesizer, synthesize
+from gcd_model.geometry import Intrinsics, fitted_trajectory, from_pose, invert_rigid
+from gcd_model.live.config import LiveConfig
+from gcd_model.live.depth_net import SKY_M, pixel_rays
+from gcd_model.live.paint_net import filled, seen_of
+from gcd_model.live.splat import splat, unproject
+from gcd_model.live.view import Floor, FrameGeometry, LiveNetworks, LiveView
+from gcd_train.baselines.depth_reprojection import splat as splat_points
+from gcd_train.errors import DataError
+from gcd_train.live.batches import Pictures, pictures_of, training_paths
+from gcd_train.live.clips import LiveClip, read_clip
+from gcd_train.live.draws import DRIVING_HFOV_DEG, METRES_A_UNIT, STAGE_HFOV_DEG
+from gcd_train.live.measure_figures import NEVER, NOW, MethodViews
+
+Array = NDArray[Any]
+_COVERED = 0.5
+"""From this coverage a pixel counts as seen."""
+_SAMPLE = 60
+"""Training clips that the fill of holes is read off."""
+_SAME_PATH, _SAME_LENS_DEG, _STANDS = 1e-3, 0.01, 1e-6
+_FEWEST_PAIRS, _MOST_PAIRS = 8, 3000
+_RANSAC_PX = 1.5
+_ECC_ROUNDS, _ECC_STEP = 40, 1e-5
+
+
+class Method(Protocol):
+    """Shows a clip as its target camera would have seen it."""
+
+    @property
+    def name(self) -> str: ...
+    def views(self, clip: LiveClip) -> MethodViews:
+        """All frames of it. Raises DataError for a clip that is nothing for this method."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Fill:
+    """What stands for pixels that nobody saw: the training targets' commonest class, and their mean colour, [3]."""
+
+    label: int
+    colour: Tensor
+
+
+@lru_cache
+def fill_of(training: Path, world: str) -> Fill:
+    """Of a world's training clips. Raises DataError if there are none."""
+    paths = [path for path in training_paths(training) if path.parent.name == world]
+    if not paths:
+        raise DataError(f"{training} holds no training clips of {world!r}; holes are filled as they are on average")
+    counts, total, pixels = np.zeros(256), np.zeros(3), 0
+    for path in paths[:: max(len(paths) // _SAMPLE, 1)][:_SAMPLE]:
+        arrays = read_clip(path, slice(6, 7)).arrays
+        counts += np.bincount(arrays["target.labels"].ravel(), minlength=256)
+        total += arrays["target.rgb"].reshape(-1, 3).sum(axis=0)
+        pixels += arrays["target.labels"].size
+    return Fill(label=int(counts.argmax()), colour=torch.from_numpy(total / pixels / 255).float())
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Kept:
+    """A method whose views of one set are kept on disk, pictures in whole levels; made anew where a file is missing."""
+
+    method: Method
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        """The method's own."""
+        return self.method.name
+
+    def views(self, clip: LiveClip) -> MethodViews:
+        """See Method."""
+        path = self.folder / self.name / f"{clip.name}.safetensors"
+        if not path.exists():
+            start = time.process_time()
+            views = self.method.views(clip)
+            self._write(path, replace(views, cpu_s=time.process_time() - start))
+        with safe_open(path, framework="pt") as file:
+            facts = json.loads(file.metadata()["facts"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        return MethodViews(**{**tensors, "video": tensors["video"].float() / 255}, **facts)
+
+    def _write(self, path: Path, views: MethodViews) -> None:
+        names = ("classes", "visibility", "log_variance", "inverse_depth")
+        tensors = {name: tensor for name in names if (tensor := getattr(views, name)) is not None}
+        tensors["video"] = (views.video.clamp(0, 1) * 255).round().to(torch.uint8)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = path.with_suffix(f".{os.getpid()}.partial")
+        facts = json.dumps({"within": views.within, "cpu_s": views.cpu_s})
+        save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, unfinished, {"facts": facts})
+        unfinished.replace(path)
+
+
+def _lens(clip: LiveClip, camera: str) -> Intrinsics:
+    height, width = clip.arrays[f"{camera}.labels"].shape[1:]
+    return Intrinsics.from_hfov(clip.hfov_deg(camera), width, height)
+
+
+def _poses(clip: LiveClip, camera: str) -> Tensor:
+    return torch.from_numpy(clip.arrays[f"{camera}.pose"])
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ExactSplat:
+    """This frame's pixels by their exact depth, as surfels; holes have the colours around and the commonest class."""
+
+    training: Path
+    classes: int = len(LiveConfig().classes)
+    name: str = "splat"
+
+    def views(self, clip: LiveClip) -> MethodViews:
+        """See Method."""
+        source, lens = pictures_of(clip, "source"), _lens(clip, "target")
+        poses, targets = _poses(clip, "source"), _poses(clip, "target")
+        rays, nothing = pixel_rays(lens), torch.zeros(lens.height, lens.width)
+        video, votes, coverage, inverse = [], [], [], []
+        for t, own in enumerate(source.lenses):
+            labels = source.labels[t].to(torch.uint8)
+            surfels = unproject(source.metres[t], source.video[t], labels, own, poses[t], 1.0)
+            made = splat(surfels, targets[t], lens, self.classes, 1.0)
+            video.append((filled(seen_of(made, None, rays, nothing))[0].clamp(-1, 1) + 1) / 2)
+            votes.append(made.votes.max(dim=0).indices)
+            coverage.append(made.coverage)
+            inverse.append(made.inverse_depth)
+        covered, label = torch.stack(coverage), fill_of(self.training, str(clip.facts["world"])).label
+        return MethodViews(
+            video=torch.stack(video),
+            classes=torch.where(covered > 0, torch.stack(votes), label).to(torch.uint8),
+            visibility=torch.where(covered >= _COVERED, NOW, NEVER).to(torch.uint8),
+            inverse_depth=torch.stack(inverse),
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PointSplat:
+    """The project's older exact splat: bilinear points, holes in the mean colour."""
+
+    training: Path
+    classes: int = len(LiveConfig().classes)
+    name: str = "splat-points"
+
+    def views(self, clip: LiveClip) -> MethodViews:
+        """See Method."""
+        source, lens, fill = (
+            pictures_of(clip, "source"),
+            _lens(clip, "target"),
+            fill_of(self.training, str(clip.facts["world"])),
+        )
+        target_from_source = invert_rigid(_poses(clip, "target")) @ _poses(clip, "source")
+        votes = F.one_hot(source.labels, self.classes).permute(0, 3, 1, 2).float()
+        values = torch.cat([(source.video + 1) / 2, votes], dim=1).flatten(2)  # [T, 3 + K, HW]
+        rays = F.pad(source.rays[0], (0, 0, 0, 0, 0, 1), value=1.0).flatten(1).T.double()  # [HW, 3]
+        video, classes = [], []
+        for t, move in enumerate(target_from_source):
+            points = rays * source.metres[t].flatten()[:, None] @ move[:3, :3].T + move[:3, 3]
+            shown, covered = splat_points(values[t], points, lens)
+            video.append(torch.where(covered, shown[:3], fill.colour[:, None, None]))
+            classes.append(torch.where(covered, shown[3:].max(dim=0).indices, fill.label))
+        return MethodViews(video=torch.stack(video), classes=torch.stack(classes).to(torch.uint8))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PackagedModel:
+    """The models that ship: driving-small on its fixed path, objects-small steered by angles and radius."""
+
+    name: str = "old"
+    _loaded: dict[str, ViewSynthesizer] = field(default_factory=dict[str, ViewSynthesizer], init=False, repr=False)
+
+    def views(self, clip: LiveClip) -> MethodViews:
+        """See Method. Clips beyond the limits of objects-small are tried all the same, and marked."""
+        driving = str(clip.facts["world"]).startswith("driving")
+        self._require_lens(clip, DRIVING_HFOV_DEG if driving else STAGE_HFOV_DEG)
+        synthesizer = self._synthesizer("driving-small" if driving else "objects-small")
+        path, within = _driving_path(synthesizer, clip) if driving else _orbit_path(synthesizer, clip)
+        source = pictures_of(clip, "source")
+        view = synthesize(synthesizer, Clip(video=source.video, fps=float(clip.facts["fps"])), path)
+        classes = None if view.classes is None else view.classes[0]
+        return MethodViews(video=view.video, classes=classes, within=within)
+
+    def _synthesizer(self, name: str) -> ViewSynthesizer:
+        if name not in self._loaded:
+            self._loaded[name] = load_synthesizer(f"package:{name}")
+        return self._loaded[name]
+
+    def _require_lens(self, clip: LiveClip, hfov_deg: float) -> None:
+        if any(abs(clip.hfov_deg(camera) - hfov_deg) > _SAME_LENS_DEG for camera in ("source", "target")):
+            raise DataError(f"{clip.name} has another lens than the {hfov_deg:.1f} degrees of {self.name}")
+
+
+def _driving_path(synthesizer: ViewSynthesizer, clip: LiveClip) -> tuple[Trajectory, bool]:
+    path = synthesizer.traits.plan_view()
+    filmed = invert_rigid(_poses(clip, "source")) @ _poses(clip, "target")
+    if float((path.source_from_target - filmed).abs().max()) > _SAME_PATH:
+        raise DataError(f"{clip.name} does not go the one way that {synthesizer.traits.name} can; use a paper set")
+    return path, True
+
+
+def _orbit_path(synthesizer: ViewSynthesizer, clip: LiveClip) -> tuple[Trajectory, bool]:
+    """The nearest path over the sphere, and whether it is within the model's limits."""
+    source, target = (_poses(clip, camera).clone() for camera in ("source", "target"))
+    if float((source - source[:1]).abs().max()) > _STANDS:
+        raise DataError(f"the source of {clip.name} moves; {synthesizer.traits.name} has a standing one")
+    unit = METRES_A_UNIT[str(clip.facts["world"])]
+    for poses in (source, target):
+        poses[:, :3, 3] /= unit
+    start, asked = from_pose(source[0]), invert_rigid(source) @ target
+    try:
+        return synthesizer.traits.plan_poses(asked, source=start), True
+    except ViewRangeError:
+        return fitted_trajectory(asked, start)[0], False
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class BestHomography:
+    """The source's picture under the best plane-to-plane map, frame by frame: of three the one nearest to the truth.
+
+    Candidates: least squares and RANSAC on exact correspondences of pixels that are seen now, and ECC on the pictures.
+    """
+
+    name: str = "homography"
+
+    def views(self, clip: LiveClip) -> MethodViews:
+        """See Method."""
+        lens, own = _lens(clip, "target"), _lens(clip, "source")
+        source_from_target = (invert_rigid(_poses(clip, "source")) @ _poses(clip, "target")).numpy()
+        metres, seen = clip.depth("target"), clip.arrays["target.visibility"] == NOW
+        video, classes = [], []
+        for t, move in enumerate(source_from_target):
+            pictures = clip.arrays["source.rgb"][t], clip.arrays["target.rgb"][t]
+            places = correspondences(metres[t], seen[t], move, lens, own)
+            best = _best(_candidates(*places, *pictures), *pictures)
+            video.append(_warped(pictures[0], best, cv2.INTER_LINEAR))
+            classes.append(_warped(clip.arrays["source.labels"][t], best, cv2.INTER_NEAREST))
+        shown = torch.from_numpy(np.stack(video)).permute(0, 3, 1, 2).float() / 255
+        return MethodViews(video=shown, classes=torch.from_numpy(np.stack(classes)))
+
+
+def correspondences(
+    metres: Array, seen: Array, source_from_target: Array, lens: Intrinsics, own: Intrinsics
+) -> tuple[Array, Array]:
+    """Where pixels are in the target and in the source, [N, 2] each, as OpenCV counts pixels; evenly chosen.
+
+    metres: [H, W], of the target. seen: bool [H, W], the pixels to take. lens, own: of target and source.
+    """
+    v, u = np.nonzero(seen)
+    chosen = slice(None, None, max(len(u) // _MOST_PAIRS, 1))
+    u, v = u[chosen], v[chosen]
+    rays = np.stack([(u + 0.5 - lens.cx) / lens.fx, (v + 0.5 - lens.cy) / lens.fy, np.ones(len(u))], axis=1)
+    points = (rays * metres[v, u, None]) @ source_from_target[:3, :3].T + source_from_target[:3, 3]
+    there = points[:, :2] / points[:, 2:] * (own.fx, own.fy) + (own.cx - 0.5, own.cy - 0.5)
+    return np.stack([u, v], axis=1).astype(np.float64), there
+
+
+def _candidates(here: Array, there: Array, source: Array, target: Array) -> list[Array]:
+    """Maps from target to source pixels."""
+    made: list[Array | None] = []
+    if len(here) >= _FEWEST_PAIRS:
+        made = [cv2.findHomography(here, there, method, _RANSAC_PX)[0] for method in (0, cv2.RANSAC)]
+    kept = [each for each in made if each is not None] or [np.eye(3)]
+    template, moved = (cv2.cvtColor(np.ascontiguousarray(each), cv2.COLOR_RGB2GRAY) for each in (target, source))
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _ECC_ROUNDS, _ECC_STEP)
+    try:
+        found = cv2.findTransformECC(template, moved, kept[0].astype(np.float32), cv2.MOTION_HOMOGRAPHY, criteria)[1]
+    except cv2.error:  # it does not converge where the pictures have little in common
+        return kept
+    return [*kept, np.asarray(found)]
+
+
+def _best(candidates: Sequence[Array], source: Array, target: Array) -> Array:
+    errors = [
+        np.square(_warped(source, each, cv2.INTER_LINEAR).astype(np.float64) - target).mean() for each in candidates
+    ]
+    return candidates[int(np.argmin(errors))]
+
+
+def _warped(picture: Array, source_from_target: Array, interpolation: int) -> Array:
+    height, width = picture.shape[:2]
+    flags = interpolation | cv2.WARP_INVERSE_MAP
+    made = cv2.warpPerspective(
+        picture, source_from_target.astype(np.float64), (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(made)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class LiveModel:
+    """The live model, frame by frame as a node runs it.
+
+    exact: the source's true depth, classes and motion instead of the depth network's. odometry: the source's true
+    motion from frame to frame; else its own ego-motion. depth_scale, floor_higher_m, floor_tilt_deg: errors that nobody
+    declares.
+    """
+
+    networks: LiveNetworks
+    name: str = "live"
+    exact: bool = False
+    odometry: bool = True
+    depth_scale: float = 1.0
+    floor_higher_m: float = 0.0
+    floor_tilt_deg: float = 0.0
+    steps: int | None = None
+
+    def views(self, clip: LiveClip) -> MethodViews:
+        """See Method."""
+        view = LiveView(self.networks, steps=self.steps)
+        source, lens = pictures_of(clip, "source"), _lens(clip, "target")
+        poses = _poses(clip, "source")
+        source_from_target = invert_rigid(poses) @ _poses(clip, "target")
+        frames = []
+        for t, own in enumerate(source.lenses):
+            floor = self._floor(source, t)
+            geometry = _exact(source, t) if self.exact else view.look(source.video[t], own, floor=floor)
+            made = view.step(
+                source.video[t],
+                [source_from_target[t]],
+                lens=own,
+                odometry=poses[t] if self.odometry else None,
+                floor=floor,
+                geometry=self._scaled(geometry),
+                target_lens=lens,
+            )
+            frames.append(made.views[0])
+        return MethodViews(
+            video=torch.stack([(frame.picture.clamp(-1, 1) + 1) / 2 for frame in frames]),
+            classes=torch.stack([frame.classes for frame in frames]),
+            visibility=torch.stack([frame.visibility for frame in frames]),
+            log_variance=torch.stack([frame.log_variance for frame in frames]),
+            inverse_depth=torch.stack([frame.inverse_depth for frame in frames]),
+        )
+
+    def _floor(self, source: Pictures, t: int) -> Floor:
+        tilt = torch.tensor(np.radians(self.floor_tilt_deg)).float()
+        x, y, z = source.ups[t]
+        up = torch.stack([x, y * tilt.cos() - z * tilt.sin(), y * tilt.sin() + z * tilt.cos()])
+        return Floor(up=up, height_m=source.heights_m[t] + self.floor_higher_m)
+
+    def _scaled(self, geometry: FrameGeometry) -> FrameGeometry:
+        metres = geometry.metres
+        return replace(geometry, metres=torch.where(metres < SKY_M, metres * self.depth_scale, metres))
+
+
+def _exact(source: Pictures, t: int) -> FrameGeometry:
+    return FrameGeometry(
+        metres=source.metres[t], labels=source.labels[t].to(torch.uint8), static=source.moves[t] < 0.5, entropy=0.0
+    )
+
+
+def live_methods(networks: LiveNetworks) -> dict[str, LiveModel]:
+    """The live model as it ships, with its own ego-motion, with exact depth, and with what may be wrong, by name."""
+    plain = LiveModel(networks=networks)
+    made = [
+        plain,
+        replace(plain, name="live-ego", odometry=False),
+        replace(plain, name="live-exact", exact=True),
+        replace(plain, name="live-depth-0.9", depth_scale=0.9),
+        replace(plain, name="live-depth-1.1", depth_scale=1.1),
+        replace(plain, name="live-floor-20cm", floor_higher_m=0.2),
+        replace(plain, name="live-floor-2deg", floor_tilt_deg=2.0),
+    ]
+    return {each.name: each for each in made}
