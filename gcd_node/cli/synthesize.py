@@ -1,5 +1,6 @@
 """`gcd-node synthesize`: one clip, one view, offline."""
 
+import math
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -102,6 +103,10 @@ Calibration: TypeAlias = Annotated[
 Rectified: TypeAlias = Annotated[
     bool, Option("--rectified", help="The device has rectified the pair.", rich_help_panel=_DEPTH)
 ]
+UnitM: TypeAlias = Annotated[
+    float,
+    Option(help="Metres in one unit of a radius, for models whose radius is none in metres.", rich_help_panel=_DEPTH),
+]
 Start: TypeAlias = Annotated[int, Option(help="First frame of the input.", rich_help_panel=_CLIP)]
 Stride: TypeAlias = Annotated[int, Option(help="Take every so-many-th frame.", rich_help_panel=_CLIP)]
 Fps: TypeAlias = Annotated[
@@ -185,6 +190,7 @@ def synthesize(
     depth: Depth = None,
     depth_model: DepthModel = None,
     depth_kind: DepthKind = "metric",
+    unit_m: UnitM = 1.0,
     start: Start = 0,
     stride: Stride = 1,
     fps: Fps = None,
@@ -237,12 +243,14 @@ def synthesize(
     _require_possible(input_path, save, samples)
     if sum(each is not None for each in (right, depth, depth_model)) > 1:
         raise UsageError("--right, --depth and --depth-model each say where depth comes from; give one of them")
+    if not 0 < unit_m < math.inf:
+        raise UsageError(f"--unit-m must be a positive number of metres, got {unit_m:g}")
     load = partial(load_synthesizer, weights, adapter=adapter, family=family, device=device, dtype=dtype, engine=engine)
     with Console(stderr=True, markup=False).status(f"loading {weights}"):
         model = load(head_width=head_width, image_heads=image_heads, providers=provider or ())
     augmentation = Augmentation(strength=cond_aug, seed=seed, noise=injected.augmentation)
     network = None if depth_model is None else (depth_model, depth_kind)
-    _run(_Order(model, input_path, clip, wanted, options, augmentation, network), out, save)
+    _run(_Order(model, input_path, clip, wanted, options, augmentation, network, unit_m), out, save)
 
 
 def _require_possible(input_path: Path, save: Path | None, samples: int) -> None:
@@ -261,6 +269,7 @@ class _Order:
     options: RenderOptions
     augmentation: Augmentation
     depth_model: tuple[Path, Literal["metric", "inverse"]] | None
+    unit_m: float
 
 
 def _run(order: _Order, out: Path, save: Path | None) -> None:
@@ -272,6 +281,8 @@ def _run(order: _Order, out: Path, save: Path | None) -> None:
     if order.depth_model is not None:
         network, kind = order.depth_model
         source = with_depth(source, OnnxDepth(network, kind=kind, scale=mount if kind == "inverse" else None))
+    if source.clip.depth is not None:
+        source = replace(source, clip=replace(source.clip, depth=source.clip.depth / order.unit_m))
     path = plan(order.model, order.view, mount)
     with _progress() as progress:
         options = replace(order.options, progress=_Steps(progress))
@@ -292,6 +303,8 @@ def _with_field_of_view(order: _Order, traits: Traits) -> ClipRequest:
     measured = (clip.right, clip.depth, order.depth_model) != (None, None, None)
     if measured and not traits.live and (traits.plane_warp is not None or not traits.knows_camera):
         raise UsageError(f"{traits.name} takes no depth; leave --right, --depth and --depth-model out")
+    if order.unit_m != 1.0 and (not measured or traits.live):
+        raise UsageError("--unit-m is about depth beside a published checkpoint; leave it out")
     needed = measured or traits.live
     if clip.hfov_deg is not None and not needed and traits.mount is None:
         raise UsageError(f"{traits.name} has no use for --hfov-deg; leave it out")

@@ -1,7 +1,7 @@
 """Depth from elsewhere, in place of the live model's own: what every source of it promises, and the door it enters by.
 
 picture, depth = source(left, right)        StereoDepth (depth_stereo.py)
-picture, depth = source(picture)            OnnxDepth (depth_onnx.py)
+picture, depth = source(picture)            OnnxDepth (this file)
 depth = clean_depth(message, (height, width))    a topic, a file, a caller
 """
 

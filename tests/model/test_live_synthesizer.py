@@ -32,6 +32,7 @@ from gcd_model import (
     driving_trajectory,
     inspect_weights,
     load_synthesizer,
+    visibility_of,
 )
 from gcd_model.checkpoints import load_weights
 from gcd_model.live.config import LIVE_TINY
@@ -409,3 +410,36 @@ def test_a_live_file_is_no_diffusion_model_and_says_so(tmp_path: Path) -> None:
             load_synthesizer(tmp_path / "mine.safetensors", device="cpu", **options)  # type: ignore[arg-type]
     fewer = load_synthesizer(tmp_path / "mine.safetensors", device="cpu", frames=5)
     assert fewer.traits.config == msgspec.structs.replace(LIVE_TINY, frames=5)
+
+
+# What is seen, without a network.
+
+
+def test_from_where_it_was_taken_all_that_has_a_depth_is_seen_and_a_hole_is_painted() -> None:
+    clip = room()
+    assert clip.depth is not None
+    clip.depth[:, :, :10] = torch.tensor([0.0, torch.nan, -1.0, torch.inf, 0.0] * 2)
+    seen = visibility_of(clip, path(0.0))
+    assert seen.dtype == torch.uint8
+    assert not seen[:, :, :10].any()
+    assert bool((seen[:, :, 11:] == 2).all())
+
+
+def test_a_view_sees_nothing_that_its_source_does_not() -> None:
+    aside = visibility_of(room(), path(1.0))
+    shift = round(1.0 / 3.0 * room().lens.fx)  # type: ignore[union-attr]
+    assert bool((aside[:, :, : WIDTH - shift - 1] == 2).all())
+    assert not aside[:, :, WIDTH - shift + 1 :].any()
+    assert not visibility_of(room(), path(50.0)).any()
+
+
+def test_the_live_model_never_calls_seen_what_no_point_covers(live: LiveSynthesizer) -> None:
+    view = live.render(live.encode(room()), [path(0.8)])[0]
+    assert view.visibility is not None
+    assert not view.visibility[0][visibility_of(room(), path(0.8))[0] == 0].any()
+
+
+def test_visibility_needs_depth_and_a_pose_for_every_frame() -> None:
+    for clip, asked in ((replace(room(), depth=None), path()), (room(), path(frames=3))):
+        with pytest.raises(ShapeError):
+            visibility_of(clip, asked)

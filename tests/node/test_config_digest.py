@@ -78,6 +78,8 @@ def test_a_default_that_is_written_out_changes_nothing(made: Traits, written_out
         (STEERED, "window.fps=12.0"),
         (STEERED, "view.topdown.azimuth_deg=1.0"),
         (STEERED, "view.other={}"),
+        (STEERED, "model.depth_model=net.onnx"),
+        (STEERED, "model.on_bad_depth=stop"),
         (STEERED, "source.resize=area"),
         (STEERED, "source.hfov_deg=60.0"),
         (STEERED, "source.pose={radius = 14.0}"),

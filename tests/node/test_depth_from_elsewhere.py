@@ -201,11 +201,25 @@ def test_with_depth_a_published_model_tells_what_was_seen(still_clip: Path, tmp_
     assert not (tmp_path / "b" / "visibility.npz").exists()
 
 
+def test_depth_in_metres_is_counted_in_the_units_of_a_models_radius(still_clip: Path, tmp_path: Path) -> None:
+    orbit = ("--azimuth-deg", 5, "--steps", 1)
+    np.save(tmp_path / "small.npy", np.load(tmp_path / "depth.npy") / 10)
+    made = {"a": ("depth.npy", 1), "b": ("small.npy", 0.1), "c": ("small.npy", 1)}
+    for name, (file, unit_m) in made.items():
+        options = (*orbit, "--depth", tmp_path / file, "--unit-m", unit_m)
+        assert synthesize(still_clip, "random:kubric90", tmp_path / name, *options) == 0
+    a, b, c = (np.load(tmp_path / name / "visibility.npz")["visibility"] for name in made)
+    assert np.array_equal(a, b)
+    assert not np.array_equal(a, c)
+
+
 @pytest.mark.parametrize(
     ("weights", "options", "code"),
     [
         ("random:svd", ["--depth", "depth.npy"], 64),
         ("random:live", ["--depth", "depth.npy", "--depth-model", "net.onnx"], 64),
+        ("random:live", ["--depth", "depth.npy", "--unit-m", "0.1"], 64),
+        ("random:kubric90", ["--depth", "depth.npy", "--unit-m", "0"], 64),
         ("random:live", ["--depth-model", "missing.onnx"], 78),
         ("random:live", ["--depth-model", "clip.npy", "--depth-kind", "inverse"], 78),
         ("random:live", ["--depth-model", "clip.npy"], 78),
@@ -216,7 +230,7 @@ def test_depth_that_cannot_be_used_is_refused_in_one_line(
 ) -> None:
     if options[0] == "--depth-model":
         pytest.importorskip("onnxruntime", reason="needs the extra `onnx`")
-    placed = [still_clip.parent / each if "." in each else each for each in options]
+    placed = [still_clip.parent / each if each.endswith(("npy", "onnx")) else each for each in options]
     assert synthesize(still_clip, weights, still_clip.parent / "out", *placed) == code
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
 
@@ -309,7 +323,7 @@ def test_a_node_refuses_depth_that_it_cannot_use(tmp_path: Path) -> None:
 
 def test_the_kinds_of_a_live_view_are_announced_before_the_first_window() -> None:
     for made, kinds in ((LIVE, ["win", "frm", "cls", "vis", "depth", "std"]), (traits(), ["win", "frm"])):
-        box = run(FakeSynthesizer(made), "", frames=0)
+        box = run(FakeSynthesizer(made), "")  # its views hold nothing of them
         assert next(fields for topic, fields in box.notes if topic == "meta")["kinds"] == kinds
 
 

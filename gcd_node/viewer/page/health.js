@@ -21,6 +21,8 @@ const WORDS = {
   fps: "a frame rate the model was not trained for",
   hfov: "a field of view the model was not trained for",
   view: "the camera is mounted otherwise than in training",
+  world: "pictures unlike those the model was trained with",
+  DEPTH_BAD: "the depth network fails, the model uses its own",
 };
 const element = (id) => document.getElementById(id);
 

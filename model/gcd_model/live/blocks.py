@@ -1,4 +1,6 @@
-"""What the depth and the paint network are built of: residual blocks in a short U, a quarter of the picture's size."""
+"""What the depth and the paint network are built of: residual blocks in a U of patches, and a head of pixels."""
+
+from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
@@ -7,8 +9,6 @@ from torch import Tensor, nn
 from gcd_model.layers import Layers, zeroed
 from gcd_model.live.config import Widths
 
-PATCH = 4
-"""The trunk's pixels are patches of this side; what is finer is added at the end, at full size."""
 _GROUPS, _HEADS = 8, 4
 
 
@@ -51,63 +51,64 @@ class Attention(nn.Module):
 
 
 class Trunk(nn.Module):
-    """A U of three levels: patches in, features of every patch out."""
+    """A U of several levels, each of half the size of the one before: patches in, features of every patch out.
 
-    def __init__(self, in_channels: int, widths: Widths, embedding_width: int = 0, stem_kernel: int = 3) -> None:
+    patch: side in pixels of what the first level calls a pixel. widths: channels of the levels.
+    """
+
+    def __init__(
+        self, in_channels: int, widths: Widths, patch: int, *, embedding_width: int = 0, stem_kernel: int = 3
+    ) -> None:
         super().__init__()
-        first, second, third = widths
-        e = embedding_width
-        self.stem = nn.Conv2d(in_channels * PATCH**2, first, stem_kernel, padding=stem_kernel // 2)
-        self.down = Layers[Block](
-            [Block(first, first, e), Block(second, second, e), Block(third, third, e), Block(third, third, e)]
-        )
+        e, last = embedding_width, widths[-1]
+        self.patch = patch
+        self.stem = nn.Conv2d(in_channels * patch**2, widths[0], stem_kernel, padding=stem_kernel // 2)
+        self.down = Layers[Block]([Block(width, width, e) for width in (*widths, last)])
         self.shrink = Layers[nn.Conv2d](
-            [nn.Conv2d(first, second, 3, stride=2, padding=1), nn.Conv2d(second, third, 3, stride=2, padding=1)]
+            [nn.Conv2d(fine, coarse, 3, stride=2, padding=1) for fine, coarse in pairwise(widths)]
         )
-        self.attention = Attention(third)
-        self.middle = Block(third, third, e)
+        self.attention = Attention(last)
+        self.middle = Block(last, last, e)
+        ways = [(coarse, fine) for fine, coarse in reversed(list(pairwise(widths)))]
         self.up = Layers[Block](
-            [Block(third + second, second, e), Block(second, second, e), Block(second + first, first, e)]
+            [block for coarse, fine in ways for block in (Block(coarse + fine, fine, e), Block(fine, fine, e))]
         )
-        self.last = Block(first, first, e)
 
     def forward(self, pictures: Tensor, embedding: Tensor | None = None) -> Tensor:
-        """pictures: [N, C, H, W] -> features [N, widths[0], H/4, W/4]."""
-        to_second, to_third = self.shrink
-        at_first, at_second, at_third, at_third_again = self.down
-        up_second, up_second_again, up_first = self.up
-        a = at_first(self.stem(F.pixel_unshuffle(pictures, PATCH)), embedding)
-        b = at_second(to_second(a), embedding)
-        c = at_third_again(at_third(to_third(b), embedding), embedding)
-        c = self.middle(self.attention(c), embedding)
-        b = up_second_again(up_second(torch.cat([_doubled(c), b], dim=1), embedding), embedding)
-        a = up_first(torch.cat([_doubled(b), a], dim=1), embedding)
-        return self.last(a, embedding)
-
-
-def _doubled(x: Tensor) -> Tensor:
-    return F.interpolate(x, scale_factor=2.0, mode="nearest")
+        """pictures: [N, C, H, W] -> features [N, widths[0], H / patch, W / patch]."""
+        x = self.down[0](self.stem(F.pixel_unshuffle(pictures, self.patch)), embedding)
+        kept: list[Tensor] = []
+        for shrink, block in zip(self.shrink, list(self.down)[1:-1], strict=True):
+            kept.append(x)
+            x = block(shrink(x), embedding)
+        x = self.middle(self.attention(self.down[-1](x, embedding)), embedding)
+        blocks = list(self.up)
+        for joining, after, fine in zip(blocks[::2], blocks[1::2], reversed(kept), strict=True):
+            x = torch.cat([F.interpolate(x, scale_factor=2.0, mode="nearest"), fine], dim=1)
+            x = after(joining(x, embedding), embedding)
+        return x
 
 
 class FineHead(nn.Module):
     """From patches back to pixels: the trunk's features beside a few features of the full picture."""
 
     def __init__(
-        self, in_channels: int, trunk_width: int, fine_width: int, out_channels: int, *, zero: bool = False
+        self, in_channels: int, trunk_width: int, fine_width: int, out_channels: int, patch: int, *, zero: bool = False
     ) -> None:
         super().__init__()
+        self.patch = patch
         self.fine = nn.Conv2d(in_channels, fine_width // 2, 3, padding=1)
-        self.spread = nn.Conv2d(trunk_width, fine_width * PATCH**2, 1)
+        self.spread = nn.Conv2d(trunk_width, fine_width * patch**2, 1)
         self.mix = nn.Conv2d(fine_width + fine_width // 2, fine_width, 3, padding=1)
         out = nn.Conv2d(fine_width, out_channels, 1)
         self.out = zeroed(out) if zero else out
 
     def forward(self, pictures: Tensor, features: Tensor, pixels: Tensor | None = None) -> Tensor:
-        """pictures: [N, C, H, W], features: [N, trunk_width, H/4, W/4] -> [N, out_channels, H, W].
+        """pictures: [N, C, H, W], features: [N, trunk_width, H / patch, W / patch] -> [N, out_channels, H, W].
 
         pixels: int64 [N, M], flat numbers of the only pixels that are computed: -> [N, out_channels, M, 1].
         """
-        spread = F.pixel_shuffle(self.spread(F.silu(features)), PATCH)
+        spread = F.pixel_shuffle(self.spread(F.silu(features)), self.patch)
         x = self.mix(F.silu(torch.cat([spread, self.fine(pictures)], dim=1)))
         if pixels is not None:
             x = x.flatten(2).gather(2, pixels[:, None].expand(-1, x.shape[1], -1))[..., None]

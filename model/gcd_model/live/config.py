@@ -10,8 +10,8 @@ from gcd_model.config.switches import require_ontology
 from gcd_model.errors import OptionError
 from gcd_model.live.ontology import LIVE_CLASSES
 
-Widths = tuple[int, int, int]
-"""Channels at a quarter, an eighth and a sixteenth of the picture's size."""
+Widths = Annotated[tuple[Annotated[int, Meta(ge=8, le=4096, multiple_of=8)], ...], Meta(min_length=2, max_length=4)]
+"""Channels of the levels, each of half the size of the one before."""
 SIZE_FACTOR = 32
 """Height and width of pictures must be multiples of this."""
 _Side = Annotated[int, Meta(ge=SIZE_FACTOR, le=8192, multiple_of=SIZE_FACTOR)]
@@ -19,9 +19,13 @@ _Channels = Annotated[int, Meta(ge=8, le=4096)]
 
 
 class DepthConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The depth network. bins are even in the logarithm from nearest_m to farthest_m; the last one is the sky."""
+    """The depth network. bins are even in the logarithm from nearest_m to farthest_m; the last one is the sky.
 
-    widths: Widths = (48, 96, 160)
+    patch: side of the trunk's patches in pixels; poles and people are lost in larger ones.
+    """
+
+    patch: Literal[2, 4] = 2
+    widths: Widths = (24, 48, 96, 160)
     fine_width: _Channels = 24
     bins: Annotated[int, Meta(ge=4, le=1024)] = 32
     nearest_m: Annotated[float, Meta(gt=0)] = 0.25
@@ -35,6 +39,7 @@ class DepthConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 class PaintConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The paint network. embedding_width: of the noise level."""
 
+    patch: Literal[2, 4] = 4
     widths: Widths = (56, 104, 160)
     fine_width: _Channels = 16
     embedding_width: _Channels = 128

@@ -61,8 +61,9 @@ class DepthNet(nn.Module):
     def __init__(self, config: DepthConfig, classes: int) -> None:
         super().__init__()
         self.config, self.classes = config, classes
-        self.trunk = Trunk(INPUTS, config.widths)
-        self.head = FineHead(INPUTS, config.widths[0], config.fine_width, 2 * config.bins + classes + 2)
+        self.trunk = Trunk(INPUTS, config.widths, config.patch)
+        outputs = 2 * config.bins + classes + 2
+        self.head = FineHead(INPUTS, config.widths[0], config.fine_width, outputs, config.patch)
 
     def forward(self, inputs: Tensor, pixels: Tensor | None = None) -> DepthOutput:
         """inputs: [N, 7, H, W], see `depth_inputs`. pixels: [N, M], of these alone, as pictures of M x 1."""

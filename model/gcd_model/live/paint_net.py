@@ -105,9 +105,9 @@ class PaintNet(nn.Module):
         first, fine = config.widths[0], config.fine_width
         self.votes = nn.Conv2d(classes, _VOTE_CHANNELS, 1)
         self.noise_level = embedding_mlp(config.embedding_width, config.embedding_width, config.embedding_width)
-        self.trunk = Trunk(INPUTS, config.widths, config.embedding_width, stem_kernel=1)
-        self.head = FineHead(INPUTS, first, fine, 3 + classes + 1 + 1 + 3, zero=True)
-        self.detail = FineHead(INPUTS, first, fine, 3, zero=True)
+        self.trunk = Trunk(INPUTS, config.widths, config.patch, embedding_width=config.embedding_width, stem_kernel=1)
+        self.head = FineHead(INPUTS, first, fine, 3 + classes + 1 + 1 + 3, config.patch, zero=True)
+        self.detail = FineHead(INPUTS, first, fine, 3, config.patch, zero=True)
 
     def inputs(self, seen: Seen, base: Tensor, noisy: Tensor | None) -> Tensor:
         """All channels, [N, INPUTS, H, W]."""

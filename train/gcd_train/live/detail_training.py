@@ -149,13 +149,13 @@ class DetailTask:
 
     def _feature_distance(self, fake: Tensor, views: Views, where: _Patches) -> Tensor:
         """Distance in features of the depth network, which knows targets too, and of a random network."""
-        never = F.avg_pool2d(where.never, 4)
         ground = torch.zeros_like(views.seen.ground_m)
         distance = torch.zeros((), device=self._device)
         with torch.autocast(self._device.type, dtype=torch.bfloat16):
             made, true = (self._depth.trunk(depth_inputs(x, views.seen.rays, ground)) for x in (fake, views.target))
             made_random, true_random = self._random(fake), self._random(views.target)
         for a, b in ((made, true), (made_random, true_random)):
+            never = F.adaptive_avg_pool2d(where.never, list(a.shape[-2:]))
             scale = b.float().abs().mean().clamp(min=1e-3)
             distance = distance + ((a.float() - b.float()).abs() / scale * never).mean()
         return distance
