@@ -59,9 +59,11 @@ class ClipRequest:
         if (self.height is None) != (self.width is None):
             raise UsageError("--height and --width go together; give both or none")
         if (self.right is None) != (self.calibration is None):
-            raise UsageError("--right and --calibration go together; give both or none")
+            raise UsageError("a pair's right video and its calibration go together; give both or none")
         if self.rectified and self.right is None:
-            raise UsageError("--rectified is about a stereo pair; give --right and --calibration, or leave it out")
+            raise UsageError(
+                "--rectified is about a stereo pair; give --depth and --calibration, or leave it out"
+            )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)

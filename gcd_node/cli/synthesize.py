@@ -1,6 +1,7 @@
 """`gcd-node synthesize`: one clip, one view, offline."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -86,19 +87,16 @@ FieldOfView: TypeAlias = Annotated[
 Depth: TypeAlias = Annotated[
     Path | None,
     Option(
-        help="Of the input's frames: a folder of 16-bit PNG in mm, or .npy of [T, H, W] metres.", rich_help_panel=_DEPTH
+        help="A folder of 16-bit PNG in mm, .npy of [T, H, W] metres, a network as .onnx, or a pair's right video.",
+        rich_help_panel=_DEPTH,
     ),
 ]
-DepthModel: TypeAlias = Annotated[Path | None, Option(help="A depth network instead, as ONNX.", rich_help_panel=_DEPTH)]
 DepthKind: TypeAlias = Annotated[
     Literal["metric", "inverse"],
-    Option(help="What it gives: metres, or relative inverse depth (state the mount).", rich_help_panel=_DEPTH),
-]
-Right: TypeAlias = Annotated[
-    Path | None, Option(help="The right video of a stereo pair; INPUT is the left one.", rich_help_panel=_DEPTH)
+    Option(help="What a network gives: metres, or relative inverse depth (state the mount).", rich_help_panel=_DEPTH),
 ]
 Calibration: TypeAlias = Annotated[
-    Path | None, Option(help="Of the pair: JSON as DepthAI writes it.", rich_help_panel=_DEPTH)
+    Path | None, Option(help="Of the stereo pair: JSON as DepthAI writes it.", rich_help_panel=_DEPTH)
 ]
 Rectified: TypeAlias = Annotated[
     bool, Option("--rectified", help="The device has rectified the pair.", rich_help_panel=_DEPTH)
@@ -184,11 +182,9 @@ def synthesize(
     mount_left: MountLeft = None,
     mount_tilt: MountTilt = None,
     hfov_deg: FieldOfView = None,
-    right: Right = None,
+    depth: Depth = None,
     calibration: Calibration = None,
     rectified: Rectified = False,
-    depth: Depth = None,
-    depth_model: DepthModel = None,
     depth_kind: DepthKind = "metric",
     unit_m: UnitM = 1.0,
     start: Start = 0,
@@ -216,41 +212,50 @@ def synthesize(
     image_heads: ImageHeads = None,
     adapter: AdapterFile = None,
 ) -> None:
-    """See one clip from another camera, offline.
-
-    Writes frames, a video, input above view, and what the model tells of it: class map, depth, which pixels were seen,
-    where several samples differ.
-    """
-    clip = ClipRequest(
-        start=start,
-        stride=stride,
-        fps=fps,
-        height=height,
-        width=width,
-        hfov_deg=hfov_deg,
-        depth=depth,
-        right=right,
-        calibration=calibration,
-        rectified=rectified,
-    )
+    """See one clip from another camera, offline: frames, video, class map, depth, and what was seen."""
+    clip = ClipRequest(start=start, stride=stride, fps=fps, height=height, width=width, hfov_deg=hfov_deg)
+    measured = _Depth(place=depth, calibration=calibration, rectified=rectified, kind=depth_kind, unit_m=unit_m)
     source = _pose((source_elevation_deg, source_radius), (mount_height, mount_forward, mount_left, mount_tilt))
-    delta = _delta(azimuth_deg, elevation_deg, radius)
-    wanted = ViewRequest(delta=delta, poses=poses, trajectory=trajectory, move_time=move_time, source=source)
+    wanted = _view((azimuth_deg, elevation_deg, radius), poses, trajectory, move_time, source)
     injected = InjectedNoise() if noise is None else read_noise(noise)
     named = RenderOptions(steps=steps, solver=solver, guidance=guidance, guidance_interval=guidance_interval)
     sampler = replace(named, quality=quality)
     options = replace(sampler, samples=samples, seed=seed, motion_bucket=motion_bucket, initial_noise=injected.initial)
-    _require_possible(input_path, save, samples)
-    if sum(each is not None for each in (right, depth, depth_model)) > 1:
-        raise UsageError("--right, --depth and --depth-model each say where depth comes from; give one of them")
-    if not 0 < unit_m < math.inf:
-        raise UsageError(f"--unit-m must be a positive number of metres, got {unit_m:g}")
     load = partial(load_synthesizer, weights, adapter=adapter, family=family, device=device, dtype=dtype, engine=engine)
-    with Console(stderr=True, markup=False).status(f"loading {weights}"):
-        model = load(head_width=head_width, image_heads=image_heads, providers=provider or ())
+    load = partial(load, head_width=head_width, image_heads=image_heads, providers=provider or ())
     augmentation = Augmentation(strength=cond_aug, seed=seed, noise=injected.augmentation)
-    network = None if depth_model is None else (depth_model, depth_kind)
-    _run(_Order(model, input_path, clip, wanted, options, augmentation, network, unit_m), out, save)
+    _run(_Order(load, weights, input_path, measured.request(clip), wanted, options, augmentation, measured), out, save)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Depth:
+    """Where depth comes from: pictures, a network, or with a calibration the right video of a pair."""
+
+    place: Path | None
+    calibration: Path | None
+    rectified: bool
+    kind: Literal["metric", "inverse"]
+    unit_m: float
+
+    def __post_init__(self) -> None:
+        if not 0 < self.unit_m < math.inf:
+            raise UsageError(f"--unit-m must be a positive number of metres, got {self.unit_m:g}")
+        if self.calibration is not None and self.place is None:
+            raise UsageError("--calibration is of a stereo pair; give its right video as --depth, or leave it out")
+
+    @property
+    def network(self) -> Path | None:
+        """The ONNX file, if it is one."""
+        is_network = self.place is not None and self.place.suffix == ".onnx" and self.calibration is None
+        return self.place if is_network else None
+
+    def request(self, clip: ClipRequest) -> ClipRequest:
+        """The clip with the depth that is read beside it."""
+        if self.network is not None:
+            return clip
+        if self.calibration is None:
+            return replace(clip, depth=self.place, rectified=self.rectified)
+        return replace(clip, right=self.place, calibration=self.calibration, rectified=self.rectified)
 
 
 def _require_possible(input_path: Path, save: Path | None, samples: int) -> None:
@@ -262,31 +267,34 @@ def _require_possible(input_path: Path, save: Path | None, samples: int) -> None
 
 @dataclass(frozen=True, slots=True)
 class _Order:
-    model: ViewSynthesizer
+    load: Callable[[], ViewSynthesizer]
+    weights: str
     input_path: Path
     clip: ClipRequest
     view: ViewRequest
     options: RenderOptions
     augmentation: Augmentation
-    depth_model: tuple[Path, Literal["metric", "inverse"]] | None
-    unit_m: float
+    depth: _Depth
 
 
 def _run(order: _Order, out: Path, save: Path | None) -> None:
-    traits = order.model.traits
+    _require_possible(order.input_path, save, order.options.samples)
+    with Console(stderr=True, markup=False).status(f"loading {order.weights}"):
+        model = order.load()
+    traits = model.traits
     require_usable(order.view.source, traits)
     source = read_clip(order.input_path, _with_field_of_view(order, traits), traits)
     mount = stated_mount(order.view.source, source.hfov_deg, traits)
     source = replace(source, clip=replace(source.clip, mount=mount))
-    if order.depth_model is not None:
-        network, kind = order.depth_model
-        source = with_depth(source, OnnxDepth(network, kind=kind, scale=mount if kind == "inverse" else None))
+    if order.depth.network is not None:
+        scale = mount if order.depth.kind == "inverse" else None
+        source = with_depth(source, OnnxDepth(order.depth.network, kind=order.depth.kind, scale=scale))
     if source.clip.depth is not None:
-        source = replace(source, clip=replace(source.clip, depth=source.clip.depth / order.unit_m))
-    path = plan(order.model, order.view, mount)
+        source = replace(source, clip=replace(source.clip, depth=source.clip.depth / order.depth.unit_m))
+    path = plan(model, order.view, mount)
     with _progress() as progress:
         options = replace(order.options, progress=_Steps(progress))
-        view = render(order.model, source, path, options, order.augmentation)
+        view = render(model, source, path, options, order.augmentation)
     console = Console(markup=False)
     if not traits.trained:
         console.print(f"{traits.name}: these weights are random, so the picture is noise.")
@@ -300,10 +308,10 @@ def _run(order: _Order, out: Path, save: Path | None) -> None:
 def _with_field_of_view(order: _Order, traits: Traits) -> ClipRequest:
     """The clip with the lens that its depth and the live model need: as stated, measured, or else as trained."""
     clip = order.clip
-    measured = (clip.right, clip.depth, order.depth_model) != (None, None, None)
+    measured = order.depth.place is not None
     if measured and not traits.live and (traits.plane_warp is not None or not traits.knows_camera):
-        raise UsageError(f"{traits.name} takes no depth; leave --right, --depth and --depth-model out")
-    if order.unit_m != 1.0 and (not measured or traits.live):
+        raise UsageError(f"{traits.name} takes no depth; leave --depth out")
+    if order.depth.unit_m != 1.0 and (not measured or traits.live):
         raise UsageError("--unit-m is about depth beside a published checkpoint; leave it out")
     needed = measured or traits.live
     if clip.hfov_deg is not None and not needed and traits.mount is None:
@@ -317,10 +325,19 @@ def _with_field_of_view(order: _Order, traits: Traits) -> ClipRequest:
     return replace(clip, hfov_deg=hfov_deg)
 
 
-def _delta(azimuth_deg: float | None, elevation_deg: float | None, radius: float | None) -> SphericalDelta | None:
-    if azimuth_deg is None and elevation_deg is None and radius is None:
-        return None
-    return SphericalDelta(azimuth_deg=azimuth_deg or 0.0, elevation_deg=elevation_deg or 0.0, radius_m=radius or 0.0)
+def _view(
+    change: tuple[float | None, float | None, float | None],
+    poses: Path | None,
+    trajectory: str | None,
+    move_time: int | None,
+    source: SourcePose | None,
+) -> ViewRequest:
+    """change: azimuth and elevation in degrees and radius."""
+    delta = None
+    if any(number is not None for number in change):
+        azimuth_deg, elevation_deg, radius = (number or 0.0 for number in change)
+        delta = SphericalDelta(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, radius_m=radius)
+    return ViewRequest(delta=delta, poses=poses, trajectory=trajectory, move_time=move_time, source=source)
 
 
 def _pose(sphere: tuple[float | None, ...], mount: tuple[float | None, ...]) -> SourcePose | None:

@@ -180,7 +180,7 @@ def still_clip(tmp_path: Path) -> Path:
 
 
 def test_a_live_view_is_written_with_all_it_tells(pair: Path, tmp_path: Path) -> None:
-    calibration = ("--right", pair / "right.mkv", "--calibration", pair / "calib.json")
+    calibration = ("--depth", pair / "right.mkv", "--calibration", pair / "calib.json")
     orbit = ("--source-radius", 2.7, "--azimuth-deg", 10)
     assert synthesize(pair / "left.mkv", "random:live", tmp_path, *calibration, *orbit) == 0
     seen = np.load(tmp_path / "visibility.npz")
@@ -217,18 +217,19 @@ def test_depth_in_metres_is_counted_in_the_units_of_a_models_radius(still_clip: 
     ("weights", "options", "code"),
     [
         ("random:svd", ["--depth", "depth.npy"], 64),
-        ("random:live", ["--depth", "depth.npy", "--depth-model", "net.onnx"], 64),
+        ("random:live", ["--calibration", "calib.json"], 64),
         ("random:live", ["--depth", "depth.npy", "--unit-m", "0.1"], 64),
         ("random:kubric90", ["--depth", "depth.npy", "--unit-m", "0"], 64),
-        ("random:live", ["--depth-model", "missing.onnx"], 78),
-        ("random:live", ["--depth-model", "clip.npy", "--depth-kind", "inverse"], 78),
-        ("random:live", ["--depth-model", "clip.npy"], 78),
+        ("random:live", ["--depth", "missing.onnx"], 78),
+        ("random:live", ["--depth", "junk.onnx", "--depth-kind", "inverse"], 78),
+        ("random:live", ["--depth", "junk.onnx"], 78),
     ],
 )
 def test_depth_that_cannot_be_used_is_refused_in_one_line(
     still_clip: Path, capsys: pytest.CaptureFixture[str], weights: str, options: Sequence[str], code: int
 ) -> None:
-    if options[0] == "--depth-model":
+    (still_clip.parent / "junk.onnx").write_bytes(b"no network")
+    if str(options[1]).endswith("onnx"):
         pytest.importorskip("onnxruntime", reason="needs the extra `onnx`")
     placed = [still_clip.parent / each if each.endswith(("npy", "onnx")) else each for each in options]
     assert synthesize(still_clip, weights, still_clip.parent / "out", *placed) == code

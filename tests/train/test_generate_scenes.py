@@ -284,7 +284,8 @@ class GreyRenderer:
     def __init__(self, width: int, height: int, *, oversample: int) -> None:
         labels = np.ones((height, width), np.uint8)
         depth = np.ones((height, width), np.float32)
-        self.drawn = Rendering(rgb=labels[..., None].repeat(3, -1), depth=depth, classes=labels, instances=labels)
+        rgb = labels[..., None].repeat(3, -1)
+        self.drawn = Rendering(rgb=rgb, depth=depth, classes=labels, instances=labels, bodies=labels)
 
     def __enter__(self) -> "GreyRenderer":
         return self

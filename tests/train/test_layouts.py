@@ -48,7 +48,8 @@ def drawing(instance: int = 9, depth: float = 10.0) -> Rendering:
     metres[:2] = 0
     rows, columns = np.mgrid[:32, :48]
     rgb = np.stack([7 * rows, 5 * columns, 200 - 3 * rows], -1).astype(np.uint8)
-    return Rendering(rgb=rgb, depth=metres, classes=np.full((32, 48), Label.CAR, np.uint8), instances=instances)
+    classes = np.full((32, 48), Label.CAR, np.uint8)
+    return Rendering(rgb=rgb, depth=metres, classes=classes, instances=instances, bodies=instances)
 
 
 def picture(path: Path) -> Any:

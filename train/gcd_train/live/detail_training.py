@@ -155,7 +155,7 @@ class DetailTask:
             made, true = (self._depth.trunk(depth_inputs(x, views.seen.rays, ground)) for x in (fake, views.target))
             made_random, true_random = self._random(fake), self._random(views.target)
         for a, b in ((made, true), (made_random, true_random)):
-            never = F.adaptive_avg_pool2d(where.never, list(a.shape[-2:]))
+            never = F.adaptive_avg_pool2d(where.never, (a.shape[-2], a.shape[-1]))
             scale = b.float().abs().mean().clamp(min=1e-3)
             distance = distance + ((a.float() - b.float()).abs() / scale * never).mean()
         return distance
