@@ -61,9 +61,7 @@ class ClipRequest:
         if (self.right is None) != (self.calibration is None):
             raise UsageError("a pair's right video and its calibration go together; give both or none")
         if self.rectified and self.right is None:
-            raise UsageError(
-                "--rectified is about a stereo pair; give --depth and --calibration, or leave it out"
-            )
+            raise UsageError("--rectified is about a stereo pair; give --depth and --calibration, or leave it out")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
