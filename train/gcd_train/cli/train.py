@@ -23,7 +23,7 @@ from gcd_train.cli.training_run import (
     stop_when_asked,
 )
 from gcd_train.errors import RecipeError
-from gcd_train.live.recipe import is_live, load_live_recipe
+from gcd_train.live.recipe import LiveRecipe, is_live, live_recipes, live_toml, load_live_recipe
 from gcd_train.recipe import Recipe, StageName, load_recipe, packaged_recipes, to_toml
 
 if TYPE_CHECKING:
@@ -79,6 +79,9 @@ def recipes(recipe: Shown = None, small: Small = False, changes: Changes = None)
     """List the recipes that ship, or show one whole: on its bases, with every default."""
     console = Console(highlight=False, soft_wrap=True)
     with errors_shown():
+        if recipe is not None and is_live(recipe):
+            console.print(live_toml(recipe), markup=False, end="")
+            return
         if recipe is not None:
             console.print(to_toml(load_recipe(recipe, small=small, changes=changes or ())), markup=False, end="")
             return
@@ -87,6 +90,8 @@ def recipes(recipe: Shown = None, small: Small = False, changes: Changes = None)
             table.add_column(column, no_wrap=True)
         for name in packaged_recipes():
             table.add_row(f"package:{name}", *_row(load_recipe(f"package:{name}")))
+        for name in live_recipes():
+            table.add_row(f"package:{name}", *_live_row(load_live_recipe(f"package:{name}")))
         # a name that is cut off cannot be given to `train`: a narrow terminal breaks lines instead
         whole = console.measure(table, options=console.options.update(max_width=1000)).maximum
         console.width = max(console.width, whole)
@@ -98,6 +103,12 @@ def _row(recipe: Recipe) -> tuple[str, ...]:
     budget = f"{unet.budget.updates}" if unet.budget.updates is not None else f"{unet.budget.minutes:g} min"
     kind = data.kind if data.modality == "rgb" else f"{data.kind}, classes"
     return kind, f"{model.base} ({model.family})", budget, f"{unet.clip_batch * unet.parts}", model.weights or "nothing"
+
+
+def _live_row(recipe: LiveRecipe) -> tuple[str, ...]:
+    budget = recipe.paint.budget
+    length = f"{budget.updates}" if budget.updates is not None else f"{budget.minutes:g} min"
+    return "live", "live", length, f"{recipe.paint.batch} views", "nothing"
 
 
 def _in_processes(

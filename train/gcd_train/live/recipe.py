@@ -65,6 +65,15 @@ def live_recipes() -> list[str]:
     return sorted(path.stem for path in PACKAGED.glob("*.toml"))
 
 
+def live_toml(source: str) -> str:
+    """The recipe's text, once it was found to be sound. Raises RecipeError."""
+    load_live_recipe(source)
+    return _path(source).read_text(encoding="utf-8")
+
+
 def _table(source: str) -> dict[str, object]:
-    path = PACKAGED / f"{source.removeprefix('package:')}.toml" if source.startswith("package:") else Path(source)
-    return tomllib.loads(path.read_text(encoding="utf-8"))
+    return tomllib.loads(_path(source).read_text(encoding="utf-8"))
+
+
+def _path(source: str) -> Path:
+    return PACKAGED / f"{source.removeprefix('package:')}.toml" if source.startswith("package:") else Path(source)

@@ -1,4 +1,4 @@
-"""The live model's training, stage by stage and resumable: depth, inputs, paint, detail, calibration, export.
+"""The live model's training, stage by stage and resumable: depth, inputs, paint, detail, export.
 
 clips -> depth network -> what it shows of every target (inputs) -> paint network -> detail -> weights
 """
