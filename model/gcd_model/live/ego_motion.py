@@ -161,6 +161,7 @@ class EgoMotion:
 
 
 def _frame(picture: Tensor, depth: Tensor, static: Tensor, lens: Intrinsics, odometry: Tensor | None) -> _Frame:
+    picture, depth, static = picture.cpu(), depth.cpu(), static.cpu()
     weights = torch.tensor([0.299, 0.587, 0.114])
     grey = torch.tensordot(weights, picture.float(), dims=1) * 127.5 + 127.5
     usable = (static & depth.isfinite() & (depth > 0)).to(torch.uint8)

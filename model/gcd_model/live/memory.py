@@ -87,9 +87,17 @@ class SurfelMemory:
             young = every.stamp >= every.stamp.max() - self._oldest_frames
             every = every if bool(young.all()) else every.rows(young)
         if len(every) > self._capacity:
-            newest_first = torch.argsort(every.stamp, descending=True, stable=True)
-            every = every.rows(newest_first[: self._capacity].sort().values)
+            every = every.rows(_newest(every.stamp, self._capacity))
         self._surfels = every
+
+
+def _newest(stamp: Tensor, count: int) -> Tensor:
+    """Numbers of the newest, in their order; of the oldest frame that still has room an even share is kept."""
+    oldest = stamp.sort(descending=True).values[count - 1]
+    newer, at = torch.nonzero(stamp > oldest)[:, 0], torch.nonzero(stamp == oldest)[:, 0]
+    room = count - len(newer)
+    even = torch.arange(room, device=stamp.device) * len(at) // max(room, 1)
+    return torch.cat([newer, at[even]]).sort().values
 
 
 def _refuted(

@@ -26,6 +26,7 @@ _SEEN_CHANNELS = 3 + 5 + _VOTE_CHANNELS  # colour; coverage, now, age, log-depth
 _PAINTED_CHANNELS = 3 + 1
 _GOAL_CHANNELS = 2 + 2
 _NOISE_CHANNELS = 3
+_CAMERA_FEATURES = 12
 INPUTS = _SEEN_CHANNELS + _PAINTED_CHANNELS + _GOAL_CHANNELS + _NOISE_CHANNELS + 3
 _AGE_FRAMES = 20.0
 _VOTE_LOGITS = 6.0
@@ -41,6 +42,7 @@ class Seen:
     colour: [N, 3, H, W] in [-1, 1]. coverage, now_share, age: [N, H, W] (age in frames). log_depth: [N, H, W], of
     metres; 0 where nothing is. votes: [N, K, H, W]. painted: [N, 3, H, W] and painted_coverage: [N, H, W], what was
     painted a frame ago. rays: [N, 2, H, W], x / z and y / z. ground_m: [N, H, W], depth of the floor, 0 without.
+    camera: [N, 12], see `camera_features`.
     """
 
     colour: Tensor
@@ -53,10 +55,21 @@ class Seen:
     painted_coverage: Tensor
     rays: Tensor
     ground_m: Tensor
+    camera: Tensor
 
 
-def seen_of(splat: Splat, painted: Splat | None, rays: Tensor, ground_m: Tensor) -> Seen:
-    """One view: the seen surfels' splat and that of what was painted a frame ago."""
+def camera_features(source_from_target: Tensor) -> Tensor:
+    """The view's camera as the network is told it: float64 [N, 4, 4] -> float32 [N, 12].
+
+    Rotation row by row, then the translation on a scale that is logarithmic beyond a metre.
+    Source: the relative pose of Van Hoorick et al. 2024 (GCD), section 3.2; the scale is ours.
+    """
+    turn, move = source_from_target[:, :3, :3], source_from_target[:, :3, 3]
+    return torch.cat([turn.flatten(1), move.asinh()], dim=1).float()
+
+
+def seen_of(splat: Splat, painted: Splat | None, rays: Tensor, ground_m: Tensor, camera: Tensor) -> Seen:
+    """One view: the seen surfels' splat and that of what was painted a frame ago. camera: [12]."""
     inverse = splat.inverse_depth
     empty = torch.zeros_like(splat.coverage)
     return Seen(
@@ -70,6 +83,7 @@ def seen_of(splat: Splat, painted: Splat | None, rays: Tensor, ground_m: Tensor)
         painted_coverage=empty[None] if painted is None else painted.coverage[None],
         rays=rays[None],
         ground_m=ground_m[None],
+        camera=camera[None],
     )
 
 
@@ -105,6 +119,7 @@ class PaintNet(nn.Module):
         first, fine = config.widths[0], config.fine_width
         self.votes = nn.Conv2d(classes, _VOTE_CHANNELS, 1)
         self.noise_level = embedding_mlp(config.embedding_width, config.embedding_width, config.embedding_width)
+        self.camera = embedding_mlp(_CAMERA_FEATURES, config.embedding_width, config.embedding_width)
         self.trunk = Trunk(INPUTS, config.widths, config.patch, embedding_width=config.embedding_width, stem_kernel=1)
         self.head = FineHead(INPUTS, first, fine, 3 + classes + 1 + 1 + 3, config.patch, zero=True)
         self.detail = FineHead(INPUTS, first, fine, 3, config.patch, zero=True)
@@ -136,15 +151,16 @@ class PaintNet(nn.Module):
             dim=1,
         )
 
-    def embedded(self, sigma: Tensor) -> Tensor:
-        """[N] noise levels -> [N, E]."""
-        return self.noise_level(sinusoid(sigma.log() * 250.0, self.config.embedding_width))
+    def embedded(self, seen: Seen, sigma: Tensor) -> Tensor:
+        """Noise levels [N] and where the cameras stand -> [N, E]."""
+        levels = self.noise_level(sinusoid(sigma.log() * 250.0, self.config.embedding_width))
+        return levels + self.camera(seen.camera)
 
     def first_step(self, seen: Seen, base: Tensor, sigma_max: float) -> Painted:
         """The answer from the highest noise level, where the noisy picture says nothing and is not shown."""
         inputs = self.inputs(seen, base, None)
         sigma = base.new_full((len(base),), sigma_max)
-        features = self.trunk(inputs, self.embedded(sigma))
+        features = self.trunk(inputs, self.embedded(seen, sigma))
         mean, classes, log_depth, log_variance, state = (
             self.head(inputs, features).float().split([3, self.classes, 1, 1, 3], dim=1)
         )
@@ -166,7 +182,7 @@ class PaintNet(nn.Module):
         c_skip, c_out, c_in = SIGMA_DATA**2 / variance, sigma * SIGMA_DATA / variance.sqrt(), variance.rsqrt()
         away = x - base
         inputs = self.inputs(seen, base, c_in[:, None, None, None] * away)
-        raw = self.head(inputs, self.trunk(inputs, self.embedded(sigma)))[:, :3].float()
+        raw = self.head(inputs, self.trunk(inputs, self.embedded(seen, sigma)))[:, :3].float()
         scaled = c_skip[:, None, None, None] * away + c_out[:, None, None, None] * raw / SIGMA_DATA
         return base + scaled
 

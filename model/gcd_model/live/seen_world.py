@@ -16,7 +16,9 @@ class SeenWorld:
     ) -> None:
         """classes: of the labels. capacity, oldest_frames: of the memory, see SurfelMemory; 0 for none."""
         self._classes, self._device = classes, device
-        self._memory = SurfelMemory(capacity, oldest_frames=oldest_frames, device=device) if capacity else None
+        self._memory = (
+            SurfelMemory(capacity, oldest_frames=oldest_frames or float("inf"), device=device) if capacity else None
+        )
         self._fresh, self._static = Surfels.empty(device), Surfels.empty(device)
         self._now = 0.0
 

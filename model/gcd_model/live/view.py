@@ -14,7 +14,7 @@ from gcd_model.geometry import Intrinsics, invert_rigid, require_rigid
 from gcd_model.live.config import SIZE_FACTOR, LiveConfig
 from gcd_model.live.depth_net import SKY_M, DepthNet, depth_inputs, pixel_rays, plane_depth, read_depth
 from gcd_model.live.ego_motion import EgoMotion
-from gcd_model.live.paint_net import Painted, PaintNet, Seen, filled, seen_of
+from gcd_model.live.paint_net import Painted, PaintNet, Seen, camera_features, filled, seen_of
 from gcd_model.live.seen_world import SeenWorld
 from gcd_model.live.splat import Splat, Surfels, splat, unproject
 
@@ -132,7 +132,7 @@ class LiveView:
         output = self._networks.depth(depth_inputs(picture[None], rays[None], ground[None].to(self._device)))
         reading = read_depth(output, self._config.depth)
         labels = output.classes[0].argmax(0).to(torch.uint8)
-        metres = reading.metres[0] if depth is None else _taken(depth, labels, lens).to(self._device)
+        metres = reading.metres[0] if depth is None else _taken(depth, reading.metres[0], lens)
         static = output.moves[0] < 0
         return FrameGeometry(metres=metres, labels=labels, static=static, entropy=float(reading.entropy[0]))
 
@@ -172,6 +172,7 @@ class LiveView:
         pose = motion.world_from_camera
         self._world.look(picture, geometry.metres, geometry.labels, geometry.static, lens, pose)
         out_lens = lens if target_lens is None else target_lens
+        self._painted = self._painted[: len(poses)]
         targets = [pose @ require_rigid(each, "a target pose") for each in poses]
         seen = [self._seen(i, target, out_lens, pose, floor) for i, target in enumerate(targets)]
         views = tuple(self._view(i, each, targets[i], out_lens) for i, each in enumerate(seen))
@@ -194,7 +195,8 @@ class LiveView:
         if floor is not None:
             ground = _floor_of(floor, invert_rigid(target) @ source, lens)
         rays = pixel_rays(lens, self._device)
-        return seen_of(self._world.splat(target, lens), carried, rays, ground.to(self._device))
+        camera = camera_features((invert_rigid(source) @ target)[None])[0]
+        return seen_of(self._world.splat(target, lens), carried, rays, ground.to(self._device), camera.to(self._device))
 
     def _view(self, index: int, seen: Seen, target: Tensor, lens: Intrinsics) -> ViewFrame:
         """Paint, read off, and remember what was painted."""
@@ -202,7 +204,16 @@ class LiveView:
         painted = self._networks.paint.first_step(seen, base, self._config.sigma_max)
         labels = painted.classes[0].argmax(0).to(torch.uint8)
         covered = seen.coverage[0] >= COVERED
-        state = painted.seen[0].argmax(0).to(torch.uint8)
+        share = seen.now_share[0]  # what no point of this frame, or none of an earlier one, shows cannot be seen so
+        never = torch.full_like(share, -torch.inf)
+        chances = torch.stack(
+            [
+                painted.seen[0, PAINTED],
+                torch.where(share < 0.999, painted.seen[0, SEEN_BEFORE], never),
+                torch.where(share > 0, painted.seen[0, SEEN_NOW], never),
+            ]
+        )
+        state = chances.argmax(0).to(torch.uint8)
         visibility = torch.where(covered, state, PAINTED).to(torch.uint8)
         metres = painted.log_depth[0].exp()
         picture = self._drawn(painted, seen, base)[0].clamp(-1, 1)
@@ -251,12 +262,13 @@ class LiveView:
         self._painted[index:] = [surfels] if index >= len(self._painted) else [surfels, *self._painted[index + 1 :]]
 
 
-def _taken(depth: Tensor, labels: Tensor, lens: Intrinsics) -> Tensor:
-    """Depth from elsewhere: bad numbers are holes, and a hole in the sky is the sky. Raises ShapeError."""
+def _taken(depth: Tensor, learned: Tensor, lens: Intrinsics) -> Tensor:
+    """Depth from elsewhere: bad numbers are holes, a hole in what the network calls sky is sky. Raises ShapeError."""
     if depth.shape != (lens.height, lens.width):
         raise ShapeError(f"depth must be [{lens.height}, {lens.width}] as its frame, got {list(depth.shape)}")
     metres = torch.where(depth.isfinite() & (depth > 0), depth, 0.0).float()
-    return torch.where((metres == 0) & (labels.cpu() == 0), SKY_M, metres)
+    metres = metres.to(learned.device)
+    return torch.where((metres == 0) & (learned >= SKY_M), SKY_M, metres)
 
 
 def _floor_of(floor: Floor, target_from_source: Tensor, lens: Intrinsics) -> Tensor:

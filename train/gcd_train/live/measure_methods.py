@@ -138,7 +138,7 @@ class ExactSplat:
             labels = source.labels[t].to(torch.uint8)
             surfels = unproject(source.metres[t], source.video[t], labels, own, poses[t], 1.0)
             made = splat(surfels, targets[t], lens, self.classes, 1.0)
-            video.append((filled(seen_of(made, None, rays, nothing))[0].clamp(-1, 1) + 1) / 2)
+            video.append((filled(seen_of(made, None, rays, nothing, torch.zeros(12)))[0].clamp(-1, 1) + 1) / 2)
             votes.append(made.votes.max(dim=0).indices)
             coverage.append(made.coverage)
             inverse.append(made.inverse_depth)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.config import LiveConfig
 from gcd_model.live.depth_net import plane_depth
-from gcd_model.live.paint_net import Painted, PaintNet, Seen, filled
+from gcd_model.live.paint_net import Painted, PaintNet, Seen, camera_features, filled
 from gcd_model.live.splat import splat, unproject
 from gcd_train.live.batches import Ahead, Random, class_shares, lens_rays, on, to_video
 from gcd_train.live.clips import LiveClip, read_clip
@@ -70,6 +70,7 @@ def views_of(clip: LiveClip, inputs: dict[str, Tensor], *, ground: bool) -> View
         painted_coverage=empty,
         rays=lens_rays(lens).expand(n, -1, -1, -1),
         ground_m=torch.stack(grounds),
+        camera=camera_features(torch.from_numpy(np.linalg.inv(clip.arrays["source.pose"]) @ poses)),
     )
     return Views(
         seen=seen,
@@ -162,10 +163,13 @@ def _other_look(views: Views, random: Random) -> Views:
 def mirrored(views: Views) -> Views:
     """All of it seen in a mirror. Poses are not: carry what was painted before."""
     seen = views.seen
-    turned = {name: getattr(seen, name).flip(-1) for name in Seen.__dataclass_fields__ if name != "rays"}
+    fixed = ("rays", "camera")
+    turned = {name: getattr(seen, name).flip(-1) for name in Seen.__dataclass_fields__ if name not in fixed}
+    # x becomes -x in both cameras: rotation entries that mix x with another axis change sign, and so does the move in x
+    signs = torch.tensor([1.0, -1, -1, -1, 1, 1, -1, 1, 1, -1, 1, 1], device=seen.camera.device)
     return replace(
         views,
-        seen=Seen(**turned, rays=seen.rays),
+        seen=Seen(**turned, rays=seen.rays, camera=seen.camera * signs),
         target=views.target.flip(-1),
         labels=views.labels.flip(-1),
         log_depth=views.log_depth.flip(-1),
