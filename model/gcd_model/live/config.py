@@ -21,7 +21,7 @@ _Channels = Annotated[int, Meta(ge=8, le=4096)]
 class DepthConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The depth network. bins are even in the logarithm from nearest_m to farthest_m; the last one is the sky.
 
-    patch: side of the trunk's patches in pixels; poles and people are lost in larger ones.
+    patch: side of the trunk's patches in pixels.
     """
 
     patch: Literal[2, 4] = 2

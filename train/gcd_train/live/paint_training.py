@@ -26,7 +26,7 @@ _CLASS_POWER = -0.45
 _NEVER_WEIGHT = 0.5
 """Of a never-seen pixel beside a seen one: nobody can know it."""
 _SQUARE, _ABSOLUTE, _GRADIENT, _SPREAD, _CLASS, _DEPTH, _SEEN = 40.0, 4.0, 2.0, 2.0, 0.3, 0.2, 0.15
-"""Weights that give the colours about half of the gradient that reaches the trunk."""
+"""Raised for the colours, of whose gradient little reached the trunk; that it helps is not shown."""
 _CARRIED = 0.35
 """Share of the samples that see what was painted a frame before."""
 MOVABLE = ("car", "truck", "cyclist", "person", "own_car", "robot", "object")
