@@ -95,7 +95,8 @@ def read_clip(path: Path, request: ClipRequest, traits: Traits) -> OfflineClip:
     lens, hfov_deg = None, request.hfov_deg
     if hfov_deg is not None:
         lens = fit.intrinsics(Intrinsics.from_hfov(hfov_deg, images[0].shape[1], images[0].shape[0]))
-    depth = [fit.depth(each) for each in _stated_depth(request, images[0].shape[:2], len(images))]
+    still = not path.is_dir() and path.suffix.lower() in SUFFIXES
+    depth = [fit.depth(each) for each in _stated_depth(request, images[0].shape[:2], len(images), still=still)]
     clip = Clip(
         video=torch.from_numpy(to_clip_tensor(fitted)),
         fps=_label(request, source_fps, traits),
@@ -143,8 +144,10 @@ def _size(request: ClipRequest, traits: Traits) -> tuple[int, int]:
     return width, height
 
 
-def _stated_depth(request: ClipRequest, shape: tuple[int, ...], frames: int) -> list[DepthPicture]:
-    """Of the chosen frames, as large as the input's pictures, [H, W]; empty without."""
+def _stated_depth(
+    request: ClipRequest, shape: tuple[int, ...], frames: int, *, still: bool = False
+) -> list[DepthPicture]:
+    """Of the chosen frames, as large as the input's pictures, [H, W]; empty without. still: they are one picture."""
     path, (high, wide) = request.depth, shape
     if path is None:
         return []
@@ -156,8 +159,12 @@ def _stated_depth(request: ClipRequest, shape: tuple[int, ...], frames: int) -> 
         if array.ndim != 3:
             raise SourceError(f"{path} must hold depth [T, H, W] in metres, got {array.dtype} {list(array.shape)}")
         chosen = _strided(iter(array), request, frames, path)
-    else:
+    elif still:
         chosen = [read_depth(path)] * frames
+    else:
+        raise SourceError(
+            f"{path} is the depth of one frame, wanted that of {frames}; give a folder or [T, H, W] as .npy"
+        )
     return [clean_depth(each, (high, wide)) for each in chosen]
 
 

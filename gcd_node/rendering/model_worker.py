@@ -47,7 +47,8 @@ from gcd_node.wire.view_message import (
 _LOG = logging.getLogger(__name__)
 _KEPT = 1000  # a node runs for weeks
 _BAD_DEPTH = "DEPTH_BAD"
-WORK_REASONS = ("world", _BAD_DEPTH)
+_LOST_MOTION = "MOTION_LOST"
+WORK_REASONS = ("world", _BAD_DEPTH, _LOST_MOTION)
 """What a model thread raises of the node's health by what its windows show."""
 
 
@@ -112,6 +113,7 @@ class ModelWorker:
         self._beat_s: float | None = None
         self._encoded = EncodedFrames(self._beat, self._count_bad_depth)
         self._depth_is_bad = False
+        self._motion_is_lost = False
         self._may_encode_ahead = True
 
     @property
@@ -307,13 +309,23 @@ class ModelWorker:
             self._depth_is_bad = False
             self._parts.health.clear_reason(_BAD_DEPTH)
 
-    def _tell_world(self, run: Run, view: View) -> None:
-        """Whether the source is of the kind that the model knows; the same for all views of a window."""
+    def _tell_source(self, run: Run, view: View) -> None:
+        """Whether the model knows such a source, and how it moved; the same for all views of a window."""
+        self._tell_motion(view.lost)
         self._parts.health.ood_score(view.ood)
         if world_flags(run.traits, view):
             self._parts.health.raise_reason("world", Level.WARN)
         else:
             self._parts.health.clear_reason("world")
+
+    def _tell_motion(self, lost: tuple[str, ...]) -> None:
+        """Told when it begins; over with a window through which the motion is known."""
+        if lost and not self._motion_is_lost:
+            self._parts.health.raise_reason(_LOST_MOTION, Level.WARN)
+            self._parts.announcer.event(_LOST_MOTION, Level.WARN, {"message": lost[0], "frames": len(lost)})
+        elif self._motion_is_lost and not lost:
+            self._parts.health.clear_reason(_LOST_MOTION)
+        self._motion_is_lost = bool(lost)
 
     def _asked_steps(self, job: _Job) -> int:
         return sampler_in_use(job.run.config.model, job.run.traits).steps
@@ -326,7 +338,7 @@ class ModelWorker:
             raise Cancelled("the node was told to stop")
         ended_ns, offset_ns = time.monotonic_ns(), utc_offset_ns()
         for view in drawn[:1]:
-            self._tell_world(job.run, view)
+            self._tell_source(job.run, view)
         self._endings.carried = frozenset[ViewKind]().union(*map(carried_kinds, drawn))
         for virtual, view in zip(job.views, drawn, strict=True):
             rendered = Rendered(

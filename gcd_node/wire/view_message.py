@@ -101,14 +101,15 @@ def newest_ns(run: Run, window: FrameWindow) -> int:
 
 def messages(run: Run, rendered: Rendered) -> list[ViewMessage]:
     """The window, its class map, visibility and depth if the model makes them, its frames at the goal pose, and its
-    deviation: of several samples, or of one what the model states."""
+    deviation.
+    """
     pixels = to_u8(rendered.view.video.numpy())
     header = _header(run, rendered)
     window = _message(run, header, pixels, "win")
     at_goal = _at_goal(rendered.view.trajectory) if run.traits.knows_camera else []
     goal = [_message(run, _one_frame(header, i), pixels[i : i + 1], "frm") for i in at_goal]
     view = rendered.view
-    std = view.uncertainty if view.std is None else view.std
+    std = view.std
     return [
         window,
         *([] if view.classes is None else [_class_map(header, "cls", view.classes[0].numpy(), run.classes)]),

@@ -94,6 +94,8 @@ class View:
         pictures in [0, 1]. None for models that do not state their own spread.
     ood: how unlike the training the source looks to the model, 0 to 1, mean over the frames. None for models that
         cannot tell.
+    lost: for every frame before which all that was remembered had to be forgotten, why: odometry that jumps, or motion
+        that the pictures do not tell.
     """
 
     samples: Tensor
@@ -106,6 +108,7 @@ class View:
     inverse_depth: Tensor | None = None
     log_variance: Tensor | None = None
     ood: float | None = None
+    lost: tuple[str, ...] = ()
 
     @property
     def video(self) -> Tensor:
@@ -114,7 +117,12 @@ class View:
 
     @property
     def std(self) -> Tensor | None:
-        """Per-pixel population standard deviation over samples, channel mean: [T, H, W]; None with one sample."""
+        """What the model states of its own spread; else the population standard deviation over samples, channel mean.
+
+        [T, H, W], None with one sample of a model that states nothing.
+        """
+        if self.log_variance is not None:
+            return (self.log_variance / 2).exp()
         if self.samples.shape[0] < 2:
             return None
         samples = self.samples if self.samples.is_floating_point() else self.samples / 255
@@ -124,12 +132,12 @@ class View:
     def uncertainty(self) -> Tensor | None:
         """How far the truth lies from the mean of the samples, as a standard deviation: [T, H, W], in parts of 1.
 
-        `std` times the scale that was measured on held-out clips, None where nobody measured it; with one sample what
-        the model states of itself, None where it does not.
+        What the model states of itself; of samples, `std` times the scale that was measured on held-out clips, None
+        where nobody measured it.
         """
         std = self.std
-        if std is None:
-            return None if self.log_variance is None else (self.log_variance / 2).exp()
+        if std is None or self.log_variance is not None:
+            return std
         return None if self.uncertainty_scale is None else std * self.uncertainty_scale
 
 

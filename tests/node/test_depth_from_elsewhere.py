@@ -2,7 +2,7 @@
 unlike the training."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -100,7 +100,8 @@ def test_pictures_of_eight_bits_and_files_that_are_missing_are_refused(video: Pa
     (tmp_path / "p").mkdir()
     for i in range(FRAMES):
         cv2.imwrite(str(tmp_path / "p" / f"{i}.png"), np.ones((HEIGHT, 2 * WIDTH), np.uint8))
-    for path in (tmp_path / "p", tmp_path / "missing.npy", tmp_path / "missing.png"):
+    cv2.imwrite(str(tmp_path / "one.png"), np.full((HEIGHT, 2 * WIDTH), 2000, np.uint16))  # of a whole video
+    for path in (tmp_path / "p", tmp_path / "missing.npy", tmp_path / "missing.png", tmp_path / "one.png"):
         with pytest.raises(SourceError):
             read(video, depth=path)
 
@@ -331,32 +332,41 @@ def test_the_kinds_of_a_live_view_are_announced_before_the_first_window() -> Non
 # --- a source unlike the training ------------------------------------------------------------------------------------
 
 
-class Doubting(FakeSynthesizer):
-    """Says of its windows how unlike the training they are."""
+class Telling(FakeSynthesizer):
+    """Says something of each of its windows."""
 
-    def __init__(self, scores: Sequence[float], act: Callable[[RenderOptions], None] | None = None) -> None:
-        super().__init__(LIVE, act)
-        self._scores = list(scores)
+    def __init__(self, *told: dict[str, Any]) -> None:
+        super().__init__(LIVE)
+        self._told = list(told)
 
     def render(
         self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
     ) -> list[View]:
-        score = self._scores.pop(0)
-        return [replace(view, ood=score) for view in super().render(features, trajectories, options)]
+        told = self._told.pop(0)
+        return [replace(view, **told) for view in super().render(features, trajectories, options)]
 
 
 def test_a_source_of_another_world_is_flagged_as_long_as_it_lasts() -> None:
     assert LIVE.ood_threshold is not None
     above, below = LIVE.ood_threshold + 0.2, LIVE.ood_threshold - 0.2
-    box = run(Doubting([below, above]), "")
+    box = run(Telling({"ood": below}, {"ood": above}), "")
     headers = [message.header for message in box.of("win")]
     assert [header.quality.ood_score for header in headers] == [below, above]
     assert ["world" in header.quality.ood for header in headers] == [False, True]
     status = statuses(box)[-1]
     assert "world" in status["reasons"]
     assert status["model"]["ood_score"] == round(above, 3)
-    again = statuses(run(Doubting([above, below]), ""))[-1]
+    again = statuses(run(Telling({"ood": above}, {"ood": below}), ""))[-1]
     assert "world" not in again["reasons"]
+
+
+def test_a_motion_that_is_lost_is_told_when_it_begins_and_over_with_the_next_window() -> None:
+    lost, known = {"lost": ("the odometry jumps by 100 m", "too few points")}, {"lost": ()}
+    box = run(Telling(lost, lost, known), "", frames=42)
+    events = [fields for topic, fields in box.notes if topic == "event" and fields["code"] == "MOTION_LOST"]
+    assert [(event["message"], event["frames"]) for event in events] == [("the odometry jumps by 100 m", 2)]
+    assert "MOTION_LOST" not in statuses(box)[-1]["reasons"]
+    assert "MOTION_LOST" in statuses(run(Telling(known, lost), ""))[-1]["reasons"]
 
 
 def test_a_model_that_cannot_tell_says_nothing_of_it() -> None:

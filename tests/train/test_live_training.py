@@ -85,6 +85,12 @@ def test_a_scene_is_never_both_learned_and_measured(places: LivePlaces) -> None:
         train_live(RECIPE, places, threading.Event())
 
 
+def test_clips_of_another_shape_than_the_recipes_are_refused(places: LivePlaces) -> None:
+    wide = msgspec.structs.replace(RECIPE, model=msgspec.structs.replace(TINY, width=TINY.width + 32))
+    with pytest.raises(DataError, match="takes clips of"):
+        train_live(wide, places, threading.Event())
+
+
 def test_scenes_from_a_million_on_are_not_learned_from(tmp_path: Path) -> None:
     write_clip(tmp_path, 5)
     write_clip(tmp_path, 1_000_000)

@@ -156,20 +156,23 @@ class PaintNet(nn.Module):
         levels = self.noise_level(sinusoid(sigma.log() * 250.0, self.config.embedding_width))
         return levels + self.camera(seen.camera)
 
-    def first_step(self, seen: Seen, base: Tensor, sigma_max: float) -> Painted:
-        """The answer from the highest noise level, where the noisy picture says nothing and is not shown."""
+    def first_step(self, seen: Seen, base: Tensor, sigma_max: float, *, detail: bool = True) -> Painted:
+        """The answer from the highest noise level, where the noisy picture says nothing and is not shown.
+
+        detail: False leaves the picture at its mean.
+        """
         inputs = self.inputs(seen, base, None)
         sigma = base.new_full((len(base),), sigma_max)
         features = self.trunk(inputs, self.embedded(seen, sigma))
         mean, classes, log_depth, log_variance, state = (
             self.head(inputs, features).float().split([3, self.classes, 1, 1, 3], dim=1)
         )
-        detail = self.detail(inputs.detach(), features.detach()).float()
         unseen = (1 - seen.coverage)[:, None]
+        added = self.detail(inputs.detach(), features.detach()).float() * unseen if detail else torch.zeros_like(mean)
         known = (seen.log_depth != 0) & (seen.coverage > 0)
         return Painted(
             mean=base + mean,
-            detail=detail * unseen,
+            detail=added,
             classes=classes + _VOTE_LOGITS * seen.votes,
             log_depth=log_depth[:, 0] + torch.where(known, seen.log_depth, _MEAN_DEPTH_LOG),
             log_variance=log_variance[:, 0] + _LOG_VARIANCE,

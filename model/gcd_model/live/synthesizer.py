@@ -14,7 +14,17 @@ from gcd_model.errors import Cancelled, NonFiniteError, ShapeError
 from gcd_model.families import LIVE
 from gcd_model.geometry import CameraMount, Intrinsics, Trajectory
 from gcd_model.live.splat import splat, unproject
-from gcd_model.live.view import COVERED, PAINTED, SEEN_NOW, Floor, FrameGeometry, LiveNetworks, LiveView, ViewFrame
+from gcd_model.live.view import (
+    COVERED,
+    PAINTED,
+    SEEN_NOW,
+    Floor,
+    FrameGeometry,
+    LiveFrame,
+    LiveNetworks,
+    LiveView,
+    ViewFrame,
+)
 from gcd_model.own_format import Card, Entry
 from gcd_model.synthesizer import out_of_memory_is_our_error
 from gcd_model.traits import Traits
@@ -97,9 +107,9 @@ class LiveSynthesizer:
             window.drawn(LiveView(self._networks, steps=steps, seed=s), step_done) for s in _seeds(options.seed, draws)
         ]
         drawn += drawn[:1] * (options.samples - draws)
-        ood = window.entropy
-        views = [self._view([draw[v] for draw in drawn], path, options, ood) for v, path in enumerate(trajectories)]
-        if not all(_is_finite(frame) for draw in drawn for frames in draw for frame in frames) or ood != ood:
+        views = [self._view(drawn, v, path, options, window.entropy) for v, path in enumerate(trajectories)]
+        finite = all(_is_finite(view) for draw in drawn for frame in draw for view in frame.views)
+        if not finite or window.entropy != window.entropy:
             raise NonFiniteError(
                 f"{self._traits.name} produced NaN or Inf; look at the weights with `gcd-node weights inspect`"
             )
@@ -118,8 +128,11 @@ class LiveSynthesizer:
                 raise ShapeError(f"{self._traits.name} works on {frames} frames, got {length}")
         return _Window(video, geometry, _floor(features.mount), tuple(trajectories))
 
-    def _view(self, draws: "list[list[ViewFrame]]", path: Trajectory, options: RenderOptions, ood: float) -> View:
+    def _view(
+        self, drawn: list[list[LiveFrame]], number: int, path: Trajectory, options: RenderOptions, ood: float
+    ) -> View:
         """One view of all draws; what is no draw, such as depth, is the first one's."""
+        draws = [[frame.views[number] for frame in frames] for frames in drawn]
         pixels = torch.stack([torch.stack([(each.picture + 1) / 2 for each in frames]) for frames in draws])
         first = draws[0]
         return View(
@@ -133,6 +146,7 @@ class LiveSynthesizer:
             inverse_depth=torch.stack([each.inverse_depth for each in first]).float().cpu(),
             log_variance=torch.stack([each.log_variance for each in first]).float().cpu(),
             ood=ood,
+            lost=tuple(frame.lost for frame in drawn[0] if frame.lost is not None),
         )
 
 
@@ -150,9 +164,9 @@ class _Window:
         """Mean over the frames."""
         return float(self.geometry.entropy.mean())
 
-    def drawn(self, live: LiveView, step_done: Callable[[], None]) -> list[list[ViewFrame]]:
-        """All frames of all views: V lists of T. step_done: called before each frame, may raise Cancelled."""
-        views: list[list[ViewFrame]] = [[] for _ in self.trajectories]
+    def drawn(self, live: LiveView, step_done: Callable[[], None]) -> list[LiveFrame]:
+        """All frames of all views. step_done: called before each frame, may raise Cancelled."""
+        frames: list[LiveFrame] = []
         geometry, odometry = self.geometry, self.geometry.odometry
         for t, frame in enumerate(self.video):
             step_done()
@@ -169,9 +183,8 @@ class _Window:
                     entropy=float(geometry.entropy[t]),
                 ),
             )
-            for frames, view in zip(views, made.views, strict=True):
-                frames.append(view)
-        return views
+            frames.append(made)
+        return frames
 
 
 class _Counter:

@@ -22,8 +22,12 @@ PAINTED, SEEN_BEFORE, SEEN_NOW = 0, 1, 2
 """Visibility of a pixel."""
 COVERED = 0.5
 """A pixel that points cover by less than this share counts as painted, whatever the network says."""
-MOVABLE = ("car", "truck", "cyclist", "person", "own_car", "robot", "object")
-"""What is painted of these classes is not carried to the next frame: nobody knows where it goes."""
+_MOVABLE = ("car", "truck", "cyclist", "person", "own_car", "robot", "object")
+
+
+def movable_classes(config: LiveConfig) -> Tensor:
+    """Classes of which nothing that was painted is carried to the next frame: nobody knows where it goes. bool [K]."""
+    return torch.tensor([entry.name in _MOVABLE for entry in config.classes])
 
 
 class LiveNetworks(nn.Module):
@@ -110,7 +114,7 @@ class LiveView:
         )
         self._ego = EgoMotion()
         self._painted: list[Surfels] = []
-        self._movable = torch.tensor([entry.name in MOVABLE for entry in config.classes], device=self._device)
+        self._movable = movable_classes(config).to(self._device)
 
     def reset(self) -> None:
         """Forget all that was seen and painted."""

@@ -16,7 +16,7 @@ from gcd_train.errors import RecipeError
 from gcd_train.layouts.scene_run import SceneRun, generate_scenes
 from gcd_train.layouts.scene_sheet import write_scene_sheet
 from gcd_train.layouts.scene_writer import SceneFormat
-from gcd_train.live.draws import LIVE_SCENES, LIVE_WORLDS, LiveWorld, TargetPath
+from gcd_train.live.draws import LIVE_SCENES, LiveWorld, TargetPath, worlds_of
 from gcd_train.scenes.contact_sheet import write_contact_sheet
 from gcd_train.scenes.film import write_film
 from gcd_train.scenes.pair_world import CameraWay, PairForm, World, driving_world, orbit_world
@@ -161,7 +161,9 @@ def driving(
 def live(
     out: Annotated[Path, typer.Argument(help="Folder for the clips; those that are there are kept.")],
     world: Annotated[LiveWorld | None, typer.Option(help="Only this world.")] = None,
-    path: Annotated[TargetPath, typer.Option(help="Which targets: the training's mixture, or one kind.")] = "mixed",
+    path: Annotated[
+        TargetPath, typer.Option(help="Which targets: the training's mixture, or one kind, of the worlds that have it.")
+    ] = "mixed",
     scenes: Scenes = None,
     first_seed: FirstSeed = 0,
     width: Annotated[int, typer.Option(min=32, help="Pixels.")] = 192,
@@ -177,7 +179,7 @@ def live(
     with errors_shown():
         _stop_as_by_ctrl_c()
         settings, console = ClipSettings(width=width, height=height, path=path), Console(stderr=True, highlight=False)
-        for each in LIVE_WORLDS if world is None else (world,):
+        for each in worlds_of(path) if world is None else (world,):
             seeds = range(first_seed, first_seed + (scenes or LIVE_SCENES[each]))
             there, failures = generate_live(out, each, seeds, settings, workers or os.cpu_count() or 1)
             for line in failures:

@@ -13,6 +13,7 @@ and in its metadata the lenses, the frame rate, the world, the height of its flo
 
 import json
 import os
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -253,14 +254,15 @@ def clip_paths(folder: Path, worlds: tuple[str, ...] | None = None) -> list[Path
     return paths
 
 
-def read_clip(path: Path, frames: slice = slice(None)) -> LiveClip:
-    """Some frames of a clip. Raises DataError for a file that is no live clip."""
+def read_clip(path: Path, frames: slice = slice(None), names: Collection[str] | None = None) -> LiveClip:
+    """Some frames of a clip; of some arrays, see the module. Raises DataError for a file that is no live clip."""
     try:
         with safe_open(path, framework="numpy") as file:
             facts = json.loads(file.metadata()["facts"])
-            arrays = {name: file.get_slice(name)[frames] for name in file.keys()}  # noqa: SIM118
+            wanted = file.keys() if names is None else names
+            arrays = {name: file.get_slice(name)[frames] for name in wanted}
     except Exception as error:  # safetensors and json raise kinds of their own
         raise DataError(f"{path} is no live clip ({error}); film it again") from error
-    if int(arrays["source.labels"].max()) >= len(LIVE_CLASSES):
+    if max(int(array.max()) for name, array in arrays.items() if name.endswith("labels")) >= len(LIVE_CLASSES):
         raise DataError(f"{path} holds class ids beyond {len(LIVE_CLASSES) - 1}; film it again with this version")
     return LiveClip(name=f"{path.parent.name}/{path.stem}", arrays=arrays, facts=facts)

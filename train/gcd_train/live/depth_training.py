@@ -23,13 +23,13 @@ from gcd_train.live.look import depth_sheet
 from gcd_train.loop import Progress, StepLoss
 from gcd_train.schedule import ParameterGroup
 
-_CLASS_POWER = -0.5
-_EDGE, _EDGE_WEIGHT, _THIN_WEIGHT = 0.05, 2.0, 5.0
+_CLASS_POWER = -0.25
+_EDGE, _EDGE_WEIGHT, _THIN_WEIGHT = 0.05, 2.0, 12.0
 _OFFSET, _CLASS, _MOVES = 0.5, 0.7, 0.2
 _PIXEL_SHARE = 0.2
-"""Of the pixels of a frame, how many its loss is computed from: the fine head is what costs time at full size."""
+"""How many draws of a pixel a frame's loss is computed from: the fine head is what costs time at full size."""
 THIN = ("person", "pole", "cyclist", "object")
-"""Small things that count for more."""
+"""Small things, which are drawn more often."""
 
 
 class DepthTask:
@@ -70,9 +70,10 @@ class DepthTask:
         self._net.train()
         inputs = depth_inputs(pictures.video, pictures.rays, ground).to(self._device)
         pictures = on(self._device, pictures)
-        n, _, height, width = inputs.shape
-        drawn = random.integers(0, height * width, (n, int(height * width * _PIXEL_SHARE)))
-        pixels = torch.from_numpy(drawn).to(self._device)
+        weights = self._pixel_weights(pictures).flatten(1)  # [N, H * W]
+        generator = torch.Generator().manual_seed(int(random.integers(2**62)))
+        drawn = torch.multinomial(weights.cpu(), int(weights.shape[1] * _PIXEL_SHARE), True, generator=generator)
+        pixels = drawn.to(self._device)
         with torch.autocast(self._device.type, dtype=torch.bfloat16):
             output = self._net(inputs.contiguous(memory_format=torch.channels_last), pixels)
         parts = self.losses(output, pictures, pixels)
@@ -86,31 +87,30 @@ class DepthTask:
         def at(values: Tensor) -> Tensor:
             return values.flatten(1).gather(1, pixels)[..., None]  # [N, M, 1]
 
-        metres, labels, weight = at(pictures.metres), at(pictures.labels), at(self._pixel_weights(pictures))
+        metres, labels = at(pictures.metres), at(pictures.labels)
         centres, width = bin_centres(config, self._device), bin_width(config)
         sky = metres >= config.farthest_m
         place = (metres.log() - centres[0]) / width
         nearest = place.round().clamp(0, config.bins - 2).long()
         label = torch.where(sky, config.bins - 1, nearest)
-        bin_loss = F.cross_entropy(output.logits, label, reduction="none")
+        bin_loss = F.cross_entropy(output.logits, label)
         offset = torch.zeros((), device=self._device)
         for beside in (-1, 0, 1):  # the neighbours' offsets count where the peak is read
             number = (nearest + beside).clamp(0, config.bins - 2)
             wanted = (place - number).clamp(-1.45, 1.45)
             distance = (output.offsets.gather(1, number[:, None])[:, 0] - wanted).abs()
-            offset = offset + ((2 if beside == 0 else 0.5) * distance * weight * ~sky).mean()
+            offset = offset + ((2 if beside == 0 else 0.5) * distance * ~sky).mean()
         classes = F.cross_entropy(output.classes, labels, self._class_weights)
         moves = F.binary_cross_entropy_with_logits(output.moves, at(pictures.moves))
-        return {"bin": (bin_loss * weight).mean(), "offset": offset, "class": classes, "moves": moves}
+        return {"bin": bin_loss, "offset": offset, "class": classes, "moves": moves}
 
     def _pixel_weights(self, pictures: Pictures) -> Tensor:
-        """Edges and thin things count for more: [N, H, W], mean 1."""
+        """How often a pixel is drawn, beside others: edges and thin things more often; [N, H, W]."""
         log = pictures.metres.log()[:, None]
         highest = F.max_pool2d(log, 3, 1, 1)
         lowest = -F.max_pool2d(-log, 3, 1, 1)
         edge = ((highest - lowest)[:, 0] > 2 * _EDGE).float()
-        weight = 1 + _EDGE_WEIGHT * edge + _THIN_WEIGHT * self._thin[pictures.labels].float()
-        return weight / weight.mean()
+        return 1 + _EDGE_WEIGHT * edge + _THIN_WEIGHT * self._thin[pictures.labels].float()
 
     def after_update(self, progress: Progress) -> bool:
         """Nothing to do."""

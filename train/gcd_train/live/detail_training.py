@@ -6,7 +6,7 @@ spread stay as they were, to the last bit.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,8 +18,9 @@ from torch.nn.utils.parametrizations import spectral_norm
 from gcd_model.live.config import LiveConfig
 from gcd_model.live.depth_net import DepthNet, depth_inputs
 from gcd_model.live.paint_net import Painted, PaintNet, Seen, filled
+from gcd_model.live.view import movable_classes
 from gcd_train.live.batches import Ahead, on
-from gcd_train.live.paint_training import MOVABLE, HeldOutViews, ViewBatches, Views, carry, mirrored
+from gcd_train.live.paint_training import HeldOutViews, ViewBatches, Views, carry, mirrored
 from gcd_train.loop import Progress, StepLoss
 from gcd_train.schedule import ParameterGroup
 
@@ -86,7 +87,7 @@ class DetailTask:
         net.requires_grad_(False)
         net.detail.requires_grad_(True)
         self._trained = DetailAndCritic(net).to(self._device)
-        self._movable = torch.tensor([entry.name in MOVABLE for entry in config.classes], device=self._device)
+        self._movable = movable_classes(config).to(self._device)
         torch.manual_seed(0)
         self._random = nn.Sequential(
             nn.Conv2d(3, 32, 5, stride=2, padding=2), nn.LeakyReLU(0.2), nn.Conv2d(32, 48, 3, stride=2, padding=1),
@@ -108,12 +109,10 @@ class DetailTask:
     def step_loss(self, progress: Progress) -> StepLoss:
         """Of the detail against the critic, and of the critic: their gradients do not meet."""
         before, now, random = on(self._device, self._batch(progress.updates))
-        with torch.no_grad():
-            painted = self._first_step(before.seen)
-        carried = torch.from_numpy(random.random(len(now.poses)) < 0.6).to(self._device)
-        moved = carry(painted, before, now, self._movable)
-        coverage = moved.seen.painted_coverage * carried[:, None, None]
-        now = _with_painted(moved, coverage)
+        if before is not None:
+            with torch.no_grad():
+                painted = self._first_step(before.seen)
+            now = carry(painted, before, now, self._movable)
         if random.random() < 0.5:
             now = mirrored(now)
         self._net.train()
@@ -170,10 +169,6 @@ class DetailTask:
         """As in the stage before, with the detail in the sheet."""
         self._net.eval()
         return self._held_out.measure(self._net, self._config, picture)
-
-
-def _with_painted(views: Views, coverage: Tensor) -> Views:
-    return replace(views, seen=replace(views.seen, painted_coverage=coverage))
 
 
 def _energy_distance(made: Tensor, true: Tensor, never: Tensor) -> Tensor:

@@ -22,15 +22,20 @@ from gcd_train.scenes.worlds import scene_world
 Poses = NDArray[np.float64]
 Random = np.random.Generator
 LiveWorld = Literal["driving", "driving-first", "drop", "tabletop"]
-LIVE_WORLDS: tuple[LiveWorld, ...] = get_args(LiveWorld)
 TargetPath = Literal["mixed", "paper", "orbit60", "small"]
-"""Which targets: the training's mixture, the paper's path of the world, orbits of 10 to 60 degrees, small moves."""
+"""Which targets: the training's mixture, the paper's path over a road, orbits of 10 to 60 degrees, small moves."""
 
 FRAMES = 14
 CLIPS_PER_SCENE = {"driving": 1, "driving-first": 1, "drop": 3, "tabletop": 3}
 """A simulated scene is filmed several times, a drive once."""
 LIVE_SCENES: dict[LiveWorld, int] = {"driving": 1400, "driving-first": 560, "drop": 224, "tabletop": 280}
 """What the packaged model learned from."""
+_WORLDS: dict[TargetPath, tuple[LiveWorld, ...]] = {
+    "mixed": get_args(LiveWorld),
+    "paper": ("driving", "driving-first"),
+    "orbit60": ("drop", "tabletop"),
+    "small": ("drop", "tabletop"),
+}
 METRES_A_UNIT = {"driving": 1.0, "driving-first": 1.0, "drop": 1.0, "tabletop": 0.1}
 FLOOR_Z_M = {"driving": 0.0, "driving-first": 0.0, "drop": 0.0, "tabletop": -0.12}
 """Height of the plane on which the world stands: the road, the floor, the table."""
@@ -41,6 +46,11 @@ _SMALL_M, _SMALL_DEG = 0.15, 15.0
 _CLEAR_UNITS = 1.0
 """Cameras keep this far from the sphere about any thing on a stage."""
 _ATTEMPTS = 60
+
+
+def worlds_of(path: TargetPath) -> tuple[LiveWorld, ...]:
+    """The worlds in which there are targets of this kind."""
+    return _WORLDS[path]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -66,6 +76,8 @@ def live_scene(world: LiveWorld, seed: int, path: TargetPath) -> tuple[Scene, li
         RenderError: the scene cannot be simulated, or leaves no room for cameras.
         RecipeError: this world has no such path.
     """
+    if world not in worlds_of(path):
+        raise RecipeError(f"{world} has no targets of the kind {path!r}; {', '.join(worlds_of(path))} have")
     salt = zlib.crc32(f"live {world} {path}".encode())
     if world in ("driving", "driving-first"):
         return _drive(world, seed, path, np.random.default_rng([seed, salt]))
@@ -79,8 +91,6 @@ def live_scene(world: LiveWorld, seed: int, path: TargetPath) -> tuple[Scene, li
 
 
 def _drive(world: LiveWorld, seed: int, path: TargetPath, random: Random) -> tuple[Scene, list[LiveDraw]]:
-    if path not in ("mixed", "paper"):
-        raise RecipeError(f"a drive is filmed along 'mixed' or 'paper', got {path!r}")
     paper = path == "paper" or random.random() < 0.3
     mount = CameraMount() if paper else _random_mount(random)
     # the paper's path is gradual where it is measured; in training it also stands at its goal, which is the live view

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.numpy import load_file, save_file
+from safetensors import safe_open
+from safetensors.numpy import save_file
 from torch import Tensor
 
 from gcd_model.geometry import Intrinsics
@@ -125,10 +126,11 @@ def make_inputs(out: Path, paths: Sequence[Path], net: DepthNet | None, config: 
 
 def read_inputs(path: Path, frames: slice, classes: int) -> dict[str, Tensor]:
     """The fields of `Seen` that do not depend on the lens, of some frames: see the module."""
-    arrays = load_file(path)
-    cut = {name: torch.from_numpy(array[frames]) for name, array in arrays.items() if name != "log_depth"}
+    with safe_open(path, framework="numpy") as file:
+        arrays = {name: file.get_slice(name)[frames] for name in file.keys()}  # noqa: SIM118
+    metres = torch.from_numpy(decode_depth(arrays.pop("log_depth")))
+    cut = {name: torch.from_numpy(array) for name, array in arrays.items()}
     coverage = cut["coverage"].float() / 255
-    metres = torch.from_numpy(decode_depth(arrays["log_depth"][frames]))
     share = (cut["label_share"].float() / 255 * (coverage > 0))[:, None]
     votes = torch.zeros(len(coverage), classes, *coverage.shape[1:]).scatter_(1, cut["label"].long()[:, None], share)
     return {

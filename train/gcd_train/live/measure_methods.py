@@ -314,7 +314,7 @@ class LiveModel:
     networks: LiveNetworks
     name: str = "live"
     exact: bool = False
-    odometry: bool = True
+    odometry: bool = False
     depth_scale: float = 1.0
     floor_higher_m: float = 0.0
     floor_tilt_deg: float = 0.0
@@ -366,12 +366,12 @@ def _exact(source: Pictures, t: int) -> FrameGeometry:
 
 
 def live_methods(networks: LiveNetworks) -> dict[str, LiveModel]:
-    """The live model as it ships, with its own ego-motion, with exact depth, and with what may be wrong, by name."""
+    """The live model as it ships, told its motion, with exact depth, and with what may be wrong, by name."""
     plain = LiveModel(networks=networks)
     made = [
         plain,
-        replace(plain, name="live-ego", odometry=False),
-        replace(plain, name="live-exact", exact=True),
+        replace(plain, name="live-odometry", odometry=True),
+        replace(plain, name="live-exact", exact=True, odometry=True),
         replace(plain, name="live-depth-0.9", depth_scale=0.9),
         replace(plain, name="live-depth-1.1", depth_scale=1.1),
         replace(plain, name="live-floor-20cm", floor_higher_m=0.2),

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import EllipsisType
 
 import numpy as np
 import torch
@@ -12,8 +13,9 @@ from torch import Tensor, nn
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.config import LiveConfig
 from gcd_model.live.depth_net import plane_depth
-from gcd_model.live.paint_net import Painted, PaintNet, Seen, camera_features, filled
+from gcd_model.live.paint_net import SIGMA_DATA, Painted, PaintNet, Seen, camera_features, filled
 from gcd_model.live.splat import splat, unproject
+from gcd_model.live.view import movable_classes
 from gcd_train.live.batches import Ahead, Random, class_shares, lens_rays, on, to_video
 from gcd_train.live.clips import LiveClip, read_clip
 from gcd_train.live.inputs import read_inputs
@@ -26,11 +28,12 @@ _CLASS_POWER = -0.45
 _NEVER_WEIGHT = 0.5
 """Of a never-seen pixel beside a seen one: nobody can know it."""
 _SQUARE, _ABSOLUTE, _GRADIENT, _SPREAD, _CLASS, _DEPTH, _SEEN = 40.0, 4.0, 2.0, 2.0, 0.3, 0.2, 0.15
-"""Raised for the colours, of whose gradient little reached the trunk; that it helps is not shown."""
-_CARRIED = 0.35
-"""Share of the samples that see what was painted a frame before."""
-MOVABLE = ("car", "truck", "cyclist", "person", "own_car", "robot", "object")
-"""Painted things of these classes are not carried along: nobody knows where they go."""
+_DENOISING_SHARE = 0.2
+"""Of the updates: they teach draws of several steps."""
+_SEEN_DENOISED = 0.25
+"""Weight of a seen pixel beside a never-seen one there."""
+VIEW_ARRAYS = ("source.pose", *(f"target.{name}" for name in ("pose", "rgb", "depth", "labels", "visibility")))
+"""What is read of a clip."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -114,13 +117,22 @@ def frame_of(views: Views, index: Tensor) -> Views:
 
 
 class ViewBatches:
-    """Batches of pairs of consecutive frames of target views; the number of the update decides which.
+    """Batches of target views; the number of the update decides which.
 
-    inputs: folders of `make_inputs`; of those that have a clip one is drawn.
+    inputs: folders of `make_inputs`; of those that have a clip one is drawn. carried: share of the views that see what
+    was painted a frame before.
     """
 
-    def __init__(self, paths: Sequence[Path], inputs: Sequence[Path], config: LiveConfig, size: int, seed: int) -> None:
-        self._config, self._size, self._seed = config, size, seed
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        inputs: Sequence[Path],
+        config: LiveConfig,
+        size: int,
+        seed: int,
+        carried: float = 0.35,
+    ) -> None:
+        self._config, self._size, self._seed, self._carried = config, size, seed, carried
         places = [
             (path, [p for folder in inputs if (p := folder / path.parent.name / path.name).exists()]) for path in paths
         ]
@@ -129,20 +141,26 @@ class ViewBatches:
     def __len__(self) -> int:
         return len(self._clips)
 
-    def batch(self, update: int) -> tuple[Views, Views, Random]:
-        """The frames before and the frames themselves, N each, and the generator for what else is drawn."""
+    def batch(self, update: int) -> tuple[Views | None, Views, Random]:
+        """N views; before them the frames before of the first of them, which see what was painted there.
+
+        And the generator for what else is drawn.
+        """
         random = np.random.default_rng([self._seed, update])
-        made: list[Views] = []
-        for _ in range(self._size):
-            path, there = self._clips[int(random.integers(len(self._clips)))]
-            first = int(random.integers(13))
-            cut = slice(first, first + 2)
-            inputs = read_inputs(there[int(random.integers(len(there)))], cut, len(self._config.classes))
-            views = views_of(read_clip(path, cut), inputs, ground=random.random() < 0.6)
-            made.append(_other_look(views, random))
-        every = together(made)
-        index = torch.arange(0, 2 * self._size, 2)
-        return frame_of(every, index), frame_of(every, index + 1), random
+        carried = int(random.binomial(self._size, self._carried))
+        made = [self._views(random, 2 if i < carried else 1) for i in range(self._size)]
+        before = [frame_of(views, torch.tensor([0])) for views in made[:carried]]
+        now = [*(frame_of(views, torch.tensor([1])) for views in made[:carried]), *made[carried:]]
+        return together(before) if before else None, together(now), random
+
+    def _views(self, random: Random, count: int) -> Views:
+        """Frames in a row of some clip."""
+        path, there = self._clips[int(random.integers(len(self._clips)))]
+        first = int(random.integers(self._config.frames + 1 - count))
+        cut = slice(first, first + count)
+        inputs = read_inputs(there[int(random.integers(len(there)))], cut, len(self._config.classes))
+        views = views_of(read_clip(path, cut, VIEW_ARRAYS), inputs, ground=random.random() < 0.6)
+        return _other_look(views, random)
 
 
 def _other_look(views: Views, random: Random) -> Views:
@@ -179,8 +197,8 @@ def mirrored(views: Views) -> Views:
 
 @torch.no_grad()
 def carry(painted: Painted, before: Views, now: Views, movable: Tensor) -> Views:
-    """`now` with what was painted in the frames before, moved into its cameras."""
-    colours, coverages = [], []
+    """`now` with what was painted in the frames before of the first of its views, moved into their cameras."""
+    colours, coverages = now.seen.painted.clone(), now.seen.painted_coverage.clone()
     labels = painted.classes.argmax(1)
     for i, (pose, lens) in enumerate(zip(before.poses, before.lenses, strict=True)):
         keep = (before.seen.coverage[i] < 0.5) & ~movable[labels[i]]
@@ -195,10 +213,8 @@ def carry(painted: Painted, before: Views, now: Views, movable: Tensor) -> Views
             keep=keep,
         )
         moved = splat(surfels, now.poses[i], now.lenses[i], painted.classes.shape[1], 0.0)
-        colours.append(moved.colour)
-        coverages.append(moved.coverage)
-    seen = replace(now.seen, painted=torch.stack(colours), painted_coverage=torch.stack(coverages))
-    return replace(now, seen=seen)
+        colours[i], coverages[i] = moved.colour, moved.coverage
+    return replace(now, seen=replace(now.seen, painted=colours, painted_coverage=coverages))
 
 
 class PaintTask:
@@ -219,7 +235,7 @@ class PaintTask:
         shares = class_shares(paths, len(config.classes))
         weights = shares.clamp(min=1e-4) ** _CLASS_POWER
         self._class_weights = (weights / (weights * shares).sum()).to(self._device)
-        self._movable = torch.tensor([entry.name in MOVABLE for entry in config.classes], device=self._device)
+        self._movable = movable_classes(config).to(self._device)
 
     @property
     def module(self) -> nn.Module:
@@ -234,29 +250,39 @@ class PaintTask:
     def step_loss(self, progress: Progress) -> StepLoss:
         """Of one batch of views; half of them see what was painted a frame before."""
         before, now, random = on(self._device, self._batch(progress.updates))
-        carried = torch.from_numpy(random.random(len(now.poses)) < _CARRIED).to(self._device)
-        if bool(carried.any()):
-            index = torch.nonzero(carried)[:, 0]
-            some_before, some = frame_of(before, index), frame_of(now, index)
+        if before is not None:
             with torch.no_grad():
-                painted = self._first_step(some_before.seen)
-            some = carry(painted, some_before, some, self._movable)
-            rest = torch.nonzero(~carried)[:, 0]
-            now = together([some, frame_of(now, rest)]) if len(rest) else some
+                painted = self._first_step(before.seen)
+            now = carry(painted, before, now, self._movable)
         if random.random() < 0.5:
             now = mirrored(now)
         self._net.train()
-        made = self._first_step(now.seen)
-        parts = self.losses(made, now)
+        if random.random() < _DENOISING_SHARE:
+            parts = {"denoising": self._denoising(now, random)}
+        else:
+            row, column = random.integers(2, size=2).tolist()
+            parts = self.losses(self._first_step(now.seen), now, (..., slice(row, None, 2), slice(column, None, 2)))
         total = torch.stack(list(parts.values())).sum()
         return StepLoss(total=total, parts=parts, frames=len(now.poses))
 
     def _first_step(self, seen: Seen) -> Painted:
         with torch.autocast(self._device.type, dtype=torch.bfloat16):
-            return self._net.first_step(seen, filled(seen), self._config.sigma_max)
+            return self._net.first_step(seen, filled(seen), self._config.sigma_max, detail=False)
 
-    def losses(self, made: Painted, views: Views) -> dict[str, Tensor]:
-        """Weighted parts of the loss."""
+    def _denoising(self, views: Views, random: Random) -> Tensor:
+        """Weighted as in Karras et al. 2022, Table 1, from the levels that the sampler visits."""
+        low, high = np.log(self._config.sigma_min), np.log(self._config.sigma_start)
+        sigma = torch.from_numpy(np.exp(random.uniform(low, high, len(views.poses)))).float().to(self._device)
+        noise = torch.from_numpy(random.standard_normal(tuple(views.target.shape), np.float32)).to(self._device)
+        noisy = views.target + sigma[:, None, None, None] * noise
+        with torch.autocast(self._device.type, dtype=torch.bfloat16):
+            clean = self._net.denoised(views.seen, filled(views.seen), noisy, sigma)
+        scale = (sigma**2 + SIGMA_DATA**2) / (sigma * SIGMA_DATA) ** 2
+        weight = torch.where(views.visibility > 0, _SEEN_DENOISED, 1.0) * scale[:, None, None]
+        return ((clean - views.target).square().mean(dim=1) * weight).mean()
+
+    def losses(self, made: Painted, views: Views, some: tuple[EllipsisType | slice, ...] = (...,)) -> dict[str, Tensor]:
+        """Weighted parts of the loss. some: the pixels from which all but the colours' are computed."""
         seen = (views.visibility > 0).float()
         error = made.mean - views.target
         weight = seen + (1 - seen) * _NEVER_WEIGHT
@@ -264,7 +290,7 @@ class PaintTask:
         mask = seen[:, None]
         gradient = gradient_l1(made.mean * mask, views.target * mask)
         # the spread learns of the mean, the mean nothing of it; times its own variance its gradient stays bounded
-        fixed, log_variance = square.detach(), made.log_variance.clamp(-9, 3)
+        fixed, log_variance = square.detach()[some], made.log_variance[some].clamp(-9, 3)
         variance = log_variance.exp()
         spread = variance.detach() * (fixed * (-log_variance).exp() + log_variance)
         return {
@@ -272,9 +298,9 @@ class PaintTask:
             "absolute": _ABSOLUTE * (error.abs().mean(dim=1) * weight).mean(),
             "gradient": _GRADIENT * gradient,
             "spread": _SPREAD * spread.mean(),
-            "class": _CLASS * F.cross_entropy(made.classes, views.labels, self._class_weights),
-            "depth": _DEPTH * ((made.log_depth - views.log_depth).abs().clamp(max=3.0)).mean(),
-            "seen": _SEEN * F.cross_entropy(made.seen, views.visibility),
+            "class": _CLASS * F.cross_entropy(made.classes[some], views.labels[some], self._class_weights),
+            "depth": _DEPTH * ((made.log_depth - views.log_depth)[some].abs().clamp(max=3.0)).mean(),
+            "seen": _SEEN * F.cross_entropy(made.seen[some], views.visibility[some]),
         }
 
     def after_update(self, progress: Progress) -> bool:
@@ -300,7 +326,8 @@ class HeldOutViews:
             place = inputs / path.parent.name / path.name
             for t in frames:
                 cut = slice(t, t + 1)
-                views = views_of(read_clip(path, cut), read_inputs(place, cut, len(config.classes)), ground=True)
+                inputs_there = read_inputs(place, cut, len(config.classes))
+                views = views_of(read_clip(path, cut, VIEW_ARRAYS), inputs_there, ground=True)
                 self._views.append(views)
 
     def measure(self, net: PaintNet, config: LiveConfig, sheet: Path) -> dict[str, float]:

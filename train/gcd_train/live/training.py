@@ -19,7 +19,7 @@ from gcd_model.live.synthesizer import save_live
 from gcd_model.live.view import LiveNetworks
 from gcd_train.errors import DataError
 from gcd_train.live.batches import training_paths
-from gcd_train.live.clips import clip_paths
+from gcd_train.live.clips import clip_paths, read_clip
 from gcd_train.live.depth_training import DepthTask
 from gcd_train.live.detail_training import DetailTask
 from gcd_train.live.inputs import make_inputs
@@ -49,9 +49,11 @@ def train_live(recipe: LiveRecipe, places: LivePlaces, stop: StopSignal) -> Path
     """All stages, or what is left of them; returns the weight file.
 
     Raises:
-        DataError: no clips, or held-out clips among the training's. Interrupted: `stop` was set; the state is saved.
+        DataError: no clips, clips of another shape than the recipe's, or held-out clips among the training's.
+        Interrupted: `stop` was set; the state is saved.
     """
     _require_apart(places)
+    _require_shape(recipe, places)
     folder, paths, held_out = RunFolder(places.out), training_paths(places.data), clip_paths(places.valid)
     torch.manual_seed(recipe.seed)
     networks = LiveNetworks(recipe.model).to(_device(recipe.device), memory_format=torch.channels_last)  # pyright: ignore
@@ -60,16 +62,13 @@ def train_live(recipe: LiveRecipe, places: LivePlaces, stop: StopSignal) -> Path
     depth = DepthTask(networks.depth, recipe.model, paths, measured, recipe.depth.batch, recipe.seed, recipe.workers)
     run("depth", recipe.depth, depth)
     inputs = places.out / "inputs"
-    for name, chosen, net in (
-        ("exact", paths[:: recipe.exact_every], None),
-        ("learned", paths, networks.depth),
-        ("held-out", measured, networks.depth),
-    ):
-        _make_all_inputs(inputs / name, chosen, net, recipe, stop)
-    batches = ViewBatches(paths, [inputs / "exact", inputs / "learned"], recipe.model, recipe.paint.batch, recipe.seed)
-    views = HeldOutViews(measured, inputs / "held-out", recipe.model)
+    exact = _make_all_inputs(inputs / "exact", paths[:: recipe.exact_every], None, recipe, stop)
+    learned = _make_all_inputs(inputs / "learned", paths, networks.depth, recipe, stop)
+    shown = _make_all_inputs(inputs / "held-out", measured, networks.depth, recipe, stop)
+    batches = ViewBatches(paths, [exact, learned], recipe.model, recipe.paint.batch, recipe.seed)
+    views = HeldOutViews(measured, shown, recipe.model)
     run("paint", recipe.paint, PaintTask(networks.paint, recipe.model, batches, paths, views, recipe.workers))
-    batches = ViewBatches(paths, [inputs / "learned"], recipe.model, recipe.detail.batch, recipe.seed + 1)
+    batches = ViewBatches(paths, [learned], recipe.model, recipe.detail.batch, recipe.seed + 1, carried=0.6)
     run(
         "detail",
         recipe.detail,
@@ -93,6 +92,16 @@ def _require_apart(places: LivePlaces) -> None:
         raise DataError(
             f"{len(both)} held-out scenes are among the training's, first: {both[0]}; give --valid scenes of their own"
         )
+
+
+def _require_shape(recipe: LiveRecipe, places: LivePlaces) -> None:
+    """Raises DataError if the clips have another size or number of frames than the model."""
+    wanted = (recipe.model.frames, recipe.model.height, recipe.model.width)
+    for folder in (places.data, places.valid):
+        path = clip_paths(folder)[0]
+        found = read_clip(path, names=["target.labels"]).arrays["target.labels"].shape
+        if found != wanted:
+            raise DataError(f"the recipe's model takes clips of [T, H, W] {wanted}, {path} has {found}")
 
 
 def _scene(path: Path) -> str:
@@ -122,11 +131,12 @@ def _stage(
 
 def _make_all_inputs(
     out: Path, paths: Sequence[Path], net: DepthNet | None, recipe: LiveRecipe, stop: StopSignal
-) -> None:
-    """Inputs of every clip, in processes where the recipe has workers."""
+) -> Path:
+    """Inputs of every clip, in processes where the recipe has workers; gives their folder, one a depth network."""
+    out = out / _digest(net, recipe)
     missing = [path for path in paths if not (out / path.parent.name / path.name).exists()]
     if not missing:
-        return
+        return out
     _log.info("working out what is seen of %d clips (%s)", len(missing), out.name)
     state = None if net is None else {name: value.cpu().clone() for name, value in net.state_dict().items()}
     work = partial(_inputs_of, out, state, recipe)
@@ -134,6 +144,15 @@ def _make_all_inputs(
         outcome.unwrap()
         if stop.is_set():
             break
+    return out
+
+
+def _digest(net: DepthNet | None, recipe: LiveRecipe) -> str:
+    """Of all that decides what is seen of a clip."""
+    told = hashlib.sha256(msgspec.json.encode([recipe.model.memory, recipe.model.memory_frames, recipe.seed]))
+    for name, value in {} if net is None else net.state_dict().items():
+        told.update(name.encode() + value.cpu().numpy().tobytes())
+    return told.hexdigest()[:12]
 
 
 def _shares(paths: Sequence[Path], size: int = 16) -> Iterator[list[Path]]:
@@ -142,10 +161,14 @@ def _shares(paths: Sequence[Path], size: int = 16) -> Iterator[list[Path]]:
 
 
 def _inputs_of(out: Path, state: dict[str, Any] | None, recipe: LiveRecipe, paths: list[Path]) -> None:
-    torch.set_num_threads(1)
     net: DepthNet | None = None
     if state is not None:
         net = DepthNet(recipe.model.depth, len(recipe.model.classes))
         net.load_state_dict(state)
         net.eval()
-    make_inputs(out, paths, net, recipe.model, recipe.seed)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        make_inputs(out, paths, net, recipe.model, recipe.seed)
+    finally:
+        torch.set_num_threads(threads)
