@@ -24,8 +24,8 @@ class DepthConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     patch: side of the trunk's patches in pixels.
     """
 
-    patch: Literal[2, 4] = 2
-    widths: Widths = (24, 48, 96, 160)
+    patch: Literal[2, 4] = 4
+    widths: Widths = (64, 128, 192)
     fine_width: _Channels = 24
     bins: Annotated[int, Meta(ge=4, le=1024)] = 32
     nearest_m: Annotated[float, Meta(gt=0)] = 0.25
