@@ -209,7 +209,7 @@ def _traits(report: WeightsReport, section: ModelSection) -> Traits:
         family=None if report.family is None else FAMILIES[report.family],
         move_time=report.move_time,
         sha256_12=report.sha256_12,
-        precision=section.dtype or ("bfloat16" if device != "cpu" and report.family != "live" else "float32"),
+        precision=section.dtype or ("float32" if device == "cpu" else "bfloat16"),
         device=device,
         trained=report.trained,
         uncertainty_scale=report.uncertainty_scale,

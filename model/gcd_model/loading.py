@@ -53,7 +53,7 @@ def load_synthesizer(
         family: see `load_weights`. device: "auto" (CUDA where there is one), "cpu", "cuda" or "cuda:N".
         dtype: "float32", "bfloat16" or "float16"; else float32 on the CPU, bfloat16 on CUDA. The VAE decoder
             stays float32 (on CUDA torch may use TF32 in its convolutions, see torch.backends.cudnn). The live model
-            computes in float32 alone.
+            computes in bfloat16 also on a CPU that multiplies in it (Intel AMX).
         head_width, image_heads, frames: see `load_weights`.
         adapter: file of a low-rank adapter that was trained on these weights; family and path are then the adapter's.
         engine: what computes the networks: "torch" as they are, or "cuda", compiled and as CUDA graphs, for a GPU; it
@@ -208,14 +208,24 @@ def _device(name: str) -> torch.device:
 def _live_synthesizer(
     loaded: LoadedWeights, networks: LiveNetworks, place: _Place, *, asked: str | None
 ) -> LiveSynthesizer:
-    if asked not in (None, "float32"):
-        raise OptionError(f"{loaded.name} is the live model, which computes in float32; leave dtype {asked} out")
+    if asked == "float16":
+        raise OptionError(
+            f"{loaded.name} is the live model, which was not trained for float16; take bfloat16 or float32"
+        )
     if place.engine != "torch":
         raise OptionError(
             f"{loaded.name} is the live model, which torch runs as it is; leave engine {place.engine} out"
         )
-    place = replace(place, dtype=torch.float32, precision="float32")
-    return LiveSynthesizer(networks.to(place.device, place.dtype), _traits(loaded, place))
+    if asked is None and _multiplies_in_bfloat16():
+        place = replace(place, dtype=torch.bfloat16, precision="bfloat16")
+    networks = networks.to(place.device, place.dtype, memory_format=torch.channels_last)  # pyright: ignore
+    return LiveSynthesizer(networks, _traits(loaded, place))
+
+
+def _multiplies_in_bfloat16() -> bool:
+    """Whether this processor has Intel AMX; older versions of torch cannot tell."""
+    capabilities = getattr(torch.cpu, "get_capabilities", dict)()
+    return bool(capabilities.get("amx_bf16", False))
 
 
 def _synthesizer(loaded: LoadedWeights, place: _Place) -> Synthesizer:

@@ -324,7 +324,7 @@ def test_a_placed_view_stands_where_it_says_on_the_vehicle(live: LiveSynthesizer
 def test_weights_survive_their_file(tmp_path: Path) -> None:
     networks = random_networks(LIVE_TINY, seed=4)
     save_live(tmp_path / "mine.safetensors", networks, "mine")
-    loaded = load_synthesizer(tmp_path / "mine.safetensors", device="cpu")
+    loaded = load_synthesizer(tmp_path / "mine.safetensors", device="cpu", dtype="float32")
     assert isinstance(loaded, LiveSynthesizer)
     assert (loaded.traits.name, loaded.traits.move_time, loaded.traits.config) == ("mine", 0, LIVE_TINY)
     assert {each.dtype for each in loaded.networks.parameters()} == {torch.float32}
@@ -407,7 +407,10 @@ def test_a_live_file_is_no_diffusion_model_and_says_so(tmp_path: Path) -> None:
     loaded = load_weights(tmp_path / "mine.safetensors")
     with pytest.raises(CheckpointError):
         loaded.diffusion  # noqa: B018
-    for options in ({"dtype": "bfloat16"}, {"frames": 0}):
+    half = load_synthesizer(tmp_path / "mine.safetensors", device="cpu", dtype="bfloat16")
+    assert isinstance(half, LiveSynthesizer)
+    assert {each.dtype for each in half.networks.parameters()} == {torch.bfloat16}
+    for options in ({"dtype": "float16"}, {"frames": 0}):
         with pytest.raises(OptionError):
             load_synthesizer(tmp_path / "mine.safetensors", device="cpu", **options)  # type: ignore[arg-type]
     fewer = load_synthesizer(tmp_path / "mine.safetensors", device="cpu", frames=5)

@@ -121,10 +121,14 @@ def test_what_points_do_not_cover_is_never_marked_seen(networks: LiveNetworks) -
         assert bool((~covered).any())
 
 
-def test_holes_are_filled_by_nobody_but_the_sky(networks: LiveNetworks) -> None:
-    depth = torch.full((HEIGHT, WIDTH), torch.nan)
-    seen = LiveView(networks).look(room().video[0], LENS, depth=depth)
-    assert torch.equal(seen.metres, torch.where(seen.labels == 0, SKY_M, 0.0))
+@pytest.mark.parametrize(("sky", "metres"), [(1e6, SKY_M), (-1e6, 0.0)])
+def test_holes_are_filled_by_nobody_but_the_sky(sky: float, metres: float) -> None:
+    networks = random_networks(LIVE_TINY, seed=0)
+    bias = networks.depth.head.out.bias
+    assert bias is not None
+    bias.data[LIVE_TINY.depth.bins - 1] = sky
+    seen = LiveView(networks).look(room().video[0], LENS, depth=torch.full((HEIGHT, WIDTH), torch.nan))
+    assert bool((seen.metres == metres).all())
 
 
 def test_a_jump_drops_the_memory_says_so_and_goes_on(networks: LiveNetworks) -> None:

@@ -9,11 +9,20 @@ import pytest
 import torch
 from live_clips import HEIGHT, WIDTH, write_clip
 
+from gcd_model.geometry import Intrinsics
 from gcd_model.live.config import DepthConfig, LiveConfig, PaintConfig
-from gcd_model.live.depth_net import DepthNet, DepthOutput, bin_centres, bin_width, read_depth
+from gcd_model.live.depth_net import (
+    DepthNet,
+    DepthOutput,
+    bin_width,
+    depth_inputs,
+    first_bin,
+    plane_depth,
+    read_depth,
+)
 from gcd_model.live.paint_net import PaintNet, Seen, filled
 from gcd_train.errors import DataError, Interrupted, RecipeError
-from gcd_train.live.batches import FrameBatches, pictures_of, training_paths
+from gcd_train.live.batches import FrameBatches, lens_rays, pictures_of, training_paths
 from gcd_train.live.clips import read_clip
 from gcd_train.live.depth_training import DepthTask, edge_matches, measure_depth
 from gcd_train.live.inputs import exact_geometry, make_inputs, read_inputs, splats_of
@@ -131,13 +140,36 @@ def test_batches_follow_from_the_update_alone(places: LivePlaces) -> None:
 def test_true_logits_are_read_as_the_true_depth() -> None:
     config = DepthConfig()
     metres = torch.tensor([[[0.4, 3.0], [47.0, 1000.0]]])
-    place = (metres.log() - bin_centres(config)[0]) / bin_width(config)
+    place = (metres.log() - first_bin(config)) / bin_width(config)
     nearest = place.round().clamp(0, config.bins - 2).long()
     label = torch.where(metres >= config.farthest_m, config.bins - 1, nearest)
     logits = 50.0 * torch.nn.functional.one_hot(label, config.bins).permute(0, 3, 1, 2).float()
-    offsets = torch.zeros_like(logits).scatter_(1, nearest[:, None], (place - nearest).clamp(-1, 1)[:, None])
-    output = DepthOutput(logits=logits, offsets=offsets, classes=logits[:, :2], moves=metres)
+    offsets = torch.zeros_like(logits)[:, 1:].scatter(1, nearest[:, None], ((place - nearest) / 1.5).atanh()[:, None])
+    nowhere = torch.zeros_like(logits[:, :1])
+    output = DepthOutput(
+        logits=logits,
+        raw_offsets=offsets,
+        classes=logits[:, :2],
+        moves=metres,
+        ground=nowhere,
+        ground_place=nowhere,
+    )
     assert torch.allclose(read_depth(output, config).metres, metres, rtol=1e-3)
+
+
+def test_where_the_gate_is_open_depth_is_that_of_the_declared_ground() -> None:
+    net = DepthNet(TINY.depth, len(TINY.classes)).eval()
+    assert net.head.out.bias is not None
+    net.head.out.bias.data[-1] = 1e6
+    lens = Intrinsics.from_hfov(85.0, TINY.width, TINY.height)
+    ground = plane_depth(lens, torch.tensor([0.0, -0.985, -0.174]), 1.5)
+    inputs = depth_inputs(torch.zeros(1, 3, TINY.height, TINY.width), lens_rays(lens)[None], ground[None])
+    with torch.no_grad():
+        net.head.out.weight.zero_()
+        metres = read_depth(net(inputs), TINY.depth).metres[0]
+    near = (ground > TINY.depth.nearest_m * 1.5) & (ground < 20.0)
+    assert near.float().mean() > 0.2
+    assert ((metres / ground - 1).abs()[near] < 0.05).float().mean() > 0.98
 
 
 def test_depth_learns_one_picture_by_heart(places: LivePlaces) -> None:

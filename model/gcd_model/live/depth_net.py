@@ -32,14 +32,23 @@ _SMOOTH_PX, _SMOOTH_SPREAD, _SMOOTH_ROUNDS = 2, 0.1, 2
 class DepthOutput:
     """What the network says of N pictures.
 
-    logits: [N, B, H, W], the last bin is the sky. offsets: [N, B, H, W], parts of a bin from its centre. classes:
-    [N, K, H, W], logits. moves: [N, H, W], logit of a thing in motion.
+    logits: [N, B, H, W], the last bin is the sky. raw_offsets: [N, B - 1, H, W], see `offsets`. classes: [N, K, H, W],
+    logits. moves: [N, H, W], logit of a thing in motion. ground: [N, 1, H, W], probability that the declared ground is
+    seen. ground_place: [N, 1, H, W], where it is, in bins.
     """
 
     logits: Tensor
-    offsets: Tensor
+    raw_offsets: Tensor
     classes: Tensor
     moves: Tensor
+    ground: Tensor
+    ground_place: Tensor
+
+    def offsets(self, bins: Tensor) -> Tensor:
+        """Of the depth from the centres of some bins, int64 [N, M, H, W], in parts of a bin: [N, M, H, W]."""
+        learned = self.raw_offsets.gather(1, bins).tanh() * _OFFSET_REACH
+        plane = self.ground_place - bins
+        return learned.lerp(plane.clamp(-_OFFSET_REACH, _OFFSET_REACH), self.ground * (plane.abs() < _OFFSET_REACH))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -62,28 +71,30 @@ class DepthNet(nn.Module):
         super().__init__()
         self.config, self.classes = config, classes
         self.trunk = Trunk(INPUTS, config.widths, config.patch)
-        outputs = 2 * config.bins + classes + 2
+        outputs = 2 * config.bins - 1 + classes + 2
         self.head = FineHead(INPUTS, config.widths[0], config.fine_width, outputs, config.patch)
 
     def forward(self, inputs: Tensor, pixels: Tensor | None = None) -> DepthOutput:
         """inputs: [N, 7, H, W], see `depth_inputs`. pixels: [N, M], of these alone, as pictures of M x 1."""
-        made = self.head(inputs, self.trunk(inputs), pixels).float()
-        bins = self.config.bins
-        logits, offsets, classes, moves, gate = made.split([bins, bins, self.classes, 1, 1], dim=1)
-        ground = inputs[:, -2:].float()
+        weight, bins = self.trunk.stem.weight, self.config.bins
+        pictures = inputs.to(weight.dtype, memory_format=torch.channels_last)
+        made = self.head(pictures, self.trunk(pictures), pixels).float()
+        logits, offsets, classes, moves, gate = made.split([bins, bins - 1, self.classes, 1, 1], dim=1)
+        ground = inputs[:, -2:]
         if pixels is not None:
             ground = ground.flatten(2).gather(2, pixels[:, None].expand(-1, 2, -1))[..., None]
         opened = torch.sigmoid(gate + _GATE_AT_FIRST) * ground[:, 1:]
-        centres = bin_centres(self.config, inputs.device)
-        place = (ground[:, :1] * _GROUND_SCALE - centres[:, None, None]) / bin_width(self.config)  # [N, B - 1, H, W]
-        prior = _GROUND_LOGIT * opened * (1 - place.abs()).clamp(min=0)
-        share = opened * (place.abs() < _OFFSET_REACH)
-        solid, sky = offsets.tanh().mul(_OFFSET_REACH).split([bins - 1, 1], dim=1)
+        place = (ground[:, :1] * _GROUND_SCALE - first_bin(self.config)) / bin_width(self.config)
+        around = place.floor() + torch.arange(2, device=place.device).view(1, 2, 1, 1)  # the bins next to it
+        solid = (around >= 0) & (around < bins - 1)
+        prior = _GROUND_LOGIT * opened * (1 - (place - around).abs()) * solid
         return DepthOutput(
-            logits=torch.cat([logits[:, :-1] + prior, logits[:, -1:]], dim=1),
-            offsets=torch.cat([torch.lerp(solid, place.clamp(-_OFFSET_REACH, _OFFSET_REACH), share), sky], dim=1),
+            logits=logits.scatter_add(1, around.clamp(0, bins - 2).long(), prior),
+            raw_offsets=offsets,
             classes=classes,
             moves=moves[:, 0],
+            ground=opened,
+            ground_place=place,
         )
 
 
@@ -119,10 +130,9 @@ def plane_depth(lens: Intrinsics, up: Tensor, height_m: float) -> Tensor:
     return torch.where(falling > height_m / SKY_M, height_m / falling.clamp(min=1e-6), 0.0).float()
 
 
-def bin_centres(config: DepthConfig, device: torch.device | None = None) -> Tensor:
-    """Log-depth of the bins' centres, all but the sky's: [B - 1]."""
-    edges = torch.linspace(math.log(config.nearest_m), math.log(config.farthest_m), config.bins, device=device)
-    return (edges[1:] + edges[:-1]) / 2
+def first_bin(config: DepthConfig) -> float:
+    """Log-depth of the nearest bin's centre."""
+    return math.log(config.nearest_m) + bin_width(config) / 2
 
 
 def bin_width(config: DepthConfig) -> float:
@@ -138,12 +148,12 @@ def read_depth(output: DepthOutput, config: DepthConfig) -> DepthReading:
     mass[:, 1:] += solid[:, :-1]
     mass[:, :-1] += solid[:, 1:]
     best, peak = mass.max(dim=1)  # [N, H, W]
-    places = bin_centres(config, output.logits.device)[:, None, None] + output.offsets[:, :-1] * bin_width(config)
     around = peak[:, None] + torch.arange(-1, 2, device=peak.device).view(1, 3, 1, 1)
     inside = ((around >= 0) & (around < config.bins - 1)).to(solid.dtype)
     around = around.clamp(0, config.bins - 2)
     weight = solid.gather(1, around) * inside
-    place = (places.gather(1, around) * weight).sum(dim=1) / weight.sum(dim=1).clamp(min=1e-8)
+    places = first_bin(config) + (around + output.offsets(around)) * bin_width(config)
+    place = (places * weight).sum(dim=1) / weight.sum(dim=1).clamp(min=1e-8)
     sky = probability[:, -1] > best
     confidence = torch.maximum(best, probability[:, -1])
     metres = torch.where(sky, SKY_M, place.exp())

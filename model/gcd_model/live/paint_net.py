@@ -140,7 +140,7 @@ class PaintNet(nn.Module):
             [
                 seen.colour,
                 torch.stack(facts, dim=1),
-                self.votes(seen.votes),
+                self.votes(seen.votes.to(self.votes.weight.dtype)).float(),
                 seen.painted * seen.painted_coverage[:, None],
                 seen.painted_coverage[:, None],
                 seen.rays,
@@ -149,12 +149,13 @@ class PaintNet(nn.Module):
                 base,
             ],
             dim=1,
-        )
+        ).to(self.votes.weight.dtype, memory_format=torch.channels_last)
 
     def embedded(self, seen: Seen, sigma: Tensor) -> Tensor:
         """Noise levels [N] and where the cameras stand -> [N, E]."""
-        levels = self.noise_level(sinusoid(sigma.log() * 250.0, self.config.embedding_width))
-        return levels + self.camera(seen.camera)
+        dtype = self.votes.weight.dtype
+        levels = self.noise_level(sinusoid(sigma.log() * 250.0, self.config.embedding_width).to(dtype))
+        return levels + self.camera(seen.camera.to(dtype))
 
     def first_step(self, seen: Seen, base: Tensor, sigma_max: float, *, detail: bool = True) -> Painted:
         """The answer from the highest noise level, where the noisy picture says nothing and is not shown.

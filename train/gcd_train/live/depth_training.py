@@ -12,9 +12,9 @@ from gcd_model.live.depth_net import (
     SKY_M,
     DepthNet,
     DepthOutput,
-    bin_centres,
     bin_width,
     depth_inputs,
+    first_bin,
     read_depth,
 )
 from gcd_train.live.batches import Ahead, FrameBatches, Pictures, class_shares, on, pictures_of
@@ -75,7 +75,7 @@ class DepthTask:
         drawn = torch.multinomial(weights.cpu(), int(weights.shape[1] * _PIXEL_SHARE), True, generator=generator)
         pixels = drawn.to(self._device)
         with torch.autocast(self._device.type, dtype=torch.bfloat16):
-            output = self._net(inputs.contiguous(memory_format=torch.channels_last), pixels)
+            output = self._net(inputs, pixels)
         parts = self.losses(output, pictures, pixels)
         total = parts["bin"] + _OFFSET * parts["offset"] + _CLASS * parts["class"] + _MOVES * parts["moves"]
         return StepLoss(total=total, parts=parts, frames=len(pictures.lenses))
@@ -88,18 +88,18 @@ class DepthTask:
             return values.flatten(1).gather(1, pixels)[..., None]  # [N, M, 1]
 
         metres, labels = at(pictures.metres), at(pictures.labels)
-        centres, width = bin_centres(config, self._device), bin_width(config)
         sky = metres >= config.farthest_m
-        place = (metres.log() - centres[0]) / width
+        place = (metres.log() - first_bin(config)) / bin_width(config)
         nearest = place.round().clamp(0, config.bins - 2).long()
         label = torch.where(sky, config.bins - 1, nearest)
         bin_loss = F.cross_entropy(output.logits, label)
-        offset = torch.zeros((), device=self._device)
-        for beside in (-1, 0, 1):  # the neighbours' offsets count where the peak is read
-            number = (nearest + beside).clamp(0, config.bins - 2)
-            wanted = (place - number).clamp(-1.45, 1.45)
-            distance = (output.offsets.gather(1, number[:, None])[:, 0] - wanted).abs()
-            offset = offset + ((2 if beside == 0 else 0.5) * distance * ~sky).mean()
+        # the neighbours' offsets count where the peak is read
+        around = (nearest[:, None] + torch.arange(-1, 2, device=self._device).view(1, 3, 1, 1)).clamp(
+            0, config.bins - 2
+        )
+        wanted = (place[:, None] - around).clamp(-1.45, 1.45)
+        distance = (output.offsets(around) - wanted).abs() * torch.tensor([0.5, 2.0, 0.5]).to(wanted).view(1, 3, 1, 1)
+        offset = (distance.sum(dim=1) * ~sky).mean()
         classes = F.cross_entropy(output.classes, labels, self._class_weights)
         moves = F.binary_cross_entropy_with_logits(output.moves, at(pictures.moves))
         return {"bin": bin_loss, "offset": offset, "class": classes, "moves": moves}
