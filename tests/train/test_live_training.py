@@ -21,11 +21,15 @@ from gcd_model.live.depth_net import (
     read_depth,
 )
 from gcd_model.live.paint_net import PaintNet, Seen, filled
+from gcd_model.live.view import LiveNetworks
 from gcd_train.errors import DataError, Interrupted, RecipeError
 from gcd_train.live.batches import FrameBatches, lens_rays, pictures_of, training_paths
+from gcd_train.live.calibration import calibrate
 from gcd_train.live.clips import read_clip
 from gcd_train.live.depth_training import DepthTask, edge_matches, measure_depth
 from gcd_train.live.inputs import exact_geometry, make_inputs, read_inputs, splats_of
+from gcd_train.live.measure_figures import SpreadHistogram
+from gcd_train.live.measure_methods import LiveModel
 from gcd_train.live.paint_training import HeldOutViews, PaintTask, ViewBatches, carry, views_of
 from gcd_train.live.recipe import LiveRecipe, LiveStage, live_recipes, load_live_recipe
 from gcd_train.live.training import LivePlaces, train_live
@@ -267,3 +271,32 @@ def test_paint_losses_are_lowest_at_the_truth(places: LivePlaces) -> None:
         best = task.losses(replace(made, mean=now.target, log_depth=now.log_depth), now)
     assert best["square"] == best["absolute"] == best["gradient"] == best["depth"] == 0
     assert losses["square"] > 0
+
+
+def test_calibration_makes_the_interval_hold_and_takes_back_what_rare_classes_were_given(places: LivePlaces) -> None:
+    torch.manual_seed(0)
+    networks = LiveNetworks(TINY).eval()
+    paths = [*places.data.glob("*/*.safetensors")][:1]
+    make_inputs(places.out, paths, None, TINY, 0)
+    views = HeldOutViews(paths, places.out, TINY)
+    assert networks.depth.head.out.bias is not None
+    biases = networks.depth.head.out.bias.requires_grad_(False)
+    rare = 2 * TINY.depth.bins - 1 + 10
+    biases[rare] = 3.0  # a class that does not occur wins
+    weights = torch.ones(len(TINY.classes))
+    weights[10] = torch.tensor(4.0).exp()
+    labels = pictures_of(read_clip(paths[0]), "source").labels
+    assert not bool((labels == 10).any())
+    calibrate(networks, paths, views, weights, torch.ones_like(weights))
+    assert float(biases[rare]) <= 1.0
+    inside = SpreadHistogram()
+    clip = read_clip(paths[0])
+    made = LiveModel(networks=networks).views(clip)
+    assert made.log_variance is not None
+    assert made.visibility is not None
+    error = (made.video - torch.from_numpy(clip.arrays["target.rgb"]).permute(0, 3, 1, 2) / 255)[1:]
+    inside.add(error, made.log_variance[1:], made.visibility[1:])
+    shares = [share for share in inside.coverage if share == share]
+    assert shares
+    assert all(0.89 < share < 0.91 for share in shares)
+    assert 0.0 < networks.config.ood_threshold <= 1.0

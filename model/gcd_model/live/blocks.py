@@ -100,8 +100,9 @@ class FineHead(nn.Module):
         self.fine = nn.Conv2d(in_channels, fine_width // 2, 3, padding=1)
         self.spread = nn.Conv2d(trunk_width, fine_width * patch**2, 1)
         self.mix = nn.Conv2d(fine_width + fine_width // 2, fine_width, 3, padding=1)
-        out = nn.Conv2d(fine_width, out_channels, 1)
-        self.out = zeroed(out) if zero else out
+        self.out = nn.Conv2d(fine_width, out_channels, 1)
+        if zero:
+            zeroed(self.out)
 
     def forward(self, pictures: Tensor, features: Tensor, pixels: Tensor | None = None) -> Tensor:
         """pictures: [N, C, H, W], features: [N, trunk_width, H / patch, W / patch] -> [N, out_channels, H, W].

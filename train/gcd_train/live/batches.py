@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from gcd_model.geometry import Intrinsics
+from gcd_model.live.config import LiveConfig
 from gcd_model.live.depth_net import pixel_rays, plane_depth
 from gcd_train.live.clips import LiveClip, clip_paths, read_clip
 
@@ -171,13 +172,19 @@ def other_camera(video: Tensor, random: Random, n: int) -> Tensor:
     return (levels * 2 - 1 + noise * drawn(0.04).abs()).clamp(-1, 1)
 
 
-def class_shares(paths: Sequence[Path], classes: int, sample: int = 48) -> Tensor:
-    """How much of the pictures each class fills, [K], over evenly chosen clips."""
+def class_weights(paths: Sequence[Path], config: LiveConfig, power: float, sample: int = 48) -> Tensor:
+    """Weights of the classes in a loss, [K]: a power of how much of the pictures they fill, 1 for a mean pixel.
+
+    sample: so many evenly chosen clips are looked at.
+    """
+    classes = len(config.classes)
     counts = np.ones(classes)
     for path in list(paths)[:: max(len(paths) // sample, 1)][:sample]:
         labels: NDArray[Any] = read_clip(path, slice(0, 1)).arrays["source.labels"]
         counts += np.bincount(labels.ravel(), minlength=classes)
-    return torch.from_numpy(counts / counts.sum()).float()
+    shares = torch.from_numpy(counts / counts.sum()).float()
+    weights = shares.clamp(min=1e-4) ** power
+    return weights / (weights * shares).sum()
 
 
 def on(device: torch.device, record: Record) -> Record:

@@ -17,7 +17,7 @@ from gcd_model.live.depth_net import (
     first_bin,
     read_depth,
 )
-from gcd_train.live.batches import Ahead, FrameBatches, Pictures, class_shares, on, pictures_of
+from gcd_train.live.batches import Ahead, FrameBatches, Pictures, class_weights, on, pictures_of
 from gcd_train.live.clips import read_clip
 from gcd_train.live.look import depth_sheet
 from gcd_train.loop import Progress, StepLoss
@@ -49,11 +49,14 @@ class DepthTask:
         self._net, self._config, self._held_out = net, config, list(held_out)
         self._device = next(net.parameters()).device
         self._batch = Ahead(FrameBatches(paths, size, seed).batch, workers)
-        shares = class_shares(paths, len(config.classes))
-        weights = shares.clamp(min=1e-4) ** _CLASS_POWER
-        self._class_weights = (weights / (weights * shares).sum()).to(self._device)
+        self._class_weights = class_weights(paths, config, _CLASS_POWER).to(self._device)
         names = [entry.name for entry in config.classes]
         self._thin = torch.tensor([name in THIN for name in names], device=self._device)
+
+    @property
+    def class_weights(self) -> Tensor:
+        """How much a pixel of each class counts, by how often it is drawn and by its weight: [K]."""
+        return self._class_weights * (1 + _THIN_WEIGHT * self._thin)
 
     @property
     def module(self) -> nn.Module:

@@ -1,6 +1,6 @@
 """How the paint network learns: the mean of every pixel, its spread, its class and depth, and what was seen of it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import EllipsisType
@@ -16,7 +16,7 @@ from gcd_model.live.depth_net import plane_depth
 from gcd_model.live.paint_net import SIGMA_DATA, Painted, PaintNet, Seen, camera_features, filled
 from gcd_model.live.splat import splat, unproject
 from gcd_model.live.view import movable_classes
-from gcd_train.live.batches import Ahead, Random, class_shares, lens_rays, on, to_video
+from gcd_train.live.batches import Ahead, Random, class_weights, lens_rays, on, to_video
 from gcd_train.live.clips import LiveClip, read_clip
 from gcd_train.live.inputs import read_inputs
 from gcd_train.live.look import picture, write_rows
@@ -232,9 +232,7 @@ class PaintTask:
         """workers: processes that read batches."""
         self._net, self._config, self._held_out = net, config, held_out
         self._device, self._batch = next(net.parameters()).device, Ahead(batches.batch, workers)
-        shares = class_shares(paths, len(config.classes))
-        weights = shares.clamp(min=1e-4) ** _CLASS_POWER
-        self._class_weights = (weights / (weights * shares).sum()).to(self._device)
+        self.class_weights = class_weights(paths, config, _CLASS_POWER).to(self._device)
         self._movable = movable_classes(config).to(self._device)
 
     @property
@@ -298,7 +296,7 @@ class PaintTask:
             "absolute": _ABSOLUTE * (error.abs().mean(dim=1) * weight).mean(),
             "gradient": _GRADIENT * gradient,
             "spread": _SPREAD * spread.mean(),
-            "class": _CLASS * F.cross_entropy(made.classes[some], views.labels[some], self._class_weights),
+            "class": _CLASS * F.cross_entropy(made.classes[some], views.labels[some], self.class_weights),
             "depth": _DEPTH * ((made.log_depth - views.log_depth)[some].abs().clamp(max=3.0)).mean(),
             "seen": _SEEN * F.cross_entropy(made.seen[some], views.visibility[some]),
         }
@@ -329,6 +327,10 @@ class HeldOutViews:
                 inputs_there = read_inputs(place, cut, len(config.classes))
                 views = views_of(read_clip(path, cut, VIEW_ARRAYS), inputs_there, ground=True)
                 self._views.append(views)
+
+    def on(self, device: torch.device) -> Iterator[Views]:
+        """One by one."""
+        return (on(device, views) for views in self._views)
 
     def measure(self, net: PaintNet, config: LiveConfig, sheet: Path) -> dict[str, float]:
         """PSNR of base and mean, of seen and never-seen pixels, mIoU, and IoU of the three states."""

@@ -1,4 +1,4 @@
-"""The live model's training, stage by stage and resumable: depth, inputs, paint, detail, export.
+"""The live model's training, stage by stage and resumable: depth, inputs, paint, detail, calibration, export.
 
 clips -> depth network -> what it shows of every target (inputs) -> paint network -> detail -> weights
 """
@@ -19,6 +19,7 @@ from gcd_model.live.synthesizer import save_live
 from gcd_model.live.view import LiveNetworks
 from gcd_train.errors import DataError
 from gcd_train.live.batches import training_paths
+from gcd_train.live.calibration import calibrate
 from gcd_train.live.clips import clip_paths, read_clip
 from gcd_train.live.depth_training import DepthTask
 from gcd_train.live.detail_training import DetailTask
@@ -67,15 +68,17 @@ def train_live(recipe: LiveRecipe, places: LivePlaces, stop: StopSignal) -> Path
     shown = _make_all_inputs(inputs / "held-out", measured, networks.depth, recipe, stop)
     batches = ViewBatches(paths, [exact, learned], recipe.model, recipe.paint.batch, recipe.seed)
     views = HeldOutViews(measured, shown, recipe.model)
-    run("paint", recipe.paint, PaintTask(networks.paint, recipe.model, batches, paths, views, recipe.workers))
+    paint = PaintTask(networks.paint, recipe.model, batches, paths, views, recipe.workers)
+    run("paint", recipe.paint, paint)
     batches = ViewBatches(paths, [learned], recipe.model, recipe.detail.batch, recipe.seed + 1, carried=0.6)
     run(
         "detail",
         recipe.detail,
         DetailTask(networks.paint, networks.depth, recipe.model, batches, views, recipe.workers),
     )
+    calibrate(networks.cpu(), held_out, views, depth.class_weights, paint.class_weights)
     path = places.out / f"{recipe.name}.safetensors"
-    save_live(path, networks.cpu(), recipe.name, overwrite=True)
+    save_live(path, networks, recipe.name, overwrite=True)
     _log.info("wrote %s", path)
     return path
 
