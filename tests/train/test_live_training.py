@@ -263,7 +263,7 @@ def test_paint_losses_are_lowest_at_the_truth(places: LivePlaces) -> None:
     batches = ViewBatches([path], [places.out], TINY, 2, 0)
     views = HeldOutViews([path], places.out, TINY)
     net = PaintNet(TINY.paint, len(TINY.classes))
-    task = PaintTask(net, TINY, batches, [path], views)
+    task = PaintTask(net, TINY, [batches], [path], views)
     _, now, _ = batches.batch(0)
     with torch.no_grad():
         made = net.first_step(now.seen, filled(now.seen), TINY.sigma_max)

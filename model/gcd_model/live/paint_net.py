@@ -157,6 +157,14 @@ class PaintNet(nn.Module):
         levels = self.noise_level(sinusoid(sigma.log() * 250.0, self.config.embedding_width).to(dtype))
         return levels + self.camera(seen.camera.to(dtype))
 
+    def forward(
+        self, seen: Seen, base: Tensor, sigma: float | Tensor, x: Tensor | None = None, *, detail: bool = True
+    ) -> Painted | Tensor:
+        """`denoised` with x, else `first_step`: what trainings call, so that processes can share them."""
+        if x is None:
+            return self.first_step(seen, base, float(sigma), detail=detail)
+        return self.denoised(seen, base, x, torch.as_tensor(sigma))
+
     def first_step(self, seen: Seen, base: Tensor, sigma_max: float, *, detail: bool = True) -> Painted:
         """The answer from the highest noise level, where the noisy picture says nothing and is not shown.
 

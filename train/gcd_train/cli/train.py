@@ -24,7 +24,7 @@ from gcd_train.cli.training_run import (
 )
 from gcd_train.errors import RecipeError
 from gcd_train.live.recipe import LiveRecipe, is_live, live_recipes, live_toml, load_live_recipe
-from gcd_train.recipe import Recipe, StageName, load_recipe, packaged_recipes, to_toml
+from gcd_train.recipe import ComputeRecipe, Recipe, StageName, load_recipe, packaged_recipes, to_toml
 
 if TYPE_CHECKING:
     from gcd_train.engine.processes import Processes
@@ -68,11 +68,16 @@ def train(
 
 
 def _train_live(recipe: str, data: Path, valid: Path | None, out: Path) -> None:
+    from gcd_train.engine.processes import processes_of
     from gcd_train.live.training import LivePlaces, train_live
 
     if valid is None:
         raise RecipeError("a live model is measured on clips of their own: give --valid, see `gcd-train generate live`")
-    train_live(load_live_recipe(recipe), LivePlaces(data=data, valid=valid, out=out), stop_when_asked())
+    loaded, places = load_live_recipe(recipe), LivePlaces(data=data, valid=valid, out=out)
+    with processes_of(ComputeRecipe(device=loaded.device, parallel="ddp")) as processes:
+        if not processes.first:
+            logging.getLogger().setLevel(logging.WARNING)
+        train_live(loaded, places, stop_when_asked(), processes)
 
 
 def recipes(recipe: Shown = None, small: Small = False, changes: Changes = None) -> None:

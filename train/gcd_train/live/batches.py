@@ -20,6 +20,8 @@ from gcd_train.live.clips import LiveClip, clip_paths, read_clip
 Random = np.random.Generator
 Record = TypeVar("Record")
 Batch = TypeVar("Batch")
+PART_SEED = 1_000_003
+"""Between the seeds of the batches of one update."""
 _TARGET_SHARE = 0.25  # of the pictures that depth learns from: targets see the world from above
 _NO_MOUNT, _EXACT_MOUNT = 0.35, 0.35
 _HEIGHT_SPREAD, _TILT_SPREAD_DEG = 0.05, 0.7  # of the other mounts that are declared

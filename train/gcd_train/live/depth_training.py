@@ -17,7 +17,7 @@ from gcd_model.live.depth_net import (
     first_bin,
     read_depth,
 )
-from gcd_train.live.batches import Ahead, FrameBatches, Pictures, class_weights, on, pictures_of
+from gcd_train.live.batches import PART_SEED, Ahead, FrameBatches, Pictures, class_weights, on, pictures_of
 from gcd_train.live.clips import read_clip
 from gcd_train.live.look import depth_sheet
 from gcd_train.loop import Progress, StepLoss
@@ -43,12 +43,16 @@ class DepthTask:
         held_out: Sequence[Path],
         size: int,
         seed: int,
+        parts: int = 1,
         workers: int = 0,
     ) -> None:
-        """size: frames an update. workers: processes that read them."""
+        """size: frames a batch. parts: batches an update. workers: processes that read them."""
         self._net, self._config, self._held_out = net, config, list(held_out)
+        self._network: nn.Module = net
         self._device = next(net.parameters()).device
-        self._batch = Ahead(FrameBatches(paths, size, seed).batch, workers)
+        self._batches = [
+            Ahead(FrameBatches(paths, size, seed + part * PART_SEED).batch, workers) for part in range(parts)
+        ]
         self._class_weights = class_weights(paths, config, _CLASS_POWER).to(self._device)
         names = [entry.name for entry in config.classes]
         self._thin = torch.tensor([name in THIN for name in names], device=self._device)
@@ -63,13 +67,17 @@ class DepthTask:
         """The network."""
         return self._net
 
+    def compute_through(self, network: nn.Module) -> None:
+        """See SharedTask."""
+        self._network = network
+
     def parameter_groups(self) -> Sequence[ParameterGroup]:
         """All weights."""
         return [ParameterGroup(parameters=list(self._net.parameters()))]
 
     def step_loss(self, progress: Progress) -> StepLoss:
         """Of one batch of frames."""
-        pictures, ground, random = self._batch(progress.updates)
+        pictures, ground, random = self._batches[progress.part](progress.updates)
         self._net.train()
         inputs = depth_inputs(pictures.video, pictures.rays, ground).to(self._device)
         pictures = on(self._device, pictures)
@@ -78,7 +86,7 @@ class DepthTask:
         drawn = torch.multinomial(weights.cpu(), int(weights.shape[1] * _PIXEL_SHARE), True, generator=generator)
         pixels = drawn.to(self._device)
         with torch.autocast(self._device.type, dtype=torch.bfloat16):
-            output = self._net(inputs, pixels)
+            output = self._network(inputs, pixels)
         parts = self.losses(output, pictures, pixels)
         total = parts["bin"] + _OFFSET * parts["offset"] + _CLASS * parts["class"] + _MOVES * parts["moves"]
         return StepLoss(total=total, parts=parts, frames=len(pictures.lenses))

@@ -28,8 +28,10 @@ _CLASS_POWER = -0.45
 _NEVER_WEIGHT = 0.5
 """Of a never-seen pixel beside a seen one: nobody can know it."""
 _SQUARE, _ABSOLUTE, _GRADIENT, _SPREAD, _CLASS, _DEPTH, _SEEN = 40.0, 4.0, 2.0, 2.0, 0.3, 0.2, 0.15
-_DENOISING_SHARE = 0.2
-"""Of the updates: they teach draws of several steps."""
+_MEAN_ALONE = 0.5
+"""Share of the training in which nothing but the mean of single frames is learned, which is what takes longest."""
+_DENOISING_SHARE = 0.3
+"""Of the updates after that: they teach draws of several steps."""
 _SEEN_DENOISED = 0.25
 """Weight of a seen pixel beside a never-seen one there."""
 VIEW_ARRAYS = ("source.pose", *(f"target.{name}" for name in ("pose", "rgb", "depth", "labels", "visibility")))
@@ -224,14 +226,15 @@ class PaintTask:
         self,
         net: PaintNet,
         config: LiveConfig,
-        batches: ViewBatches,
+        batches: Sequence[ViewBatches],
         paths: Sequence[Path],
         held_out: "HeldOutViews",
         workers: int = 0,
     ) -> None:
-        """workers: processes that read batches."""
+        """batches: of the parts of an update. workers: processes that read them."""
         self._net, self._config, self._held_out = net, config, held_out
-        self._device, self._batch = next(net.parameters()).device, Ahead(batches.batch, workers)
+        self._network: nn.Module = net
+        self._device, self._batches = next(net.parameters()).device, [Ahead(each.batch, workers) for each in batches]
         self.class_weights = class_weights(paths, config, _CLASS_POWER).to(self._device)
         self._movable = movable_classes(config).to(self._device)
 
@@ -240,32 +243,39 @@ class PaintTask:
         """The network."""
         return self._net
 
+    def compute_through(self, network: nn.Module) -> None:
+        """See SharedTask."""
+        self._network = network
+
     def parameter_groups(self) -> Sequence[ParameterGroup]:
         """All weights but those of the detail."""
         trained = [p for name, p in self._net.named_parameters() if not name.startswith("detail.")]
         return [ParameterGroup(parameters=trained)]
 
     def step_loss(self, progress: Progress) -> StepLoss:
-        """Of one batch of views; half of them see what was painted a frame before."""
-        before, now, random = on(self._device, self._batch(progress.updates))
-        if before is not None:
+        """Of one batch of views."""
+        before, now, random = on(self._device, self._batches[progress.part](progress.updates))
+        later = progress.share >= _MEAN_ALONE
+        if before is not None and later:
             with torch.no_grad():
-                painted = self._first_step(before.seen)
+                painted = self._first_step(before.seen, self._net)
             now = carry(painted, before, now, self._movable)
         if random.random() < 0.5:
             now = mirrored(now)
         self._net.train()
-        if random.random() < _DENOISING_SHARE:
+        if later and random.random() < _DENOISING_SHARE:
             parts = {"denoising": self._denoising(now, random)}
         else:
             row, column = random.integers(2, size=2).tolist()
-            parts = self.losses(self._first_step(now.seen), now, (..., slice(row, None, 2), slice(column, None, 2)))
+            parts = self.losses(
+                self._first_step(now.seen, self._network), now, (..., slice(row, None, 2), slice(column, None, 2))
+            )
         total = torch.stack(list(parts.values())).sum()
         return StepLoss(total=total, parts=parts, frames=len(now.poses))
 
-    def _first_step(self, seen: Seen) -> Painted:
+    def _first_step(self, seen: Seen, network: nn.Module) -> Painted:
         with torch.autocast(self._device.type, dtype=torch.bfloat16):
-            return self._net.first_step(seen, filled(seen), self._config.sigma_max, detail=False)
+            return network(seen, filled(seen), self._config.sigma_max, detail=False)
 
     def _denoising(self, views: Views, random: Random) -> Tensor:
         """Weighted as in Karras et al. 2022, Table 1, from the levels that the sampler visits."""
@@ -274,7 +284,7 @@ class PaintTask:
         noise = torch.from_numpy(random.standard_normal(tuple(views.target.shape), np.float32)).to(self._device)
         noisy = views.target + sigma[:, None, None, None] * noise
         with torch.autocast(self._device.type, dtype=torch.bfloat16):
-            clean = self._net.denoised(views.seen, filled(views.seen), noisy, sigma)
+            clean = self._network(views.seen, filled(views.seen), sigma, noisy)
         scale = (sigma**2 + SIGMA_DATA**2) / (sigma * SIGMA_DATA) ** 2
         weight = torch.where(views.visibility > 0, _SEEN_DENOISED, 1.0) * scale[:, None, None]
         return ((clean - views.target).square().mean(dim=1) * weight).mean()

@@ -16,10 +16,15 @@ PACKAGED = Path(__file__).parent.parent / "recipes" / "live"
 
 
 class LiveStage(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How long a stage trains and how. batch: frames (depth) or views (paint, detail) an update."""
+    """How long a stage trains and how.
+
+    batch: frames (depth) or views (paint, detail) of a batch. parts: batches an update, which the processes that
+    `torchrun` starts share; of the detail, one.
+    """
 
     budget: Budget
     batch: Annotated[int, Meta(ge=1)] = 8
+    parts: Annotated[int, Meta(ge=1)] = 1
     optimiser: OptimiserRecipe
     ema: EmaRecipe = EmaRecipe(limit=0.998, horizon=0.15)
 

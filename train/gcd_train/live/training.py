@@ -17,8 +17,10 @@ import torch
 from gcd_model.live.depth_net import DepthNet
 from gcd_model.live.synthesizer import save_live
 from gcd_model.live.view import LiveNetworks
+from gcd_train.engine.engine import Engine
+from gcd_train.engine.processes import ALONE, Processes
 from gcd_train.errors import DataError
-from gcd_train.live.batches import training_paths
+from gcd_train.live.batches import PART_SEED, training_paths
 from gcd_train.live.calibration import calibrate
 from gcd_train.live.clips import clip_paths, read_clip
 from gcd_train.live.depth_training import DepthTask
@@ -28,6 +30,7 @@ from gcd_train.live.paint_training import HeldOutViews, PaintTask, ViewBatches
 from gcd_train.live.recipe import LiveRecipe, LiveStage
 from gcd_train.loop import Loop, LoopOptions, Task
 from gcd_train.map_items import map_items
+from gcd_train.recipe import ComputeRecipe
 from gcd_train.recipe.values import LiveStageName
 from gcd_train.run_folder import RunFolder
 from gcd_train.stop import StopSignal
@@ -46,12 +49,14 @@ class LivePlaces:
     out: Path
 
 
-def train_live(recipe: LiveRecipe, places: LivePlaces, stop: StopSignal) -> Path:
+def train_live(recipe: LiveRecipe, places: LivePlaces, stop: StopSignal, processes: Processes = ALONE) -> Path:
     """All stages, or what is left of them; returns the weight file.
+
+    Several processes share the updates of depth and paint; the first one does the rest.
 
     Raises:
         DataError: no clips, clips of another shape than the recipe's, or held-out clips among the training's.
-        Interrupted: `stop` was set; the state is saved.
+        RecipeError: an update's parts cannot be shared. Interrupted: `stop` was set; the state is saved.
     """
     _require_apart(places)
     _require_shape(recipe, places)
@@ -60,26 +65,35 @@ def train_live(recipe: LiveRecipe, places: LivePlaces, stop: StopSignal) -> Path
     networks = LiveNetworks(recipe.model).to(_device(recipe.device), memory_format=torch.channels_last)  # pyright: ignore
     measured = held_out[:: max(len(held_out) // _VALID_SHARE, 1)]
     run = partial(_stage, recipe, folder, stop)
-    depth = DepthTask(networks.depth, recipe.model, paths, measured, recipe.depth.batch, recipe.seed, recipe.workers)
-    run("depth", recipe.depth, depth)
-    inputs = places.out / "inputs"
-    exact = _make_all_inputs(inputs / "exact", paths[:: recipe.exact_every], None, recipe, stop)
-    learned = _make_all_inputs(inputs / "learned", paths, networks.depth, recipe, stop)
-    shown = _make_all_inputs(inputs / "held-out", measured, networks.depth, recipe, stop)
-    batches = ViewBatches(paths, [exact, learned], recipe.model, recipe.paint.batch, recipe.seed)
-    views = HeldOutViews(measured, shown, recipe.model)
-    paint = PaintTask(networks.paint, recipe.model, batches, paths, views, recipe.workers)
-    run("paint", recipe.paint, paint)
-    batches = ViewBatches(paths, [learned], recipe.model, recipe.detail.batch, recipe.seed + 1, carried=0.6)
-    run(
-        "detail",
-        recipe.detail,
-        DetailTask(networks.paint, networks.depth, recipe.model, batches, views, recipe.workers),
+    alone = partial(processes.by_the_first, stop=stop)
+    model, (seed, workers) = recipe.model, (recipe.seed, recipe.workers)
+    depth = DepthTask(networks.depth, model, paths, measured, recipe.depth.batch, seed, recipe.depth.parts, workers)
+    run("depth", recipe.depth, depth, processes)
+    exact, learned, shown = (
+        places.out / "inputs" / name / _digest(net, recipe)
+        for name, net in (("exact", None), ("learned", networks.depth), ("held-out", networks.depth))
     )
-    calibrate(networks.cpu(), held_out, views, depth.class_weights, paint.class_weights)
+    make = partial(_make_all_inputs, recipe=recipe, stop=stop, workers=max(workers, processes.count))
+    alone(lambda: make(exact, paths[:: recipe.exact_every], None))
+    alone(lambda: make(learned, paths, networks.depth))
+    alone(lambda: make(shown, measured, networks.depth))
+    batches = [
+        ViewBatches(paths, [exact, learned], model, recipe.paint.batch, seed + part * PART_SEED)
+        for part in range(recipe.paint.parts)
+    ]
+    views = HeldOutViews(measured, shown, model)
+    paint = PaintTask(networks.paint, model, batches, paths, views, workers)
+    run("paint", recipe.paint, paint, processes)
+    seen = ViewBatches(paths, [learned], model, recipe.detail.batch, seed + 1, carried=0.6)
     path = places.out / f"{recipe.name}.safetensors"
-    save_live(path, networks, recipe.name, overwrite=True)
-    _log.info("wrote %s", path)
+
+    def finish() -> None:
+        run("detail", recipe.detail, DetailTask(networks.paint, networks.depth, model, seen, views, workers), ALONE)
+        calibrate(networks.cpu(), held_out, views, depth.class_weights, paint.class_weights)
+        save_live(path, networks, recipe.name, overwrite=True)
+        _log.info("wrote %s", path)
+
+    alone(finish)
     return path
 
 
@@ -112,7 +126,13 @@ def _scene(path: Path) -> str:
 
 
 def _stage(
-    recipe: LiveRecipe, folder: RunFolder, stop: StopSignal, name: LiveStageName, stage: LiveStage, task: Task
+    recipe: LiveRecipe,
+    folder: RunFolder,
+    stop: StopSignal,
+    name: LiveStageName,
+    stage: LiveStage,
+    task: Task,
+    processes: Processes,
 ) -> None:
     """Train a stage to the end of its budget; its module then has the averaged weights."""
     told = msgspec.json.encode([recipe.model.depth, recipe.model.paint, recipe.seed, name])
@@ -125,6 +145,8 @@ def _stage(
         log=recipe.log,
         stop=stop,
         frames_per_clip=recipe.model.frames,
+        parts=stage.parts,
+        engine=Engine(processes=processes, compute=ComputeRecipe(parallel="ddp")),
     )
     loop = Loop(task, folder, options)
     loop.run()
@@ -133,21 +155,19 @@ def _stage(
 
 
 def _make_all_inputs(
-    out: Path, paths: Sequence[Path], net: DepthNet | None, recipe: LiveRecipe, stop: StopSignal
-) -> Path:
-    """Inputs of every clip, in processes where the recipe has workers; gives their folder, one a depth network."""
-    out = out / _digest(net, recipe)
+    out: Path, paths: Sequence[Path], net: DepthNet | None, recipe: LiveRecipe, stop: StopSignal, workers: int
+) -> None:
+    """Inputs of every clip that has none yet."""
     missing = [path for path in paths if not (out / path.parent.name / path.name).exists()]
     if not missing:
-        return out
-    _log.info("working out what is seen of %d clips (%s)", len(missing), out.name)
+        return
+    _log.info("working out what is seen of %d clips (%s)", len(missing), out.parent.name)
     state = None if net is None else {name: value.cpu().clone() for name, value in net.state_dict().items()}
     work = partial(_inputs_of, out, state, recipe)
-    for outcome in map_items(work, list(_shares(missing)), workers=max(recipe.workers, 1)):
+    for outcome in map_items(work, list(_shares(missing)), workers=workers):
         outcome.unwrap()
         if stop.is_set():
             break
-    return out
 
 
 def _digest(net: DepthNet | None, recipe: LiveRecipe) -> str:
