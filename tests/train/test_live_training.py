@@ -1,5 +1,6 @@
 """The live model's training at a tiny size: every stage runs, resumes, and leaves alone what is not its own."""
 
+import os
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +9,7 @@ import msgspec
 import pytest
 import torch
 from live_clips import HEIGHT, WIDTH, write_clip
+from torch.distributed import TCPStore
 
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.config import DepthConfig, LiveConfig, PaintConfig
@@ -22,6 +24,7 @@ from gcd_model.live.depth_net import (
 )
 from gcd_model.live.paint_net import PaintNet, Seen, filled
 from gcd_model.live.view import LiveNetworks
+from gcd_train.engine.processes import processes_of
 from gcd_train.errors import DataError, Interrupted, RecipeError
 from gcd_train.live.batches import FrameBatches, lens_rays, pictures_of, training_paths
 from gcd_train.live.calibration import calibrate
@@ -34,7 +37,7 @@ from gcd_train.live.paint_training import HeldOutViews, PaintTask, ViewBatches, 
 from gcd_train.live.recipe import LiveRecipe, LiveStage, live_recipes, load_live_recipe
 from gcd_train.live.training import LivePlaces, train_live
 from gcd_train.loop import Progress
-from gcd_train.recipe import Budget, LogRecipe, OptimiserRecipe
+from gcd_train.recipe import Budget, ComputeRecipe, LogRecipe, OptimiserRecipe
 
 TINY = LiveConfig(
     height=HEIGHT,
@@ -57,6 +60,13 @@ RECIPE = LiveRecipe(
     paint=stage(3),
     detail=stage(2),
     log=LogRecipe(log_s=0.001, measure_s=1000.0),
+)
+
+
+SHARED = msgspec.structs.replace(
+    RECIPE,
+    depth=msgspec.structs.replace(stage(3), parts=2),
+    paint=msgspec.structs.replace(stage(3), parts=2),
 )
 
 
@@ -119,6 +129,29 @@ def test_the_detail_stage_leaves_all_other_weights_as_they_are(places: LivePlace
     changed = {name for name in with_detail if not torch.equal(with_detail[name], without[name])}
     assert changed
     assert all(name.startswith("paint.detail.") for name in changed)
+
+
+def in_one_of_two(rank: int, places: LivePlaces, port: int) -> None:
+    os.environ |= {"RANK": str(rank), "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    os.environ["TORCHELASTIC_USE_AGENT_STORE"] = "True"
+    torch.set_num_threads(1)
+    with processes_of(ComputeRecipe(device="cpu", parallel="ddp")) as processes:
+        train_live(SHARED, places, threading.Event(), processes)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_two_processes_end_with_the_weights_of_one(places: LivePlaces) -> None:
+    """Half a minute of two CPUs."""
+    from safetensors.torch import load_file
+
+    alone = load_file(train_live(SHARED, places, threading.Event()))
+    other = replace(places, out=places.out.with_name("two"))
+    store = TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)  # as torchrun has it
+    torch.multiprocessing.start_processes(in_one_of_two, (other, store.port), nprocs=2, start_method="spawn")
+    together = load_file(other.out / f"{SHARED.name}.safetensors")
+    for name in (name for name in alone if name.startswith("depth.")):
+        assert torch.allclose(alone[name].float(), together[name].float(), atol=2e-3), name
 
 
 def test_the_packaged_recipes_load_and_say_what_they_are() -> None:
