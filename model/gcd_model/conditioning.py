@@ -15,17 +15,14 @@ from gcd_model.layers import sinusoid
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SourceGeometry:
-    """What T source frames show in metres, for the live model.
+    """What is stated of T source frames, for the live model.
 
-    metres: float32 [T, H, W], 0 for a hole. labels: uint8 [T, H, W]. static: bool [T, H, W], what stands still.
-    entropy: float32 [T], how unsure the depth network was, 0 to 1. odometry: float64 [T, 4, 4], world_from_camera, or
-    None. lens: of all of them.
+    metres: float32 [T, H, W], 0 for a hole. stated: bool [T], whether a frame came with a depth at all. odometry:
+    float64 [T, 4, 4], world_from_camera, or None. lens: of all of them.
     """
 
     metres: Tensor
-    labels: Tensor
-    static: Tensor
-    entropy: Tensor
+    stated: Tensor
     odometry: Tensor | None
     lens: Intrinsics
 

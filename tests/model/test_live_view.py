@@ -12,6 +12,7 @@ from gcd_model import Intrinsics, OptionError, PoseError, RenderOptions, ShapeEr
 from gcd_model.live.config import LIVE_TINY
 from gcd_model.live.depth_net import SKY_M
 from gcd_model.live.seen_world import SeenWorld
+from gcd_model.live.sweep import Reference
 from gcd_model.live.synthesizer import LiveSynthesizer
 from gcd_model.live.view import LiveFrame, LiveNetworks, LiveView
 from gcd_model.networks import random_networks
@@ -83,6 +84,20 @@ def test_looking_ahead_changes_no_state(networks: LiveNetworks) -> None:
     for t in range(3):
         looks.look(clip.video[13 - t], LENS)
         assert_same(*(steps(each, range(t, t + 1))[0] for each in (looks, plain)))
+
+
+def test_depth_looks_at_an_earlier_frame_where_there_is_one(networks: LiveNetworks) -> None:
+    clip = room()
+    assert clip.odometry is not None
+    view = LiveView(networks)
+    made = [view.step(clip.video[t], [HERE], lens=LENS, odometry=clip.odometry[t]).geometry for t in range(3)]
+    alone = LiveView(networks).look(clip.video[2], LENS)
+    move = torch.linalg.inv(clip.odometry[0]) @ clip.odometry[2]
+    compared = view.look(
+        clip.video[2], LENS, reference=Reference(picture=clip.video[0], reference_from_camera=move.double())
+    )
+    assert not torch.equal(made[2].metres, alone.metres)
+    assert_close(made[2].metres, compared.metres)
 
 
 @pytest.mark.parametrize("hfov_deg", [40.0, 85.0, 120.0])

@@ -53,16 +53,24 @@ class Attention(nn.Module):
 class Trunk(nn.Module):
     """A U of several levels, each of half the size of the one before: patches in, features of every patch out.
 
-    patch: side in pixels of what the first level calls a pixel. widths: channels of the levels.
+    patch: side in pixels of what the first level calls a pixel. widths: channels of the levels. beside: channels that
+    are given patch by patch.
     """
 
     def __init__(
-        self, in_channels: int, widths: Widths, patch: int, *, embedding_width: int = 0, stem_kernel: int = 3
+        self,
+        in_channels: int,
+        widths: Widths,
+        patch: int,
+        *,
+        embedding_width: int = 0,
+        stem_kernel: int = 3,
+        beside: int = 0,
     ) -> None:
         super().__init__()
         e, last = embedding_width, widths[-1]
         self.patch = patch
-        self.stem = nn.Conv2d(in_channels * patch**2, widths[0], stem_kernel, padding=stem_kernel // 2)
+        self.stem = nn.Conv2d(in_channels * patch**2 + beside, widths[0], stem_kernel, padding=stem_kernel // 2)
         self.down = Layers[Block]([Block(width, width, e) for width in (*widths, last)])
         self.shrink = Layers[nn.Conv2d](
             [nn.Conv2d(fine, coarse, 3, stride=2, padding=1) for fine, coarse in pairwise(widths)]
@@ -74,9 +82,10 @@ class Trunk(nn.Module):
             [block for coarse, fine in ways for block in (Block(coarse + fine, fine, e), Block(fine, fine, e))]
         )
 
-    def forward(self, pictures: Tensor, embedding: Tensor | None = None) -> Tensor:
-        """pictures: [N, C, H, W] -> features [N, widths[0], H / patch, W / patch]."""
-        x = self.down[0](self.stem(F.pixel_unshuffle(pictures, self.patch)), embedding)
+    def forward(self, pictures: Tensor, embedding: Tensor | None = None, beside: Tensor | None = None) -> Tensor:
+        """pictures: [N, C, H, W], beside: [N, beside, H / patch, W / patch] -> features [N, widths[0], same size]."""
+        x = F.pixel_unshuffle(pictures, self.patch)
+        x = self.down[0](self.stem(x if beside is None else torch.cat([x, beside], dim=1)), embedding)
         kept: list[Tensor] = []
         for shrink, block in zip(self.shrink, list(self.down)[1:-1], strict=True):
             kept.append(x)

@@ -1,4 +1,4 @@
-"""How far everything is, what it is, and whether it moves: from one picture, its lens and, where known, its mount.
+"""How far everything is, what it is, and whether it moves: from a picture, an earlier one, the lens and the mount.
 
 Depth is a choice among bins that are even in log-depth, each with an offset: at an edge two peaks stand side by side
 and the likelier one is taken, never their mean. Where a mount is declared, one gate a pixel says "this is the ground":
@@ -9,11 +9,13 @@ import math
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.blocks import FineHead, Trunk
 from gcd_model.live.config import DepthConfig
+from gcd_model.live.sweep import SWEEP_SCALE, sweep_channels
 
 SKY_M = 1000.0
 """Where the sky is put, metres: no step of a robot moves it by a pixel."""
@@ -70,15 +72,31 @@ class DepthNet(nn.Module):
     def __init__(self, config: DepthConfig, classes: int) -> None:
         super().__init__()
         self.config, self.classes = config, classes
-        self.trunk = Trunk(INPUTS, config.widths, config.patch)
+        self.trunk = Trunk(INPUTS, config.widths, config.patch, beside=sweep_channels(config) * self._sweep_patch**2)
         outputs = 2 * config.bins - 1 + classes + 2
         self.head = FineHead(INPUTS, config.widths[0], config.fine_width, outputs, config.patch)
 
-    def forward(self, inputs: Tensor, pixels: Tensor | None = None) -> DepthOutput:
-        """inputs: [N, 7, H, W], see `depth_inputs`. pixels: [N, M], of these alone, as pictures of M x 1."""
+    @property
+    def _sweep_patch(self) -> int:
+        return self.config.patch // SWEEP_SCALE
+
+    def features(self, inputs: Tensor, sweep: Tensor | None = None) -> Tensor:
+        """What the heads look at: [N, widths[0], H / patch, W / patch]. Args: see `forward`."""
+        n, _, height, width = inputs.shape
+        if sweep is None:
+            sweep = inputs.new_zeros(n, sweep_channels(self.config), height // SWEEP_SCALE, width // SWEEP_SCALE)
+        return self.trunk(inputs, beside=F.pixel_unshuffle(sweep.to(inputs), self._sweep_patch))
+
+    def forward(self, inputs: Tensor, sweep: Tensor | None = None, pixels: Tensor | None = None) -> DepthOutput:
+        """What is seen.
+
+        Args:
+            inputs: [N, 7, H, W], see `depth_inputs`. sweep: [N, bins + 1, H/2, W/2], see `sweep_costs`; None without
+                earlier frames. pixels: [N, M], of these alone, as pictures of M x 1.
+        """
         weight, bins = self.trunk.stem.weight, self.config.bins
         pictures = inputs.to(weight.dtype, memory_format=torch.channels_last)
-        made = self.head(pictures, self.trunk(pictures), pixels).float()
+        made = self.head(pictures, self.features(pictures, sweep), pixels).float()
         logits, offsets, classes, moves, gate = made.split([bins, bins - 1, self.classes, 1, 1], dim=1)
         ground = inputs[:, -2:]
         if pixels is not None:

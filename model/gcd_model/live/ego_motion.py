@@ -77,6 +77,14 @@ class _Frame:
     lens: Intrinsics
     odometry: Tensor | None
 
+    def with_depth(self, depth: Tensor, static: Tensor) -> "_Frame":
+        depth, static = depth.cpu(), static.cpu()
+        usable = (static & depth.isfinite() & (depth > 0)).to(torch.uint8)
+        inner = torch.zeros_like(usable)
+        inside = (slice(_BORDER_PX, -_BORDER_PX),) * 2
+        inner[inside] = usable[inside]
+        return replace(self, depth=depth.double().numpy(), usable=inner.numpy())
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Tracks:
@@ -111,6 +119,7 @@ class EgoMotion:
     def reset(self) -> None:
         """Forget the last frame: the next one is where the world begins."""
         self._last: _Frame | None = None
+        self._new: _Frame | None = None
         self._begin_world()
 
     def _begin_world(self) -> None:
@@ -120,11 +129,16 @@ class EgoMotion:
     def step(
         self, picture: Tensor, depth: Tensor, static: Tensor, lens: Intrinsics, odometry: Tensor | None = None
     ) -> Motion:
-        """The motion from the last frame to this one.
+        """`follow` and `settle` at once, where depth is known beforehand."""
+        motion = self.follow(picture, lens, odometry)
+        self.settle(depth, static)
+        return motion
+
+    def follow(self, picture: Tensor, lens: Intrinsics, odometry: Tensor | None = None) -> Motion:
+        """The motion from the last frame that was settled to this one.
 
         Args:
-            picture: float32 [3, H, W] in [-1, 1]. depth: [H, W] metres, 1000 for the sky; 0 or not finite: a hole.
-            static: bool [H, W], what does not move by itself.
+            picture: float32 [3, H, W] in [-1, 1].
             odometry: float64 [4, 4], world_from_camera in a world of its own; only differences count. Two frames in a
                 row must have it, else the pictures decide.
         """
@@ -134,17 +148,31 @@ class EgoMotion:
                 odometry = require_rigid(odometry, "odometry").double()
             except PoseError as error:
                 odometry, refused = None, str(error)
-        last, self._last = self._last, _frame(picture, depth, static, lens, odometry)
+        last, self._new = self._last, _frame(picture, lens, odometry)
         try:
             if refused:
                 raise _LostError(refused)
             if last is None:
                 return Motion(world_from_camera=torch.eye(4, dtype=torch.float64))
-            inliers = self._advance(last, self._last)
+            inliers = self._advance(last, self._new)
         except _LostError as error:
             self._begin_world()
             return Motion(world_from_camera=torch.eye(4, dtype=torch.float64), lost=True, reason=str(error))
         return Motion(world_from_camera=torch.from_numpy(self._pose.copy()), inliers=inliers)
+
+    def settle(self, depth: Tensor, static: Tensor) -> None:
+        """What the frame shows that was just followed: the next one's motion hangs on it.
+
+        Args:
+            depth: [H, W] metres, 1000 for the sky; 0 or not finite: a hole. static: bool [H, W], what does not move.
+        """
+        if self._new is None:
+            return
+        self._last = frame = self._new.with_depth(depth, static)
+        if len(self._tracks):
+            column, row = np.rint(self._tracks.place).astype(int).T
+            here = self._pose
+            self._tracks = _placed_better(self._tracks, frame, here).rows(frame.usable[row, column] > 0)
 
     def _advance(self, last: _Frame, frame: _Frame) -> int:
         """Number of inliers. Raises _LostError."""
@@ -160,18 +188,14 @@ class EgoMotion:
         return len(tracks)
 
 
-def _frame(picture: Tensor, depth: Tensor, static: Tensor, lens: Intrinsics, odometry: Tensor | None) -> _Frame:
-    picture, depth, static = picture.cpu(), depth.cpu(), static.cpu()
+def _frame(picture: Tensor, lens: Intrinsics, odometry: Tensor | None) -> _Frame:
     weights = torch.tensor([0.299, 0.587, 0.114])
-    grey = torch.tensordot(weights, picture.float(), dims=1) * 127.5 + 127.5
-    usable = (static & depth.isfinite() & (depth > 0)).to(torch.uint8)
-    inner = torch.zeros_like(usable)
-    inside = (slice(_BORDER_PX, -_BORDER_PX),) * 2
-    inner[inside] = usable[inside]
+    grey = torch.tensordot(weights, picture.cpu().float(), dims=1) * 127.5 + 127.5
+    nothing = np.zeros(grey.shape, np.uint8)
     return _Frame(
         grey=grey.round().clamp(0, 255).to(torch.uint8).numpy(),
-        depth=depth.double().numpy(),
-        usable=inner.numpy(),
+        depth=nothing.astype(np.float64),
+        usable=nothing,
         lens=lens,
         odometry=odometry,
     )
@@ -188,7 +212,7 @@ def _require_plausible(step: Array, what: str) -> None:
 
 
 def _followed(last: _Frame, frame: _Frame, tracks: _Tracks, pose: Array, guess: Array) -> tuple[Array, _Tracks]:
-    """world_from_camera of the frame, and the tracks that agree with it.
+    """world_from_camera of the frame, and the tracks that agree with it; of the frame itself no depth is asked.
 
     pose: of the last frame. guess: of this one, had the camera gone on as before.
     """
@@ -208,8 +232,7 @@ def _followed(last: _Frame, frame: _Frame, tracks: _Tracks, pose: Array, guess: 
     )
     if np.quantile(shift, _STANDS_SHARE) < _STANDS_PX:
         here = pose
-    column, row = np.rint(seen.place).astype(int).T
-    return here, _placed_better(seen, frame, here).rows(frame.usable[row, column] > 0)
+    return here, seen
 
 
 def _contrasted(*pictures: Array) -> list[Array]:

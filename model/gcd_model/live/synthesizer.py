@@ -1,5 +1,6 @@
 """The live model behind the door of all models: clips of T frames in, views of T frames out."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,11 +20,9 @@ from gcd_model.live.view import (
     PAINTED,
     SEEN_NOW,
     Floor,
-    FrameGeometry,
     LiveFrame,
     LiveNetworks,
     LiveView,
-    ViewFrame,
 )
 from gcd_model.own_format import Card, Entry
 from gcd_model.synthesizer import out_of_memory_is_our_error
@@ -34,7 +33,7 @@ _SEED_STEP, _SEEDS = 0x9E3779B97F4A7C15, 1 << 63  # neighbouring seeds of sample
 
 
 class LiveSynthesizer:
-    """A ViewSynthesizer: `encode` is one `LiveView.look` a frame, `render` resets and takes one `step` a frame.
+    """A ViewSynthesizer: `encode` keeps what is stated of the frames, `render` takes one `LiveView.step` for each.
 
     Where a view stands is seen from the source camera of the same frame, which may move: `source_from_target[t]`. One
     that stands still is the case of all other models.
@@ -42,7 +41,6 @@ class LiveSynthesizer:
 
     def __init__(self, networks: LiveNetworks, traits: Traits) -> None:
         self._networks, self._traits = networks.requires_grad_(False), traits
-        self._look = LiveView(networks).look
 
     @property
     def traits(self) -> Traits:
@@ -58,7 +56,7 @@ class LiveSynthesizer:
     def encode(
         self, clip: Clip, augmentation: Augmentation | None = None, extra: Tensor | None = None
     ) -> SourceFeatures:
-        """See ViewSynthesizer. Frames are independent of each other; any number of them may be given.
+        """See ViewSynthesizer. Nothing is worked out here: depth looks at earlier frames; any number may be given.
 
         The lens is the clip's, else of its mount's field of view, else of CameraMount()'s, 85 degrees. The ground is
         known where the clip states a mount. Augmentation is for diffusion models and means nothing here.
@@ -68,9 +66,7 @@ class LiveSynthesizer:
         self._traits.check_size(*clip.video.shape[-2:])
         if extra is not None:
             raise ShapeError(f"{self._traits.name} wants no extra condition channels, got {extra.shape[1]}")
-        lens, floor = lens_of(clip), _floor(clip.mount)
-        depth: Sequence[Tensor | None] = [None] * clip.frames if clip.depth is None else list(clip.depth)
-        seen = [self._look(frame, lens, depth=d, floor=floor) for frame, d in zip(clip.video, depth, strict=True)]
+        stated = clip.depth is not None
         return SourceFeatures(
             tokens=None,
             latents=clip.video.new_zeros(clip.frames, 0, 1, 1),
@@ -80,12 +76,10 @@ class LiveSynthesizer:
             video=clip.video,
             mount=clip.mount,
             geometry=SourceGeometry(
-                metres=torch.stack([each.metres for each in seen]),
-                labels=torch.stack([each.labels for each in seen]),
-                static=torch.stack([each.static for each in seen]),
-                entropy=torch.tensor([each.entropy for each in seen]),
+                metres=clip.video.new_zeros(clip.video[:, 0].shape) if clip.depth is None else clip.depth,
+                stated=torch.full((clip.frames,), stated),
                 odometry=clip.odometry,
-                lens=lens,
+                lens=lens_of(clip),
             ),
         )
 
@@ -107,9 +101,8 @@ class LiveSynthesizer:
             window.drawn(LiveView(self._networks, steps=steps, seed=s), step_done) for s in _seeds(options.seed, draws)
         ]
         drawn += drawn[:1] * (options.samples - draws)
-        views = [self._view(drawn, v, path, options, window.entropy) for v, path in enumerate(trajectories)]
-        finite = all(_is_finite(view) for draw in drawn for frame in draw for view in frame.views)
-        if not finite or window.entropy != window.entropy:
+        views = [self._view(drawn, v, path, options) for v, path in enumerate(trajectories)]
+        if not all(_is_finite(frame) for draw in drawn for frame in draw):
             raise NonFiniteError(
                 f"{self._traits.name} produced NaN or Inf; look at the weights with `gcd-node weights inspect`"
             )
@@ -128,9 +121,7 @@ class LiveSynthesizer:
                 raise ShapeError(f"{self._traits.name} works on {frames} frames, got {length}")
         return _Window(video, geometry, _floor(features.mount), tuple(trajectories))
 
-    def _view(
-        self, drawn: list[list[LiveFrame]], number: int, path: Trajectory, options: RenderOptions, ood: float
-    ) -> View:
+    def _view(self, drawn: list[list[LiveFrame]], number: int, path: Trajectory, options: RenderOptions) -> View:
         """One view of all draws; what is no draw, such as depth, is the first one's."""
         draws = [[frame.views[number] for frame in frames] for frames in drawn]
         pixels = torch.stack([torch.stack([(each.picture + 1) / 2 for each in frames]) for frames in draws])
@@ -145,7 +136,7 @@ class LiveSynthesizer:
             visibility=torch.stack([each.visibility for each in first]).cpu(),
             inverse_depth=torch.stack([each.inverse_depth for each in first]).float().cpu(),
             log_variance=torch.stack([each.log_variance for each in first]).float().cpu(),
-            ood=ood,
+            ood=sum(frame.geometry.entropy for frame in drawn[0]) / len(drawn[0]),
             lost=tuple(frame.lost for frame in drawn[0] if frame.lost is not None),
         )
 
@@ -159,11 +150,6 @@ class _Window:
     floor: Floor | None
     trajectories: tuple[Trajectory, ...]
 
-    @property
-    def entropy(self) -> float:
-        """Mean over the frames."""
-        return float(self.geometry.entropy.mean())
-
     def drawn(self, live: LiveView, step_done: Callable[[], None]) -> list[LiveFrame]:
         """All frames of all views. step_done: called before each frame, may raise Cancelled."""
         frames: list[LiveFrame] = []
@@ -176,12 +162,7 @@ class _Window:
                 lens=geometry.lens,
                 odometry=None if odometry is None else odometry[t],
                 floor=self.floor,
-                geometry=FrameGeometry(
-                    metres=geometry.metres[t],
-                    labels=geometry.labels[t],
-                    static=geometry.static[t],
-                    entropy=float(geometry.entropy[t]),
-                ),
+                depth=geometry.metres[t] if bool(geometry.stated[t]) else None,
             )
             frames.append(made)
         return frames
@@ -243,9 +224,9 @@ def _seeds(seed: int, draws: int) -> list[int]:
     return [(seed + s * _SEED_STEP) % _SEEDS for s in range(draws)]
 
 
-def _is_finite(frame: ViewFrame) -> bool:
-    pictures = (frame.picture, frame.inverse_depth, frame.log_variance)
-    return all(bool(each.isfinite().all()) for each in pictures)
+def _is_finite(frame: LiveFrame) -> bool:
+    pictures = [each for view in frame.views for each in (view.picture, view.inverse_depth, view.log_variance)]
+    return math.isfinite(frame.geometry.entropy) and all(bool(each.isfinite().all()) for each in pictures)
 
 
 def save_live(

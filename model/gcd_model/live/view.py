@@ -17,6 +17,7 @@ from gcd_model.live.ego_motion import EgoMotion
 from gcd_model.live.paint_net import Painted, PaintNet, Seen, camera_features, filled, seen_of
 from gcd_model.live.seen_world import SeenWorld
 from gcd_model.live.splat import Splat, Surfels, splat, unproject
+from gcd_model.live.sweep import Reference, References, sweep_costs
 
 PAINTED, SEEN_BEFORE, SEEN_NOW = 0, 1, 2
 """Visibility of a pixel."""
@@ -112,7 +113,7 @@ class LiveView:
             oldest_frames=config.memory_frames or float("inf"),
             device=self._device,
         )
-        self._ego = EgoMotion()
+        self._ego, self._references = EgoMotion(), References()
         self._painted: list[Surfels] = []
         self._movable = movable_classes(config).to(self._device)
 
@@ -120,20 +121,28 @@ class LiveView:
         """Forget all that was seen and painted."""
         self._world.reset()
         self._ego.reset()
+        self._references.reset()
         self._painted = []
 
     @torch.inference_mode()
     def look(
-        self, frame: Tensor, lens: Intrinsics, *, depth: Tensor | None = None, floor: Floor | None = None
+        self,
+        frame: Tensor,
+        lens: Intrinsics,
+        *,
+        depth: Tensor | None = None,
+        floor: Floor | None = None,
+        reference: Reference | None = None,
     ) -> FrameGeometry:
-        """Depth, classes and motion of one frame: stateless, so that it may run ahead.
+        """Depth, classes and motion of one frame; leaves the state alone.
 
-        Args: see `step`.
+        Args: see `step`. reference: an earlier frame, see `sweep_costs`.
         """
         picture = self._checked(frame, lens)
         ground = torch.zeros(lens.height, lens.width) if floor is None else plane_depth(lens, floor.up, floor.height_m)
         rays = pixel_rays(lens, self._device)
-        output = self._networks.depth(depth_inputs(picture[None], rays[None], ground[None].to(self._device)))
+        inputs = depth_inputs(picture[None], rays[None], ground[None].to(self._device))
+        output = self._networks.depth(inputs, sweep_costs(picture, lens, reference, self._config.depth)[None])
         reading = read_depth(output, self._config.depth)
         labels = output.classes[0].argmax(0).to(torch.uint8)
         metres = reading.metres[0] if depth is None else _taken(depth, reading.metres[0], lens)
@@ -162,18 +171,22 @@ class LiveView:
             depth: [H, W] metres, 0 or not finite where unknown, instead of the depth network's.
             odometry: world_from_source [4, 4] of any world that stays the same from frame to frame; None: from the
                 pictures.
-            floor: where the declared mount has the ground. geometry: what `look` gave for this frame.
+            floor: where the declared mount has the ground. geometry: what the frame shows, if that is known.
             target_lens: of the views; None: the source's.
         Raises:
             ShapeError: frame, depth and lens differ in size, or the size is no multiple of 32. PoseError.
         """
         picture = self._checked(frame, lens)
-        geometry = self.look(frame, lens, depth=depth, floor=floor) if geometry is None else geometry
-        motion = self._ego.step(picture, geometry.metres, geometry.static, lens, odometry)
+        motion = self._ego.follow(picture, lens, odometry)
         if motion.lost:
             self._world.reset()
+            self._references.reset()
             self._painted = []
         pose = motion.world_from_camera
+        if geometry is None:
+            geometry = self.look(frame, lens, depth=depth, floor=floor, reference=self._references.chosen(pose))
+        self._ego.settle(geometry.metres, geometry.static)
+        self._references.add(picture, pose, geometry.metres)
         self._world.look(picture, geometry.metres, geometry.labels, geometry.static, lens, pose)
         out_lens = lens if target_lens is None else target_lens
         self._painted = self._painted[: len(poses)]

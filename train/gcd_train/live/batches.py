@@ -13,15 +13,21 @@ from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from gcd_model.geometry import Intrinsics
-from gcd_model.live.config import LiveConfig
-from gcd_model.live.depth_net import pixel_rays, plane_depth
+from gcd_model.live.config import DepthConfig, LiveConfig
+from gcd_model.live.depth_net import SKY_M, pixel_rays, plane_depth
+from gcd_model.live.sweep import LONGEST, Reference, References, sweep_costs
 from gcd_train.live.clips import LiveClip, clip_paths, read_clip
+from gcd_train.live.draws import Poses
 
 Random = np.random.Generator
 Record = TypeVar("Record")
 Batch = TypeVar("Batch")
 PART_SEED = 1_000_003
 """Between the seeds of the batches of one update."""
+_MOST_GAP, _REFERENCE_SHARE = 6, 0.85
+"""Frames between a picture and the earlier one it is compared with; how often there is such a one."""
+_TURN_NOISE_DEG, _MOVE_NOISE = 0.03, 0.001
+"""Errors of the motion between two frames; of the move in parts of the median depth."""
 _TARGET_SHARE = 0.25  # of the pictures that depth learns from: targets see the world from above
 _NO_MOUNT, _EXACT_MOUNT = 0.35, 0.35
 _HEIGHT_SPREAD, _TILT_SPREAD_DEG = 0.05, 0.7  # of the other mounts that are declared
@@ -33,6 +39,7 @@ class Pictures:
 
     video: float32 [N, 3, H, W] in [-1, 1]. metres: float32 [N, H, W]. labels: int64 [N, H, W]. moves: float32
     [N, H, W]. lenses: N. ups: N normals of the floor in camera axes, [3]. heights_m: N, of the cameras over it.
+    references: N earlier frames of the same cameras, None where there is none.
     """
 
     video: Tensor
@@ -42,6 +49,18 @@ class Pictures:
     lenses: tuple[Intrinsics, ...]
     ups: tuple[Tensor, ...]
     heights_m: tuple[float, ...]
+    references: tuple[Reference | None, ...]
+
+    def sweeps(self, config: DepthConfig) -> Tensor:
+        """[N, bins + 1, H/2, W/2], see `sweep_costs`."""
+        each = zip(self.video, self.lenses, self.references, strict=True)
+        return torch.stack([sweep_costs(picture, lens, reference, config) for picture, lens, reference in each])
+
+    def last(self) -> "Pictures":
+        """The last of them."""
+        tensors = {name: getattr(self, name)[-1:] for name in ("video", "metres", "labels", "moves")}
+        tuples = {name: getattr(self, name)[-1:] for name in ("lenses", "ups", "heights_m", "references")}
+        return Pictures(**tensors, **tuples)
 
     @property
     def rays(self) -> Tensor:
@@ -81,7 +100,7 @@ def _declared(up: Tensor, height: float, random: Random) -> tuple[Tensor, float]
 
 
 def pictures_of(clip: LiveClip, camera: str) -> Pictures:
-    """All frames that were read of a clip, as "source" or "target" sees them."""
+    """All frames that were read of a clip, as "source" or "target" sees them, without references."""
     arrays = {name.removeprefix(f"{camera}."): array for name, array in clip.arrays.items() if name.startswith(camera)}
     n, height, width = arrays["labels"].shape
     lens = Intrinsics.from_hfov(clip.hfov_deg(camera), width, height)
@@ -95,12 +114,24 @@ def pictures_of(clip: LiveClip, camera: str) -> Pictures:
         lenses=(lens,) * n,
         ups=tuple(torch.from_numpy(pose[2, :3].copy()).float() for pose in poses),
         heights_m=tuple(max(float(pose[2, 3]) - floor, 0.05) for pose in poses),
+        references=(None,) * n,
     )
 
 
 def to_video(rgb: NDArray[np.uint8]) -> Tensor:
     """u8 [N, H, W, 3] -> float32 [N, 3, H, W] in [-1, 1]."""
     return torch.from_numpy(rgb).permute(0, 3, 1, 2).float() / 127.5 - 1
+
+
+def with_true_references(clip: LiveClip, camera: str) -> Pictures:
+    """All frames of a clip, each with the earlier one that a live view would compare it with, by true poses."""
+    pictures = pictures_of(clip, camera)
+    kept, references = References(), []
+    for picture, pose, metres in zip(pictures.video, clip.arrays[f"{camera}.pose"], pictures.metres, strict=True):
+        world_from_camera = torch.from_numpy(pose)
+        references.append(kept.chosen(world_from_camera))
+        kept.add(picture, world_from_camera, metres)
+    return replace(pictures, references=tuple(references))
 
 
 class FrameBatches:
@@ -117,9 +148,36 @@ class FrameBatches:
             path = self._paths[int(random.integers(len(self._paths)))]
             frame = int(random.integers(14))
             camera = "target" if random.random() < _TARGET_SHARE else "source"
-            made.append(pictures_of(read_clip(path, slice(frame, frame + 1)), camera))
+            names = [f"{camera}.{name}" for name in ("rgb", "depth", "labels", "moves", "pose")]
+            clip = read_clip(path, slice(frame, frame + 1), names)
+            earlier = frame - int(random.integers(1, _MOST_GAP + 1))
+            pictures = pictures_of(clip, camera)
+            if earlier >= 0 and random.random() < _REFERENCE_SHARE:
+                before = read_clip(path, slice(earlier, earlier + 1), names[:1] + names[-1:])
+                pictures = _compared(pictures, before, clip.arrays[names[-1]][0], camera, random)
+            made.append(pictures)
         together = augmented(joined(made), random)
         return together, together.ground(random), random
+
+
+def _compared(pictures: Pictures, before: LiveClip, pose: Poses, camera: str, random: Random) -> Pictures:
+    """One picture with an earlier one, unless that is too far away; the motion between them is not quite right."""
+    move = torch.from_numpy(np.linalg.inv(before.arrays[f"{camera}.pose"][0]) @ pose)
+    near = pictures.metres[pictures.metres < SKY_M]
+    median = float(near.median()) if near.numel() else 0.0
+    if float(move[:3, 3].norm()) > 2 * LONGEST * median:
+        return pictures
+    turn = torch.from_numpy(random.normal(size=3) * np.radians(_TURN_NOISE_DEG))
+    move[:3, :3] = move[:3, :3] @ torch.linalg.matrix_exp(_cross(turn))
+    move[:3, 3] += torch.from_numpy(random.normal(size=3) * _MOVE_NOISE * median)
+    reference = Reference(picture=to_video(before.arrays[f"{camera}.rgb"])[0], reference_from_camera=move)
+    return replace(pictures, references=(reference,))
+
+
+def _cross(turn: Tensor) -> Tensor:
+    """[3] -> [3, 3], the matrix of the cross product."""
+    x, y, z = turn.tolist()
+    return torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
 
 
 def joined(parts: Sequence[Pictures]) -> Pictures:
@@ -132,6 +190,7 @@ def joined(parts: Sequence[Pictures]) -> Pictures:
         lenses=sum((part.lenses for part in parts), ()),
         ups=sum((part.ups for part in parts), ()),
         heights_m=sum((part.heights_m for part in parts), ()),
+        references=sum((part.references for part in parts), ()),
     )
 
 
@@ -145,8 +204,23 @@ def augmented(pictures: Pictures, random: Random) -> Pictures:
     def turned(x: Tensor) -> Tensor:
         return torch.where(flip if x.ndim == 3 else flip[:, None], x.flip(-1), x)
 
+    look = other_camera(random, n)
+    flipped = torch.diag(torch.tensor([-1.0, 1, 1, 1], dtype=torch.float64))
+    earlier = [video[i] if each is None else each.picture for i, each in enumerate(pictures.references)]
+    seen_earlier = look(turned(torch.stack(earlier)), random)
     return Pictures(
-        video=other_camera(turned(video), random, n),
+        video=look(turned(video), random),
+        references=tuple(
+            None
+            if each is None
+            else Reference(
+                picture=seen_earlier[i],
+                reference_from_camera=flipped @ each.reference_from_camera @ flipped
+                if mirrored[i]
+                else each.reference_from_camera,
+            )
+            for i, each in enumerate(pictures.references)
+        ),
         metres=turned(pictures.metres),
         labels=turned(pictures.labels),
         moves=turned(pictures.moves),
@@ -158,20 +232,31 @@ def augmented(pictures: Pictures, random: Random) -> Pictures:
     )
 
 
-def other_camera(video: Tensor, random: Random, n: int) -> Tensor:
-    """Exposure, gamma, white balance, noise and blur of N cameras, [N, 3, H, W] in [-1, 1]; one in four as it is."""
+def other_camera(random: Random, n: int) -> Callable[[Tensor, Random], Tensor]:
+    """Exposure, gamma, white balance, noise and blur of N cameras, one in four as it is.
+
+    What pictures [N, 3, H, W] in [-1, 1] look like through them; only the noise is drawn anew every time.
+    """
 
     def drawn(spread: float, channels: int = 1) -> Tensor:
         wide = random.normal(size=(n, channels, 1, 1)) * spread * (random.random((n, 1, 1, 1)) < 0.75)
         return torch.from_numpy(wide).float()
 
-    levels = ((video + 1) / 2).clamp(0, 1) ** drawn(0.25).exp()
-    levels = (levels * (drawn(0.15) + drawn(0.07, 3)).exp() + drawn(0.03)).clamp(0, 1)
+    gamma, gain, offset, spread = (
+        drawn(0.25).exp(),
+        (drawn(0.15) + drawn(0.07, 3)).exp(),
+        drawn(0.03),
+        drawn(0.04).abs(),
+    )
     blur = torch.from_numpy(random.random((n, 1, 1, 1)) * (random.random((n, 1, 1, 1)) < 0.3)).float()
-    soft = torch.nn.functional.avg_pool2d(levels, 3, 1, 1, count_include_pad=False)
-    levels = torch.lerp(levels, soft, blur)
-    noise = torch.from_numpy(random.standard_normal(levels.shape, np.float32))
-    return (levels * 2 - 1 + noise * drawn(0.04).abs()).clamp(-1, 1)
+
+    def look(video: Tensor, random: Random) -> Tensor:
+        levels = (((video + 1) / 2).clamp(0, 1) ** gamma * gain + offset).clamp(0, 1)
+        soft = torch.nn.functional.avg_pool2d(levels, 3, 1, 1, count_include_pad=False)
+        noise = torch.from_numpy(random.standard_normal(levels.shape, np.float32))
+        return (torch.lerp(levels, soft, blur) * 2 - 1 + noise * spread).clamp(-1, 1)
+
+    return look
 
 
 def class_weights(paths: Sequence[Path], config: LiveConfig, power: float, sample: int = 48) -> Tensor:

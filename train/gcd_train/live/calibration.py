@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from gcd_model.live.depth_net import depth_inputs, read_depth
 from gcd_model.live.paint_net import filled
 from gcd_model.live.view import LiveNetworks
-from gcd_train.live.batches import pictures_of, to_video
+from gcd_train.live.batches import to_video, with_true_references
 from gcd_train.live.clips import read_clip
 from gcd_train.live.measure_figures import SpreadHistogram, fit_spread
 from gcd_train.live.measure_methods import LiveModel
@@ -67,8 +67,11 @@ def _take_back(
 def _source_classes(networks: LiveNetworks, paths: Sequence[Path]) -> Iterator[tuple[Tensor, Tensor]]:
     device = next(networks.parameters()).device
     for path in paths:
-        source = pictures_of(read_clip(path, _FRAMES), "source")
-        yield networks.depth(depth_inputs(source.video, source.rays, source.ground()).to(device)).classes, source.labels
+        source = with_true_references(read_clip(path), "source")
+        output = networks.depth(
+            depth_inputs(source.video, source.rays, source.ground()).to(device), source.sweeps(networks.config.depth)
+        )
+        yield output.classes[_FRAMES], source.labels[_FRAMES]
 
 
 def _view_classes(networks: LiveNetworks, views: HeldOutViews) -> Iterator[tuple[Tensor, Tensor]]:
@@ -95,7 +98,9 @@ def _threshold(networks: LiveNetworks, paths: Sequence[Path]) -> float:
     scores: list[float] = []
     device = next(networks.parameters()).device
     for path in paths:
-        source = pictures_of(read_clip(path), "source")
-        output = networks.depth(depth_inputs(source.video, source.rays, source.ground()).to(device))
+        source = with_true_references(read_clip(path), "source")
+        output = networks.depth(
+            depth_inputs(source.video, source.rays, source.ground()).to(device), source.sweeps(networks.config.depth)
+        )
         scores.append(float(read_depth(output, networks.config.depth).entropy.mean()))
     return min(_DOUBT * max(scores), 1.0)

@@ -263,6 +263,6 @@ def read_clip(path: Path, frames: slice = slice(None), names: Collection[str] | 
             arrays = {name: file.get_slice(name)[frames] for name in wanted}
     except Exception as error:  # safetensors and json raise kinds of their own
         raise DataError(f"{path} is no live clip ({error}); film it again") from error
-    if max(int(array.max()) for name, array in arrays.items() if name.endswith("labels")) >= len(LIVE_CLASSES):
+    if any(int(array.max()) >= len(LIVE_CLASSES) for name, array in arrays.items() if name.endswith("labels")):
         raise DataError(f"{path} holds class ids beyond {len(LIVE_CLASSES) - 1}; film it again with this version")
     return LiveClip(name=f"{path.parent.name}/{path.stem}", arrays=arrays, facts=facts)

@@ -17,7 +17,7 @@ from gcd_model.live.depth_net import (
     first_bin,
     read_depth,
 )
-from gcd_train.live.batches import PART_SEED, Ahead, FrameBatches, Pictures, class_weights, on, pictures_of
+from gcd_train.live.batches import PART_SEED, Ahead, FrameBatches, Pictures, class_weights, on, with_true_references
 from gcd_train.live.clips import read_clip
 from gcd_train.live.look import depth_sheet
 from gcd_train.loop import Progress, StepLoss
@@ -85,8 +85,9 @@ class DepthTask:
         generator = torch.Generator().manual_seed(int(random.integers(2**62)))
         drawn = torch.multinomial(weights.cpu(), int(weights.shape[1] * _PIXEL_SHARE), True, generator=generator)
         pixels = drawn.to(self._device)
+        sweeps = pictures.sweeps(self._config.depth)
         with torch.autocast(self._device.type, dtype=torch.bfloat16):
-            output = self._network(inputs, pixels)
+            output = self._network(inputs, sweeps, pixels)
         parts = self.losses(output, pictures, pixels)
         total = parts["bin"] + _OFFSET * parts["offset"] + _CLASS * parts["class"] + _MOVES * parts["moves"]
         return StepLoss(total=total, parts=parts, frames=len(pictures.lenses))
@@ -153,9 +154,10 @@ def measure_depth(
     shown: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
     for path in paths:
         for frame in frames:
-            truth = pictures_of(read_clip(path, slice(frame, frame + 1)), "source")
+            truth = with_true_references(read_clip(path, slice(frame + 1)), "source").last()
             device = next(net.parameters()).device
-            output = net(depth_inputs(truth.video, truth.rays, truth.ground()).to(device))
+            sweeps = truth.sweeps(config.depth).to(device)
+            output = net(depth_inputs(truth.video, truth.rays, truth.ground()).to(device), sweeps)
             output = on(torch.device("cpu"), output)
             metres, true = read_depth(output, config.depth).metres, truth.metres
             near = true < config.depth.farthest_m

@@ -151,7 +151,7 @@ class DetailTask:
         ground = torch.zeros_like(views.seen.ground_m)
         distance = torch.zeros((), device=self._device)
         with torch.autocast(self._device.type, dtype=torch.bfloat16):
-            made, true = (self._depth.trunk(depth_inputs(x, views.seen.rays, ground)) for x in (fake, views.target))
+            made, true = (self._depth.features(depth_inputs(x, views.seen.rays, ground)) for x in (fake, views.target))
             made_random, true_random = self._random(fake), self._random(views.target)
         for a, b in ((made, true), (made_random, true_random)):
             never = F.adaptive_avg_pool2d(where.never, (a.shape[-2], a.shape[-1]))

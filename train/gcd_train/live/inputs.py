@@ -22,7 +22,7 @@ from gcd_model.live.config import LiveConfig
 from gcd_model.live.depth_net import SKY_M, DepthNet, depth_inputs, read_depth
 from gcd_model.live.seen_world import SeenWorld
 from gcd_model.live.splat import Splat
-from gcd_train.live.batches import Pictures, Random, pictures_of
+from gcd_train.live.batches import Pictures, Random, pictures_of, with_true_references
 from gcd_train.live.clips import LiveClip, decode_depth, encode_depth, read_clip
 
 Array = NDArray[Any]
@@ -42,9 +42,10 @@ class Geometry:
 def learned_geometry(net: DepthNet, config: LiveConfig, source: Pictures, ground: Tensor) -> Geometry:
     """By the depth network, frame by frame."""
     metres, labels, static = [], [], []
+    sweeps = source.sweeps(config.depth)
     for t in range(len(source.lenses)):
         inputs = depth_inputs(source.video[t : t + 1], source.rays[t : t + 1], ground[t : t + 1])
-        output = net(inputs)
+        output = net(inputs, sweeps[t : t + 1])
         metres.append(read_depth(output, config.depth).metres)
         labels.append(output.classes.argmax(1).to(torch.uint8))
         static.append(output.moves < 0)
@@ -115,7 +116,7 @@ def make_inputs(out: Path, paths: Sequence[Path], net: DepthNet | None, config: 
         if place.exists():
             continue
         clip = read_clip(path)
-        source = pictures_of(clip, "source")
+        source = with_true_references(clip, "source")
         random = np.random.default_rng([seed, int(path.stem.replace("-", ""))])
         if net is None:
             geometry = exact_geometry(source, random)

@@ -322,21 +322,20 @@ class LiveModel:
 
     def views(self, clip: LiveClip) -> MethodViews:
         """See Method."""
-        view = LiveView(self.networks, steps=self.steps)
+        view = _Misjudging(self.networks, self.depth_scale, self.steps)
         source, lens = pictures_of(clip, "source"), _lens(clip, "target")
         poses = _poses(clip, "source")
         source_from_target = invert_rigid(poses) @ _poses(clip, "target")
         frames = []
         for t, own in enumerate(source.lenses):
             floor = self._floor(source, t)
-            geometry = _exact(source, t) if self.exact else view.look(source.video[t], own, floor=floor)
             made = view.step(
                 source.video[t],
                 [source_from_target[t]],
                 lens=own,
                 odometry=poses[t] if self.odometry else None,
                 floor=floor,
-                geometry=self._scaled(geometry),
+                geometry=_exact(source, t) if self.exact else None,
                 target_lens=lens,
             )
             frames.append(made.views[0])
@@ -354,9 +353,18 @@ class LiveModel:
         up = torch.stack([x, y * tilt.cos() - z * tilt.sin(), y * tilt.sin() + z * tilt.cos()])
         return Floor(up=up, height_m=source.heights_m[t] + self.floor_higher_m)
 
-    def _scaled(self, geometry: FrameGeometry) -> FrameGeometry:
+
+class _Misjudging(LiveView):
+    """A live view whose depth is off by a factor."""
+
+    def __init__(self, networks: LiveNetworks, scale: float, steps: int | None) -> None:
+        super().__init__(networks, steps=steps)
+        self._scale = scale
+
+    def look(self, *args: Any, **kwargs: Any) -> FrameGeometry:
+        geometry = super().look(*args, **kwargs)
         metres = geometry.metres
-        return replace(geometry, metres=torch.where(metres < SKY_M, metres * self.depth_scale, metres))
+        return replace(geometry, metres=torch.where(metres < SKY_M, metres * self._scale, metres))
 
 
 def _exact(source: Pictures, t: int) -> FrameGeometry:

@@ -1,0 +1,65 @@
+"""What an earlier frame tells of depth: the right depth explains it best."""
+
+import pytest
+import torch
+from live_room import LENS, room
+
+from gcd_model.live.config import DepthConfig
+from gcd_model.live.sweep import LONGEST, Reference, References, sweep_channels, sweep_costs
+
+CONFIG = DepthConfig(bins=32, nearest_m=1.0, farthest_m=10.0)
+HERE = torch.eye(4, dtype=torch.float64)
+
+
+def at(x: float) -> torch.Tensor:
+    pose = HERE.clone()
+    pose[0, 3] = x
+    return pose
+
+
+def reference(frames: int) -> Reference:
+    """The room's wall is 3 m away; its camera goes to the right."""
+    clip = room()
+    assert clip.odometry is not None
+    move = torch.linalg.inv(clip.odometry[0]) @ clip.odometry[frames]
+    return Reference(picture=clip.video[0], reference_from_camera=move)
+
+
+def test_the_true_depth_costs_least() -> None:
+    costs = sweep_costs(room().video[3], LENS, reference(3), CONFIG)[: CONFIG.bins - 1, 2:-2, 2:-4].mean(dim=(1, 2))
+    best = 1.0 * (10.0 / 1.0) ** ((int(costs.argmin()) + 0.5) / (CONFIG.bins - 1))
+    assert best == pytest.approx(3.0, rel=0.08)
+    assert costs.min() < 0.5 * costs.median()
+
+
+def test_without_a_reference_there_is_nothing_and_it_says_so() -> None:
+    made = sweep_costs(room().video[3], LENS, None, CONFIG)
+    assert made.shape == (sweep_channels(CONFIG), LENS.height // 2, LENS.width // 2)
+    assert not made.any()
+    assert bool((sweep_costs(room().video[3], LENS, reference(2), CONFIG)[-1] == 1).all())
+
+
+def test_what_the_earlier_frame_did_not_see_costs_the_same_at_any_depth() -> None:
+    away = Reference(picture=room().video[0], reference_from_camera=at(100.0))
+    made = sweep_costs(room().video[3], LENS, away, CONFIG)[: CONFIG.bins - 1]
+    assert bool((made == 1.0).all())
+
+
+def test_the_oldest_frame_from_which_the_scene_looks_alike_is_chosen() -> None:
+    kept, metres = References(), torch.full((4, 4), 2.0)
+    metres[0] = 1000.0
+    assert kept.chosen(HERE) is None
+    for i in range(10):
+        kept.add(torch.full((3, 4, 4), float(i)), at(0.2 * i), metres)
+    chosen = kept.chosen(at(2.0))
+    assert chosen is not None
+    assert float(chosen.reference_from_camera[0, 3]) == pytest.approx(0.6)  # at most LONGEST of 2 m
+    assert LONGEST * 2.0 >= 0.6
+    standing = References()
+    for i in range(10):
+        standing.add(torch.full((3, 4, 4), float(i)), HERE, metres)
+    still = standing.chosen(HERE)
+    assert still is not None
+    assert float(still.picture[0, 0, 0]) == 4.0  # the oldest of the six that are kept
+    kept.reset()
+    assert kept.chosen(at(2.0)) is None
