@@ -9,7 +9,7 @@ import msgspec
 import pytest
 import torch
 from live_clips import HEIGHT, WIDTH, write_clip
-from torch.distributed.distributed_c10d import TCPStore
+from torch.distributed import TCPStore  # pyright: ignore[reportPrivateImportUsage]
 from torch.multiprocessing.spawn import start_processes
 
 from gcd_model.geometry import Intrinsics
