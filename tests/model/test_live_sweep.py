@@ -3,8 +3,10 @@
 import pytest
 import torch
 from live_room import LENS, room
+from torch.testing import assert_close
 
 from gcd_model.live.config import DepthConfig
+from gcd_model.live.depth_net import DepthNet, depth_inputs, pixel_rays, read_depth
 from gcd_model.live.sweep import LONGEST, Reference, References, sweep_channels, sweep_costs
 
 CONFIG = DepthConfig(bins=32, nearest_m=1.0, farthest_m=10.0)
@@ -30,6 +32,26 @@ def test_the_true_depth_costs_least() -> None:
     best = 1.0 * (10.0 / 1.0) ** ((int(costs.argmin()) + 0.5) / (CONFIG.bins - 1))
     assert best == pytest.approx(3.0, rel=0.08)
     assert costs.min() < 0.5 * costs.median()
+
+
+def test_a_network_that_trusts_the_sweep_reads_its_depth_off_it() -> None:
+    net = DepthNet(DepthConfig(widths=(8, 16), bins=32, nearest_m=1.0, farthest_m=10.0), 3).eval()
+    bias = net.head.out.bias
+    assert bias is not None
+    with torch.no_grad():
+        net.head.out.weight.zero_()
+        bias.zero_()
+        bias[-1] = 50.0
+        picture = room().video[3]
+        inputs = depth_inputs(picture[None], pixel_rays(LENS)[None], torch.zeros(1, LENS.height, LENS.width))
+        costs = sweep_costs(picture, LENS, reference(3), net.config)[None]
+        output = net(inputs, costs)
+        some = torch.randint(0, LENS.height * LENS.width, (1, 40))
+        sampled = net(inputs, costs, some)
+    metres = read_depth(output, net.config).metres[0, 4:-4, 4:-8]
+    assert ((metres / 3.0 - 1).abs() < 0.1).float().mean() > 0.8
+    whole = output.logits.flatten(2).gather(2, some[:, None].expand(-1, 32, -1))
+    assert_close(sampled.logits[..., 0], whole)
 
 
 def test_without_a_reference_there_is_nothing_and_it_says_so() -> None:

@@ -2,7 +2,8 @@
 
 Depth is a choice among bins that are even in log-depth, each with an offset: at an edge two peaks stand side by side
 and the likelier one is taken, never their mean. Where a mount is declared, one gate a pixel says "this is the ground":
-then the bins, and the places within them, are those of the plane.
+then the bins, and the places within them, are those of the plane. Where the camera has moved, one number a pixel says
+how far the plane sweep is trusted: bins that explain the earlier frame badly lose by it.
 """
 
 import math
@@ -25,6 +26,8 @@ _GROUND_SCALE = 3.0  # of its log-depth, as an input
 _GROUND_LOGIT = 8.0
 """How much a fully open gate adds to the bins of the ground."""
 _GATE_AT_FIRST = -3.0
+_TRUST, _TRUST_AT_FIRST, _DOUBT_PX = 4.0, -2.0, 5
+"""What a difference of colour takes from a bin's logit where the sweep is trusted; a mean over so many half pixels."""
 _OFFSET_REACH = 1.5
 _SMOOTH_PX, _SMOOTH_SPREAD, _SMOOTH_ROUNDS = 2, 0.1, 2
 """Depth is averaged over so many pixels to each side, where it differs by about this share at most, so many times."""
@@ -73,7 +76,7 @@ class DepthNet(nn.Module):
         super().__init__()
         self.config, self.classes = config, classes
         self.trunk = Trunk(INPUTS, config.widths, config.patch, beside=sweep_channels(config) * self._sweep_patch**2)
-        outputs = 2 * config.bins - 1 + classes + 2
+        outputs = 2 * config.bins - 1 + classes + 3
         self.head = FineHead(INPUTS, config.widths[0], config.fine_width, outputs, config.patch)
 
     @property
@@ -97,7 +100,9 @@ class DepthNet(nn.Module):
         weight, bins = self.trunk.stem.weight, self.config.bins
         pictures = inputs.to(weight.dtype, memory_format=torch.channels_last)
         made = self.head(pictures, self.features(pictures, sweep), pixels).float()
-        logits, offsets, classes, moves, gate = made.split([bins, bins - 1, self.classes, 1, 1], dim=1)
+        logits, offsets, classes, moves, gate, trust = made.split([bins, bins - 1, self.classes, 1, 1, 1], dim=1)
+        if sweep is not None:
+            logits = logits - F.softplus(trust + _TRUST_AT_FIRST) * _TRUST * _doubt(sweep, inputs.shape[-1], pixels)
         ground = inputs[:, -2:]
         if pixels is not None:
             ground = ground.flatten(2).gather(2, pixels[:, None].expand(-1, 2, -1))[..., None]
@@ -114,6 +119,20 @@ class DepthNet(nn.Module):
             ground=opened,
             ground_place=place,
         )
+
+
+def _doubt(sweep: Tensor, width: int, pixels: Tensor | None) -> Tensor:
+    """How much worse than the best each bin explains the earlier frame, about each pixel: [N, B, H, W] or [N, B, M, 1].
+
+    sweep: [N, B + 1, H/2, W/2]. width: W. pixels: [N, M], of these alone.
+    """
+    costs = F.avg_pool2d(sweep[:, :-1], _DOUBT_PX, 1, _DOUBT_PX // 2, count_include_pad=False)
+    costs = costs - costs.amin(dim=1, keepdim=True)
+    if pixels is None:
+        return F.interpolate(costs, scale_factor=SWEEP_SCALE, mode="nearest")
+    row, column = pixels // width // SWEEP_SCALE, pixels % width // SWEEP_SCALE
+    place = (row * (width // SWEEP_SCALE) + column)[:, None].expand(-1, costs.shape[1], -1)
+    return costs.flatten(2).gather(2, place)[..., None]
 
 
 def depth_inputs(pictures: Tensor, rays: Tensor, ground_m: Tensor) -> Tensor:
