@@ -107,15 +107,12 @@ def test_one_sample_of_a_model_that_states_its_spread_has_a_deviation() -> None:
     assert len(published("log_variance", frames=28).ends) == len(published(frames=28).ends) + 1
 
 
-def test_the_spread_of_several_samples_is_measured_and_not_stated() -> None:
-    one, told = (
-        published(samples=3, frames=14).of("std")[0],
-        published("log_variance", samples=3, frames=14).of("std")[0],
-    )
-    assert bytes(one.payload) == bytes(told.payload)
+def test_a_spread_that_is_stated_counts_however_many_samples_there_are() -> None:
+    one, several = (published("log_variance", samples=n, frames=14).of("std")[0] for n in (1, 3))
+    assert bytes(one.payload) == bytes(several.payload)
 
 
-def test_uncertainty_is_stated_for_one_sample_and_scaled_for_several() -> None:
+def test_uncertainty_is_stated_or_scaled_from_several_samples() -> None:
     maps = fake_maps()
     video = torch.rand(2, 14, 3, 64, 96)
     trajectory = traits().plan_view()
@@ -127,7 +124,10 @@ def test_uncertainty_is_stated_for_one_sample_and_scaled_for_several() -> None:
     stated = view(video[:1], log_variance=maps["log_variance"]).uncertainty
     assert stated is not None
     assert torch.allclose(stated, torch.tensor(0.1))
-    several = view(video, log_variance=maps["log_variance"], uncertainty_scale=2.0)
+    both = view(video, log_variance=maps["log_variance"], uncertainty_scale=2.0)
+    assert both.uncertainty is not None
+    assert torch.equal(both.uncertainty, stated)
+    several = view(video, uncertainty_scale=2.0)
     assert several.std is not None
     assert several.uncertainty is not None
     assert torch.equal(several.uncertainty, 2.0 * several.std)

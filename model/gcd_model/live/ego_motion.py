@@ -7,7 +7,7 @@ drifts less than a sum of steps. Every sighting's depth improves that place. Ope
 """
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,16 @@ from torch import Tensor
 from gcd_model.errors import PoseError
 from gcd_model.geometry import Intrinsics
 from gcd_model.geometry.pose import require_rigid
+from gcd_model.live.track_pose import (
+    BEHIND_M,
+    OUTLIER,
+    Tracks,
+    inverse,
+    likeliest_pose,
+    no_tracks,
+    projected,
+    unprojected,
+)
 
 Array = NDArray[Any]
 
@@ -34,22 +44,12 @@ _THERE_AND_BACK_PX = 0.5
 """A point followed into the new frame and back again must return to its place."""
 _FEWEST, _SMALLEST_SHARE = 10, 0.5
 """Of the tracks: fewer that agree are a coincidence. A wrong pose does more harm than a lost one."""
-_MOST = 0.75
-"""Share of the tracks that agree with a pose from which on no other is tried."""
-_RANSAC_PX, _RANSAC_ROUNDS = 2.0, 150
-_FLOW_PX, _DEPTH_SHARE = 0.25, 0.04
-"""Standard errors of a followed place, and of one sighting's depth."""
-_DOUBTED, _OUTLIER, _HOPELESS = 1.5, 4.0, 12.0
-"""In standard errors: from here on a track counts less, not at all, and not even while the pose is still rough."""
-_ROUGH_STEPS, _FINE_STEPS, _SETTLED = 4, 4, 1e-5
-"""Of the least squares; settled once the camera moves by no more than this, metres and radians."""
 _STANDS_PX, _STANDS_SHARE = 0.15, 0.9
 """A camera stands if its motion would shift this share of the tracks by less than what optical flow gets wrong."""
 _SIGHTINGS = 8
 """A place is the mean of this many sightings; from then on newer ones count more."""
 _OTHER_SURFACE = 0.15
 """Relative step of depth from which on a track's pixel shows something else than its point."""
-_BEHIND_M = 0.05
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -86,26 +86,6 @@ class _Frame:
         return replace(self, depth=depth.double().numpy(), usable=inner.numpy())
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Tracks:
-    """N points of the world that are followed.
-
-    place: float32 [N, 2], where the last frame shows them, pixels as OpenCV counts them. point: [N, 3].
-    eye: [N, 3], from where they were seen, on average. sightings: [N], that the point is the mean of.
-    """
-
-    place: Array
-    point: Array
-    eye: Array
-    sightings: Array
-
-    def __len__(self) -> int:
-        return len(self.place)
-
-    def rows(self, index: Array) -> "_Tracks":
-        return _Tracks(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
-
-
 class _LostError(Exception):
     """Says why the motion is unknown."""
 
@@ -124,7 +104,7 @@ class EgoMotion:
 
     def _begin_world(self) -> None:
         self._pose, self._step = np.eye(4), np.eye(4)
-        self._tracks = _no_tracks()
+        self._tracks = no_tracks()
 
     def step(
         self, picture: Tensor, depth: Tensor, static: Tensor, lens: Intrinsics, odometry: Tensor | None = None
@@ -177,12 +157,12 @@ class EgoMotion:
     def _advance(self, last: _Frame, frame: _Frame) -> int:
         """Number of inliers. Raises _LostError."""
         if last.odometry is not None and frame.odometry is not None:
-            step = _inverse(last.odometry.numpy()) @ frame.odometry.numpy()
+            step = inverse(last.odometry.numpy()) @ frame.odometry.numpy()
             _require_plausible(step, "the odometry")
-            pose, tracks = self._pose @ step, _no_tracks()
+            pose, tracks = self._pose @ step, no_tracks()
         else:
             pose, tracks = _followed(last, frame, self._tracks, self._pose, self._pose @ self._step)
-            step = _inverse(self._pose) @ pose
+            step = inverse(self._pose) @ pose
             _require_plausible(step, "the picture")
         self._pose, self._step, self._tracks = pose, step, tracks
         return len(tracks)
@@ -211,7 +191,7 @@ def _require_plausible(step: Array, what: str) -> None:
         )
 
 
-def _followed(last: _Frame, frame: _Frame, tracks: _Tracks, pose: Array, guess: Array) -> tuple[Array, _Tracks]:
+def _followed(last: _Frame, frame: _Frame, tracks: Tracks, pose: Array, guess: Array) -> tuple[Array, Tracks]:
     """world_from_camera of the frame, and the tracks that agree with it; of the frame itself no depth is asked.
 
     pose: of the last frame. guess: of this one, had the camera gone on as before.
@@ -221,14 +201,14 @@ def _followed(last: _Frame, frame: _Frame, tracks: _Tracks, pose: Array, guess: 
     seen = _seen_again(tracks, pictures, frame.lens, pose, guess) if len(tracks) else tracks
     if len(seen) < _FEWEST:
         raise _LostError(f"only {len(seen)} of {len(tracks)} static corners are seen again; {_FEWEST} are needed")
-    here, errors = _likeliest_pose(seen, frame.lens, pose, guess)
-    agree = errors < _OUTLIER
+    here, errors = likeliest_pose(seen, frame.lens, pose, guess)
+    agree = errors < OUTLIER
     needed = max(_FEWEST, math.ceil(_SMALLEST_SHARE * len(seen)))
     if agree.sum() < needed:
         raise _LostError(f"only {agree.sum()} of {len(seen)} static corners agree on a motion; {needed} are needed")
     seen = seen.rows(agree)
     shift = np.linalg.norm(
-        _projected(seen.point, here, frame.lens)[1] - _projected(seen.point, pose, frame.lens)[1], axis=1
+        projected(seen.point, here, frame.lens)[1] - projected(seen.point, pose, frame.lens)[1], axis=1
     )
     if np.quantile(shift, _STANDS_SHARE) < _STANDS_PX:
         here = pose
@@ -244,7 +224,7 @@ def _contrasted(*pictures: Array) -> list[Array]:
     return [equalizer.apply(picture).astype(np.uint8) for picture in pictures]
 
 
-def _with_new_corners(tracks: _Tracks, frame: _Frame, grey: Array, pose: Array) -> _Tracks:
+def _with_new_corners(tracks: Tracks, frame: _Frame, grey: Array, pose: Array) -> Tracks:
     """And corners of the frame where there is no track yet."""
     import cv2
 
@@ -257,8 +237,8 @@ def _with_new_corners(tracks: _Tracks, frame: _Frame, grey: Array, pose: Array) 
         return tracks
     place = corners[:, 0]
     column, row = place.astype(int).T  # corners lie on whole pixels
-    point = _unprojected(place, frame.depth[row, column], frame.lens, pose)
-    return _Tracks(
+    point = unprojected(place, frame.depth[row, column], frame.lens, pose)
+    return Tracks(
         place=np.concatenate([tracks.place, place]),
         point=np.concatenate([tracks.point, point]),
         eye=np.concatenate([tracks.eye, np.broadcast_to(pose[:3, 3], point.shape)]),
@@ -266,10 +246,10 @@ def _with_new_corners(tracks: _Tracks, frame: _Frame, grey: Array, pose: Array) 
     )
 
 
-def _seen_again(tracks: _Tracks, pictures: list[Array], lens: Intrinsics, pose: Array, guess: Array) -> _Tracks:
+def _seen_again(tracks: Tracks, pictures: list[Array], lens: Intrinsics, pose: Array, guess: Array) -> Tracks:
     """Those that optical flow finds in the second picture, and from there in the first again."""
-    ahead, after = _projected(tracks.point, guess, lens)
-    shift = np.where(ahead[:, 2:] > _BEHIND_M, after - _projected(tracks.point, pose, lens)[1], 0.0)
+    ahead, after = projected(tracks.point, guess, lens)
+    shift = np.where(ahead[:, 2:] > BEHIND_M, after - projected(tracks.point, pose, lens)[1], 0.0)
     shift = shift.clip(-lens.width, lens.width).astype(np.float32)
     there, found = _flow(pictures[0], pictures[1], tracks.place, tracks.place + shift)
     back, returned = _flow(pictures[1], pictures[0], there, there - shift)
@@ -291,90 +271,13 @@ def _flow(one: Array, other: Array, place: Array, near: Array) -> tuple[Array, A
     return there, found[:, 0] > 0
 
 
-def _likeliest_pose(tracks: _Tracks, lens: Intrinsics, pose: Array, guess: Array) -> tuple[Array, Array]:
-    """The pose with which most tracks agree, and by how many standard errors each differs: [N].
-
-    Going on as before is tried first, then standing, then what RANSAC finds.
-    """
-    best, agreed = (guess, np.full(len(tracks), np.inf)), -1
-    for start in (lambda: guess, lambda: pose, lambda: _consensus(tracks, lens, guess)):
-        refined = _refined(tracks, lens, start())
-        count = int((refined[1] < _OUTLIER).sum())
-        if count > agreed:
-            best, agreed = refined, count
-        if agreed > _MOST * len(tracks):
-            break
-    return best
-
-
-def _consensus(tracks: _Tracks, lens: Intrinsics, guess: Array) -> Array:
-    """The pose that RANSAC finds; the guess where it finds none."""
-    import cv2
-
-    cv2.setRNGSeed(0)
-    found, turn, step, _ = cv2.solvePnPRansac(
-        tracks.point,
-        tracks.place.astype(np.float64),
-        np.array([[lens.fx, 0, lens.cx - 0.5], [0, lens.fy, lens.cy - 0.5], [0, 0, 1]]),
-        None,
-        iterationsCount=_RANSAC_ROUNDS,
-        reprojectionError=_RANSAC_PX,
-        flags=cv2.SOLVEPNP_SQPNP,
-    )
-    usable = found and np.isfinite(turn).all() and np.isfinite(step).all()
-    return _inverse(_rigid(turn[:, 0], step[:, 0])) if usable else guess
-
-
-def _refined(tracks: _Tracks, lens: Intrinsics, pose: Array) -> tuple[Array, Array]:
-    """Robust least squares over all tracks: the pose, and by how many standard errors each track differs from it."""
-    for number in range(_ROUGH_STEPS + _FINE_STEPS):
-        limit = _HOPELESS if number < _ROUGH_STEPS else _OUTLIER
-        residual, slope = _reprojection(tracks, lens, pose)
-        distance = np.linalg.norm(residual, axis=1)
-        weight = np.minimum(1.0, _DOUBTED / np.maximum(distance, 1e-9)) * (distance < limit)
-        weighted = (slope * weight[:, None, None]).reshape(-1, 6)
-        normal = weighted.T @ slope.reshape(-1, 6) + 1e-6 * np.eye(6)
-        change = np.linalg.solve(normal, weighted.T @ residual.reshape(-1))
-        pose = pose @ _inverse(_rigid(change[3:], change[:3]))
-        if number >= _ROUGH_STEPS and np.abs(change).max() < _SETTLED:
-            break
-    distance = np.linalg.norm(_reprojection(tracks, lens, pose)[0], axis=1)
-    behind = _projected(tracks.point, pose, lens)[0][:, 2] <= _BEHIND_M
-    return pose, np.where(behind, np.inf, distance)
-
-
-def _reprojection(tracks: _Tracks, lens: Intrinsics, pose: Array) -> tuple[Array, Array]:
-    """Residuals [N, 2] and their slopes by a step and a turn of the camera [N, 2, 6], in standard errors.
-
-    A wrong depth moves a point along the ray on which it was seen: in that direction of the picture it counts less.
-    """
-    local, place = _projected(tracks.point, pose, lens)
-    x, y, z = local.T
-    z = np.maximum(z, _BEHIND_M)
-    slope = np.zeros((len(z), 2, 6))  # by the step [0:3], which is the slope by the point, and by the turn [3:6]
-    slope[:, 0, 0], slope[:, 0, 2] = lens.fx / z, -lens.fx * x / z**2
-    slope[:, 1, 1], slope[:, 1, 2] = lens.fy / z, -lens.fy * y / z**2
-    right, down, ahead = np.moveaxis(slope[:, :, :3], 2, 0)  # each [N, 2]
-    x, y, z = x[:, None], y[:, None], z[:, None]
-    slope[:, :, 3], slope[:, :, 4], slope[:, :, 5] = y * ahead - z * down, z * right - x * ahead, x * down - y * right
-    ray = (tracks.point - tracks.eye) @ pose[:3, :3]
-    blur = (slope[:, :, :3] @ ray[:, :, None])[:, :, 0] * (_DEPTH_SHARE / np.sqrt(tracks.sightings))[:, None]
-    size = np.linalg.norm(blur, axis=1)[:, None]
-    along = blur / np.maximum(size, 1e-9)
-    excess = (1 - _FLOW_PX / np.hypot(_FLOW_PX, size)) * along
-    residual = tracks.place - place
-    residual = residual - excess * (along * residual).sum(1, keepdims=True)
-    slope = slope - excess[:, :, None] * (along[:, None] @ slope)
-    return residual / _FLOW_PX, slope / _FLOW_PX
-
-
-def _placed_better(tracks: _Tracks, frame: _Frame, pose: Array) -> _Tracks:
+def _placed_better(tracks: Tracks, frame: _Frame, pose: Array) -> Tracks:
     """With this frame's depth as one more sighting, where it shows the same surface."""
     column, row = np.rint(tracks.place).astype(int).T
     depth = frame.depth[row, column]
     expected = (tracks.point - pose[:3, 3]) @ pose[:3, 2]
     same = (depth > 0) & (depth < _FARTHEST_M) & (np.abs(depth - expected) < _OTHER_SURFACE * expected)
-    sighting = _unprojected(tracks.place, np.where(same, depth, 1.0), frame.lens, pose)
+    sighting = unprojected(tracks.place, np.where(same, depth, 1.0), frame.lens, pose)
     share = np.where(same, 1 / (tracks.sightings + 1), 0.0)[:, None]
     return replace(
         tracks,
@@ -382,42 +285,3 @@ def _placed_better(tracks: _Tracks, frame: _Frame, pose: Array) -> _Tracks:
         eye=tracks.eye + share * (pose[:3, 3] - tracks.eye),
         sightings=np.minimum(tracks.sightings + same, _SIGHTINGS - 1),
     )
-
-
-def _no_tracks() -> _Tracks:
-    return _Tracks(
-        place=np.zeros((0, 2), np.float32),
-        point=np.zeros((0, 3)),
-        eye=np.zeros((0, 3)),
-        sightings=np.zeros(0, np.int64),
-    )
-
-
-def _unprojected(place: Array, depth: Array, lens: Intrinsics, pose: Array) -> Array:
-    x, y = (place[:, 0] + 0.5 - lens.cx) / lens.fx, (place[:, 1] + 0.5 - lens.cy) / lens.fy
-    return np.stack([x * depth, y * depth, depth], axis=1) @ pose[:3, :3].T + pose[:3, 3]
-
-
-def _projected(point: Array, pose: Array, lens: Intrinsics) -> tuple[Array, Array]:
-    """In the camera's axes [N, 3], and in its picture [N, 2] as OpenCV counts pixels."""
-    local = (point - pose[:3, 3]) @ pose[:3, :3]
-    z = np.maximum(local[:, 2], _BEHIND_M)
-    return local, np.stack(
-        [local[:, 0] / z * lens.fx + lens.cx - 0.5, local[:, 1] / z * lens.fy + lens.cy - 0.5], axis=1
-    )
-
-
-def _rigid(rotation: Array, translation: Array) -> Array:
-    """rotation: [3], its axis times its angle."""
-    import cv2
-
-    a_from_b = np.eye(4)
-    a_from_b[:3, :3], a_from_b[:3, 3] = cv2.Rodrigues(rotation)[0], translation
-    return a_from_b
-
-
-def _inverse(a_from_b: Array) -> Array:
-    b_from_a = np.eye(4)
-    b_from_a[:3, :3] = a_from_b[:3, :3].T
-    b_from_a[:3, 3] = -a_from_b[:3, :3].T @ a_from_b[:3, 3]
-    return b_from_a
