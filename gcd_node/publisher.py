@@ -195,6 +195,8 @@ class Publisher:
                 return self._queue.put(parcel, timeout=0.05)
             except queue.Full:
                 self.check()
+        if parcel.follow_s is not None:
+            self._queue.maxsize += 1  # room of its own: an end is never lost to a full queue
         try:
             self._queue.put_nowait(parcel)
         except queue.Full:

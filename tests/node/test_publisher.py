@@ -263,6 +263,19 @@ def test_a_slow_reader_cannot_stretch_the_end_of_a_node_that_was_told_to_stop(tm
     assert len(tries) < 60  # all 60 messages would take two tries each
 
 
+def test_a_full_queue_loses_no_end_of_a_node_that_was_told_to_stop(tmp_path, monkeypatch) -> None:
+    publisher = Publisher(PublisherOptions(data=f"ipc://{tmp_path}/data", status=None, queue_size=1))
+    ready, left = threading.Event(), []
+    monkeypatch.setattr(publisher._data, "send", lambda parcel: ready.is_set() and not left.append(parcel))
+    publisher.send(window())
+    publisher.hurry()
+    for view_id in ("left", "right", "top"):
+        publisher.end(end(view_id=view_id))
+    ready.set()
+    publisher.close()
+    assert [parcel.follow_s is not None for parcel in left] == [False, True, True, True]
+
+
 def test_closing_twice_is_harmless_and_sending_afterwards_is_an_error(tmp_path) -> None:
     publisher = Publisher(options(tmp_path))
     publisher.close()
