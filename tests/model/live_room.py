@@ -1,7 +1,9 @@
 """A small clip whose depth and odometry are known, for tests of the live model."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
+import pytest
 import torch
 
 from gcd_model import Clip, Intrinsics, Trajectory, pose_trajectory
@@ -25,3 +27,12 @@ def path(x: float = 0.5, frames: int = FRAMES) -> Trajectory:
     poses = torch.eye(4, dtype=torch.float64).repeat(frames, 1, 1)
     poses[:, 0, 3] = x
     return pose_trajectory(poses)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    """As a node computes; import it where it is wanted."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)

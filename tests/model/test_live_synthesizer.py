@@ -2,14 +2,14 @@
 
 import json
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import msgspec
 import pytest
 import torch
-from live_room import FRAMES, HEIGHT, WIDTH, path, room
+from live_room import FRAMES, HEIGHT, WIDTH, one_thread, path, room  # noqa: F401  a fixture
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.testing import assert_close
@@ -39,14 +39,6 @@ from gcd_model.live.config import LIVE_TINY
 from gcd_model.live.synthesizer import LiveSynthesizer, save_live
 from gcd_model.live.view import LiveNetworks
 from gcd_model.networks import random_networks
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

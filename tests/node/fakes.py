@@ -25,7 +25,7 @@ from gcd_model import (
     View,
     ViewSynthesizer,
 )
-from gcd_node.config import NodeConfig
+from gcd_node.config import NodeConfig, parse_config
 from gcd_node.envelope import EndMessage, NoteTopic, ViewMessage
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.life.machinery import Parts
@@ -210,3 +210,20 @@ class Box:
 
     def of(self, kind: str, view: str = "main") -> list[ViewMessage]:
         return [message for message in self.views if message.topic == f"view/{view}/{kind}"]
+
+
+def fake_config(more: str = "", *, samples: int = 1, encoding: str = "rgb8") -> NodeConfig:
+    """A lockstep node of one view with a model of these fakes. more: further lines of [model]."""
+    text = f"""
+        [source]
+        kind = "synthetic"
+        pace = "lockstep"
+        [model]
+        weights = "fake"
+        samples = {samples}
+        {more}
+        [publish]
+        encoding = "{encoding}"
+        [view.main]
+    """
+    return parse_config(text.encode(), "test")

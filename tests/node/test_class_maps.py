@@ -13,6 +13,7 @@ from fakes import (
     FakeSource,
     FakeSynthesizer,
     fake_classes,
+    fake_config,
     made_node,
     painting_traits,
     traits,
@@ -20,7 +21,6 @@ from fakes import (
 )
 
 from gcd_model import DRIVING_CLASSES, Traits
-from gcd_node.config import NodeConfig, parse_config
 from gcd_node.envelope import images
 from gcd_node.publisher import Publisher, PublisherOptions
 from gcd_node.subscriber import NoteSubscriber, ReceivedView, ViewSubscriber
@@ -29,24 +29,9 @@ from gcd_node.wire.view_message import ontology
 pytestmark = pytest.mark.timeout(30)
 
 
-def config(*, samples: int = 1, encoding: str = "rgb8") -> NodeConfig:
-    text = f"""
-        [source]
-        kind = "synthetic"
-        pace = "lockstep"
-        [model]
-        weights = "fake"
-        samples = {samples}
-        [publish]
-        encoding = "{encoding}"
-        [view.main]
-    """
-    return parse_config(text.encode(), "test")
-
-
 def published(made: Traits, frames: int = 28, **options: int) -> Box:
     box = Box()
-    made_node(config(**options), FakeSynthesizer(made), FakeSource(frames, fps=10.0), box).run()
+    made_node(fake_config(**options), FakeSynthesizer(made), FakeSource(frames, fps=10.0), box).run()
     return box
 
 
@@ -127,7 +112,7 @@ def test_a_reader_in_another_thread_gets_map_and_meaning_over_real_sockets(tmp_p
     with Publisher(options) as publisher:
         reader = threading.Thread(target=read, daemon=True)
         reader.start()
-        made_node(config(), FakeSynthesizer(warping_traits()), FakeSource(28, fps=10.0), publisher).run()
+        made_node(fake_config(), FakeSynthesizer(warping_traits()), FakeSource(28, fps=10.0), publisher).run()
         with NoteSubscriber(f"ipc://{tmp_path}/s", ("meta",)) as notes:
             meta = notes.receive(5000)
         reader.join(10)

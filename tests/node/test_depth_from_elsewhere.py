@@ -10,11 +10,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, made_node, traits
+from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, fake_config, made_node, traits
 
 from gcd_model import RenderOptions, SourceFeatures, Trajectory, View, load_synthesizer
 from gcd_node.cli.main import run_app
-from gcd_node.config import NodeConfig, parse_config
 from gcd_node.errors import ConfigError, DepthError, SourceError, TooShortError, UsageError
 from gcd_node.frame import Image
 from gcd_node.offline_clip import ClipRequest, OfflineClip, read_clip
@@ -240,19 +239,6 @@ def test_depth_that_cannot_be_used_is_refused_in_one_line(
 # --- a node ----------------------------------------------------------------------------------------------------------
 
 
-def config(more: str = "") -> NodeConfig:
-    text = f"""
-        [source]
-        kind = "synthetic"
-        pace = "lockstep"
-        [model]
-        weights = "fake"
-        {more}
-        [view.main]
-    """
-    return parse_config(text.encode(), "test")
-
-
 @pytest.fixture
 def bad(monkeypatch: pytest.MonkeyPatch) -> set[int]:
     """A depth network that gives a frame's number in metres, and fails on the frames of this set."""
@@ -274,7 +260,7 @@ def bad(monkeypatch: pytest.MonkeyPatch) -> set[int]:
 
 def run(model: FakeSynthesizer, more: str, frames: int = 28) -> Box:
     box = Box()
-    made_node(config(more), model, FakeSource(frames, fps=10.0), box).run()
+    made_node(fake_config(more), model, FakeSource(frames, fps=10.0), box).run()
     return box
 
 

@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fakes import Box, FakeSource, FakeSynthesizer, fake_maps, made_node, traits, warping_traits
+from fakes import Box, FakeSource, FakeSynthesizer, fake_config, fake_maps, made_node, traits, warping_traits
 
 from gcd_model import View
-from gcd_node.config import NodeConfig, parse_config
 from gcd_node.envelope import depth_m, images, inverse_depth
 from gcd_node.publisher import Publisher, PublisherOptions
 from gcd_node.subscriber import ReceivedView, ViewSubscriber
@@ -18,25 +17,10 @@ pytestmark = pytest.mark.timeout(30)
 HELD = ("visibility", "inverse_depth")
 
 
-def config(*, samples: int = 1, encoding: str = "rgb8") -> NodeConfig:
-    text = f"""
-        [source]
-        kind = "synthetic"
-        pace = "lockstep"
-        [model]
-        weights = "fake"
-        samples = {samples}
-        [publish]
-        encoding = "{encoding}"
-        [view.main]
-    """
-    return parse_config(text.encode(), "test")
-
-
 def published(*holds: str, frames: int = 28, **options: int | str) -> Box:
     box = Box()
     made_node(
-        config(**options), FakeSynthesizer(warping_traits(), holds=holds), FakeSource(frames, fps=10.0), box
+        fake_config(**options), FakeSynthesizer(warping_traits(), holds=holds), FakeSource(frames, fps=10.0), box
     ).run()
     return box
 
@@ -91,7 +75,7 @@ def test_they_are_never_made_lossy() -> None:
 def test_a_kind_that_views_hold_no_longer_ends_once() -> None:
     box, windows = Box(), iter((HELD, ("visibility",), ("visibility",)))
     model = FakeSynthesizer(traits(), lambda _: setattr(model, "holds", next(windows)))
-    made_node(config(), model, FakeSource(42), box).run()
+    made_node(fake_config(), model, FakeSource(42), box).run()
     assert [message.header.window_id for message in box.of("depth")] == [0]
     ends = {message.topic: message.header.window_id for message in box.ends}
     assert ends == {"view/main/win": 2, "view/main/frm": 2, "view/main/vis": 2, "view/main/depth": 1}
@@ -147,7 +131,7 @@ def test_a_reader_of_both_kinds_gets_exactly_what_was_published_in_order(tmp_pat
         reader = threading.Thread(target=read, daemon=True)
         reader.start()
         model = FakeSynthesizer(traits("driving"), holds=HELD)
-        made_node(config(), model, FakeSource(28, fps=10.0), publisher).run()
+        made_node(fake_config(), model, FakeSource(28, fps=10.0), publisher).run()
         reader.join(10)
     topics = ["view/main/vis", "view/main/depth"]
     assert [(view.message.topic, view.header.window_id) for view in received] == [
