@@ -36,8 +36,7 @@ class ModelSlot:
     @property
     def can_halve(self) -> bool:
         """Whether bfloat16 weights would be smaller, and the device is one that gains by them."""
-        whole = self._traits.precision == "float32" and not self._traits.live
-        return whole and self._traits.device.startswith("cuda")
+        return self._traits.device.startswith("cuda") and self._traits.precision == "float32"
 
     def halve(self) -> None:
         """Let the model go and load it in bfloat16. Raises as `load`."""

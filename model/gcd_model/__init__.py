@@ -50,7 +50,7 @@ from gcd_model.geometry import (
     spherical_trajectory,
 )
 from gcd_model.live.synthesizer import visibility_of
-from gcd_model.loading import ENGINES, EngineName, load_synthesizer
+from gcd_model.loading import ENGINES, EngineName, default_precision, load_synthesizer
 from gcd_model.measuring import (
     IMPLEMENTATIONS,
     STAGES,
@@ -138,6 +138,7 @@ __all__ = [
     "bench_model",
     "center_crop_box",
     "convert_weights",
+    "default_precision",
     "driving_trajectory",
     "explain_settings_error",
     "export_weights",

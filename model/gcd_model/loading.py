@@ -190,8 +190,16 @@ def _place(device: str, dtype: str | None, engine: EngineName = "torch") -> _Pla
         raise OptionError(f"the engine must be one of {', '.join(ENGINES)}, got {engine!r}")
     if engine == "cuda" and chosen.type != "cuda":
         raise OptionError(f"the engine cuda needs a CUDA device, got {chosen}; take the engine torch")
-    name = dtype or ("bfloat16" if chosen.type == "cuda" else "float32")
+    name = dtype or default_precision(chosen, live=False)
     return _Place(chosen, precision(name), name, engine)
+
+
+def default_precision(device: torch.device, *, live: bool) -> str:
+    """What networks compute in where nobody says: bfloat16 on CUDA; of the live model on a CPU with Intel AMX, too."""
+    capabilities = getattr(torch.cpu, "get_capabilities", dict)()  # older versions of torch cannot tell
+    if device.type == "cuda" or (live and bool(capabilities.get("amx_bf16", False))):
+        return "bfloat16"
+    return "float32"
 
 
 def _device(name: str) -> torch.device:
@@ -216,16 +224,11 @@ def _live_synthesizer(
         raise OptionError(
             f"{loaded.name} is the live model, which torch runs as it is; leave engine {place.engine} out"
         )
-    if asked is None and _multiplies_in_bfloat16():
-        place = replace(place, dtype=torch.bfloat16, precision="bfloat16")
+    if asked is None:
+        name = default_precision(place.device, live=True)
+        place = replace(place, dtype=precision(name), precision=name)
     networks = networks.to(place.device, place.dtype, memory_format=torch.channels_last)  # pyright: ignore
     return LiveSynthesizer(networks, _traits(loaded, place))
-
-
-def _multiplies_in_bfloat16() -> bool:
-    """Whether this processor has Intel AMX; older versions of torch cannot tell."""
-    capabilities = getattr(torch.cpu, "get_capabilities", dict)()
-    return bool(capabilities.get("amx_bf16", False))
 
 
 def _synthesizer(loaded: LoadedWeights, place: _Place) -> Synthesizer:

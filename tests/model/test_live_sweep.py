@@ -85,3 +85,10 @@ def test_the_oldest_frame_from_which_the_scene_looks_alike_is_chosen() -> None:
     assert float(still.picture[0, 0, 0]) == 4.0  # the oldest of the six that are kept
     kept.reset()
     assert kept.chosen(at(2.0)) is None
+
+
+def test_one_depth_everywhere_is_a_median_and_nothing_but_sky_is_none() -> None:
+    for metres, moved, known in ((2.0, 0.5, True), (2.0, 0.7, False), (1000.0, 0.1, False), (0.0, 0.1, False)):
+        kept = References()
+        kept.add(torch.zeros(3, 4, 4), HERE, torch.full((4, 4), metres))
+        assert (kept.chosen(at(moved)) is not None) == known

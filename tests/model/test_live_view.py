@@ -1,16 +1,13 @@
 """The live view frame by frame: state, reset, lenses, and what may be called seen."""
 
-from collections.abc import Iterator
-
 import pytest
 import torch
-from live_room import FRAMES, HEIGHT, LENS, WIDTH, path, room
+from live_room import FRAMES, HEIGHT, LENS, WIDTH, one_thread, path, room  # noqa: F401  a fixture
 from torch import Tensor
 from torch.testing import assert_close
 
 from gcd_model import Intrinsics, OptionError, PoseError, RenderOptions, ShapeError, load_synthesizer
-from gcd_model.live.config import LIVE_TINY
-from gcd_model.live.depth_net import SKY_M
+from gcd_model.live.config import LIVE_TINY, SKY_M
 from gcd_model.live.seen_world import SeenWorld
 from gcd_model.live.sweep import Reference
 from gcd_model.live.synthesizer import LiveSynthesizer
@@ -18,14 +15,6 @@ from gcd_model.live.view import LiveFrame, LiveNetworks, LiveView
 from gcd_model.networks import random_networks
 
 HERE = torch.eye(4, dtype=torch.float64)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +65,15 @@ def test_after_a_reset_nothing_is_known_of_what_was_before(networks: LiveNetwork
     used.reset()
     for again, first in zip(steps(used, range(3)), steps(fresh, range(3)), strict=True):
         assert_same(again, first)
+
+
+def test_another_lens_is_another_camera_of_which_nothing_is_known_yet(networks: LiveNetworks) -> None:
+    used, wide = LiveView(networks), Intrinsics.from_hfov(100.0, 2 * WIDTH, 2 * HEIGHT)
+    steps(used, range(3))
+    frame = torch.zeros(3, 2 * HEIGHT, 2 * WIDTH)
+    again, first = (view.step(frame, [aside(0.5)], lens=wide) for view in (used, LiveView(networks)))
+    assert_same(again, first)
+    assert again.lost is None
 
 
 def test_looking_ahead_changes_no_state(networks: LiveNetworks) -> None:

@@ -160,6 +160,11 @@ def test_the_packaged_recipes_load_and_say_what_they_are() -> None:
     assert all(load_live_recipe(f"package:{name}").kind == "live" for name in live_recipes())
 
 
+def test_a_detail_of_several_batches_is_refused() -> None:
+    with pytest.raises(RecipeError, match="parts"):
+        msgspec.structs.replace(RECIPE, detail=msgspec.structs.replace(stage(1), parts=2))
+
+
 def test_an_unknown_key_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "live.toml"
     path.write_text('kind = "live"\nname = "x"\nspeed = 1\n')
@@ -305,6 +310,21 @@ def test_paint_losses_are_lowest_at_the_truth(places: LivePlaces) -> None:
         best = task.losses(replace(made, mean=now.target, log_depth=now.log_depth), now)
     assert best["square"] == best["absolute"] == best["gradient"] == best["depth"] == 0
     assert losses["square"] > 0
+
+
+def test_the_second_half_of_the_training_carries_and_denoises(places: LivePlaces) -> None:
+    path = training_paths(places.data)[0]
+    make_inputs(places.out, [path], None, TINY, 0)
+    net = PaintNet(TINY.paint, len(TINY.classes))
+    batches = ViewBatches([path], [places.out], TINY, 2, 0, carried=1.0)
+    task = PaintTask(net, TINY, [batches], [path], HeldOutViews([path], places.out, TINY))
+    early, late = ([task.step_loss(Progress(u, share)).parts for u in range(8)] for share in (0.0, 0.9))
+    assert all("denoising" not in parts for parts in early)
+    denoised = [parts["denoising"] for parts in late if "denoising" in parts]
+    assert 0 < len(denoised) < 8
+    assert all(bool(loss.isfinite()) and float(loss.detach()) > 0 for loss in denoised)
+    plain = [(a["square"], b["square"]) for a, b in zip(early, late, strict=True) if "square" in b]
+    assert any(float(a.detach()) != float(b.detach()) for a, b in plain)  # what was carried along is seen
 
 
 def test_calibration_makes_the_interval_hold_and_takes_back_what_rare_classes_were_given(places: LivePlaces) -> None:

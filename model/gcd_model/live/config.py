@@ -12,6 +12,8 @@ from gcd_model.live.ontology import LIVE_CLASSES
 
 Widths = Annotated[tuple[Annotated[int, Meta(ge=8, le=4096, multiple_of=8)], ...], Meta(min_length=2, max_length=4)]
 """Channels of the levels, each of half the size of the one before."""
+SKY_M = 1000.0
+"""Where the sky is put: no step of a robot moves it by a pixel."""
 SIZE_FACTOR = 32
 """Height and width of pictures must be multiples of this."""
 _Side = Annotated[int, Meta(ge=SIZE_FACTOR, le=8192, multiple_of=SIZE_FACTOR)]

@@ -15,11 +15,9 @@ from torch import Tensor, nn
 
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.blocks import FineHead, Trunk
-from gcd_model.live.config import DepthConfig
+from gcd_model.live.config import SKY_M, DepthConfig
 from gcd_model.live.sweep import SWEEP_SCALE, sweep_channels
 
-SKY_M = 1000.0
-"""Where the sky is put, metres: no step of a robot moves it by a pixel."""
 INPUTS = 7
 _FARTHEST_GROUND_M = 200.0
 _GROUND_SCALE = 3.0  # of its log-depth, as an input

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gcd_model.geometry import Intrinsics, invert_rigid
-from gcd_model.live.config import DepthConfig
+from gcd_model.live.config import SKY_M, DepthConfig
 
 SWEEP_SCALE = 2
 """Costs are worked out at half the size."""
@@ -93,7 +93,7 @@ class References:
     def add(self, picture: Tensor, world_from_camera: Tensor, metres: Tensor) -> None:
         """picture: [3, H, W]. metres: [H, W]; 0 for holes."""
         self._frames.append((picture, world_from_camera))
-        near = metres[(metres > 0) & (metres < metres.max())] if bool(metres.any()) else metres[:0]
+        near = metres[(metres > 0) & (metres < SKY_M)]
         self._median_m = float(near.median()) if near.numel() else 0.0
 
     def chosen(self, world_from_camera: Tensor) -> Reference | None:

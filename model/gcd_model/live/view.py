@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from gcd_model.errors import OptionError, ShapeError
 from gcd_model.geometry import Intrinsics, invert_rigid, require_rigid
-from gcd_model.live.config import SIZE_FACTOR, LiveConfig
-from gcd_model.live.depth_net import SKY_M, DepthNet, depth_inputs, pixel_rays, plane_depth, read_depth
+from gcd_model.live.config import SIZE_FACTOR, SKY_M, LiveConfig
+from gcd_model.live.depth_net import DepthNet, depth_inputs, pixel_rays, plane_depth, read_depth
 from gcd_model.live.ego_motion import EgoMotion
 from gcd_model.live.paint_net import Painted, PaintNet, Seen, camera_features, filled, seen_of
 from gcd_model.live.seen_world import SeenWorld
@@ -96,7 +96,7 @@ class LiveFrame:
 class LiveView:
     """Views of one camera's video, one frame at a time; a window is its frames one by one.
 
-    Not thread-safe. The state is what was seen and what was painted; `reset` drops both.
+    Not thread-safe. The state is what was seen and what was painted; `reset` drops both, and so does another lens.
     """
 
     def __init__(self, networks: LiveNetworks, *, steps: int | None = None, seed: int = 0) -> None:
@@ -115,6 +115,7 @@ class LiveView:
         )
         self._ego, self._references = EgoMotion(), References()
         self._painted: list[Surfels] = []
+        self._lens: Intrinsics | None = None
         self._movable = movable_classes(config).to(self._device)
 
     def reset(self) -> None:
@@ -177,6 +178,9 @@ class LiveView:
             ShapeError: frame, depth and lens differ in size, or the size is no multiple of 32. PoseError.
         """
         picture = self._checked(frame, lens)
+        if lens != self._lens:  # another camera, or another size of its pictures
+            self.reset()
+            self._lens = lens
         motion = self._ego.follow(picture, lens, odometry)
         if motion.lost:
             self._world.reset()

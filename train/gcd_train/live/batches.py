@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from gcd_model.geometry import Intrinsics
-from gcd_model.live.config import DepthConfig, LiveConfig
-from gcd_model.live.depth_net import SKY_M, pixel_rays, plane_depth
+from gcd_model.live.config import SKY_M, DepthConfig, LiveConfig
+from gcd_model.live.depth_net import pixel_rays, plane_depth
 from gcd_model.live.sweep import LONGEST, Reference, References, sweep_costs
 from gcd_train.live.clips import LiveClip, clip_paths, read_clip
 from gcd_train.live.draws import Poses

@@ -18,8 +18,8 @@ from safetensors.numpy import save_file
 from torch import Tensor
 
 from gcd_model.geometry import Intrinsics
-from gcd_model.live.config import LiveConfig
-from gcd_model.live.depth_net import SKY_M, DepthNet, depth_inputs, read_depth
+from gcd_model.live.config import SKY_M, LiveConfig
+from gcd_model.live.depth_net import DepthNet, depth_inputs, read_depth
 from gcd_model.live.seen_world import SeenWorld
 from gcd_model.live.splat import Splat
 from gcd_train.live.batches import Pictures, Random, pictures_of, with_true_references

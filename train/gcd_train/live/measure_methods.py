@@ -20,8 +20,8 @@ from torch import Tensor
 
 from gcd_model import Clip, Trajectory, ViewRangeError, ViewSynthesizer, load_synthesizer, synthesize
 from gcd_model.geometry import Intrinsics, fitted_trajectory, from_pose, invert_rigid
-from gcd_model.live.config import LiveConfig
-from gcd_model.live.depth_net import SKY_M, pixel_rays
+from gcd_model.live.config import SKY_M, LiveConfig
+from gcd_model.live.depth_net import pixel_rays
 from gcd_model.live.paint_net import filled, seen_of
 from gcd_model.live.splat import splat, unproject
 from gcd_model.live.view import Floor, FrameGeometry, LiveNetworks, LiveView

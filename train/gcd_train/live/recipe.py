@@ -48,6 +48,10 @@ class LiveRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     detail: LiveStage
     log: LogRecipe = LogRecipe()
 
+    def __post_init__(self) -> None:
+        if self.detail.parts != 1:
+            raise RecipeError(f"the detail stage takes one batch an update, got detail.parts = {self.detail.parts}")
+
 
 def is_live(source: str) -> bool:
     """Whether a recipe, by `package:NAME` or path, is a live model's."""
