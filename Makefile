@@ -41,9 +41,10 @@ $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "gcd-node needs Python 3.11 or newer, this is " + sys.version.split()[0] + "; name another with PYTHON=")'
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/.core: $(VENV)/bin/python pyproject.toml constraints.txt
+$(VENV)/.core: $(VENV)/bin/python pyproject.toml client/pyproject.toml constraints.txt
 	@echo "Installing into $(VENV) (a minute or two the first time) ..."
 	$(PIP) $(if $(TORCH_INDEX),--no-deps --index-url $(TORCH_INDEX)) torch==$(shell sed -n 's/^torch==//p' constraints.txt)
+	$(PIP) -e client
 	$(PIP) -e .
 	@touch $@
 

@@ -1,1 +1,1 @@
-"""The live node: a camera in, virtual camera views out over ZeroMQ. `gcd_node.subscriber` is for planners."""
+"""The live node: a camera in, virtual camera views out over ZeroMQ. Planners import gcd_client instead."""

@@ -5,14 +5,14 @@ import time
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-from gcd_node.errors import TooShortError
+from gcd_node.errors import NodeError, ReaderError, TooShortError
 from gcd_node.frame import FrameSource
-from gcd_node.window import Filling, FrameWindow, WindowBuilder
+from gcd_node.window import FrameWindow, PartialWindow, WindowBuilder
 
 T = TypeVar("T")
 
 
-class Newest(Generic[T]):
+class LatestSlot(Generic[T]):
     """A slot for one item between two threads. A newer item replaces an unread one, which counts as dropped.
 
     With `lossless` a full slot makes `put` wait instead, and nothing is dropped.
@@ -24,7 +24,7 @@ class Newest(Generic[T]):
         self._changed = threading.Condition()
         self._slot: list[T] = []
         self._dropped = 0
-        self._nudges = 0
+        self._notices = 0
         self._finished = False
         self._closed = False
         self._error: Exception | None = None
@@ -53,19 +53,19 @@ class Newest(Generic[T]):
             self._changed.notify_all()
             return True
 
-    def take(self, meanwhile: Callable[[], bool] | None = None) -> T | None:
+    def take(self, idle_work: Callable[[], bool] | None = None) -> T | None:
         """Wait for an item. None after `close`, or after `finish` once the last item was taken.
 
         Args:
-            meanwhile: what to do while there is nothing to take: called until it returns False, and anew after every
-                `nudge`. An item that comes is taken as soon as the call under way returns.
+            idle_work: what to do while there is nothing to take: called until it returns False, and anew after every
+                `notify`. An item that comes is taken as soon as the call under way returns.
         Raises:
-            the error given to `finish`, once, after the last item was taken; what `meanwhile` raises.
+            the error given to `finish`, once, after the last item was taken; what `idle_work` raises.
         """
-        asleep, nudges = meanwhile is None, 0
-        while not self._await(asleep, nudges):
-            nudges = self._nudges
-            asleep = meanwhile is None or not meanwhile()
+        asleep, notices = idle_work is None, 0
+        while not self._await(asleep, notices):
+            notices = self._notices
+            asleep = idle_work is None or not idle_work()
         with self._changed:
             if self._closed:
                 return None
@@ -77,17 +77,17 @@ class Newest(Generic[T]):
             raise error
         return None
 
-    def nudge(self) -> None:
+    def notify(self) -> None:
         """Giver: there may be something to do for a taker who waits."""
         with self._changed:
-            self._nudges += 1
+            self._notices += 1
             self._changed.notify_all()
 
-    def _await(self, asleep: bool, nudges: int) -> bool:
-        """Whether `take` need not wait any longer. asleep: return only then, or after another nudge than these."""
+    def _await(self, asleep: bool, notices: int) -> bool:
+        """Whether `take` need not wait any longer. asleep: return only then, or after another notify than these."""
         with self._changed:
             if asleep:
-                self._changed.wait_for(lambda: self._due or self._nudges != nudges)
+                self._changed.wait_for(lambda: self._due or self._notices != notices)
             return self._due
 
     @property
@@ -109,25 +109,25 @@ class Newest(Generic[T]):
             self._changed.notify_all()
 
 
-class WindowSlot(Newest[FrameWindow]):
+class WindowSlot(LatestSlot[FrameWindow]):
     """The slot for windows; it also shows what the next window holds so far."""
 
     def __init__(self, *, lossless: bool = False) -> None:
         super().__init__(lossless=lossless)
-        self._filling: Filling | None = None
+        self._filling: PartialWindow | None = None
 
     @property
-    def filling(self) -> Filling | None:
+    def filling(self) -> PartialWindow | None:
         """What the next window holds so far; None where nobody knows."""
         return self._filling
 
-    def show(self, filling: Filling) -> None:
+    def show(self, filling: PartialWindow) -> None:
         """Reader: this is what the next window holds so far. Never waits."""
         self._filling = filling
-        self.nudge()
+        self.notify()
 
     def put(self, item: FrameWindow) -> bool:
-        """See Newest."""
+        """See LatestSlot."""
         self._filling = None  # it is this window's
         return super().put(item)
 
@@ -150,8 +150,12 @@ def read(
     """
     try:
         _read_all(source, windows, newest, clock_ns)
-    except Exception as error:  # the end of a thread: whoever takes gets it
+    except NodeError as error:
         newest.finish(error)
+    except Exception as error:  # the end of a thread: whoever takes gets it
+        broken = ReaderError(f"reading frames broke: {type(error).__name__}: {error}")
+        broken.__cause__ = error
+        newest.finish(broken)
     else:
         newest.finish()
 

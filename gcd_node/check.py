@@ -1,15 +1,17 @@
 """Goes through a launch file as a start would, but loads no weights: what `gcd-node check` finds. Prints nothing."""
 
+import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.resources import files
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal, TypeAlias
 
 import torch
 
+from gcd_client.endpoints import resolve_endpoint
+from gcd_client.protocol import ClientError
 from gcd_model import (
     FAMILIES,
     CheckpointError,
@@ -23,18 +25,17 @@ from gcd_model import (
     is_export,
     load_synthesizer,
 )
+from gcd_node.auth import load_server_security
 from gcd_node.config import ModelSection, NodeConfig, RecordConfig
 from gcd_node.errors import ConfigError, NodeError, SourceLostError
 from gcd_node.frame import Frame, FrameSource, SourceInfo
-from gcd_node.life.live_config import LiveConfig
-from gcd_node.optics.source_pose import in_words
-from gcd_node.recording.folder import LimitReachedError, check_folder
-from gcd_node.rendering.preparation import prepare_run
-from gcd_node.rendering.sampling import drawing_options, sampler_in_use
-from gcd_node.rendering.virtual_view import VirtualViews
+from gcd_node.mcap_file import RoomError, check_room
+from gcd_node.model import drawing_options, sampler_in_use
+from gcd_node.preprocess import in_words
 from gcd_node.session import load_model, model_threads, open_session
 from gcd_node.sources import open_source
-from gcd_node.wire.endpoints import resolve_endpoint
+from gcd_node.stream_context import prepare_run
+from gcd_node.views import LiveConfig, VirtualViews
 
 Verdict: TypeAlias = Literal["ok", "warning", "failed"]
 
@@ -82,7 +83,7 @@ def check(config: NodeConfig, resources: Resources | None = None) -> Iterator[Fi
         yield _tried("record", lambda: _record(Path(config.record.folder or ""), config.record))
     yield _tried("source", lambda: _source(config, known))
     yield _tried("weights", lambda: _weights(config.model, known))
-    info, traits = known.info, known.traits
+    info, traits = known.info, None if known.traits is None else known.traits.streaming()
     if traits is not None:
         yield _tried("memory", lambda: _memory(traits, known.weight_bytes, resources or measured(traits.device)))
     if traits is not None and info is not None:
@@ -99,7 +100,7 @@ def _tried(topic: str, look: Callable[[], str]) -> Finding:
         return Finding(topic=topic, verdict="ok", detail=look())
     except _DoubtfulError as doubt:
         return Finding(topic=topic, verdict="warning", detail=str(doubt))
-    except (NodeError, ModelError) as error:
+    except (NodeError, ClientError, ModelError) as error:
         return Finding(topic=topic, verdict="failed", detail=str(error), error=error)
 
 
@@ -114,19 +115,19 @@ def _record(folder: Path, section: RecordConfig) -> str:
     """What fails here ends no start, but nothing would be recorded."""
     root = folder.expanduser()
     try:
-        free_mb = check_folder(root, section)
+        root.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=root):
+            free_mb = check_room(section, root)
     except OSError as error:
         raise ConfigError(f"nothing can be recorded in {root}: {error}; check folder in [record]") from error
-    except LimitReachedError as limit:
+    except RoomError as limit:
         raise _DoubtfulError(f"nothing would be recorded: {limit}") from limit
-    if find_spec("mcap") is None:
-        raise ConfigError("recording needs the extra `record`: pip install 'gcd-node[record]'")
     when = "from the start" if section.autostart else "when asked to"
     return f"{', '.join(section.what)} into {root}, {when}; {free_mb / 1000:.1f} GB are free"
 
 
 def _source(config: NodeConfig, known: _Known) -> str:
-    source = open_source(config.source)
+    source = open_source(config.source, load_server_security(config.security))
     try:
         first = _first_frame(source)
         told = known.info = source.info
@@ -247,7 +248,8 @@ def _memory(traits: Traits, needed: int, found: Resources) -> str:
 def _views(config: NodeConfig, traits: Traits, info: SourceInfo) -> str:
     run, fps = prepare_run(config, traits, info)
     VirtualViews(traits).following(LiveConfig(config).settings(), run.mount)
-    line = f"{', '.join(config.view)}: windows of {traits.config.frames} frames at {fps:g} FPS"
+    frames = traits.config.frames
+    line = f"{', '.join(config.view)}: {f'windows of {frames} frames' if frames > 1 else 'every frame'} at {fps:g} FPS"
     camera = in_words(run.mount, config.source.pose, traits)
     line += f"; {camera}" if camera else ""
     if run.ood:
@@ -264,7 +266,8 @@ def _time(config: NodeConfig, traits: Traits, info: SourceInfo) -> str:
     else:
         runs = sampler_in_use(model, traits).steps * traits.config.frames
     runs *= model.samples * len(config.view)
+    unit = "window" if traits.config.frames > 1 else "frame"
     return (
-        f"a window every {period_s:.2f} s, {runs} network evaluations each, so {1000 * period_s / runs:.1f} ms for one "
+        f"a {unit} every {period_s:.2f} s, {runs} network evaluations each, so {1000 * period_s / runs:.1f} ms for one "
         f"if none is to be left out; {model_threads(model)} CPU threads"
     )

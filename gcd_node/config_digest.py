@@ -6,8 +6,9 @@ import msgspec
 from msgspec.structs import replace
 
 from gcd_model import ASSUMED_SOURCE, CameraMount, ModelConfig, Traits
-from gcd_node.config import ModelSection, NodeConfig, SourcePose, WindowConfig
-from gcd_node.rendering.sampling import sampler_in_use
+from gcd_node.config import ModelSection, NodeConfig, WindowConfig
+from gcd_node.model import sampler_in_use
+from gcd_node.source_config import SourcePose
 
 
 def config_digest(config: NodeConfig, traits: Traits) -> str:
@@ -24,7 +25,7 @@ def config_digest(config: NodeConfig, traits: Traits) -> str:
     """
     source = config.source
     taken = source.resize, source.allow_upscale, source.hfov_deg, _pose(source.pose, traits)
-    filled = taken, _told(_model(config.model, traits)), _views(config), _window(config.window, traits)
+    filled = taken, _model(config.model, traits), _views(config), _window(config.window, traits)
     plain = _without_negative_zero(msgspec.to_builtins(filled))
     return hashlib.sha256(msgspec.json.encode(plain, order="deterministic")).hexdigest()[:12]
 
@@ -55,14 +56,6 @@ def _model(section: ModelSection, traits: Traits) -> ModelSection:
     )
 
 
-def _told(section: ModelSection) -> dict[str, object]:
-    """Without what is newer than the first recordings and as it was then, so that those keep their name."""
-    told: dict[str, object] = msgspec.structs.asdict(section)
-    as_ever = {"adapter": None, "quality": "exact", "solver": "euler", "guidance_interval": None}
-    as_ever |= {"engine": None, "providers": (), "depth_model": None, "depth_kind": "metric", "on_bad_depth": "learned"}
-    return {name: value for name, value in told.items() if name not in as_ever or value != as_ever[name]}
-
-
 def _views(config: NodeConfig) -> dict[str, dict[str, object]]:
     return {view_id: view.plain for view_id, view in config.view.items()}
 
@@ -73,10 +66,8 @@ def _window(section: WindowConfig, traits: Traits) -> WindowConfig:
 
 def _pose(pose: SourcePose | None, traits: Traits) -> SourcePose | None:
     """Where the camera stands in the words the model knows; None for a model that has no use for them."""
-    stated, mount = pose or SourcePose(), traits.mount
+    stated, mount = pose or SourcePose(), CameraMount()
     if traits.live and stated.on_vehicle:
-        mount = CameraMount()
-    if mount is not None:
         return SourcePose(
             height_m=mount.height_m if stated.height_m is None else stated.height_m,
             forward_m=mount.forward_m if stated.forward_m is None else stated.forward_m,

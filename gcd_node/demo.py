@@ -8,70 +8,55 @@ import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 
+import numpy as np
 from msgspec.structs import replace
 
-from gcd_model import Traits
-from gcd_node.config import (
-    ControlConfig,
-    ModelSection,
-    NodeConfig,
-    PublishConfig,
-    SourceConfig,
-    SourcePose,
-    ViewConfig,
-    ViewerConfig,
-)
+from gcd_client.protocol import ClassRecord
+from gcd_model import Traits, hatched
+from gcd_node.config import ControlConfig, ModelSection, NodeConfig, PublishConfig, ViewConfig, ViewerConfig
 from gcd_node.errors import NodeError
 from gcd_node.frame import Image
-from gcd_node.life.stream import Summary
+from gcd_node.inference import WindowReport
+from gcd_node.messages import ontology
 from gcd_node.node import NodeOptions
 from gcd_node.pictures.comparison import Moment, comparison
 from gcd_node.pictures.files import make_folder, scaled, spread, write_animation, write_png, write_video
+from gcd_node.pipeline import Summary
 from gcd_node.publisher import Publisher
-from gcd_node.rendering.model_worker import WindowReport
 from gcd_node.session import open_session, run_until_signal
+from gcd_node.source_config import FileSource, SourcePose
 from gcd_node.sources import read_picture
-from gcd_node.wire.header import ClassRecord
-from gcd_node.wire.view_message import ontology
 
 VIEW_ID = "topdown"
-HEADINGS = ("input: the packaged drive", "generated view from above", "generated class map")
+WEIGHTS = "package:live-small"
+HEADINGS = ("input: the packaged drive", "view from above", "the same: what is painted is hatched", "its class map")
 """Columns of the demo's pictures."""
 
-_TRAINED = "driving-small"
 _MOUNT = SourcePose(height_m=1.55, forward_m=1.6, left_m=0.0, tilt_deg=0.0)
 _RECEIVER_TIMEOUT_S = 60.0
 _ROWS = 4
-_PAGE_WIDTH = 760
+_PAGE_WIDTH = 1000
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class DemoReport:
     """How the demo went. model: its name. received: windows that arrived in the other process. noise: the weights are
-    random. columns: what the pictures show, from left to right. files: the pictures."""
+    random. files: the pictures."""
 
     summary: Summary
     model: str
     received: int
     noise: bool
-    columns: tuple[str, ...]
     files: tuple[Path, ...]
-
-
-def demo_weights() -> str:
-    """The trained weights that ship with the package; where they are missing, random ones whose picture is noise."""
-    shipped = files("gcd_model").joinpath("weights", f"{_TRAINED}.safetensors")
-    return f"package:{_TRAINED}" if shipped.is_file() else "random:driving"
 
 
 def demo_config(folder: Path) -> NodeConfig:
     """The demo's launch file, with sockets in a folder of its own so that it never meets a running node."""
     return NodeConfig(
-        source=SourceConfig(kind="file", path="package:drive.mp4", pace="realtime", hfov_deg=85.0),
-        model=ModelSection(weights=demo_weights(), threads=min(4, len(os.sched_getaffinity(0)))),
+        source=FileSource(path="package:drive.mp4", pace="realtime", hfov_deg=85.0, pose=_MOUNT),
+        model=ModelSection(weights=WEIGHTS, threads=min(4, len(os.sched_getaffinity(0)))),
         view={VIEW_ID: ViewConfig(kind="fixed")},
         publish=PublishConfig(data=f"ipc://{folder}/data", status=f"ipc://{folder}/status"),
         control=ControlConfig(endpoint=None),
@@ -84,17 +69,17 @@ def open_demo_config(folder: Path) -> NodeConfig:
     config = demo_config(folder)
     return replace(
         config,
-        source=replace(config.source, loop=True, pose=_MOUNT if config.model.weights.startswith("package:") else None),
+        source=replace(config.source, loop=True),
         control=ControlConfig(endpoint=f"ipc://{folder}/control"),
         viewer=ViewerConfig(http="127.0.0.1:0"),
     )
 
 
-def run_open_demo(on_viewer: Callable[[str], None]) -> Summary:
-    """Run the drive in a loop, in real time, until SIGINT or SIGTERM. on_viewer: told the page's address."""
+def run_open_demo() -> Summary:
+    """Run the drive in a loop, in real time, until SIGINT or SIGTERM; its viewer opens the page."""
     with tempfile.TemporaryDirectory(prefix="gcd-demo-") as name:
         config = open_demo_config(Path(name))
-        with open_session(config, options=NodeOptions(), on_viewer=on_viewer) as (node, publisher):
+        with open_session(config, options=NodeOptions(), viewer=True, show_page=True) as (node, publisher):
             return run_until_signal(node, publisher)
 
 
@@ -123,15 +108,16 @@ def run_demo(out: Path, on_window: Callable[[WindowReport], None]) -> DemoReport
             summary = run_until_signal(node, publisher)
             publisher.close()
             _wait_for(receiver)
-        views, maps = (_arrived(folder / "received" / VIEW_ID / kind) for kind in (".", "cls"))
+        received = folder / "received" / VIEW_ID
+        views, maps = (_pictures(received / kind) for kind in (".", "cls"))
+        seen = {int(path.stem): list(np.load(path)) for path in (received / "vis").glob("*.npy")}
     (traits,) = models
-    shown = moments(inputs, views, maps)
+    shown = moments(inputs, views, seen, maps)
     return DemoReport(
         summary=summary,
         model=traits.name,
         received=len(shown),
         noise=not traits.trained,
-        columns=HEADINGS[: len(shown[0][0].columns)],
         files=tuple(_write_pictures(out, shown, ontology(traits), summary.fps)),
     )
 
@@ -165,7 +151,7 @@ def _wait_for(receiver: subprocess.Popen[bytes]) -> None:
         ) from error
 
 
-def _arrived(folder: Path) -> dict[int, list[Image]]:
+def _pictures(folder: Path) -> dict[int, list[Image]]:
     """Frames by window, from the pictures the receiver saved as WINDOW_FRAME.png; empty if it saved none."""
     windows: dict[int, list[Image]] = {}
     for path in sorted(folder.glob("*_*.png")):
@@ -174,15 +160,18 @@ def _arrived(folder: Path) -> dict[int, list[Image]]:
 
 
 def moments(
-    inputs: Mapping[int, Sequence[Image]], views: Mapping[int, Sequence[Image]], maps: Mapping[int, Sequence[Image]]
+    inputs: Mapping[int, Sequence[Image]],
+    views: Mapping[int, Sequence[Image]],
+    seen: Mapping[int, Sequence[Image]],
+    maps: Mapping[int, Sequence[Image]],
 ) -> list[list[Moment]]:
-    """Frames by window put together, in the order of the windows. Left out: windows that were not saved whole, and, if
-    some have a class map, those without.
+    """Frames by window put together, in the order of the windows; those that did not arrive whole are left out.
 
+    seen: visibility u8 [H, W].
     Raises:
         NodeError: there is nothing to put together.
     """
-    arrived = (views, maps) if maps else (views,)
+    arrived = (inputs, views, seen, maps)
     windows = [
         number
         for number, frames in sorted(inputs.items())
@@ -192,22 +181,19 @@ def moments(
         raise NodeError("no whole window arrived in the receiving process; run `gcd-node -v demo` to see why")
     return [
         [
-            Moment(source=source, view=view, classes=painted)
-            for source, view, painted in zip(
-                inputs[window], views[window], maps.get(window) or [None] * len(views[window]), strict=True
-            )
+            Moment(source=source, view=view, seen=hatched(view, visibility), classes=painted)
+            for source, view, visibility, painted in zip(*(each[window] for each in arrived), strict=True)
         ]
         for window in windows
     ]
 
 
 def _write_pictures(out: Path, shown: list[list[Moment]], classes: Sequence[ClassRecord], fps: float) -> list[Path]:
-    """The video of all windows, the same small for a page, and a picture of a few moments of the last window."""
+    """The video of all windows, the same small for a page, and a picture of a few moments."""
     video, moving, still = (out / f"side_by_side.{kind}" for kind in ("mp4", "webp", "png"))
-    headings = HEADINGS[: len(shown[0][0].columns)]
-    frames = [comparison([moment], classes, headings) for window in shown for moment in window]
+    all_moments = [moment for window in shown for moment in window]
+    frames = [comparison([moment], classes, HEADINGS) for moment in all_moments]
     write_video(video, frames, fps)
     write_animation(moving, [scaled(frame, _PAGE_WIDTH) for frame in frames], fps)
-    last = shown[-1]
-    write_png(still, comparison([last[i] for i in spread(len(last), _ROWS)], classes, headings))
+    write_png(still, comparison([all_moments[i] for i in spread(len(all_moments), _ROWS)], classes, HEADINGS))
     return [video, moving, still]

@@ -6,19 +6,18 @@
     │   ├── TooShortError 65      an input has fewer frames than one window
     │   ├── DepthError 65         a depth picture, or a picture that depth is taken from, cannot be used
     │   ├── SourceAbsentError 69  there is no such camera
+    │   ├── ReaderError 70        reading or placing frames broke: nobody foresaw how
     │   └── SourceLostError 75    a camera is gone and did not come back
-    ├── MessageError 65       bytes that are not a valid message of this protocol
-    ├── StaleError 69         a view arrived too old to be used
+    ├── StaleError 69         no fresh status came in time
     ├── EndpointError 73      an endpoint is in use or cannot be bound
+    ├── PublisherError 70     the publisher thread has died
     ├── OutputError 73        a result cannot be written
     ├── DamagedRunError 65    the folder of a replay is incomplete, damaged or none
     ├── ModelFailedError 70   the model keeps producing unusable views
-    ├── ControlError 70       a command was refused; 69 if nobody answers it
-    ├── AuthError 77          a node does not let us in
     └── ConfigError 78        a launch file or a setting is wrong
 
-Every message says what was wanted, what came, and what to do. Standard library only, Python 3.10 syntax: planners
-import this.
+Messages, commands, endpoints and keys have the client's errors (gcd_client.ClientError), with exit codes of the same
+kind. Every message says what was wanted, what came, and what to do.
 """
 
 
@@ -58,20 +57,20 @@ class SourceAbsentError(SourceError):
     exit_code = 69
 
 
+class ReaderError(SourceError):
+    """Reading frames, or placing them in windows, broke in a way that nobody foresaw."""
+
+    exit_code = 70
+
+
 class SourceLostError(SourceError):
     """A camera is gone and did not come back."""
 
     exit_code = 75
 
 
-class MessageError(NodeError):
-    """Bytes that are not a valid message of this protocol."""
-
-    exit_code = 65
-
-
 class StaleError(NodeError):
-    """A view arrived too old to be used."""
+    """No fresh status came in time."""
 
     exit_code = 69
 
@@ -80,6 +79,12 @@ class EndpointError(NodeError):
     """An endpoint is in use or cannot be bound."""
 
     exit_code = 73
+
+
+class PublisherError(NodeError):
+    """The publisher thread has died."""
+
+    exit_code = 70
 
 
 class OutputError(NodeError):
@@ -98,23 +103,6 @@ class ModelFailedError(NodeError):
     """The model keeps producing unusable views."""
 
     exit_code = 70
-
-
-class ControlError(NodeError):
-    """A command was refused, or nobody answers it. code: of the protocol, section 5; None if nobody answered."""
-
-    exit_code = 70
-
-    def __init__(self, message: str, code: "str | None" = None) -> None:
-        super().__init__(message)
-        self.code = code
-        self.exit_code = 70 if code is not None else 69
-
-
-class AuthError(NodeError):
-    """A node does not let us in: it asks for a key, or does not know ours, or is another one than we think."""
-
-    exit_code = 77
 
 
 class ConfigError(NodeError):

@@ -2,14 +2,14 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal, Protocol, TypeAlias
+from typing import Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_node.config import LIVE_KINDS, SourceKind
+from gcd_node.calibration import LensModel
 from gcd_node.errors import SourceError
-from gcd_node.optics.calibration import LensModel
+from gcd_node.source_config import LIVE_KINDS, SourceKind
 
 Image: TypeAlias = NDArray[np.uint8]
 """u8 [H, W, 3], RGB."""
@@ -22,6 +22,9 @@ UTC when they are published. "replay": of a recording, from its start or from it
 MAX_FPS = 1000.0
 """Frame rates above this are taken for a mistake."""
 
+MAX_PIXELS = 64_000_000
+"""Larger pictures are refused before they are decoded: so many pixels are 192 MB."""
+
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Frame:
@@ -30,12 +33,17 @@ class Frame:
     image: u8 [H, W, 3], RGB. The frame takes the array over: it is read-only from here on.
     stamp_ns: when it was captured, on the source's clock.
     seq: the source's own sequence number, gaps included.
+    depth: float32 [H, W], metres along the camera's axis at the picture's pixels, 0 where unknown; None without.
+    odometry: float64 [4, 4], world_from_camera, rigid, metres, camera axes x right, y down, z ahead, of any world that
+        stays the same from frame to frame; None without.
     Raises SourceError for an array of another type or shape.
     """
 
     image: Image
     stamp_ns: int
     seq: int
+    depth: NDArray[np.float32] | None = None
+    odometry: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         if self.image.dtype != np.uint8 or self.image.ndim != 3 or self.image.shape[2] != 3 or self.image.size == 0:
@@ -43,7 +51,16 @@ class Frame:
                 f"frame {self.seq} must be u8 [H, W, 3], got {self.image.dtype} {list(self.image.shape)}: "
                 "convert it in the source"
             )
+        self._require(self.depth, "depth", np.float32, self.image.shape[:2])
+        self._require(self.odometry, "odometry", np.float64, (4, 4))
         self.image.setflags(write=False)
+
+    def _require(self, array: NDArray[Any] | None, name: str, kind: type, shape: tuple[int, ...]) -> None:
+        if array is not None and (array.dtype != kind or array.shape != shape):
+            raise SourceError(
+                f"{name} of frame {self.seq} must be {kind.__name__} {list(shape)}, got {array.dtype} "
+                f"{list(array.shape)}: convert it in the source"
+            )
 
     @property
     def size(self) -> tuple[int, int]:
@@ -80,6 +97,10 @@ class SourceInfo:
     def live(self) -> bool:
         """Whether it cannot be played again, and may fall silent and come back."""
         return self.kind in LIVE_KINDS
+
+    def hfov_in_use(self, stated_deg: float | None) -> float | None:
+        """The field of view a launch file states, else what the source itself knows, degrees."""
+        return self.hfov_deg if stated_deg is None else stated_deg
 
 
 class FrameSource(Protocol):

@@ -8,30 +8,28 @@ import logging
 import queue
 import threading
 import time
+import uuid
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from gcd_client.control import Code, ControlError
 from gcd_model import ModelError, Traits
+from gcd_node.auth import Role
+from gcd_node.commands import NodeCommands
 from gcd_node.config import NodeConfig
-from gcd_node.control.message import Code, Command, Outcome
-from gcd_node.envelope import new_boot_id
-from gcd_node.errors import ControlError, NodeError, SourceAbsentError, SourceError, SourceLostError
-from gcd_node.health.announcer import Announcer
-from gcd_node.health.monitor import Health
-from gcd_node.health.report import Level
-from gcd_node.health.systemd import ServiceManager
-from gcd_node.health.vigil import Vigil
-from gcd_node.life.commands import NodeCommands
-from gcd_node.life.lifecycle import Lifecycle, State, Verb
-from gcd_node.life.live_config import LiveConfig
-from gcd_node.life.machinery import Links, Machinery, Parts
-from gcd_node.life.source_watch import Backoff
-from gcd_node.life.stream import Summary
-from gcd_node.publishing.outbox import Outbox
-from gcd_node.recording.recorder import Recorder
-from gcd_node.recording.tap import RecordedOutbox
-from gcd_node.rendering.model_worker import WindowReport
-from gcd_node.security.keys import Role
+from gcd_node.control.message import Command, Outcome
+from gcd_node.errors import NodeError, SourceAbsentError, SourceError, SourceLostError
+from gcd_node.health import Health, Level
+from gcd_node.inference import WindowReport
+from gcd_node.life.source_watch import backoff_of
+from gcd_node.lifecycle import Lifecycle, State, Verb
+from gcd_node.pipeline import Summary
+from gcd_node.publisher import MessageSink
+from gcd_node.recorder import Recorder, RecordingSink
+from gcd_node.service import ServiceManager, Watchdog
+from gcd_node.status import Announcer
+from gcd_node.transitions import Links, Parts, Transitions
+from gcd_node.views import LiveConfig
 
 _LOG = logging.getLogger(__name__)
 _TICK_S = 0.1
@@ -68,28 +66,28 @@ class Node:
     """Implements Commands. `run` blocks; `stop` and `handle` may be called from other threads, `stop` from a signal
     handler too. Transitions are worked through in a thread of their own, so that status and commands go on."""
 
-    def __init__(self, config: NodeConfig, parts: Parts, outbox: Outbox, options: NodeOptions | None = None) -> None:
-        """Nothing is opened or loaded before `run`. Raises ConfigError: see Recorder."""
+    def __init__(self, config: NodeConfig, parts: Parts, sink: MessageSink, options: NodeOptions | None = None) -> None:
+        """Nothing is opened or loaded before `run`."""
         self._config, self._options = config, options or NodeOptions()
-        self.health, live, boot_id = Health(), LiveConfig(config), new_boot_id()
+        self.health, live, boot_id = Health(), LiveConfig(config), uuid.uuid4().hex
         self.recorder = Recorder(config, boot_id, lambda: live.config, self._say)
-        self._outbox = RecordedOutbox(outbox, self.recorder)
-        self._announcer = Announcer(config.node_id, boot_id, self._outbox, self.health)
+        self._sink = RecordingSink(sink, self.recorder)
+        self._announcer = Announcer(config.node_id, boot_id, self._sink, self.health)
         links = Links(
-            outbox=self._outbox,
+            sink=self._sink,
             health=self.health,
             announcer=self._announcer,
             on_over=self._notice_over,
             on_window=self._options.on_window,
             tap=self.recorder,
         )
-        self._machinery = Machinery(live, parts, links)
+        self._machinery = Transitions(live, parts, links)
         self._commands = NodeCommands(self._machinery, self._announcer, self.health, self.ask, self.recorder)
         self._life, self._order = Lifecycle(), threading.Lock()
         self._inbox: queue.SimpleQueue[_Done | str] = queue.SimpleQueue()
         self._work: threading.Thread | None = None
-        self._vigil = Vigil(self._announcer, self.health, config.life.hang_s, self._options.service)
-        self._backoff = Backoff()
+        self._watchdog = Watchdog(self._say, self.health, config.life.hang_s, self._options.service)
+        self._backoff = backoff_of(config.source.kind)
         self._stop_s: float | None = None
         self._retry_s: float | None = None
         self._on_its_own = config.life.autostart
@@ -105,9 +103,13 @@ class Node:
         """After `run`: whether a thread hangs that Python would wait for in vain."""
         return self._machinery.left_behind or (self._work is not None and self._work.is_alive())
 
+    def watch(self, dead_threads: Callable[[], list[str]]) -> None:
+        """Ask this for the names of dead threads as long as the node runs: without them it is not ready."""
+        self._watchdog.watch(dead_threads)
+
     def stop(self) -> None:
         """End in order, soon: no new window begins, the one in work is abandoned at its next layer."""
-        self._outbox.hurry()
+        self._sink.stop_waiting()
         self._inbox.put("stop")
 
     def handle(self, command: Command, role: Role) -> Outcome:
@@ -124,7 +126,7 @@ class Node:
 
     def ask(self, verb: Verb, dry_run: bool) -> Outcome:
         """Begin a transition; an event tells how it ends."""
-        if verb == "activate" and self.health.snapshot().model.state == "failed":
+        if verb == "activate" and self._machinery.model_failed:
             return Outcome(code=Code.NOT_READY, message="the model has failed; cleanup and configure load it anew")
         if verb == "activate" and self._machinery.left_behind:
             return Outcome(code=Code.NOT_READY, message="a thread of the last activation hangs; restart the process")
@@ -151,12 +153,13 @@ class Node:
             failed with.
         """
         try:
-            self.recorder.start_if_wanted()
+            if self._config.record.autostart:
+                self.recorder.start()
             self._turn()
             if self._on_its_own:
                 self._begin("configure")
             else:
-                self._vigil.ready()
+                self._watchdog.ready()
             while self.state is not State.FINALIZED and not self._overdue():
                 self._hear()
                 self._tick()
@@ -190,7 +193,7 @@ class Node:
         stream = self._machinery.stream
         if stream is not None:
             stream.tick()
-        self._vigil.look(0.0 if stream is None else stream.worker.silent_s)
+        self._watchdog.check(0.0 if stream is None else stream.worker.silent_s)
         self.health.recording(self.recorder.report())
         if self._retry_s is not None and time.monotonic() >= self._retry_s and self.state is State.INACTIVE:
             self._retry_s = None
@@ -203,7 +206,7 @@ class Node:
     def _prepare_stop(self) -> None:
         if self._stop_s is None:
             self._stop_s = time.monotonic()
-            self._vigil.stopping()
+            self._watchdog.stopping()
         self._machinery.interrupt()
 
     def _overdue(self) -> bool:
@@ -228,7 +231,7 @@ class Node:
             self._life.begin(verb)
         self._turn()
         if verb == "configure":
-            self._vigil.loading()
+            self._watchdog.loading()
         self._work = threading.Thread(target=self._perform, args=(verb, asked), name=verb, daemon=True)
         self._work.start()
 
@@ -289,7 +292,7 @@ class Node:
                 self._try("activate")
         elif done.verb == "activate":
             self._backoff.reset()
-            self._vigil.ready()
+            self._watchdog.ready()
             if self._machinery.has_ended:  # before the node was active
                 self._try("deactivate")
         elif done.verb == "deactivate" and not done.asked and self._stop_s is None:
@@ -309,7 +312,7 @@ class Node:
 
     def _after_failure(self, error: Exception, verb: Verb) -> None:
         """Give up, try again later, or wait for somebody to ask."""
-        self._vigil.ready()
+        self._watchdog.ready()
         if self._stop_s is not None and verb != "shutdown":
             return
         if self._options.once or isinstance(error, SourceLostError):

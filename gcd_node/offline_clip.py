@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from gcd_model import Clip, Intrinsics, Traits
 from gcd_node.errors import DepthError, SourceError, TooShortError, UsageError
 from gcd_node.frame import Image
-from gcd_node.optics.preprocess import Fit, to_clip_tensor
 from gcd_node.pictures.array_file import read_npy
+from gcd_node.preprocess import Fit, to_clip_tensor
 from gcd_node.sources.depth import DepthPicture, DepthSource, clean_depth
 from gcd_node.sources.depth_stereo import StereoDepth
-from gcd_node.sources.image_folder import SUFFIXES, ImageFolder, list_pictures, read_depth, read_picture
+from gcd_node.sources.image_folder import PICTURES, ImageFolder, list_pictures, read_depth, read_picture
 from gcd_node.sources.video_file import VideoFile
 
 _LOG = logging.getLogger(__name__)
@@ -95,7 +95,7 @@ def read_clip(path: Path, request: ClipRequest, traits: Traits) -> OfflineClip:
     lens, hfov_deg = None, request.hfov_deg
     if hfov_deg is not None:
         lens = fit.intrinsics(Intrinsics.from_hfov(hfov_deg, images[0].shape[1], images[0].shape[0]))
-    still = not path.is_dir() and path.suffix.lower() in SUFFIXES
+    still = not path.is_dir() and path.suffix.lower() in PICTURES
     depth = [fit.depth(each) for each in _stated_depth(request, images[0].shape[:2], len(images), still=still)]
     clip = Clip(
         video=torch.from_numpy(to_clip_tensor(fitted)),
@@ -180,7 +180,7 @@ def _pictures(path: Path, request: ClipRequest, frames: int) -> tuple[list[Image
     """T pictures and the input's frame rate, None if it has none."""
     if path.is_dir():
         return _strided((frame.image for frame in ImageFolder(path, fps=1.0).frames()), request, frames, path), None
-    if path.suffix.lower() in SUFFIXES:
+    if path.suffix.lower() in PICTURES:
         return [read_picture(path)] * frames, None
     video = VideoFile(path)
     images = _strided((frame.image for frame in video.frames()), request, frames, path)

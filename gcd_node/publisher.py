@@ -1,55 +1,77 @@
 """Sends encoded messages: one thread owns the data and the status socket (wire protocol, section 1).
 
-ZeroMQ sockets belong to one thread, so callers hand messages over through a bounded queue. The thread looks at its
-sockets at least every 10 ms: without that, welcome messages and subscriptions would never be served.
-
-Longer than most files: the two sockets and the thread that owns them are one matter.
+ZeroMQ sockets belong to one thread, so callers hand messages over through a bounded queue and wake the thread; it
+sleeps until a message, a subscription or the end comes.
 """
 
+import contextlib
 import logging
+import os
 import queue
 import threading
 import time
-from collections import Counter, deque
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from types import TracebackType
-from typing import Any
+from typing import Any, Protocol
 
 import zmq
+from msgspec.structs import replace
 
-from gcd_node.envelope import (
-    PREVIEW_TOPIC,
-    TOPIC_BYTES,
-    WELCOME,
-    EndMessage,
-    NoteMessage,
-    NoteTopic,
-    ViewMessage,
-    encode,
-)
-from gcd_node.errors import EndpointError, NodeError
-from gcd_node.publishing.options import PublisherOptions, PublisherStats
-from gcd_node.publishing.subscriptions import Subscriptions
-from gcd_node.security.gate import Context, EventSink, Gate, Socket, unbind
-from gcd_node.wire.endpoints import own_endpoint
-from gcd_node.wire.header import OriginHeader
+from gcd_client.protocol import ClientError, EndMessage, OriginHeader, StatusMessage, StatusTopic, ViewMessage, encode
+from gcd_node.auth import EventSink, SocketGuard
+from gcd_node.errors import EndpointError, NodeError, PublisherError
+from gcd_node.sockets import NO_READERS, DataSocket, Parcel, PublisherOptions, Readers, StatusSocket
 
 _LOG = logging.getLogger(__name__)
-_IDLE_S = 0.01
 _RETRY_MS = 3
-_DATA_HWM = 4
-_STATUS_HWM = 100
 _LEAST_LINGER_MS = 100
-_MAX_SUBSCRIPTION = 4096
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class _Parcel:
-    """An encoded message; follow_s: how long it must come after the last one, None for at once."""
+class PublisherStats:
+    """sent, bytes: handed to ZeroMQ on the data socket. dropped: refused because the queue was full. What ZeroMQ drops
+    for a slow reader shows in no counter here: that reader sees a gap in the sequence."""
 
-    part: bytes
-    follow_s: float | None = None
+    sent: int = 0
+    dropped: int = 0
+    bytes: int = 0
+    readers: Readers = NO_READERS
+
+    @property
+    def subscribers(self) -> int:
+        """Subscriptions on the data socket now."""
+        return self.readers.total
+
+
+class MessageSink(Protocol):
+    """Where the node's messages go: a Publisher, the files of a replay, or a list in a test."""
+
+    def send(self, message: ViewMessage) -> object:
+        """Hand over a view."""
+        ...
+
+    def preview(self, made: Callable[[], ViewMessage]) -> None:
+        """Hand over the newest preview of the input, to be made when it leaves."""
+        ...
+
+    def end(self, message: EndMessage, *, delay_ms: int | None = None) -> None:
+        """Hand over an end-of-stream, to follow the last view."""
+        ...
+
+    def note(self, topic: StatusTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
+        """Hand over a status, event or meta note."""
+        ...
+
+    def stop_waiting(self) -> None:
+        """Stop waiting for readers."""
+        ...
+
+    @property
+    def stats(self) -> PublisherStats:
+        """What has left."""
+        ...
 
 
 class Publisher:
@@ -64,32 +86,37 @@ class Publisher:
 
     def __init__(self, options: PublisherOptions, on_event: EventSink | None = None) -> None:
         self._options = options
-        self._queue: queue.Queue[_Parcel] = queue.Queue(options.queue_size)
+        self._queue: queue.Queue[Parcel] = queue.Queue(options.queue_size)
         self._notes: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-        self._preview: deque[bytes] = deque(maxlen=1)
+        self._preview: Callable[[], ViewMessage] | None = None
         self._sequences: Counter[tuple[str, str]] = Counter()
-        self._hand_over, self._note_order = threading.Lock(), threading.Lock()
+        self._hand_over, self._note_order, self._waking = threading.Lock(), threading.Lock(), threading.Lock()
         self._hurried = threading.Event()
         self._closing, self._abandoned, self._closed = threading.Event(), threading.Event(), threading.Event()
         self._failure: Exception | None = None
         self._dropped, self._closing_s = 0, 0.0
+        self._wake_fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._context = zmq.Context()
+        self._guard = SocketGuard(self._context, options.security, on_event)
         try:
-            self._gate = Gate(self._context, options.security, on_event)
-            self._data = _DataSocket(self._context, self._gate, options)
-            self._status = None if options.status is None else _StatusSocket(self._context, self._gate, options.status)
+            self._data = DataSocket(self._context, self._guard, options)
+            self._status = None if options.status is None else StatusSocket(self._context, self._guard, options.status)
         except BaseException:
+            self._guard.close()
             self._context.destroy(linger=0)
+            self._close_wake()
             raise
-        self._gate.start()
+        self._poller = zmq.Poller()
+        sockets = [self._data.socket] if self._status is None else [self._data.socket, self._status.socket]
+        for source in (self._wake_fd, *sockets, *self._guard.monitors):
+            self._poller.register(source, zmq.POLLIN)
         self._thread = threading.Thread(target=self._serve, name="publisher", daemon=True)
         self._thread.start()
 
     def send(self, message: ViewMessage) -> bool:
         """Number, encode and hand over one message; its own `sequence` is replaced.
 
-        Realtime never waits: with a full queue the message is dropped and counted. Lockstep waits for room. Previews
-        of the input wait in a place of their own, the newest wins: they never take the room of a view, nor wait.
+        Realtime never waits: with a full queue the message is dropped and counted. Lockstep waits for room.
 
         Returns:
             Whether it was accepted.
@@ -98,15 +125,21 @@ class Publisher:
         """
         with self._hand_over:
             self.check()
-            if message.topic == PREVIEW_TOPIC:
-                self._preview.append(self._encoded(message))
-                return True
             if self._queue.full() and not self._options.lockstep:
                 self._dropped += 1
                 return False
-            self._put(_Parcel(part=self._encoded(message)))
+            self._put(Parcel(part=self._encoded(message)))
         time.sleep(0)  # lets the thread begin now, instead of when the caller has time
         return True
+
+    def preview(self, made: Callable[[], ViewMessage]) -> None:
+        """Send the newest preview of the input, in lockstep too without waiting: what finds no room is lost.
+
+        made: called in the publisher's thread. Raises: as send().
+        """
+        self.check()
+        self._preview = made
+        self._wake()
 
     def end(self, message: EndMessage, *, delay_ms: int | None = None) -> None:
         """Queue an end-of-stream message, to leave `delay_ms` (else end_delay_ms) after the last window; never dropped.
@@ -116,20 +149,25 @@ class Publisher:
         delay = self._options.end_delay_ms if delay_ms is None else delay_ms
         with self._hand_over:
             self.check()
-            self._put(_Parcel(part=self._encoded(message), follow_s=delay / 1000))
+            self._put(Parcel(part=self._encoded(message), follow_s=delay / 1000))
 
-    def note(self, topic: NoteTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
+    def note(self, topic: StatusTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
         """Send a status, event or meta message; the last of each topic is repeated to whoever subscribes later.
 
         Raises: as send().
         """
         with self._note_order:
             self.check()
-            self._notes.put(self._encoded(NoteMessage(topic=topic, header=header, fields=fields)))
+            self._notes.put(self._encoded(StatusMessage(topic=topic, header=header, fields=fields)))
+        self._wake()
 
-    def hurry(self) -> None:
+    def stop_waiting(self) -> None:
         """Stop waiting for readers, for a node that was told to stop: what does not leave in `linger_ms` is lost."""
         self._hurried.set()
+
+    def dead_threads(self) -> list[str]:
+        """Threads that have died, of those that nobody else waits for."""
+        return [] if self._guard.alive else ["authentication"]
 
     def check(self) -> None:
         """Raises what stopped the thread, or NodeError if the publisher is closed."""
@@ -141,13 +179,7 @@ class Publisher:
     def stats(self) -> PublisherStats:
         """Counters since the start."""
         data = self._data
-        return PublisherStats(
-            sent=data.sent,
-            dropped=self._dropped,
-            subscribers=data.readers.now.total,
-            bytes=data.bytes,
-            readers=data.readers.now,
-        )
+        return PublisherStats(sent=data.sent, dropped=self._dropped, bytes=data.bytes, readers=data.subscriptions.now)
 
     @property
     def endpoint(self) -> str:
@@ -182,43 +214,60 @@ class Publisher:
         if self._failure is not None:
             _LOG.error("the publisher had failed too: %s", self._failure)
 
-    def _encoded(self, message: ViewMessage | EndMessage | NoteMessage) -> bytes:
+    def _encoded(self, message: ViewMessage | EndMessage | StatusMessage) -> bytes:
         key = (message.header.boot_id, message.topic)
         numbered = replace(message, sequence=self._sequences[key])
-        part = encode(numbered, checksum=isinstance(message, NoteMessage) or not self._data.local)
+        part = encode(numbered, checksum=isinstance(message, StatusMessage) or not self._data.local)
         self._sequences[key] += 1
         return part
 
-    def _put(self, parcel: _Parcel) -> None:
+    def _put(self, parcel: Parcel) -> None:
         while not self._hurried.is_set():
             try:
-                return self._queue.put(parcel, timeout=0.05)
+                self._queue.put(parcel, timeout=0.05)
             except queue.Full:
                 self.check()
+            else:
+                self._wake()
+                return
         if parcel.follow_s is not None:
             self._queue.maxsize += 1  # room of its own: an end is never lost to a full queue
         try:
             self._queue.put_nowait(parcel)
         except queue.Full:
             self._dropped += 1
+        self._wake()
+
+    def _wake(self) -> None:
+        with self._waking:
+            if self._wake_fd >= 0:  # else it may mean another file by now
+                os.eventfd_write(self._wake_fd, 1)
 
     def _raise_failure(self) -> None:
         if isinstance(self._failure, NodeError):
             raise self._failure
         if self._failure is not None:
-            raise NodeError(f"the publisher thread stopped: {self._failure}") from self._failure
+            raise PublisherError(f"the publisher thread died: {self._failure}") from self._failure
 
     def _shut(self, orderly: bool) -> None:
         if not orderly:
             self._abandoned.set()  # also cuts short an orderly close that another thread is in
+            self._wake()
         if self._closed.is_set():
             return
         self._closed.set()
         self._closing_s = time.monotonic()
         self._closing.set()
+        self._wake()
         self._thread.join()
-        self._gate.close()
+        self._guard.close()
         self._context.term()
+        self._close_wake()
+
+    def _close_wake(self) -> None:
+        with self._waking:
+            descriptor, self._wake_fd = self._wake_fd, -1
+        os.close(descriptor)
 
     # What follows runs in the publisher thread alone.
 
@@ -237,33 +286,40 @@ class Publisher:
                 self._status.close(linger_ms)
 
     def _run(self) -> None:
-        parcel: _Parcel | None = None
+        parcel: Parcel | None = None
         progress = time.monotonic()
         while not self._abandoned.is_set():
             closing = self._closing.is_set()  # read first: what was queued before it is seen below
             self._serve_sockets()
             parcel = parcel or self._take()
-            if parcel is None and closing:
-                return
-            if parcel is None or self._data.send(parcel):
-                parcel, progress = None, time.monotonic()
-            elif not closing:
+            if parcel is None:
+                if closing:
+                    return
+                self._wait(None)
                 progress = time.monotonic()
-                self._data.wait(_RETRY_MS)
-            elif self._left_s(progress) < 0:
+            elif self._data.send(parcel):
+                parcel, progress = None, time.monotonic()
+            elif closing and self._left_s(progress) < 0:
                 if self._hurried.is_set():
                     return
                 raise EndpointError(self._undelivered())
             else:
-                self._data.wait(_RETRY_MS)
+                progress = progress if closing else time.monotonic()
+                self._wait(_RETRY_MS)
+
+    def _wait(self, timeout_ms: int | None) -> None:
+        """Until a message, a subscription or the end comes."""
+        self._poller.poll(timeout_ms)
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_read(self._wake_fd)
 
     def _see_off(self) -> None:
         """Wait until readers have left. ZeroMQ's linger ends when its last batch of bytes is on its way, and loses it
         to a reader too slow to take it at once; who leaves has the end-of-stream message."""
         until = time.monotonic() + self._left_s(time.monotonic())
-        while self._data.ended and self._data.readers.now.total > 0 and time.monotonic() < until:
+        while self._data.ended and self._data.subscriptions.now.total > 0 and time.monotonic() < until:
             self._serve_sockets()
-            self._data.wait(_RETRY_MS)
+            self._wait(_RETRY_MS)
             if self._abandoned.is_set():
                 return
 
@@ -275,9 +331,14 @@ class Publisher:
         return (self._closing_s if hurried else progress_s) + patience_ms / 1000 - time.monotonic()
 
     def _serve_sockets(self) -> None:
+        self._guard.report_failures()
         self._data.serve()
-        while self._preview:
-            self._data.try_send(self._preview.pop())  # what finds no room is lost, in lockstep too
+        made, self._preview = self._preview, None
+        if made is not None:
+            try:
+                self._data.try_send(self._encoded(made()))
+            except (NodeError, ClientError) as error:  # views must not suffer from it
+                _LOG.warning("a preview of the input cannot be sent: %s", error)
         while not self._notes.empty():
             part = self._notes.get()
             if self._status is not None:
@@ -285,112 +346,14 @@ class Publisher:
         if self._status is not None:
             self._status.serve()
 
-    def _take(self) -> _Parcel | None:
+    def _take(self) -> Parcel | None:
         try:
-            return self._queue.get(timeout=_IDLE_S)
+            return self._queue.get_nowait()
         except queue.Empty:
             return None
 
     def _undelivered(self) -> str:
         count, seconds = self._queue.qsize() + 1, self._options.drain_ms / 1000
-        have, wanted = self._data.readers.now.watchers, self._options.min_subscribers
+        have, wanted = self._data.subscriptions.now.watchers, self._options.min_subscribers
         readers = f"{have} subscribers, wanted {wanted}"
         return f"{count} messages were not taken within {seconds:g} s at {self.endpoint} ({readers}); start the reader"
-
-
-class _DataSocket:
-    """The data socket; in lockstep it refuses rather than skips."""
-
-    def __init__(self, context: Context, gate: Gate, options: PublisherOptions) -> None:
-        self._options = options
-        self._socket = _made(context, _DATA_HWM, no_drop=options.lockstep)
-        self.endpoint = gate.bind(self._socket, own_endpoint(options.data, "data"), "data")
-        self.local = self.endpoint.startswith("ipc://")
-        self.sent = self.bytes = 0
-        self.readers = Subscriptions()
-        self._begun = self.ended = False
-        self._last_sent = time.monotonic()
-
-    def serve(self) -> None:
-        """Count who comes and goes."""
-        for event in _events(self._socket):
-            self.readers.hear(event)
-
-    def send(self, parcel: _Parcel) -> bool:
-        """Whether it left; if not, try again later."""
-        if self._options.lockstep and not self._begun and self.readers.now.watchers < self._options.min_subscribers:
-            return False
-        if parcel.follow_s is not None and time.monotonic() < self._last_sent + parcel.follow_s:
-            return False
-        if not self.try_send(parcel.part):
-            return False
-        self._begun, self.ended = True, parcel.follow_s is not None
-        if not self.ended:
-            self._last_sent = time.monotonic()
-        return True
-
-    def try_send(self, part: bytes) -> bool:
-        """Whether it left."""
-        try:
-            self._socket.send(part, zmq.NOBLOCK, copy=False)  # a copy would cost more than all the rest
-        except zmq.Again:
-            return False
-        self.sent += 1
-        self.bytes += len(part)
-        return True
-
-    def wait(self, timeout_ms: int) -> None:
-        """Until a subscription arrives, at most `timeout_ms`."""
-        self._socket.poll(timeout_ms)
-
-    def close(self, linger_ms: int) -> None:
-        unbind(self._socket, self.endpoint, linger_ms)
-
-
-class _StatusSocket:
-    """The status socket: keeps the last message of each topic for whoever comes later."""
-
-    def __init__(self, context: Context, gate: Gate, endpoint: str) -> None:
-        self._socket = _made(context, _STATUS_HWM, no_drop=False)
-        self.endpoint = gate.bind(self._socket, own_endpoint(endpoint, "status"), "status")
-        self._last: dict[bytes, bytes] = {}
-
-    def serve(self) -> None:
-        """Repeat what a new subscriber asks for; ZeroMQ sends it to all, who know it by its sequence."""
-        for event in _events(self._socket):
-            for part in [part for key, part in self._last.items() if event[0] and key.startswith(event[1:])]:
-                self._socket.send(part)
-
-    def send(self, part: bytes) -> None:
-        self._last[part[:TOPIC_BYTES]] = part
-        self._socket.send(part)
-
-    def close(self, linger_ms: int) -> None:
-        unbind(self._socket, self.endpoint, linger_ms)
-
-
-def begin_zero_copy() -> None:
-    """Start what lets go of messages once they have left. It begins with the first one otherwise, once a process, and
-    stays: for whoever counts threads and sockets."""
-    zmq.Frame(bytes(zmq.COPY_THRESHOLD), copy=False)
-
-
-def _events(socket: Socket) -> list[bytes]:
-    """Pending subscribe (first byte 1) and unsubscribe (first byte 0) events; anything else a peer sends is ignored."""
-    found: list[bytes] = []
-    while socket.poll(0):
-        event = socket.recv(zmq.NOBLOCK)
-        if event[:1] in (b"\0", b"\1"):
-            found.append(event)
-    return found
-
-
-def _made(context: Context, high_water_mark: int, *, no_drop: bool) -> Socket:
-    socket = context.socket(zmq.XPUB)
-    socket.set(zmq.XPUB_VERBOSER, 1)  # VERBOSE, and unsubscriptions too: only so can subscribers be counted
-    socket.set(zmq.XPUB_NODROP, int(no_drop))
-    socket.set(zmq.XPUB_WELCOME_MSG, WELCOME)
-    socket.set(zmq.SNDHWM, high_water_mark)
-    socket.set(zmq.MAXMSGSIZE, _MAX_SUBSCRIPTION)
-    socket.set(zmq.LINGER, 0)
-    return socket

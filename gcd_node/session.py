@@ -3,31 +3,33 @@
 import logging
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Callable, Generator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import replace
+from pathlib import Path
 from types import FrameType
 
 import cv2
 import torch
 
+from gcd_client.endpoints import read_key_pair
 from gcd_model import OptionError, ViewSynthesizer, load_synthesizer
-from gcd_node.config import LIVE_KINDS, ModelSection, NodeConfig
+from gcd_node.auth import ServerSecurity, load_server_security
+from gcd_node.config import ModelSection, NodeConfig
 from gcd_node.control.server import ControlOptions, ControlServer
 from gcd_node.errors import ConfigError
-from gcd_node.health.metrics_server import MetricsServer
-from gcd_node.life.machinery import Parts
-from gcd_node.life.memory import settle_process
-from gcd_node.life.stream import Summary
+from gcd_node.health import Health
+from gcd_node.inference import WindowReport
 from gcd_node.node import Node, NodeOptions
+from gcd_node.pipeline import Summary
 from gcd_node.publisher import Publisher
-from gcd_node.publishing.options import PublisherOptions
-from gcd_node.rendering.model_worker import WindowReport
-from gcd_node.security.allow_list import load_server_security
-from gcd_node.security.gate import ServerSecurity
+from gcd_node.service import listen
+from gcd_node.sockets import PublisherOptions
+from gcd_node.source_config import LIVE_KINDS
 from gcd_node.sources import open_source
-from gcd_node.viewer.hub import NodeEndpoints
-from gcd_node.viewer.server import ViewerOptions, ViewerServer, own_keys
+from gcd_node.transitions import Parts
 
 _LOG = logging.getLogger(__name__)
 
@@ -85,16 +87,19 @@ def open_session(
     config: NodeConfig,
     on_window: Callable[[WindowReport], None] | None = None,
     options: NodeOptions | None = None,
-    on_viewer: Callable[[str], None] | None = None,
+    *,
+    viewer: bool = False,
+    show_page: bool = False,
 ) -> Generator[tuple[Node, Publisher]]:
-    """A node ready to run, and its publisher, already bound; its control and health sockets and its page too, if it
-    has any. on_viewer: told the page's address, with the token that makes an operator.
+    """A node ready to run, and its publisher, already bound; its control and health sockets too, if it has any.
+
+    viewer: start `gcd-node viewer` beside the node, if its launch file has a [viewer]; else that is only checked.
+    show_page: let it open its page in a browser.
 
     Raises:
-        EndpointError, ConfigError: see Publisher, ControlServer, MetricsServer, Recorder, ViewerServer. Nothing stays
-            open.
+        EndpointError, ConfigError: see Publisher, ControlServer, MetricsServer, Recorder, viewer_arguments(). Nothing
+            stays open.
     """
-    settle_process()
     options = replace(options or NodeOptions(once=ends_by_itself(config)), on_window=on_window)
     heard: list[Node] = []
 
@@ -105,36 +110,72 @@ def open_session(
     security = load_server_security(config.security, tell)
     with ExitStack() as stack:
         publisher = stack.enter_context(Publisher(publisher_options(config, security), tell))
-        node = Node(config, Parts(open_source=open_source, load_model=load_model), publisher, options)
+        parts = Parts(open_source=lambda source: open_source(source, security, tell), load_model=load_model)
+        node = Node(config, parts, publisher, options)
         heard.append(node)
+        node.watch(publisher.dead_threads)
         control: str | None = None
         if config.control.endpoint is not None:
             wanted = ControlOptions(endpoint=config.control.endpoint, security=security)
-            control = stack.enter_context(
+            server = stack.enter_context(
                 ControlServer(wanted, node, lambda: node.state.label, tell, node.recorder.command)
-            ).endpoint
+            )
+            node.watch(server.dead_threads)
+            control = server.endpoint
         if config.health.http is not None:
-            stack.enter_context(MetricsServer(config.health.http, node.health))
+            stack.enter_context(_metrics_server(config.health.http, node.health))
         if config.viewer.http is not None:
-            viewer = stack.enter_context(_viewer(config, publisher, control, security))
-            if on_viewer is not None:
-                on_viewer(viewer.operator_url)
+            arguments = viewer_arguments(config, publisher, control, security)
+            if viewer:
+                stack.enter_context(_viewer_process([*arguments, *(["--open"] if show_page else [])]))
         yield node, publisher
 
 
-def _viewer(
+def viewer_arguments(
     config: NodeConfig, publisher: Publisher, control: str | None, security: ServerSecurity | None
-) -> ViewerServer:
-    """The page of a node whose sockets are bound; it reaches them from outside, as any client."""
-    bound = (publisher.endpoint, publisher.status_endpoint or config.publish.status, control)
-    secured = security is not None and any(each is not None and each.startswith("tcp://") for each in bound)
-    node = NodeEndpoints(
-        data=bound[0],
-        status=bound[1],
-        control=control,
-        keys=own_keys(config.viewer.keys, security if secured else None),
-    )
-    return ViewerServer(ViewerOptions(http=config.viewer.http or "", node=node))
+) -> list[str]:
+    """What `gcd-node viewer` is given beside a node whose sockets are bound.
+
+    Raises:
+        ConfigError: other machines could reach the page; the node asks for keys, and the page has none.
+        EndpointError: the page's port is in use.
+    """
+    http = config.viewer.http or ""
+    listen(http, "[viewer] http").close()  # to know at once
+    status = publisher.status_endpoint or config.publish.status
+    arguments = ["--http", http, "--data", publisher.endpoint, "--status", status, "--control", control or "none"]
+    if security is None or not any(each.startswith("tcp://") for each in arguments):
+        return arguments
+    if config.viewer.keys is None:
+        raise ConfigError(
+            "this node asks its clients for keys, and the page is one of them: make a pair with `gcd-node keys new`, "
+            "name its folder in [viewer] keys, and put its public key on the list in [security] allow"
+        )
+    folder = Path(config.viewer.keys).expanduser()
+    read_key_pair(folder)
+    return [*arguments, "--keys", str(folder), "--node-key", security.keys.public]
+
+
+@contextmanager
+def _viewer_process(arguments: list[str]) -> Generator[None]:
+    """The viewer costs the node nothing: it reads the sockets as any client, in a process that ends with this one."""
+    command = [sys.executable, "-m", "gcd_node", "viewer", *arguments, "--ends-with-stdin"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:  # noqa: S603
+        try:
+            yield
+        finally:
+            process.communicate()
+
+
+def _metrics_server(address: str, health: Health) -> AbstractContextManager[object]:
+    """Raises ConfigError, EndpointError: see MetricsServer; ConfigError without the extra `metrics`."""
+    try:
+        from gcd_node.metrics import MetricsServer  # needs prometheus_client, which not every node has
+    except ImportError as error:
+        raise ConfigError(
+            f"[health] http needs the package {error.name}: pip install 'gcd-node[metrics]', or leave http out"
+        ) from error
+    return MetricsServer(address, health)
 
 
 def run_until_signal(node: Node, publisher: Publisher) -> Summary:

@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from gcd_client.images import VISIBILITY, paint
+from gcd_client.protocol import ClassRecord
 from gcd_model import (
     Augmentation,
     CameraMount,
@@ -17,14 +19,13 @@ from gcd_model import (
     Trajectory,
     View,
     ViewSynthesizer,
+    hatched,
     visibility_of,
 )
-from gcd_node.config import SourcePose
 from gcd_node.errors import OutputError, SourceError, UsageError
 from gcd_node.offline_clip import OfflineClip
-from gcd_node.optics.source_pose import stated_sphere
 from gcd_node.pictures.array_file import read_npy, read_npz, write_npz
-from gcd_node.pictures.comparison import hatched, legend
+from gcd_node.pictures.comparison import legend
 from gcd_node.pictures.files import (
     Image,
     heat,
@@ -36,8 +37,8 @@ from gcd_node.pictures.files import (
     write_png,
     write_video,
 )
-from gcd_node.wire.class_colours import paint
-from gcd_node.wire.header import VISIBILITY, ClassRecord
+from gcd_node.preprocess import stated_sphere
+from gcd_node.source_config import SourcePose
 
 _STRIP_FRAMES = 7
 

@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
-    from gcd_node.replay.manifest import Manifest
-    from gcd_node.replay.run_folder import RunFolder
+    from gcd_node.replay.run import Manifest, RunFolder
 
 __all__ = ["ReplayFixture", "ReplayedRun", "gcd_replay"]
 
@@ -70,17 +69,16 @@ class ReplayedRun:
             raise AssertionError(text)
 
     def _renew(self, golden: Path) -> None:
-        from gcd_node.replay.golden import renew_golden
+        from gcd_node.replay.compare import renew_golden
 
         if renew_golden(self._run, golden):
             self._config.stash[_RENEWED].append(str(golden))
 
     def _difference(self, golden: Path, min_psnr: float | None, max_class_share: float) -> str | None:
         """What to say of a run that is too far from its golden; None for one that is near enough."""
-        from gcd_node.replay.diff_pictures import write_report
-        from gcd_node.replay.diff_report import report_text
-        from gcd_node.replay.run_diff import Tolerance, compare
-        from gcd_node.replay.run_folder import open_run
+        from gcd_node.replay.compare import Tolerance, compare
+        from gcd_node.replay.diff_report import report_text, write_report
+        from gcd_node.replay.run import open_run
 
         tolerance, expected = Tolerance(min_psnr_db=min_psnr, max_class_share=max_class_share), open_run(golden)
         comparison = compare(expected, self._run)

@@ -3,15 +3,14 @@
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gcd_node.errors import ConfigError
 from gcd_node.frame import MAX_FPS, Frame, Image
-from gcd_node.time_grid import TimeGrid
-from gcd_node.window_pixels import WindowPixels
+from gcd_node.preprocess import write_planes
 
 Reason: TypeAlias = Literal["WIN_GAP", "CLOCK_STEP", "SRC_FORMAT", "SRC_LOST"]
 """Why frames did not become a window: a hole in time, a step of the source's clock, another picture size, a source
@@ -21,48 +20,45 @@ RATE_TOLERANCE = 0.01
 """Rates that differ by this part are the same: 23.976 is 24."""
 
 _LONGEST_STEP_NS = 1_000_000_000
-_SURE = 0.05
-_FOLLOW = 0.1
+_SURE, _FOLLOW = 0.05, 0.1  # periods that nothing nearer can come within; how far the grid is drawn to each frame
+_EARLY = 0.5  # periods of the source: of the frames around a grid point, the nearest comes at most so early
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class FrameWindow:
-    """T frames at an even rate, still with their stamps.
+class PartialWindow:
+    """The frames that the next window holds so far, from none to all but one; or all of them, see FrameWindow.
 
-    images: u8 [T, H, W, 3], RGB, read-only.
-    clip: the same as the network takes them, float32 [T, 3, H, W] in [-1, 1]; not to be changed either.
-    stamps_ns, seqs: of each frame, as the source gave them.
-    window_id: counts windows, from where the builder was told to begin.
+    clip: as the network takes them, float32 [n, 3, H, W] in [-1, 1]; not to be changed.
+    stamps_ns, seqs, depths, odometry: of each frame, as the source gave them; depth in the size of the clip.
     fps: the rate the network is told.
-    arrival_ns: when the newest frame arrived, on the monotonic clock.
-    dropped: frames the builder has thrown away so far, for a stamp that did not rise.
     epoch: counts the restarts of the builder; stamps of different epochs cannot be compared.
     """
 
-    images: Image
     clip: NDArray[np.float32]
     stamps_ns: tuple[int, ...]
     seqs: tuple[int, ...]
-    window_id: int
+    depths: tuple[NDArray[np.float32] | None, ...]
+    odometry: tuple[NDArray[np.float64] | None, ...]
     fps: float
-    arrival_ns: int
-    dropped: int
     epoch: int
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Filling:
-    """The frames that the next window holds so far: from none to all but one. Fields as of FrameWindow, which will hold
-    the same, if nothing comes between.
+class FrameWindow(PartialWindow):
+    """T frames at an even rate, still with their stamps.
 
-    clip: float32 [n, 3, H, W] in [-1, 1]; not to be changed.
+    images: u8 [T, H, W, 3], RGB, read-only; the same as `clip`.
+    window_id: counts windows, from where the builder was told to begin.
+    arrival_ns: when the newest frame arrived, on the monotonic clock.
+    dropped: frames the builder has thrown away so far, for a stamp that did not rise.
+    static: all pictures are alike; of a single one, it is like the one before.
     """
 
-    clip: NDArray[np.float32]
-    stamps_ns: tuple[int, ...]
-    seqs: tuple[int, ...]
-    fps: float
-    epoch: int
+    images: Image
+    window_id: int
+    arrival_ns: int
+    dropped: int
+    static: bool
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -80,19 +76,17 @@ class WindowCounts:
     reasons: dict[Reason, int]
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Arrived:
+class _Arrived(NamedTuple):
     frame: Frame
     arrival_ns: int
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Placed:
-    """A frame on the grid; its pixels are among those of the next window."""
-
+class _Placed(NamedTuple):  # on the grid; its pixels are among those of the next window
     stamp_ns: int
     seq: int
     arrival_ns: int
+    depth: NDArray[np.float32] | None
+    odometry: NDArray[np.float64] | None
 
 
 def choose_fps(source_fps: float, trained: Sequence[float]) -> tuple[float, bool]:
@@ -117,6 +111,9 @@ class WindowBuilder:
     A grid point takes the frame nearest to it, no frame twice. A point without a frame within `max_skew` periods is a
     hole: the window it falls in is rejected (WIN_GAP) and the next begins behind it. A frame is never repeated.
 
+    With windows of one frame every frame is one at once, without waiting for a nearer one; at a rate below the
+    source's, the first that is due.
+
     The grid starts at the first frame. If the source runs at the grid's own rate, it follows the source's clock
     slowly, so that every frame is used once however long the stream; else it is even.
     """
@@ -130,6 +127,7 @@ class WindowBuilder:
         max_skew: float = 0.5,
         source_fps: float | None = None,
         fit: Callable[[Image], Image] | None = None,
+        fit_depth: Callable[[NDArray[np.float32]], NDArray[np.float32]] | None = None,
         first_id: int = 0,
         first_epoch: int = 0,
     ) -> None:
@@ -142,6 +140,7 @@ class WindowBuilder:
             max_skew: how far a frame may lie from its grid point, in periods, up to 0.5.
             source_fps: nominal rate of the source, if known.
             fit: brings a picture to the network's size; called once for every frame on the grid, on arrival.
+            fit_depth: the same for depth; None: nobody wants depth and odometry.
             first_id, first_epoch: of the first window, for a builder that goes on where another one ended.
         Raises:
             ConfigError: a number out of range.
@@ -149,12 +148,14 @@ class WindowBuilder:
         self.frames = frames
         self._stride = frames if stride is None else stride
         self._max_skew = max_skew
-        self._fit = fit
+        self._fit, self._fit_depth = fit, fit_depth
         self.run_at(fps, source_fps)
         self._placed: deque[_Placed] = deque()
-        self._pixels = WindowPixels(frames)
+        self._pixels = _WindowPixels(frames)
         self._waiting: _Arrived | None = None
         self._newest: Frame | None = None
+        self._arrival_ns = 0
+        self._thin: NDArray[np.uint8] | None = None  # of the last window, to see whether anything changes
         self._skip = 0
         self._first_id, self._epoch = first_id, first_epoch
         self._totals: Counter[str] = Counter()
@@ -163,14 +164,8 @@ class WindowBuilder:
     @property
     def counts(self) -> WindowCounts:
         """What was done so far."""
-        totals = self._totals
-        return WindowCounts(
-            frames=totals["frames"],
-            placed=totals["placed"],
-            built=totals["built"],
-            dropped=totals["dropped"],
-            reasons=dict(self._reasons),
-        )
+        totals = {name: self._totals[name] for name in ("frames", "placed", "built", "dropped")}
+        return WindowCounts(**totals, reasons=dict(self._reasons))
 
     @property
     def next_id(self) -> int:
@@ -178,15 +173,17 @@ class WindowBuilder:
         return self._first_id + self._totals["built"]
 
     @property
-    def filling(self) -> Filling:
+    def filling(self) -> PartialWindow:
         """What the next window holds so far."""
         placed = list(self._placed)
-        return Filling(
+        return PartialWindow(
             clip=self._pixels.filled(len(placed)),
             stamps_ns=tuple(each.stamp_ns for each in placed),
             seqs=tuple(each.seq for each in placed),
             fps=self.fps,
             epoch=self._epoch,
+            depths=tuple(each.depth for each in placed),
+            odometry=tuple(each.odometry for each in placed),
         )
 
     @property
@@ -207,14 +204,16 @@ class WindowBuilder:
         if self._newest is not None:
             if frame.size != self._newest.size:
                 self.restart("SRC_FORMAT")
-            elif self._is_clock_step(frame.stamp_ns - self._newest.stamp_ns):
+            elif self._is_clock_step(frame.stamp_ns - self._newest.stamp_ns, arrival_ns - self._arrival_ns):
                 self.restart("CLOCK_STEP")
             elif frame.stamp_ns <= self._newest.stamp_ns:
                 self._totals["dropped"] += 1
                 return []
         if self._newest is None:
             self._grid.start(frame.stamp_ns)
-        self._newest = frame
+        self._newest, self._arrival_ns = frame, arrival_ns
+        if self.frames == 1:
+            return self._alone(_Arrived(frame=frame, arrival_ns=arrival_ns))
         return self._place(_Arrived(frame=frame, arrival_ns=arrival_ns))
 
     def flush(self) -> list[FrameWindow]:
@@ -230,7 +229,7 @@ class WindowBuilder:
         self._epoch += 1
         self._placed.clear()
         self._waiting = None
-        self._newest = None
+        self._newest = self._thin = None
         self._skip = 0
 
     def run_at(self, fps: float, source_fps: float | None) -> None:
@@ -248,12 +247,25 @@ class WindowBuilder:
             )
         self.fps = fps
         self._skew_ns = self._max_skew * 1e9 / fps
-        follows = source_fps is not None and abs(source_fps / fps - 1) <= RATE_TOLERANCE
-        self._grid = TimeGrid(fps=fps, follow=_FOLLOW if follows else 0.0)
+        self._early_ns = _EARLY * 1e9 / (fps if source_fps is None else source_fps)
+        follows = self._follows = source_fps is not None and abs(source_fps / fps - 1) <= RATE_TOLERANCE
+        self._grid = _TimeGrid(fps=fps, follow=_FOLLOW if follows else 0.0)
 
-    def _is_clock_step(self, step_ns: int) -> bool:
-        """Backwards by over a second, or forwards by over a second and a whole window."""
-        return step_ns < -_LONGEST_STEP_NS or step_ns > max(_LONGEST_STEP_NS, self.frames * 1e9 / self.fps)
+    def _is_clock_step(self, step_ns: int, waited_ns: int) -> bool:
+        """Backwards by over a second, or forwards by over a second and a whole window more than it took to arrive: a
+        camera that was silent is no clock that was set."""
+        ahead_ns = step_ns - max(waited_ns, 0)
+        return step_ns < -_LONGEST_STEP_NS or ahead_ns > max(_LONGEST_STEP_NS, self.frames * 1e9 / self.fps)
+
+    def _alone(self, arrived: _Arrived) -> list[FrameWindow]:
+        """A window of one frame, unless the grid is slower than the source and the frame is not due."""
+        stamp_ns = arrived.frame.stamp_ns
+        if not self._follows and stamp_ns < self._grid.next_ns - self._early_ns:
+            return []
+        windows = self._take(arrived)
+        while self._grid.next_ns <= stamp_ns:
+            self._grid.advance(None)
+        return windows
 
     def _place(self, arrived: _Arrived) -> list[FrameWindow]:
         """Settle all grid points up to the new frame, and those so near behind it that nothing can be nearer."""
@@ -296,12 +308,16 @@ class WindowBuilder:
             return []
         frame = arrived.frame
         self._pixels.put(len(self._placed), frame.image if self._fit is None else self._fit(frame.image))
-        self._placed.append(_Placed(stamp_ns=frame.stamp_ns, seq=frame.seq, arrival_ns=arrived.arrival_ns))
+        depth = None if frame.depth is None or self._fit_depth is None else self._fit_depth(frame.depth)
+        odometry = None if self._fit_depth is None else frame.odometry
+        self._placed.append(_Placed(frame.stamp_ns, frame.seq, arrived.arrival_ns, depth, odometry))
         return [self._window()] if len(self._placed) == self.frames else []
 
     def _window(self) -> FrameWindow:
         placed = list(self._placed)
         images, clip = self._pixels.hand_over()
+        thin = images.reshape(*images.shape[:2], -1)[:, ::16, ::8]  # of all three colours in turn
+        before, self._thin = self._thin if self.frames == 1 else thin[0], thin[-1]
         window = FrameWindow(
             images=images,
             clip=clip,
@@ -312,9 +328,73 @@ class WindowBuilder:
             arrival_ns=placed[-1].arrival_ns,
             dropped=self._totals["dropped"],
             epoch=self._epoch,
+            static=before is not None and all(np.array_equal(each, before) for each in thin),
+            depths=tuple(each.depth for each in placed),
+            odometry=tuple(each.odometry for each in placed),
         )
         self._totals["built"] += 1
         self._skip = max(0, self._stride - self.frames)
         for _ in range(min(self._stride, self.frames)):
             self._placed.popleft()
         return window
+
+
+class _WindowPixels:
+    """The next window's pixels: as pictures, and as the network takes them."""
+
+    def __init__(self, frames: int) -> None:
+        self._frames = frames
+        self._images: NDArray[np.uint8] = np.empty((frames, 0, 0, 3), np.uint8)
+        self._clip: NDArray[np.float32] = np.empty((frames, 3, 0, 0), np.float32)
+
+    def put(self, place: int, image: Image) -> None:
+        """Take the picture of one place: u8 [H, W, 3].
+
+        Places are filled one after another, from 0, or after `hand_over` from any other: then what comes before it is
+        how the last window ended. Pictures of one window have one size. What was ever given away stays as it was.
+        """
+        if place == 0 or not self._images.flags.writeable or self._images.shape[1:] != image.shape:
+            self._begin(image, place)
+        self._images[place] = image
+        write_planes(image, self._clip[place])
+
+    def hand_over(self) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """The whole window, as of FrameWindow; nothing of it changes any more."""
+        self._images.setflags(write=False)
+        return self._images, self._clip
+
+    def filled(self, count: int) -> NDArray[np.float32]:
+        """The first places of the next window; after `hand_over` how the last window ended."""
+        begin = 0 if self._images.flags.writeable else self._frames - count
+        return self._clip[begin : begin + count]
+
+    def _begin(self, image: Image, shared: int) -> None:
+        """Other arrays, which begin with the last `shared` places of these."""
+        height, width, _ = image.shape
+        images = np.empty((self._frames, height, width, 3), np.uint8)
+        clip = np.empty((self._frames, 3, height, width), np.float32)
+        if shared > 0:
+            images[:shared], clip[:shared] = self._images[-shared:], self._clip[-shared:]
+        self._images, self._clip = images, clip
+
+
+class _TimeGrid:
+    """Points in time, evenly spaced; with `follow` > 0 each is drawn that part of the way to the frame it took."""
+
+    def __init__(self, *, fps: float, follow: float) -> None:
+        self.period_ns = 1e9 / fps
+        self.next_ns = 0
+        self._follow = follow
+        self._start_ns = 0
+        self._index = 0
+
+    def start(self, stamp_ns: int) -> None:
+        self._start_ns = self.next_ns = stamp_ns
+        self._index = 0
+
+    def advance(self, taken_ns: int | None) -> None:
+        """Go to the next point; taken_ns is the stamp of the frame this one took, None for a hole."""
+        if taken_ns is not None and self._follow > 0:
+            self._start_ns += round(self._follow * (taken_ns - self.next_ns))
+        self._index += 1
+        self.next_ns = self._start_ns + round(self._index * self.period_ns)

@@ -4,7 +4,7 @@
 #   launch/bench-gpu.sh [FOLDER]        FOLDER: for the figures and logs (docs/performance)
 #
 # Every step keeps what it has done: after a stop, or on a machine that is lent for ten minutes at a time, run the same
-# line again. The steps, each a file gpu-*.json for `gcd-node bench page`:
+# line again. The steps, each a file gpu-*.json that `tools/bench_model.py --show` prints:
 #   check    the tests that only a GPU can run (gpu-check.log)
 #   engines  plain torch, CUDA graphs alone, compiled alone, both, both with the decoder in float32: 25 guided steps
 #   peer     ours against diffusers, as it is and compiled, in turns in one process
@@ -49,11 +49,10 @@ else
   "$PYTHON" -c 'import torch; assert torch.cuda.is_available(), "no CUDA device; SMALL=1 tries the script on a CPU"'
 fi
 
-MODULES="import kornia, msgspec, rich, safetensors, typer, zmq, yaml, websockets, diffusers, transformers, cv2, pytest_timeout"
+MODULES="import kornia, msgspec, safetensors, psutil, diffusers, transformers, cv2, pytest_timeout"
 "$PYTHON" -c "$MODULES" 2>/dev/null ||
   "$PYTHON" -m pip install -q ${WHEELS:+--no-index --find-links "$WHEELS"} \
-    kornia msgspec rich safetensors typer pyzmq pyyaml websockets diffusers transformers opencv-contrib-python-headless \
-    pytest pytest-timeout
+    kornia msgspec safetensors psutil diffusers transformers opencv-contrib-python-headless pytest pytest-timeout
 
 limited() {
   local left=$((${MINUTES:-60} * 60 - SECONDS))
@@ -66,8 +65,8 @@ wanted() { [[ " $STEPS " == *" $1 "* ]] && [ ! -e "$ROOT/$2" ]; }
 bench_model() {
   local file=$1
   shift
-  echo "gcd-node bench model $* -> $file" >&2
-  limited "$PYTHON" -c 'from gcd_node.cli.main import main; main()' bench model "${MODEL[@]}" "$@" --json "$ROOT/$file.part"
+  echo "bench_model.py $* -> $file" >&2
+  limited "$PYTHON" tools/bench_model.py "${MODEL[@]}" "$@" --json "$ROOT/$file.part"
   mv "$ROOT/$file.part" "$ROOT/$file"
 }
 
@@ -95,4 +94,4 @@ fi
 if wanted memory gpu-memory.json; then
   bench_model gpu-memory.json --engine cuda "${PEERS[@]}" --memory --repeats 1 --warm 1
 fi
-echo "done; the page: gcd-node bench page $ROOT/*.json --out docs/performance.md" >&2
+echo "done; as tables: tools/bench_model.py --show $ROOT/gpu-*.json" >&2

@@ -53,7 +53,7 @@ for path in gradual direct; do
   gcd_train train "package:study-$path-pretrained" --data "$DATA/train/$path" --valid "$DATA/valid/$path" \
     --out "$ROOT/study-$path-pretrained" "${TRAIN[@]}" --set "model.weights=$PRETRAINED"
   gcd_train train "package:study-$path-scratch" --data "$DATA/train/$path" --valid "$DATA/valid/$path" \
-    --out "$ROOT/study-$path-scratch" "${TRAIN[@]}"
+    --out "$ROOT/study-$path-scratch" "${TRAIN[@]}" --set "model.weights=$PRETRAINED"
 done
 
 METHODS=copy_source,mean_target,ground_homography,depth_reprojection,depth_reprojection_on_mean,reproject_rgbd,vanilla_svd

@@ -1,96 +1,84 @@
-"""`gcd-node bench`: figures of this machine."""
+"""`gcd-node bench`: how a node keeps up on this machine."""
 
-from typing import Annotated, TypeAlias
+from pathlib import Path
+from typing import Annotated, Any, TypeAlias
 
 import msgspec
-import typer
 from rich.console import Console
 from rich.table import Table
-from typer import Option
+from typer import Argument, Option
 
-from gcd_node.cli.bench_model import model
-from gcd_node.cli.bench_page import page
-from gcd_node.cli.bench_stream import stream
-from gcd_node.cli.soak import quiet_node
-from gcd_node.load.bench import BenchOptions, BenchReport, Latency, bench_node
+from gcd_node.bench import RATES_HZ, bench
+from gcd_node.cli.check import Changes
+from gcd_node.config import load_config, parse_config
+from gcd_node.config_text import to_toml
+from gcd_node.errors import OutputError
 
-bench = typer.Typer(no_args_is_help=True, help="Measure on this machine.")
-bench.command("model")(model)
-bench.command("stream")(stream)
-bench.command("page")(page)
+LaunchFile: TypeAlias = Annotated[
+    Path | None, Argument(metavar="[CONFIG]", help="A launch file; the packaged drive where left out.")
+]
+Rates: TypeAlias = Annotated[
+    list[float] | None, Option("--rate", min=0.1, help="Input rate for latency, Hz; 5, 10 and 15. Again for more.")
+]
+Seconds: TypeAlias = Annotated[float, Option(min=1.0, help="How long each run is watched after its first view.")]
+Stream: TypeAlias = Annotated[bool, Option("--stream", help="One run alone, at the source's own rate.")]
+JsonFile: TypeAlias = Annotated[Path | None, Option("--json", help="Also a file, in the names of Isaac ROS Benchmark.")]
 
-Windows: TypeAlias = Annotated[int, Option(min=3, help="Windows for the latency.")]
-SlowWindows: TypeAlias = Annotated[int, Option(min=3, help="Windows of the slow model.")]
-Stall: TypeAlias = Annotated[float, Option(min=1.0, help="Seconds a reader does not read.")]
-Returns: TypeAlias = Annotated[int, Option(min=1, help="Times the camera goes and comes back.")]
-Starts: TypeAlias = Annotated[int, Option(min=1, help="Processes with the packaged model.")]
-AsJson: TypeAlias = Annotated[bool, Option("--json", help="Print the figures as one line of JSON.")]
+_ROWS: dict[str, tuple[str, int]] = {
+    "input frames": ("BasicPerformanceMetrics.NUM_FRAMES_SENT", 0),
+    "missed": ("BasicPerformanceMetrics.NUM_MISSED_FRAMES", 0),
+    "views": ("GcdNodeMetrics.NUM_VIEWS", 0),
+    "throughput, frames/s": ("BasicPerformanceMetrics.MEAN_FRAME_RATE", 1),
+    "age of a view on arrival, mean, ms": ("BasicPerformanceMetrics.MEAN_LATENCY", 0),
+    "p50": ("GcdNodeMetrics.P50_LATENCY", 0),
+    "p95": ("GcdNodeMetrics.P95_LATENCY", 0),
+    "p99": ("GcdNodeMetrics.P99_LATENCY", 0),
+    "max": ("BasicPerformanceMetrics.MAX_LATENCY", 0),
+    "jitter, mean, ms": ("BasicPerformanceMetrics.MEAN_JITTER", 0),
+    "jitter, max, ms": ("BasicPerformanceMetrics.MAX_JITTER", 0),
+    "process start to first view, s": ("GcdNodeMetrics.FIRST_VIEW", 1),
+    "CPU of the machine, idle, %": ("ResourceMetrics.BASELINE_OVERALL_CPU_UTILIZATION", 0),
+    "the same over idle while the node runs, %": ("GcdNodeMetrics.CPU_OVER_IDLE", 0),
+    "cores the node used": ("GcdNodeMetrics.CPU_CORES", 2),
+    "peak memory, MiB": ("GcdNodeMetrics.PEAK_MEMORY", 0),
+}
+"""What the table shows: the figure's name, and its decimals."""
 
 
-@bench.callback()
-def group() -> None:
-    """Nothing of its own; with it, a single command keeps its name."""
-
-
-@bench.command("node")
-def node(
-    windows: Windows = 100,
-    slow_windows: SlowWindows = 12,
-    stall: Stall = 60.0,
-    returns: Returns = 3,
-    starts: Starts = 3,
-    as_json: AsJson = False,
+def bench_command(
+    config: LaunchFile = None,
+    rates: Rates = None,
+    seconds: Seconds = 20.0,
+    stream: Stream = False,
+    changes: Changes = None,
+    json_file: JsonFile = None,
 ) -> None:
-    """Everything but the model: a scripted camera, a stand-in for the model, readers in processes of their own. And how
-    long it takes from the start of a process to the first view of the packaged model.
+    """Run a launch file in a process of its own and read its views: latency, throughput, missed frames, cost.
 
-    Takes about four minutes, with nothing else running. Needs no camera.
+    First as fast as the node can take the input, then at 5, 10 and 15 Hz; or with --stream as the source plays.
     """
-    options = BenchOptions(windows=windows, slow_windows=slow_windows, stall_s=stall, returns=returns, starts=starts)
-    with Console(stderr=True).status("starting") as status, quiet_node():
-        report = bench_node(options, lambda part: status.update(part))
-    if as_json:
-        typer.echo(msgspec.json.encode(report).decode())
+    if json_file is not None and not json_file.parent.is_dir():
+        raise OutputError(f"cannot write {json_file}: there is no folder {json_file.parent}; make it, or give another")
+    if config is None:
+        from gcd_node.demo import demo_config
+
+        settings = parse_config(to_toml(demo_config(Path())).encode(), "the packaged drive", changes or ())
     else:
-        Console().print(bench_table(report))
+        settings = load_config(config, changes or ())
+    with Console(stderr=True).status("idle") as status:
+        figures = bench(settings, status.update, rates_hz=rates or RATES_HZ, seconds=seconds, stream=stream)
+    Console().print(bench_table(figures, "stream" if stream else "as fast as it can"))
+    if json_file is not None:
+        try:
+            json_file.write_bytes(msgspec.json.format(msgspec.json.encode(figures), indent=2) + b"\n")
+        except OSError as error:
+            raise OutputError(f"cannot write {json_file}: {error.strerror}; give another path with --json") from error
 
 
-def bench_table(report: BenchReport) -> Table:
-    """The figures for people, each with what is wanted of two shared cores."""
-    title = f"{report.frames} x {report.height} x {report.width} rgb8 over ipc"
-    table = Table("", "measured", "wanted", title=title, title_style="dim")
-    slow, stalled, back = report.slow_model, report.stalled_reader, report.source_back
-    first = report.first_view
-    stages = ", ".join(f"{name} {each:.1f}" for name, each in report.stages_ms.items() if name != "capture_gap")
-    rows = (
-        ("frame to view, ms", _latency(report.latency), "p50 10, p99 30"),
-        ("stages of that, p50 ms", stages, ""),
-        (
-            f"model of {slow.work_ms:.0f} ms for windows every {slow.window_ms:.0f} ms: age, ms",
-            f"{slow.first_ms:.0f}, at the end {slow.last_ms:.0f}, most {slow.most_ms:.0f}",
-            f"no growth: never over {slow.work_ms + slow.window_ms:.0f} and what is beside the model",
-        ),
-        ("its backlog, windows", f"{slow.backlog_windows}, {slow.dropped} dropped", "at most 1"),
-        ("healthy reader alone, ms", _latency(stalled.before), ""),
-        (f"beside one stalled for {stalled.stall_s:.0f} s, ms", _latency(stalled.during), "the same"),
-        ("memory of the node meanwhile, MiB", f"{stalled.memory_growth_mb:+.1f}", "under +64"),
-        (
-            "camera back, its first frame to a view, ms",
-            f"{back.after_first_ms:.0f}, most {back.after_first_most_ms:.0f}",
-            f"{1000 + back.window_ms:.0f}",
-        ),
-        (
-            f"the same from when it could be opened, gone {back.outage_s:g} s",
-            f"{back.after_plugged_ms:.0f}, most {back.after_plugged_most_ms:.0f}",
-            "",
-        ),
-        ("process start to first view, packaged model, s", f"{first.median_s:.1f}, most {first.most_s:.1f}", "10"),
-        ("load of the machine before", f"{report.machine_load:.1f}", "0: ages are those of a starved one else"),
-    )
-    for row in rows:
-        table.add_row(*row)
+def bench_table(figures: dict[str, Any], first: str) -> Table:
+    """A column for each run, `first` above that whose figures stand at the top."""
+    rates = [name for name in figures if name.endswith("fps")]
+    table = Table("", first, *(f"{rate.removesuffix('.0fps').removesuffix('fps')} Hz" for rate in rates))
+    for label, (name, decimals) in _ROWS.items():
+        table.add_row(label, *(f"{run[name]:.{decimals}f}" for run in (figures, *(figures[rate] for rate in rates))))
     return table
-
-
-def _latency(each: Latency) -> str:
-    return f"p50 {each.p50_ms:.1f}, p99 {each.p99_ms:.1f} ({each.count} windows)"

@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from typer import Argument, Option
 
+from gcd_model import printable
 from gcd_node.check import Finding, check
 from gcd_node.config import load_config
 from gcd_node.config_text import to_toml
@@ -41,5 +42,5 @@ def check_launch(config: ConfigPath, changes: Changes = None, print_config: Prin
 def _table(findings: list[Finding]) -> Table:
     table = Table(show_header=False)
     for finding in findings:
-        table.add_row(finding.topic, finding.verdict, finding.detail, style=_STYLES[finding.verdict])
+        table.add_row(finding.topic, finding.verdict, printable(finding.detail, 4000), style=_STYLES[finding.verdict])
     return table

@@ -9,12 +9,12 @@ from rich.console import Console
 from rich.pretty import Pretty
 from typer import Argument, Option
 
-from gcd_node.control.client import ControlClient
-from gcd_node.control.message import Reply, text_arguments
+from gcd_client.control import ControlClient, ControlError, Reply
+from gcd_client.endpoints import ClientKeys, fingerprint, read_key_pair, read_public_key
+from gcd_node.auth import new_key_pair, write_key_pair
+from gcd_node.control.message import text_arguments
 from gcd_node.control.verbs import VERBS
-from gcd_node.errors import ControlError, UsageError
-from gcd_node.security.gate import check_pair, new_key_pair
-from gcd_node.security.keys import ClientKeys, fingerprint, read_key_pair, read_public_key, write_key_pair
+from gcd_node.errors import UsageError
 
 keys = typer.Typer(no_args_is_help=True, help="CURVE keys, for nodes that are reached over a network.")
 
@@ -89,7 +89,7 @@ def client_keys(folder: Path | None, node_key: str | None) -> ClientKeys | None:
     """The keys that options name; None if they name none.
 
     Raises:
-        UsageError: one without the other. ConfigError: they cannot be read.
+        UsageError: one without the other. SetupError: they cannot be read.
     """
     if folder is None and node_key is None:
         return None
@@ -117,7 +117,6 @@ def _show(reply: Reply) -> None:
 
 def _describe(folder: Path) -> None:
     pair = read_key_pair(folder)
-    check_pair(pair)
     typer.echo(f"public key   {pair.public}")
     typer.echo(f"fingerprint  {fingerprint(pair.public)}")
     typer.echo("\nTo allow it, write into the node's list of clients ([security] allow):\n")

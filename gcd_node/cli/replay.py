@@ -7,16 +7,16 @@ import msgspec
 import typer
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 from typer import Argument, Option
 
 from gcd_node.cli.check import Changes, ConfigPath
 from gcd_node.config import load_config
-from gcd_node.rendering.model_worker import WindowReport
-from gcd_node.replay.diff_pictures import REPORT, write_report
-from gcd_node.replay.diff_report import divergence, facts_table, to_plain, verdict, views_table
+from gcd_node.inference import WindowReport
+from gcd_node.replay.compare import RunComparison, Tolerance, compare
+from gcd_node.replay.diff_report import REPORT, divergence, tables, to_plain, verdict, write_report
 from gcd_node.replay.lockstep import replay
-from gcd_node.replay.run_diff import RunComparison, Tolerance, compare
-from gcd_node.replay.run_folder import RunFolder, open_run
+from gcd_node.replay.run import RunFolder, open_run
 
 RunOut: TypeAlias = Annotated[Path, Option("--out", metavar="RUN", help="Folder for the run; new, or empty.")]
 RunA: TypeAlias = Annotated[Path, Argument(metavar="RUN_A", help="A run of `gcd-node replay`, such as the golden one.")]
@@ -42,7 +42,7 @@ def replay_launch(config: ConfigPath, out: RunOut, changes: Changes = None) -> N
     """
     settings = load_config(config, changes or ())
     console = Console(stderr=True, markup=False)
-    with console.status(f"loading {settings.model.weights}") as status:
+    with console.status(Text(f"loading {settings.model.weights}")) as status:
 
         def tell(report: WindowReport) -> None:
             status.update(f"window {report.window.window_id}: {report.render_s * 1000:.0f} ms")
@@ -81,9 +81,7 @@ def diff(
 
 def _print(comparison: RunComparison, tolerance: Tolerance) -> None:
     console = Console(markup=False)
-    if comparison.facts:
-        console.print(facts_table(comparison))
-    console.print(views_table(comparison, tolerance))
+    console.print(*tables(comparison, tolerance), sep="\n")
     first = divergence(comparison)
     for line in (verdict(comparison, tolerance), *(() if first is None else (first,))):
         console.print(line, soft_wrap=True, highlight=False)
@@ -91,17 +89,17 @@ def _print(comparison: RunComparison, tolerance: Tolerance) -> None:
 
 def _run_table(run: RunFolder) -> Table:
     manifest = run.manifest
-    totals, machine = manifest.totals, manifest.machine
+    totals, made_from = manifest.totals, manifest.made_from
     rejected = ", ".join(f"{count} {reason}" for reason, count in totals.rejected.items()) or "0"
     table = Table(show_header=False)
     for row in (
-        ("weights", f"{manifest.weights.name} {manifest.weights.sha256_12}"),
+        ("weights", f"{made_from['weights name']} {made_from['weights sha256_12']}"),
         ("frames read", str(totals.frames)),
         ("windows rendered", str(totals.windows)),
         ("windows rejected", rejected),
         ("windows with NaN", str(totals.nan_windows)),
         ("views", ", ".join(manifest.views)),
-        ("on", f"{machine.device}, {machine.processor}, {machine.threads} threads"),
+        ("on", ", ".join(made_from[f"machine {name}"] for name in ("device", "processor", "threads")) + " threads"),
     ):
         table.add_row(*row)
     return table

@@ -8,11 +8,11 @@ from rich.console import Console
 from rich.live import Live
 from typer import Argument, Option
 
+from gcd_client.endpoints import resolve_endpoint
+from gcd_client.protocol import StatusMessage
 from gcd_node.cli.control import KeyFolder, NodeKey, client_keys
-from gcd_node.envelope import NoteMessage
 from gcd_node.watching.status_board import STALE_AFTER_S, StatusBoard
 from gcd_node.watching.status_table import StatusRequest, render_status, watch_status
-from gcd_node.wire.endpoints import resolve_endpoint
 
 Endpoint: TypeAlias = Annotated[str, Argument(metavar="ENDPOINT", help="ipc, ipc://PATH or tcp://HOST:PORT.")]
 Once: TypeAlias = Annotated[bool, Option("--once", help="Print one status and end; 69 if none comes.")]
@@ -52,7 +52,7 @@ def _print_json(request: StatusRequest) -> None:
     def one(board: StatusBoard) -> None:
         line("status", board.record(time.monotonic()))
 
-    def note(message: NoteMessage) -> None:
+    def note(message: StatusMessage) -> None:
         header = message.header
         line(message.topic, {**message.fields, "node_id": header.node_id, "boot_id": header.boot_id})
 
@@ -88,5 +88,5 @@ def _show_live(request: StatusRequest) -> None:
         watch_status(request, show, _ignore)
 
 
-def _ignore(_: NoteMessage) -> None:
+def _ignore(_: StatusMessage) -> None:
     """The board has it already."""

@@ -9,6 +9,7 @@ from typing import Annotated, Literal, TypeAlias
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.text import Text
 from typer import Argument, Option
 
 from gcd_model import (
@@ -23,10 +24,11 @@ from gcd_model import (
     load_synthesizer,
 )
 from gcd_node.cli.weights import FamilyOption, HeadWidth, ImageHeads
-from gcd_node.config import SourcePose
 from gcd_node.errors import UsageError
+from gcd_node.messages import ontology
 from gcd_node.offline_clip import ClipRequest, read_clip, with_depth
-from gcd_node.optics.source_pose import assumed_hfov_deg, require_usable, stated_mount
+from gcd_node.preprocess import assumed_hfov_deg, require_usable, stated_mount
+from gcd_node.source_config import SourcePose
 from gcd_node.sources.depth import OnnxDepth
 from gcd_node.synthesize import (
     InjectedNoise,
@@ -38,7 +40,6 @@ from gcd_node.synthesize import (
     save_arrays,
     write_view,
 )
-from gcd_node.wire.view_message import ontology
 
 _VIEW, _CLIP, _SAMPLING, _MODEL = "The view", "The clip", "Sampling", "The model"
 _DEPTH = "Depth from elsewhere, for the live model; for others it tells what was seen"
@@ -72,7 +73,7 @@ SourceRadius: TypeAlias = Annotated[
 ]
 MountHeight: TypeAlias = Annotated[
     float | None,
-    Option(help="Camera above the ground, metres, for models that use its mount.", rich_help_panel=_MOUNT),
+    Option(help="Camera above the ground, metres, for the live model.", rich_help_panel=_MOUNT),
 ]
 MountForward: TypeAlias = Annotated[
     float | None, Option(help="Camera ahead of the vehicle's origin, metres.", rich_help_panel=_MOUNT)
@@ -279,7 +280,7 @@ class _Order:
 
 def _run(order: _Order, out: Path, save: Path | None) -> None:
     _require_possible(order.input_path, save, order.options.samples)
-    with Console(stderr=True, markup=False).status(f"loading {order.weights}"):
+    with Console(stderr=True, markup=False).status(Text(f"loading {order.weights}")):
         model = order.load()
     traits = model.traits
     require_usable(order.view.source, traits)
@@ -309,12 +310,12 @@ def _with_field_of_view(order: _Order, traits: Traits) -> ClipRequest:
     """The clip with the lens that its depth and the live model need: as stated, measured, or else as trained."""
     clip = order.clip
     measured = order.depth.place is not None
-    if measured and not traits.live and (traits.plane_warp is not None or not traits.knows_camera):
+    if measured and not (traits.live or traits.knows_camera):
         raise UsageError(f"{traits.name} takes no depth; leave --depth out")
     if order.depth.unit_m != 1.0 and (not measured or traits.live):
         raise UsageError("--unit-m is about depth beside a published checkpoint; leave it out")
     needed = measured or traits.live
-    if clip.hfov_deg is not None and not needed and traits.mount is None:
+    if clip.hfov_deg is not None and not needed:
         raise UsageError(f"{traits.name} has no use for --hfov-deg; leave it out")
     if not needed or clip.right is not None or clip.hfov_deg is not None:
         return clip

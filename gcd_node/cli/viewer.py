@@ -1,23 +1,24 @@
-"""`gcd-node viewer`: the page for a node that runs in another process; and how any page's address is told."""
+"""`gcd-node viewer`: the page for a running node, served from a process of its own."""
 
 import os
 import signal
+import sys
 import threading
 import webbrowser
 from types import FrameType
 from typing import Annotated, TypeAlias
 
-from rich.console import Console
+import typer
 from typer import Option
 
 from gcd_node.cli.control import KeyFolder, NodeKey, client_keys
-from gcd_node.viewer.hub import NodeEndpoints
-from gcd_node.viewer.server import ViewerOptions, ViewerServer
 
 Http: TypeAlias = Annotated[str, Option(help="Where to serve the page: 127.0.0.1:PORT.")]
 Data: TypeAlias = Annotated[str, Option(help="The node's data endpoint: ipc, ipc://PATH or tcp://HOST:PORT.")]
 Status: TypeAlias = Annotated[str, Option(help="Its status endpoint.")]
-Control: TypeAlias = Annotated[str, Option(help="Its control endpoint.")]
+Control: TypeAlias = Annotated[str, Option(help="Its control endpoint; none to look only.")]
+Open: TypeAlias = Annotated[bool, Option("--open", help="Open the page in a browser, where there is a screen.")]
+EndsWithStdin: TypeAlias = Annotated[bool, Option("--ends-with-stdin", hidden=True)]
 
 
 def viewer(
@@ -27,31 +28,33 @@ def viewer(
     control: Control = "ipc",
     key_folder: KeyFolder = None,
     node_key: NodeKey = None,
+    show: Open = False,
+    ends_with_stdin: EndsWithStdin = False,
 ) -> None:
-    """Serve the page for a running node, from a process of its own; ends with Ctrl-C."""
-    keys = client_keys(key_folder, node_key)
-    node = NodeEndpoints(data=data, status=status, control=control, keys=keys)
+    """Serve the page for a running node, which it reads as any client does; ends with Ctrl-C."""
+    from gcd_node.viewer.node_link import NodeEndpoints  # OpenCV and the server: the other quick commands need neither
+    from gcd_node.viewer.server import ViewerServer
+
     ended = threading.Event()
 
     def end(_number: int, _frame: FrameType | None) -> None:
         ended.set()
 
+    def end_with_stdin() -> None:
+        sys.stdin.buffer.read()
+        ended.set()
+
+    if ends_with_stdin:
+        threading.Thread(target=end_with_stdin, daemon=True).start()
+    keys = client_keys(key_folder, node_key)
+    node = NodeEndpoints(data=data, status=status, control=None if control == "none" else control, keys=keys)
     previous = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        with ViewerServer(ViewerOptions(http=http, node=node)) as server:
-            tell_page(Console(stderr=True), server.operator_url)
+        with ViewerServer(http, node) as server:
+            typer.echo(f"page {server.operator_url}", err=True)  # nowhere else is the token shown
+            if show and any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")):
+                webbrowser.open(server.operator_url)
             ended.wait()
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
-
-
-def tell_page(console: Console, url: str) -> None:
-    """The one place where the token is shown; without it, whoever has the rest of the address may look."""
-    console.print(f"page {url}", soft_wrap=True, highlight=False, markup=False)
-
-
-def show_page(url: str) -> None:
-    """Open a page where there is a screen; a browser in the terminal would only take the terminal away."""
-    if any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")):
-        webbrowser.open(url)

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
+from rich.text import Text
 from typer import Argument, Option, Typer
 
 from gcd_model import ModelConfig, WeightsReport, convert_weights, inspect_weights
@@ -38,7 +39,7 @@ def inspect(
 ) -> None:
     """Say what a checkpoint holds: architecture, family, sizes, and what will be left out. Loads no weights."""
     console = Console(markup=False)
-    with Console(stderr=True, markup=False).status(f"reading {file}"):
+    with Console(stderr=True, markup=False).status(Text(f"reading {file}")):
         report = inspect_weights(
             file, family=family, head_width=head_width, image_heads=image_heads, full_digest=full_digest
         )

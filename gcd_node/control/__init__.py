@@ -1,1 +1,1 @@
-"""The control socket and its client: verbs, messages, limits (wire protocol, section 5)."""
+"""The control socket: verbs, commands, limits (wire protocol, section 5). Its client: gcd_client.control."""

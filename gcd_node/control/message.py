@@ -1,55 +1,19 @@
-"""What is said on the control socket: requests, commands, replies (wire protocol, section 5). Verbs: control.verbs.
+"""From requests (gcd_client.control) to checked commands, and what becomes of them. Verbs: control.verbs.
 
 Pure: bytes in, types out. Whatever a peer sends becomes a `Command` or a `RequestError`, never another exception.
 """
 
 import difflib
-import enum
 import re
 from dataclasses import dataclass
-from typing import Annotated, TypeAlias
+from typing import TypeAlias
 
 import msgspec
 import msgspec.inspect
-from msgspec import Meta
 
-from gcd_node.control.verbs import VERBS, Arguments
-from gcd_node.errors import ControlError, MessageError
-from gcd_node.wire.header import PROTO, check_version
-from gcd_node.wire.record_json import LARGEST_INTEGER, short
-
-MAX_REQUEST = 64 * 1024
-"""Bytes a request may have; ZeroMQ drops a peer that sends more."""
-
-MAX_REPLY = 4 * 1024 * 1024
-"""Bytes a client accepts as a reply."""
-
-RequestId: TypeAlias = Annotated[str, Meta(pattern=r"^[!-~]{1,64}$(?!\n)")]
-
-
-class Code(enum.StrEnum):
-    """How a request ended. ACCEPTED: begun, an event tells how it ends."""
-
-    OK = "OK"
-    ACCEPTED = "ACCEPTED"
-    BAD_JSON = "BAD_JSON"
-    BAD_PROTO = "BAD_PROTO"
-    UNKNOWN_VERB = "UNKNOWN_VERB"
-    BAD_ARG = "BAD_ARG"
-    OUT_OF_RANGE = "OUT_OF_RANGE"
-    VIEW_FIXED = "VIEW_FIXED"
-    UNKNOWN_VIEW = "UNKNOWN_VIEW"
-    WRONG_STATE = "WRONG_STATE"
-    BUSY = "BUSY"
-    FORBIDDEN = "FORBIDDEN"
-    TOO_LARGE = "TOO_LARGE"
-    NOT_READY = "NOT_READY"
-    INTERNAL = "INTERNAL"
-
-    @property
-    def ok(self) -> bool:
-        """Whether the request was done or begun."""
-        return self in (Code.OK, Code.ACCEPTED)
+from gcd_client.control import MAX_REQUEST, Code, ControlError, Request, RequestId
+from gcd_client.protocol import MessageError, check_version
+from gcd_node.control.verbs import VERBS
 
 
 class RequestError(ControlError):
@@ -62,36 +26,6 @@ class RequestError(ControlError):
         self.result = result
 
 
-class Request(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """A request as it travels.
-
-    id: chosen by who asks, new for each request; the same one within 60 s is a repeat and gets the same reply.
-    dry_run: check everything, change nothing. if_view_rev: only if the view named still has this revision.
-    """
-
-    proto: str
-    id: RequestId
-    verb: str
-    args: msgspec.Raw = msgspec.Raw(b"{}")
-    dry_run: bool = False
-    if_view_rev: Annotated[int, Meta(ge=0, le=LARGEST_INTEGER)] | None = None
-
-
-class Reply(msgspec.Struct, frozen=True, kw_only=True):
-    """A reply as it travels; unknown keys are ignored, as a newer node may say more.
-
-    ok: the code is OK or ACCEPTED. state: of the node's life. result: what was asked for, or what would be allowed.
-    """
-
-    id: str
-    ok: bool
-    code: Code
-    message: str
-    state: str
-    result: dict[str, object] | None = None
-    proto: str = PROTO
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Command:
     """A request that was read and checked. args: the struct that VERBS names for the verb.
@@ -101,7 +35,7 @@ class Command:
     """
 
     verb: str
-    args: Arguments
+    args: msgspec.Struct
     dry_run: bool = False
     if_view_rev: int | None = None
 
@@ -117,7 +51,7 @@ class Outcome:
     @property
     def ok(self) -> bool:
         """Whether it was done or begun."""
-        return self.code.ok
+        return self.code in (Code.OK, Code.ACCEPTED)
 
 
 def parse_request(part: bytes) -> Request:
@@ -152,35 +86,18 @@ def parse_command(request: Request) -> Command:
     verb = VERBS.get(request.verb)
     if verb is None:
         known = _nearest(request.verb, list(VERBS))
-        raise RequestError(f"there is no verb {short(request.verb)}; {known}", Code.UNKNOWN_VERB, request.id)
+        raise RequestError(f"there is no verb {request.verb!a:.60}; {known}", Code.UNKNOWN_VERB, request.id)
     if request.if_view_rev is not None and not verb.names_view:
         raise RequestError(f"{request.verb} names no view, so leave if_view_rev out", Code.BAD_ARG, request.id)
     try:
         given = msgspec.json.decode(request.args, type=dict[str, msgspec.Raw])
         if nothing := [name for name, value in given.items() if bytes(value).strip() == b"null"]:
-            message = f"{short(nothing[0])} is null, as NaN becomes on some ways to JSON; leave out what you do not set"
+            message = f"{nothing[0]!a:.60} is null, as NaN becomes on some ways to JSON; leave out what you do not set"
             raise RequestError(message, Code.BAD_ARG, request.id)
         args = msgspec.json.decode(request.args, type=verb.arguments)
     except _MALFORMED as error:
         raise _refused(error, verb.arguments, request.id) from error
     return Command(verb=request.verb, args=args, dry_run=request.dry_run, if_view_rev=request.if_view_rev)
-
-
-def encode_request(request: Request) -> bytes:
-    """One JSON part, checked as a node will check it. Raises RequestError as parse_request()."""
-    part = msgspec.json.encode(request)
-    parse_request(part)
-    return part
-
-
-def decode_reply(part: bytes) -> Reply:
-    """Inverse of the node's encoding. Raises ControlError for what is no reply, or another major version's."""
-    try:
-        reply = msgspec.json.decode(part, type=Reply)
-        check_version(reply.proto)
-    except (*_MALFORMED, MessageError) as error:
-        raise ControlError(f"this is no reply of a gcd node: {_said(error)}; is it its control endpoint?") from error
-    return reply
 
 
 def text_arguments(verb: str) -> frozenset[str]:
@@ -219,7 +136,7 @@ def _explained(error: Exception, kind: type[msgspec.Struct]) -> str:
     if unknown is None:
         return _said(error).replace("`$.", "`")
     known = _nearest(unknown.group(1), list(kind.__struct_encode_fields__))
-    return f"unknown argument {short(unknown.group(1))}; {known}"
+    return f"unknown argument {unknown.group(1)!a:.60}; {known}"
 
 
 def _nearest(name: str, known: list[str]) -> str:

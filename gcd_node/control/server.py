@@ -4,7 +4,6 @@ Who reaches it over ipc, or over loopback where no keys are set up, is an operat
 Elsewhere the key decides.
 """
 
-import contextlib
 import logging
 import threading
 import time
@@ -16,30 +15,22 @@ from typing import Protocol, TypeAlias
 import msgspec
 import zmq
 
+from gcd_client.control import MAX_REPLY, MAX_REQUEST, Code, Reply, Request
+from gcd_client.protocol import ClientError
+from gcd_node.auth import Client, EventSink, Role, ServerSecurity, SocketGuard, unbind
+from gcd_node.binding import own_endpoint
 from gcd_node.control.limits import FloodGuard, ReplyCache
-from gcd_node.control.message import (
-    MAX_REPLY,
-    MAX_REQUEST,
-    Code,
-    Command,
-    Outcome,
-    Reply,
-    Request,
-    RequestError,
-    parse_command,
-    parse_request,
-)
+from gcd_node.control.message import Command, Outcome, RequestError, parse_command, parse_request
 from gcd_node.control.verbs import VERBS
 from gcd_node.errors import NodeError
-from gcd_node.security.gate import EventSink, Gate, ServerSecurity, unbind
-from gcd_node.security.keys import Client, Role
-from gcd_node.wire.endpoints import own_endpoint
 
 _LOG = logging.getLogger(__name__)
 _TICK_MS = 50
 _LINGER_MS = 500
 _QUEUED = 16
 _SECOND_NS = 1_000_000_000
+_LARGEST_READ = 4 * MAX_REQUEST  # what is longer than a request is refused with a reason, up to here
+_MALFORMED = (Code.BAD_JSON, Code.BAD_PROTO, Code.TOO_LARGE)
 _LOCAL = Client(name="", role="operator")
 
 
@@ -98,17 +89,22 @@ class ControlServer:
         self._ignore_s = options.ignore_s
         self._closing = threading.Event()
         self._context = zmq.Context()
+        self._guard = SocketGuard(self._context, options.security, on_event)
         try:
-            self._gate = Gate(self._context, options.security, on_event)
             self._socket = _router(self._context)
-            self.endpoint = self._gate.bind(self._socket, own_endpoint(options.endpoint, "control"), "control")
+            self.endpoint = self._guard.bind(self._socket, own_endpoint(options.endpoint, "control"), "control")
         except BaseException:
+            self._guard.close()
             self._context.destroy(linger=0)
             raise
-        self._named = options.security is not None and self.endpoint.startswith("tcp://")
-        self._gate.start()
+        self._security = options.security if self.endpoint.startswith("tcp://") else None
         self._thread = threading.Thread(target=self._serve, name="control", daemon=True)
         self._thread.start()
+
+    def dead_threads(self) -> list[str]:
+        """Threads of this server that have died."""
+        alive = {"control": self._thread.is_alive(), "control authentication": self._guard.alive}
+        return [] if self._closing.is_set() else [name for name, lives in alive.items() if not lives]
 
     def close(self) -> None:
         """Stop answering; replies on their way get half a second to leave. A second call does nothing."""
@@ -116,7 +112,7 @@ class ControlServer:
             return
         self._closing.set()
         self._thread.join()
-        self._gate.close()
+        self._guard.close()
         self._context.term()
 
     def __enter__(self) -> "ControlServer":
@@ -130,10 +126,11 @@ class ControlServer:
     def _serve(self) -> None:
         try:
             while not self._closing.is_set():
+                self._guard.report_failures()
                 if self._socket.poll(_TICK_MS):
                     self._receive_safely()
         except Exception:
-            _LOG.exception("the control socket stopped; the node goes on without it")
+            _LOG.exception("the control thread died")
         finally:
             unbind(self._socket, self.endpoint, _LINGER_MS)
 
@@ -146,14 +143,16 @@ class ControlServer:
     def _receive(self) -> None:
         received_ns = time.time_ns()
         peer, *parts = self._socket.recv_multipart(copy=False)
-        self._note_whole(parts)
         if self._flood.ignores(peer.bytes, time.monotonic()):
             return
         client = self._client(parts[-1]) if parts else None
         if client is None:
             return
         answer = self._answers.answer([part.bytes for part in parts], client, received_ns)
-        if answer.malformed and self._flood.bad(peer.bytes, time.monotonic()):
+        if answer.code is Code.TOO_LARGE:
+            _LOG.warning("TOO_LARGE: refused a request of %d bytes", len(parts[0]))
+            self._on_event("TOO_LARGE", {"level": 1, "channel": "control"})
+        if answer.code in _MALFORMED and self._flood.bad(peer.bytes, time.monotonic()):
             _LOG.warning("CONTROL_FLOOD: a client sends nonsense and is ignored for %g s", self._ignore_s)
             self._on_event("CONTROL_FLOOD", {"level": 1, "client": client.name, "ignored_s": self._ignore_s})
             return
@@ -161,21 +160,17 @@ class ControlServer:
         if self._on_answer is not None:
             self._on_answer(parts[0].bytes, answer.part, client)
 
-    def _note_whole(self, parts: list[zmq.Frame]) -> None:
-        with contextlib.suppress(zmq.ZMQError):  # of a connection that is gone
-            self._gate.whole(int(parts[-1].get(zmq.SRCFD)))
-
     def _client(self, frame: zmq.Frame) -> Client | None:
         """Who sent this, by his key; None if the key was taken off the list since."""
-        return self._gate.client(str(frame.get("User-Id"))) if self._named else _LOCAL
+        return _LOCAL if self._security is None else self._security.find_client(str(frame.get("User-Id")))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Answer:
-    """A reply as bytes, and whether the request was no request at all."""
+    """A reply as bytes. code: why it could not be read as a request; None if it could."""
 
     part: bytes
-    malformed: bool
+    code: Code | None = None
 
 
 class Answers:
@@ -194,11 +189,10 @@ class Answers:
             if len(parts) != 1:
                 raise RequestError(f"a request is one part, got {len(parts)}; use a DEALER socket", Code.BAD_JSON)
             request = parse_request(parts[0])
-            return Answer(part=self._reply(request, parts[0], client, received_ns), malformed=False)
+            return Answer(part=self._reply(request, parts[0], client, received_ns))
         except RequestError as error:
             outcome = Outcome(code=error.reason, message=str(error), result=error.result)
-            malformed = error.reason in (Code.BAD_JSON, Code.BAD_PROTO)
-            return Answer(part=self._encoded(error.request_id, outcome), malformed=malformed)
+            return Answer(part=self._encoded(error.request_id, outcome), code=error.reason)
 
     def _reply(self, request: Request, part: bytes, client: Client, received_ns: int) -> bytes:
         """Raises RequestError."""
@@ -226,7 +220,7 @@ class Answers:
             return self._commands.handle(command, role)
         except RequestError as error:
             return Outcome(code=error.reason, message=str(error), result=error.result)
-        except NodeError as error:
+        except (NodeError, ClientError) as error:
             return Outcome(code=Code.INTERNAL, message=str(error))
         except Exception as error:
             _LOG.exception("%s failed", command.verb)
@@ -258,7 +252,7 @@ class Answers:
 def _router(context: "zmq.Context[zmq.Socket[bytes]]") -> "zmq.Socket[bytes]":
     socket = context.socket(zmq.ROUTER)
     socket.set(zmq.ROUTER_HANDOVER, 0)
-    socket.set(zmq.MAXMSGSIZE, MAX_REQUEST)
+    socket.set(zmq.MAXMSGSIZE, _LARGEST_READ)  # of each part; libzmq hangs up on whoever sends more
     socket.set(zmq.RCVHWM, _QUEUED)
     socket.set(zmq.SNDHWM, _QUEUED)
     socket.set(zmq.LINGER, 0)

@@ -9,63 +9,11 @@ from typing import Annotated, Any, Literal, TypeAlias
 import msgspec
 from msgspec import Meta
 
-from gcd_node.config import Matrix, ViewConfig
-from gcd_node.security.keys import Role
-from gcd_node.wire.record_json import LARGEST_INTEGER
+from gcd_client.protocol import LARGEST_INTEGER
+from gcd_node.auth import Role
+from gcd_node.config import Matrix, Pose, ViewConfig, pose_matrix
 
 ViewName: TypeAlias = Annotated[str, Meta(pattern=r"^[a-z0-9_]{1,16}$(?!\n)")]
-
-
-class Hello(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Who answers: node, boot, version, and the role of who asks."""
-
-
-class Describe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Verbs and their arguments, the views this checkpoint allows, limits."""
-
-
-class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """State of the node, of its source and of its model."""
-
-
-class Stats(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The status message, now."""
-
-
-class Time(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The node's clock when the request came and when the reply left."""
-
-
-class Views(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Every view with its pose and revision."""
-
-
-class GetConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The configuration in force, without passwords."""
-
-
-class GetCalib(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Intrinsics of the source and of the views."""
-
-
-class Configure(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Check the configuration and load the model."""
-
-
-class Activate(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Open the source and publish views."""
-
-
-class Deactivate(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Close the source, keep the model."""
-
-
-class Cleanup(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Let go of the model."""
-
-
-class Shutdown(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """End the process in order."""
 
 
 class SetView(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -88,27 +36,47 @@ class SetView(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     amplitude_deg: Annotated[float, Meta(gt=0)] | None = None
 
     def __post_init__(self) -> None:
-        angles = (self.azimuth_deg, self.elevation_deg, self.radius)
-        if self.source_from_view is not None and angles != (None, None, None):
-            raise ValueError("a goal is T_src_dst, or azimuth_deg, elevation_deg and radius: state one of the two")
+        if self.source_from_view is not None:
+            pose_matrix(self.source_from_view)
+            if (self.azimuth_deg, self.elevation_deg, self.radius, self.position_m) != (None,) * 4:
+                raise ValueError("a goal is T_src_dst, or azimuth_deg, elevation_deg and radius: state one of the two")
         self.to_config()
 
     def to_config(self) -> ViewConfig:
-        """The view as a launch file states it; its differences are 0 if `source_from_view` is given instead.
+        """The view as a launch file states it.
 
         Raises:
-            ValueError: an orbit without rate or amplitude, or a fixed view with them.
+            ValueError: an orbit without rate or amplitude, or another view with them.
         """
         return ViewConfig(
-            kind=self.kind,
+            kind=self.kind if self.source_from_view is None else "pose",
             azimuth_deg=self.azimuth_deg or 0.0,
             elevation_deg=self.elevation_deg or 0.0,
             radius=self.radius or 0.0,
             position_m=self.position_m,
             look_at_m=self.look_at_m,
+            pose=self.source_from_view,
             rate_deg_s=self.rate_deg_s,
             amplitude_deg=self.amplitude_deg,
         )
+
+
+class SetPose(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Put a view at a rigid pose.
+
+    pose: as in [view.*] of kind "pose": x, y, z and a quaternion x, y, z, w, or 16 numbers, row-major 4x4, in the
+        source camera's axes.
+    """
+
+    view: ViewName
+    pose: Pose
+
+    def __post_init__(self) -> None:
+        pose_matrix(self.pose)
+
+    def to_config(self) -> ViewConfig:
+        """The view as a launch file states it."""
+        return ViewConfig(kind="pose", pose=self.pose)
 
 
 class RemoveView(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -135,50 +103,44 @@ class SetParam(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             raise ValueError(f"nothing to change; name one of {', '.join(self.__struct_fields__)}")
 
 
-class RecordStart(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Begin to record."""
-
-
-class RecordStop(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Finish the recording."""
-
-
-Arguments: TypeAlias = (
-    Hello | Describe | State | Stats | Time | Views | GetConfig | GetCalib
-    | Configure | Activate | Deactivate | Cleanup | Shutdown
-    | SetView | RemoveView | SetParam | RecordStart | RecordStop
-)  # fmt: skip
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Verb:
     """What a verb takes, who may say it, and whether `if_view_rev` goes with it."""
 
-    arguments: type[Arguments]
+    arguments: type[msgspec.Struct]
     role: Role
     names_view: bool = False
 
 
+def _plain(name: str, role: Role, about: str) -> Verb:
+    """A verb without arguments."""
+    kind = msgspec.defstruct(name, [], frozen=True, forbid_unknown_fields=True, namespace={"__doc__": about})
+    return Verb(arguments=kind, role=role)
+
+
 VERBS: Mapping[str, Verb] = types.MappingProxyType(
     {
-        "hello": Verb(arguments=Hello, role="viewer"),
-        "describe": Verb(arguments=Describe, role="viewer"),
-        "state": Verb(arguments=State, role="viewer"),
-        "stats": Verb(arguments=Stats, role="viewer"),
-        "time": Verb(arguments=Time, role="viewer"),
-        "views": Verb(arguments=Views, role="viewer"),
-        "get_config": Verb(arguments=GetConfig, role="viewer"),
-        "get_calib": Verb(arguments=GetCalib, role="viewer"),
-        "configure": Verb(arguments=Configure, role="operator"),
-        "activate": Verb(arguments=Activate, role="operator"),
-        "deactivate": Verb(arguments=Deactivate, role="operator"),
-        "cleanup": Verb(arguments=Cleanup, role="operator"),
-        "shutdown": Verb(arguments=Shutdown, role="operator"),
+        "hello": _plain("Hello", "viewer", "Who answers: node, boot, version, and the role of who asks."),
+        "describe": _plain(
+            "Describe", "viewer", "Verbs and their arguments, the views this checkpoint allows, limits."
+        ),
+        "state": _plain("State", "viewer", "State of the node, of its source and of its model."),
+        "stats": _plain("Stats", "viewer", "The status message, now."),
+        "time": _plain("Time", "viewer", "The node's clock when the request came and when the reply left."),
+        "views": _plain("Views", "viewer", "Every view with its pose and revision."),
+        "get_config": _plain("GetConfig", "viewer", "The configuration in force, without passwords."),
+        "get_calib": _plain("GetCalib", "viewer", "Intrinsics of the source and of the views."),
+        "configure": _plain("Configure", "operator", "Check the configuration and load the model."),
+        "activate": _plain("Activate", "operator", "Open the source and publish views."),
+        "deactivate": _plain("Deactivate", "operator", "Close the source, keep the model."),
+        "cleanup": _plain("Cleanup", "operator", "Let go of the model."),
+        "shutdown": _plain("Shutdown", "operator", "End the process in order."),
         "set_view": Verb(arguments=SetView, role="operator", names_view=True),
+        "set_pose": Verb(arguments=SetPose, role="operator", names_view=True),
         "remove_view": Verb(arguments=RemoveView, role="operator", names_view=True),
         "set_param": Verb(arguments=SetParam, role="operator"),
-        "record_start": Verb(arguments=RecordStart, role="operator"),
-        "record_stop": Verb(arguments=RecordStop, role="operator"),
+        "record_start": _plain("RecordStart", "operator", "Begin to record."),
+        "record_stop": _plain("RecordStop", "operator", "Finish the recording."),
     }
 )
 """Every verb. A viewer's verbs change nothing; an operator may say all of them."""

@@ -15,8 +15,9 @@ from typing import Protocol, TypeAlias
 
 from gcd_node.errors import SourceError, SourceLostError
 from gcd_node.frame import Frame, FrameSource, SourceInfo
-from gcd_node.health.report import SourceState
+from gcd_node.health import SourceState
 from gcd_node.life.camera_threads import Reading, close_in_time, leave, open_aside
+from gcd_node.source_config import SourceKind
 from gcd_node.window import Reason
 
 _LOG = logging.getLogger(__name__)
@@ -53,6 +54,11 @@ class Backoff:
     def reset(self) -> None:
         """It worked: begin again from `first_s`."""
         self._attempts = 0
+
+
+def backoff_of(kind: SourceKind) -> Backoff:
+    """A source that only listens knocks nowhere: it is hardly ever away."""
+    return Backoff(limit_s=0.5) if kind == "push" else Backoff()
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gcd_node.errors import OutputError, SourceError
 
-_FAILURES = (OSError, ValueError, EOFError, KeyError, TypeError, MemoryError, OverflowError, zipfile.BadZipFile)
+_MOST_BYTES = 2**30  # of all arrays, unfolded
 
 
 def read_npy(path: Path, wanted: str) -> NDArray[Any]:
@@ -30,7 +30,7 @@ def read_npz(path: Path, wanted: str) -> dict[str, NDArray[Any]]:
     try:
         with loaded:
             return {name: loaded[name] for name in loaded.files}
-    except _FAILURES as error:
+    except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
         raise _unreadable(path, wanted, error) from error
 
 
@@ -57,8 +57,16 @@ def _write(path: Path, save: Callable[[BinaryIO], None]) -> None:
 
 def _load(path: Path, wanted: str) -> Any:
     try:
+        if path.exists() and not path.is_file():
+            raise ValueError("it is no regular file")
+        size = path.stat().st_size
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                size = sum(entry.file_size for entry in archive.infolist())
+        if size > _MOST_BYTES:
+            raise ValueError(f"it holds more than {_MOST_BYTES} bytes")
         return np.load(path, allow_pickle=False)
-    except _FAILURES as error:
+    except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
         raise _unreadable(path, wanted, error) from error
 
 

@@ -1,4 +1,4 @@
-"""Input, view and class map of the same moments beside each other, with headings and a legend. Images are u8 RGB."""
+"""Pictures of the same moments beside each other, with headings and a legend. Images are u8 RGB."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,37 +6,31 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from gcd_node.pictures.files import Image, side_by_side
-from gcd_node.wire.header import PAINTED, ClassRecord
+from gcd_client.protocol import ClassRecord
+from gcd_node.frame import Image
+from gcd_node.pictures.files import side_by_side
 
 _COLUMN_WIDTH = 320  # pixels; smaller pictures are enlarged by a whole factor to at least this
 _FONT, _SCALE, _THICKNESS = cv2.FONT_HERSHEY_SIMPLEX, 0.45, 1
 _LINE, _SWATCH, _GAP = 22, 14, 6
 _INK, _PAPER = (30, 30, 30), 255
-_HATCH_PERIOD, _HATCH_WIDTH, _HATCH = 6, 2, (245, 158, 11)  # the page's amber: what a model drew
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Moment:
-    """One moment: the camera's picture, the view made of it, and the view's class map in colours; all [H, W, 3].
-
-    classes: None for a model that makes no class map.
-    """
+    """One moment, each [H, W, 3]: the camera's picture, the view made of it, the same with what is painted hatched, and
+    the view's class map in colours."""
 
     source: Image
     view: Image
-    classes: Image | None = None
-
-    @property
-    def columns(self) -> tuple[Image, ...]:
-        """What there is, from left to right."""
-        return (self.source, self.view) if self.classes is None else (self.source, self.view, self.classes)
+    seen: Image
+    classes: Image
 
 
 def comparison(moments: Sequence[Moment], classes: Sequence[ClassRecord], headings: Sequence[str]) -> Image:
     """One row for each moment, a heading above each column, and under them what the colours mean.
 
-    classes: the ontology, empty for no legend. headings: one for each column.
+    classes: the ontology. headings: one for each column.
     """
     rows = [side_by_side(*_enlarged(moment)) for moment in moments]
     width = rows[0].shape[1]
@@ -44,19 +38,7 @@ def comparison(moments: Sequence[Moment], classes: Sequence[ClassRecord], headin
     parts = [heading_line(headings, width)]
     for row in rows:
         parts += [row, line]
-    if classes:
-        parts.append(legend(classes, width))
-    return np.concatenate(parts, axis=0)
-
-
-def hatched(pictures: Image, visibility: Image) -> Image:
-    """Pictures u8 [..., H, W, 3] with thin amber diagonals over painted pixels; what was seen stays as it is.
-
-    visibility: u8 [..., H, W], 0 for painted.
-    """
-    rows, columns = np.indices(visibility.shape[-2:])
-    lines = ((rows + columns) % _HATCH_PERIOD < _HATCH_WIDTH) & (visibility == PAINTED)
-    return np.where(lines[..., None], pictures // 2 + np.array(_HATCH, np.uint8) // 2, pictures)
+    return np.concatenate([*parts, legend(classes, width)], axis=0)
 
 
 def heading_line(headings: Sequence[str], width: int) -> Image:
@@ -82,11 +64,9 @@ def _enlarged(moment: Moment) -> list[Image]:
     """Photographs smoothly, class maps without new colours."""
     factor = max(1, -(-_COLUMN_WIDTH // moment.source.shape[1]))
     size = (factor * moment.source.shape[1], factor * moment.source.shape[0])
-    hows = (cv2.INTER_CUBIC, cv2.INTER_CUBIC, cv2.INTER_NEAREST)
-    return [
-        np.asarray(cv2.resize(picture, size, interpolation=how), np.uint8)
-        for picture, how in zip(moment.columns, hows, strict=False)
-    ]
+    photographs = [cv2.resize(each, size, interpolation=cv2.INTER_CUBIC) for each in (moment.source, moment.view)]
+    drawn = [cv2.resize(each, size, interpolation=cv2.INTER_NEAREST) for each in (moment.seen, moment.classes)]
+    return [np.asarray(each, np.uint8) for each in (*photographs, *drawn)]
 
 
 def _places(widths: Sequence[int], available: int) -> list[tuple[int, int]]:

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_node.errors import OutputError
-
-Image = NDArray[np.uint8]
+from gcd_node.frame import Image
 
 _ANIMATION_QUALITY = 60  # WebP's scale of 100
 

@@ -1,14 +1,38 @@
-"""A comparison of two runs in words, as tables and as JSON. Nothing here prints."""
+"""A comparison of two runs in words, as tables, as JSON, and in pictures of where they differ most."""
 
-import math
+from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
+import cv2
+import msgspec
+import numpy as np
 from rich.table import Table
 
-from gcd_node.replay.run_diff import MAP_NAMES, Distance, Missing, RunComparison, Tolerance, ViewComparison
+from gcd_client.images import paint
+from gcd_node.errors import OutputError
+from gcd_node.frame import Image
+from gcd_node.pictures.comparison import heading_line, legend
+from gcd_node.pictures.files import make_folder, strip, write_png
+from gcd_node.replay.compare import (
+    MAP_NAMES,
+    Distance,
+    Missing,
+    RunComparison,
+    Tolerance,
+    ViewComparison,
+    paired_windows,
+)
+from gcd_node.replay.run import RunFolder, WindowPixels
 
-_ROWS = 40
-_LINES = 10
+WORST = 4
+"""As many pictures are made."""
+REPORT = "diff.json"
+
+_ROWS, _LINES = 40, 10
+_HIGHEST_GAIN = 64
+_COLUMN_WIDTH = 320  # pixels; smaller pictures are enlarged by a whole factor to at least this
+_PATTERN = "window-*-view-*.png"
 
 
 def verdict(comparison: RunComparison, tolerance: Tolerance) -> str:
@@ -30,14 +54,6 @@ def divergence(comparison: RunComparison) -> str | None:
         return None
     cause = _cause(first) if isinstance(first, ViewComparison) else ""
     return f"first divergence: window {first.window_id}, view {first.view_id}: {describe(first)}{cause}"
-
-
-def _cause(first: ViewComparison) -> str:
-    if not first.same_input:
-        return "; the model was given other pictures already: look at the recording and its decoder"
-    if not first.same_seed:
-        return "; the model was given the same pictures and another seed, as any other setting brings one"
-    return "; the model was given the same pictures"
 
 
 def describe(each: ViewComparison | Missing) -> str:
@@ -63,47 +79,47 @@ def report_text(comparison: RunComparison, tolerance: Tolerance) -> str:
     return "\n".join(lines)
 
 
-def facts_table(comparison: RunComparison) -> Table:
-    """What the runs were made from, as far as it differs."""
-    table = Table("differs", "A", "B", title="What the runs were made from", title_style="dim")
+def tables(comparison: RunComparison, tolerance: Tolerance) -> list[Table]:
+    """What the runs were made from, if that differs, and every view of every window; of many, those that differ."""
+    facts = Table("differs", "A", "B", title="What the runs were made from", title_style="dim")
     for fact in comparison.facts:
-        table.add_row(fact.name, fact.a, fact.b)
-    return table
-
-
-def views_table(comparison: RunComparison, tolerance: Tolerance) -> Table:
-    """Every view of every window; of a long comparison the first of those that differ."""
+        facts.add_row(fact.name, fact.a, fact.b)
     rows = sorted((*comparison.views, *comparison.missing), key=lambda each: (each.window_id, each.view_id))
     if len(rows) > _ROWS:
         rows = [each for each in rows if isinstance(each, Missing) or not each.identical]
-    table = Table(title="Views of windows", title_style="dim")
-    for name in ("window", "view", "PSNR dB", "worst frame", "class pixels", "what"):
-        table.add_column(name, justify="right" if name in ("window", "PSNR dB", "class pixels") else "left")
-    failures = set(comparison.failures(tolerance))
+    views = Table("window", "view", "difference", title="Views of windows", title_style="dim")
+    failures = comparison.failures(tolerance)
     for each in rows[:_ROWS]:
-        table.add_row(*_row(each), style="red" if each in failures else None)
+        views.add_row(str(each.window_id), each.view_id, describe(each), style="red" if each in failures else None)
     if len(rows) > _ROWS:
-        table.caption = f"and {len(rows) - _ROWS} more that differ; --json has them all"
-    return table
+        views.caption = f"and {len(rows) - _ROWS} more that differ; --json has them all"
+    return [facts, views] if comparison.facts else [views]
 
 
 def to_plain(comparison: RunComparison, tolerance: Tolerance) -> dict[str, Any]:
-    """Everything as plain values for JSON. The PSNR of identical pictures, which is infinite, is null."""
+    """Everything as plain values for JSON, which has null for the PSNR of identical pictures, infinite here."""
     first = comparison.first_divergence
     return {
         "a": str(comparison.a),
         "b": str(comparison.b),
         "passed": not comparison.failures(tolerance),
         "identical": first is None,
-        "min_psnr_db": tolerance.min_psnr_db,
-        "max_class_share": tolerance.max_class_share,
-        "facts": [{"name": fact.name, "a": fact.a, "b": fact.b} for fact in comparison.facts],
-        "first_divergence": None if first is None else {"window_id": first.window_id, "view": first.view_id},
-        "views": [_plain_view(view, tolerance) for view in comparison.views],
-        "missing": [
-            {"window_id": each.window_id, "view": each.view_id, "only_in": each.only_in} for each in comparison.missing
+        **asdict(tolerance),
+        "facts": [asdict(fact) for fact in comparison.facts],
+        "first_divergence": None if first is None else {"window_id": first.window_id, "view_id": first.view_id},
+        "views": [
+            {**asdict(view), "identical": view.identical, "passed": view.within(tolerance)} for view in comparison.views
         ],
+        "missing": [asdict(each) for each in comparison.missing],
     }
+
+
+def _cause(first: ViewComparison) -> str:
+    if not first.same_input:
+        return "; the model was given other pictures already: look at the recording and its decoder"
+    if not first.same_seed:
+        return "; the model was given the same pictures and another seed, as any other setting brings one"
+    return "; the model was given the same pictures"
 
 
 def _bounds(tolerance: Tolerance) -> str:
@@ -119,52 +135,77 @@ def _apart(distance: Distance) -> list[str]:
             f"{distance.psnr_db:.2f} dB, frame {distance.worst_frame} {distance.worst_psnr_db:.2f} dB, "
             f"up to {distance.largest} levels"
         )
-    names = {**MAP_NAMES, "cls": "class"}
-    return parts + [f"{share:.3%} of the {names[kind]} pixels" for kind, share in distance.shares if share]
+    return parts + [f"{share:.3%} of the {MAP_NAMES[kind]}" for kind, share in distance.shares.items() if share]
 
 
-def _row(each: ViewComparison | Missing) -> tuple[str, ...]:
-    distance = None if isinstance(each, Missing) else each.distance
-    if distance is None:
-        return str(each.window_id), each.view_id, "", "", "", describe(each)
-    share = "" if distance.class_share is None else f"{distance.class_share:.3%}"
-    if distance.largest == 0:
-        return str(each.window_id), each.view_id, "identical", "", share, _facts(each)
-    worst = f"{distance.worst_frame}: {distance.worst_psnr_db:.2f} dB"
-    return str(each.window_id), each.view_id, f"{distance.psnr_db:.2f}", worst, share, _facts(each)
+# Pictures.
 
 
-def _facts(each: ViewComparison | Missing) -> str:
-    """What the other columns do not say."""
-    if isinstance(each, Missing):
-        return ""
-    shares = () if each.distance is None else each.distance.shares
-    maps = [f"{share:.3%} of {MAP_NAMES[kind]}" for kind, share in shares if share and kind != "cls"]
-    return ", ".join([*maps, *(f"other {fact}" for fact in each.facts)])
+def write_report(
+    folder: Path, comparison: RunComparison, tolerance: Tolerance, runs: tuple[RunFolder, RunFolder]
+) -> tuple[Path, ...]:
+    """Write diff.json and a picture of each of the worst views; gives the paths of the pictures, worst first.
+
+    Pictures of an earlier comparison in the same folder are removed.
+    Raises:
+        OutputError: `folder` cannot be written. DamagedRunError: see paired_windows().
+    """
+    make_folder(folder)
+    try:
+        for old in folder.glob(_PATTERN):
+            old.unlink()
+        (folder / REPORT).write_bytes(msgspec.json.encode(to_plain(comparison, tolerance)) + b"\n")
+    except OSError as error:
+        raise OutputError(f"cannot write to {folder}: {error.strerror}; name another folder") from error
+    paths = {
+        (view.window_id, view.view_id): folder / f"window-{view.window_id:06d}-view-{view.view_id}.png"
+        for view in comparison.worst(WORST)
+    }
+    views = {(view.window_id, view.view_id): view for view in comparison.views}
+    for a, b in paired_windows(*runs) if paths else ():  # read again, which is cheaper than to keep all pixels
+        for key, path in paths.items():
+            if a is not None and b is not None and key[0] == a.entry.window_id:
+                write_png(path, side_by_side_picture(views[key], a, b, runs))
+    return tuple(paths.values())
 
 
-def _plain_view(view: ViewComparison, tolerance: Tolerance) -> dict[str, Any]:
+def side_by_side_picture(
+    view: ViewComparison, a: WindowPixels, b: WindowPixels, runs: tuple[RunFolder, RunFolder]
+) -> Image:
+    """A, B and their difference at the first frame, the one that differs most and the last; class maps below, at the
+    frame where most of their pixels differ.
+
+    Levels of the difference are multiplied by the heading's number; class pixels that differ are white.
+    """
     distance = view.distance
-    plain: dict[str, Any] = {
-        "window_id": view.window_id,
-        "view": view.view_id,
-        "identical": view.identical,
-        "passed": view.within(tolerance),
-        "other": list(view.facts),
-        "same_input": view.same_input,
-        "same_seed": view.same_seed,
-    }
-    if distance is None:
-        return plain
-    return plain | {
-        "psnr_db": _finite(distance.psnr_db),
-        "worst_frame": distance.worst_frame,
-        "worst_psnr_db": _finite(distance.worst_psnr_db),
-        "largest": distance.largest,
-        "class_share": distance.class_share,
-        "shares": dict(distance.shares),
-    }
+    assert distance is not None, "only views with pictures of one size have a place among the worst"
+    all_a, all_b = a.views[view.view_id], b.views[view.view_id]
+    chosen = sorted({0, distance.worst_frame, len(all_a["win"]) - 1})
+    gain = gain_for(distance.largest)
+    pairs = [(all_a["win"][i], all_b["win"][i]) for i in chosen]
+    rows = [(one, other, cv2.convertScaleAbs(cv2.absdiff(one, other), alpha=gain)) for one, other in pairs]
+    head = f"window {view.window_id}, frames {' '.join(map(str, chosen))}"
+    classes = [run.manifest.classes for run in runs]
+    if "cls" in all_a and "cls" in all_b:
+        at = distance.worst_class_frame
+        one, other = all_a["cls"][at], all_b["cls"][at]
+        differs = np.where(one != other, np.uint8(255), np.uint8(0))
+        rows.append((paint(one, classes[0]), paint(other, classes[1]), np.repeat(differs[..., None], 3, axis=2)))
+        head += f", classes {at}"
+    body = strip([[_enlarged(np.asarray(picture, np.uint8)) for picture in row] for row in rows])
+    parts = [heading_line((f"A: {head}", "B", f"difference x {gain}"), body.shape[1]), body]
+    return np.concatenate([*parts, legend(classes[0], body.shape[1])] if classes[0] else parts)
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def gain_for(largest: int) -> int:
+    """The power of two that makes a difference of so many levels as visible as it can be, at most 64."""
+    gain = 1
+    while gain < _HIGHEST_GAIN and 2 * gain * largest <= 255:
+        gain *= 2
+    return gain
+
+
+def _enlarged(picture: Image) -> Image:
+    """Without new levels: a difference is looked at pixel by pixel."""
+    factor = max(1, -(-_COLUMN_WIDTH // picture.shape[1]))
+    return np.repeat(np.repeat(picture, factor, axis=0), factor, axis=1)

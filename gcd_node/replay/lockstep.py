@@ -1,31 +1,58 @@
 """A launch file replayed: its recording through its model as fast as that goes, into a run on disk."""
 
-from collections.abc import Callable, Generator
+import hashlib
+import platform
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
+import cv2
+import kornia
+import numpy as np
 import torch
 from msgspec.structs import replace
 
+from gcd_client.protocol import ClassRecord, EndMessage, OriginHeader, StatusTopic, ViewHeader, ViewMessage, kind_of
 from gcd_model import Traits
-from gcd_node.config import LIVE_KINDS, LifeConfig, NodeConfig, SourceConfig
+from gcd_node.config import LifeConfig, NodeConfig
 from gcd_node.config_digest import config_digest
 from gcd_node.config_text import to_toml
-from gcd_node.errors import ConfigError, DamagedRunError, ModelFailedError, OutputError
+from gcd_node.errors import ConfigError, DamagedRunError, ModelFailedError, OutputError, SourceError
 from gcd_node.frame import FrameSource, SourceInfo
-from gcd_node.life.machinery import Parts
-from gcd_node.life.stream import Summary
+from gcd_node.inference import WindowReport
 from gcd_node.node import Node, NodeOptions
-from gcd_node.rendering.model_worker import WindowReport
-from gcd_node.replay import provenance
-from gcd_node.replay.manifest import Manifest, TotalsEntry
-from gcd_node.replay.run_folder import RunFolder, check_pixels, new_folder, open_run, write_manifest
-from gcd_node.replay.run_writer import RunWriter
+from gcd_node.pipeline import Summary
+from gcd_node.publisher import PublisherStats
+from gcd_node.replay.run import (
+    KeptKind,
+    Manifest,
+    Pixels,
+    PixelWriter,
+    RunFolder,
+    SizeEntry,
+    TotalsEntry,
+    TroubleEntry,
+    ViewEntry,
+    WindowEntry,
+    check_pixels,
+    new_folder,
+    open_run,
+    pixel_digest,
+    pixels_path,
+    to_stamp,
+    write_manifest,
+)
 from gcd_node.session import load_model, model_threads
-from gcd_node.sources import open_source
+from gcd_node.source_config import LiveSource, SourceConfig, SyntheticSource
+from gcd_node.sources import open_source, resolve_path
+from gcd_node.transitions import Parts
 
 PARTS = Parts(open_source=open_source, load_model=load_model)
 """What a launch file names, as `gcd-node run` opens it."""
+_TROUBLES = ("MODEL_NAN", "GPU_OOM")
 
 
 def lockstep_config(config: NodeConfig) -> NodeConfig:
@@ -36,12 +63,12 @@ def lockstep_config(config: NodeConfig) -> NodeConfig:
         ConfigError: its source cannot be replayed: a live camera, or a drawn drive without an end.
     """
     source = config.source
-    if source.kind in LIVE_KINDS:
+    if isinstance(source, LiveSource):
         raise ConfigError(
             f"a replay needs a recording, got [source] kind = {source.kind!r}, a live camera: record it first, then "
             'give a launch file with kind = "mcap" or "file" and its path'
         )
-    if source.kind == "synthetic" and source.frames is None:
+    if isinstance(source, SyntheticSource) and source.frames is None:
         raise ConfigError("a replay must end, and this drawn drive does not: set frames in [source]")
     return NodeConfig(
         source=replace(source, pace="lockstep", loop=False),
@@ -72,7 +99,10 @@ def replay(
     config = lockstep_config(config)
     with new_folder(out) as folder, _repeatable():
         write_manifest(folder, _filled(config, folder, on_window, parts))
-        _require_readable(folder, out)
+        try:
+            check_pixels(open_run(folder))  # OpenCV does not say that a disk is full
+        except DamagedRunError as error:
+            raise OutputError(f"{out} could not be written whole; is there space? {error}") from error
     return open_run(out)
 
 
@@ -88,28 +118,18 @@ def _repeatable() -> Generator[None]:
         cudnn.deterministic, cudnn.benchmark = before
 
 
-class _Watched:
-    """Parts that remember what they gave."""
-
-    def __init__(self, parts: Parts) -> None:
-        self._parts = parts
-        self.infos: list[SourceInfo] = []
-        self.traits: list[Traits] = []
-
-    def watched(self) -> Parts:
-        return Parts(open_source=self._open, load_model=self._parts.load_model)
-
-    def _open(self, section: SourceConfig) -> FrameSource:
-        source = self._parts.open_source(section)
-        self.infos.append(source.info)
-        return source
-
-
 def _filled(
     config: NodeConfig, folder: Path, on_window: Callable[[WindowReport], None] | None, parts: Parts
 ) -> Manifest:
     """Run the node; its pixels are in the folder then."""
-    watched = _Watched(parts)
+    infos: list[SourceInfo] = []
+    traits: list[Traits] = []
+
+    def open_and_note(section: SourceConfig) -> FrameSource:
+        source = parts.open_source(section)
+        infos.append(source.info)
+        return source
+
     with RunWriter(folder) as writer:
 
         def finish(report: WindowReport) -> None:
@@ -117,42 +137,208 @@ def _filled(
             if on_window is not None:
                 on_window(report)
 
-        options = NodeOptions(once=True, on_configured=watched.traits.append, on_window=finish)
-        summary = Node(config, watched.watched(), writer, options).run()
-    return _manifest(config, watched, writer, summary)
+        options = NodeOptions(once=True, on_configured=traits.append, on_window=finish)
+        summary = Node(config, Parts(open_source=open_and_note, load_model=parts.load_model), writer, options).run()
+    return _manifest(config, infos[0], traits[-1], writer, summary)
 
 
-def _manifest(config: NodeConfig, watched: _Watched, writer: RunWriter, summary: Summary) -> Manifest:
-    kept, traits = writer.kept, watched.traits[-1]
-    if kept.size is None:
+def _manifest(config: NodeConfig, info: SourceInfo, traits: Traits, writer: "RunWriter", summary: Summary) -> Manifest:
+    if writer.size is None:
         raise ModelFailedError(
             f'none of the {summary.counts.nan_windows} windows came out: all had NaN; try dtype = "float32" in '
             "[model], and look at the weights with `gcd-node weights inspect`"
         )
     return Manifest(
-        versions=provenance.versions(),
-        machine=provenance.machine(traits.device, model_threads(config.model)),
+        made_from=_made_from(config, info, traits),
         config=to_toml(config),
         cfg_digest=config_digest(config, traits),
-        weights=provenance.weights(traits),
-        source=provenance.source(config.source, watched.infos[0]),
-        size=kept.size,
-        fps=kept.fps,
-        classes=kept.classes,
+        size=writer.size,
+        fps=writer.fps,
+        classes=writer.classes,
         totals=TotalsEntry(
             frames=summary.frames,
             windows=summary.counts.windows,
             rejected=dict(sorted(summary.rejected.items())),
             nan_windows=summary.counts.nan_windows,
         ),
-        troubles=tuple(kept.troubles),
-        windows=tuple(kept.windows),
+        troubles=tuple(writer.troubles),
+        windows=tuple(writer.windows),
     )
 
 
-def _require_readable(folder: Path, out: Path) -> None:
-    """OpenCV does not say that a disk is full: what cannot be read back was not written."""
+# What a run is made from.
+
+
+def _made_from(config: NodeConfig, info: SourceInfo, traits: Traits) -> dict[str, str]:
+    """Weights, recording, programs and machine: hashes of two runs are only bound to agree if all of it does.
+
+    Raises SourceError if the recording cannot be read any more.
+    """
+    section = config.source
+    files = {
+        "source": None if isinstance(section, SyntheticSource | LiveSource) else resolve_path(section.path),
+        "calibration": None if section.calibration is None else Path(section.calibration).expanduser(),
+    }
+    return {
+        "weights name": traits.name,
+        "weights sha256_12": traits.sha256_12,
+        "weights precision": traits.precision,
+        "source id": f"{info.kind} {info.id}",
+        "source pictures": f"{info.width}x{info.height}, {info.fps_nominal:g} FPS, {info.codec or 'no codec'}",
+        **{f"{name} sha256": digest_of(path) for name, path in files.items() if path is not None},
+        "version gcd-node": version("gcd-node"),
+        "version python": platform.python_version(),
+        "version torch": str(torch.__version__),
+        "version kornia": kornia.__version__,
+        "version opencv": cv2.__version__,
+        "version numpy": np.__version__,
+        "machine system": f"{platform.system()} {platform.machine()}",
+        "machine device": traits.device,
+        "machine processor": _processor(traits.device),
+        "machine instructions": torch.backends.cpu.get_cpu_capability(),
+        "machine threads": str(model_threads(config.model)),
+    }
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of a file, 64 hex digits; of a folder, over the names and contents of all files in it, by name.
+
+    Raises:
+        SourceError: it cannot be read.
+    """
     try:
-        check_pixels(open_run(folder))
-    except DamagedRunError as error:
-        raise OutputError(f"{out} could not be written whole; is there space? {error}") from error
+        if not path.is_dir():
+            with path.open("rb") as file:
+                return hashlib.file_digest(file, "sha256").hexdigest()
+        total = hashlib.sha256()
+        for each in sorted(each for each in path.rglob("*") if each.is_file()):
+            total.update(each.relative_to(path).as_posix().encode() + b"\0")
+            total.update(bytes.fromhex(digest_of(each)))
+    except OSError as error:
+        raise SourceError(f"cannot read {path}: {error.strerror}; is it still there?") from error
+    return total.hexdigest()
+
+
+def _processor(device: str) -> str:
+    if device.startswith("cuda"):
+        return torch.cuda.get_device_name(device)
+    return next(_cpu_names(), platform.processor() or "unknown")
+
+
+def _cpu_names() -> Iterator[str]:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return
+    yield from (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+
+
+# What is kept of it.
+
+
+@dataclass(slots=True)
+class _Arrived:
+    """What has come of a view of the window in work."""
+
+    header: ViewHeader
+    sha256: dict[KeptKind, str] = field(default_factory=dict[KeptKind, str])
+
+
+class RunWriter:
+    """A message sink that needs no reader: takes the rgb8 messages of a lockstep node and keeps windows and their maps.
+
+    Single frames are part of their window, and deviations of its samples: neither is kept. Use it as a context
+    manager; at its end the videos are finished. size, fps: of its windows, None before the first.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.windows: list[WindowEntry] = []
+        self.troubles: list[TroubleEntry] = []
+        self.classes: tuple[ClassRecord, ...] = ()
+        self.size: SizeEntry | None = None
+        self.fps = 0.0
+        self._folder = folder
+        self._videos: dict[Path, PixelWriter] = {}
+        self._arrived: dict[str, _Arrived] = {}
+        self._sent = 0
+
+    def __enter__(self) -> "RunWriter":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for video in self._videos.values():
+            video.close()
+
+    def send(self, message: ViewMessage) -> bool:
+        """Take a view; see MessageSink. Raises OutputError if its video cannot be begun."""
+        self._sent += 1
+        header, kind = message.header, kind_of(message.topic)
+        if kind not in ("win", "cls", "vis", "depth"):
+            return True
+        if kind == "win":
+            self._arrived[header.view_id] = _Arrived(header)
+        if kind == "cls":
+            self.classes = tuple(header.classes or ())
+        pixels, path = _pixels(message), pixels_path(self._folder, header.view_id, kind)
+        if path not in self._videos:
+            _, height, width = pixels.shape[:3]
+            self._videos[path] = PixelWriter(path, height=height, width=width, fps=header.src.fps_cond)
+        self._videos[path].write(pixels)
+        self._arrived[header.view_id].sha256[kind] = pixel_digest(pixels)
+        return True
+
+    def finish_window(self, report: WindowReport) -> None:
+        """Take note that all views of a window were sent; a node's `on_window`."""
+        window, arrived, self._arrived = report.window, self._arrived, {}
+        frames, height, width, _ = next(iter(arrived.values())).header.shape
+        self.size, self.fps = SizeEntry(frames=frames, height=height, width=width), window.fps
+        self.windows.append(
+            WindowEntry(
+                window_id=window.window_id,
+                epoch=window.epoch,
+                stamps=tuple(to_stamp(stamp_ns) for stamp_ns in window.stamps_ns),
+                seqs=window.seqs,
+                input_sha256=pixel_digest(window.images),
+                render_ms=round(report.render_s * 1000, 3),
+                views={view_id: _view_entry(each) for view_id, each in arrived.items()},
+            )
+        )
+
+    def preview(self, made: Callable[[], ViewMessage]) -> None:
+        """Nobody looks; see MessageSink."""
+
+    def end(self, message: EndMessage, *, delay_ms: int | None = None) -> None:
+        """Nothing follows from it; see MessageSink."""
+
+    def note(self, topic: StatusTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
+        """Keep what the model could not do; see MessageSink."""
+        if topic == "event" and fields["code"] in _TROUBLES:
+            detail = fields["rung"] if "rung" in fields else f"seeds {', '.join(map(str, fields['seeds']))}"
+            self.troubles.append(TroubleEntry(code=fields["code"], window_id=fields["window_id"], detail=detail))
+
+    def stop_waiting(self) -> None:
+        """Nobody is waited for; see MessageSink."""
+
+    @property
+    def stats(self) -> PublisherStats:
+        """Messages taken; see MessageSink."""
+        return PublisherStats(sent=self._sent)
+
+
+def _pixels(message: ViewMessage) -> Pixels:
+    """Pictures [T, H, W, 3]; of maps the bytes of each row, [T, H, W] or of depth [T, H, 2 W]."""
+    frames, height, width, channels = message.header.shape
+    bytes_ = np.frombuffer(message.payload, np.uint8)
+    return bytes_.reshape((frames, height, width, 3) if channels == 3 else (frames, height, -1))
+
+
+def _view_entry(arrived: _Arrived) -> ViewEntry:
+    header, quality = arrived.header, arrived.header.quality
+    return ViewEntry(
+        view_rev=header.view_rev,
+        sha256=arrived.sha256,
+        seed=quality.seed,
+        steps=quality.steps,
+        ood=quality.ood,
+        nan_frames=quality.nan_frames,
+    )

@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_model import Intrinsics
+from gcd_node.calibration import HALF_PIXEL, LensModel, read_depthai
 from gcd_node.errors import ConfigError, DepthError
 from gcd_node.frame import Image
-from gcd_node.optics.calibration import LensModel
-from gcd_node.optics.depthai_file import read_depthai
-from gcd_node.optics.rectify import project
+from gcd_node.preprocess import project
 from gcd_node.sources.depth import DepthPicture, require_picture
 
 _SHORTEST_M, _LONGEST_M = 0.005, 2.0  # of baselines
@@ -24,7 +23,6 @@ _MOST_TURNED_DEG = 30.0
 _WIDEST_DEG, _NARROWEST_DEG = 120.0, 1.0
 _BORDER_POINTS, _DIRECTIONS, _RINGS = 33, 32, 400
 _STEEPEST = 4.0  # of rays x / z: 76 degrees off the axis
-_HALF_PIXEL = 0.5
 _BLOCK = 5  # pixels; less is noisier, more rounds heads off
 _STEPS = 16  # of SGBM's disparities in a pixel
 _LEAST_DISPARITY = 1.0  # pixels; SGBM errs by a quarter of one: farther away that is most of the depth
@@ -183,7 +181,7 @@ class _View:
 
     def __init__(self, lens: LensModel, turn: NDArray[np.float64], camera: Intrinsics) -> None:
         self._lens, self._camera = lens, camera
-        u, v = np.arange(camera.width) + _HALF_PIXEL, np.arange(camera.height) + _HALF_PIXEL
+        u, v = np.arange(camera.width) + HALF_PIXEL, np.arange(camera.height) + HALF_PIXEL
         self._pixels, self.seen = _pixels(lens, turn, camera, u, v)
         self._sampled: tuple[int, int] = (0, 0)  # size of the pictures the maps are for
         self._shrunk = (0, 0)
@@ -212,7 +210,7 @@ class _View:
         shrink = min(1.0, camera.fx / lens.fx * lens.width / width)
         self._shrunk = max(1, round(width * shrink)), max(1, round(height * shrink))
         scale = np.array([self._shrunk[0] / lens.width, self._shrunk[1] / lens.height])
-        pixels = ((self._pixels + _HALF_PIXEL) * scale - _HALF_PIXEL).astype(np.float32)
+        pixels = ((self._pixels + HALF_PIXEL) * scale - HALF_PIXEL).astype(np.float32)
         self._maps = cv2.convertMaps(pixels[..., 0], pixels[..., 1], cv2.CV_16SC2)
         self._sampled = (width, height)
 
@@ -229,7 +227,7 @@ def _pixels(
     ahead = np.stack([x, y, np.ones_like(x)], axis=-1) @ turn  # each row is turn.T @ ray
     rays = (ahead[..., :2] / np.maximum(ahead[..., 2:], 1 / _STEEPEST)).clip(-_STEEPEST, _STEEPEST)
     pixels = project(lens, rays.reshape(-1, 2)).reshape(rays.shape)
-    low, high = -_HALF_PIXEL, np.array([lens.width, lens.height]) - _HALF_PIXEL
+    low, high = -HALF_PIXEL, np.array([lens.width, lens.height]) - HALF_PIXEL
     inside = ((pixels >= low) & (pixels <= high)).all(axis=-1)
     return pixels, inside & (np.hypot(rays[..., 0], rays[..., 1]) < _reach(lens))
 
@@ -284,7 +282,7 @@ def _rows_match(left: NDArray[Any], right: NDArray[Any]) -> bool:
         return False
     there, found, _ = cv2.calcOpticalFlowPyrLK(left, right, corners, np.empty(0))
     back, returned, _ = cv2.calcOpticalFlowPyrLK(right, left, there, np.empty(0))
-    kept = np.logical_and(found, returned)[:, 0] & (np.abs(back - corners).max(axis=(1, 2)) < _HALF_PIXEL)
+    kept = np.logical_and(found, returned)[:, 0] & (np.abs(back - corners).max(axis=(1, 2)) < HALF_PIXEL)
     if np.count_nonzero(kept) < _LEAST_CORNERS:
         return False
     across, down = np.moveaxis((there - corners)[kept, 0], 1, 0)
@@ -293,7 +291,7 @@ def _rows_match(left: NDArray[Any], right: NDArray[Any]) -> bool:
             f"the rectified pictures must agree in their rows, they are {off:.1f} pixels apart: the calibration is of "
             "another device, or the pictures are of different moments"
         )
-    if np.median(across) > _HALF_PIXEL:
+    if np.median(across) > HALF_PIXEL:
         raise DepthError("things lie farther right in the right picture: swap the left and the right picture")
     return True
 

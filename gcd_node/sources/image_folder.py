@@ -5,16 +5,18 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
+import imagesize
 import numpy as np
 from numpy.typing import NDArray
 
 from gcd_node.errors import SourceError
-from gcd_node.frame import MAX_FPS, Frame, Image, SourceInfo
-from gcd_node.pictures.picture_header import MAX_PIXELS, PictureHeader, read_header
+from gcd_node.frame import MAX_FPS, MAX_PIXELS, Frame, Image, SourceInfo
 from gcd_node.sources.pace import Pace, Pacer
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 """File names that count as pictures; case does not matter."""
+
+_MAX_BYTES = 2**29
 
 
 class ImageFolder:
@@ -38,7 +40,7 @@ class ImageFolder:
         self._pacer = Pacer(pace)
         self._loop = loop
         self._pictures = list_pictures(path)
-        codec = _check_alike(self._pictures)
+        _check_alike(self._pictures)
         height, width = read_picture(self._pictures[0]).shape[:2]
         self._info = SourceInfo(
             kind="folder",
@@ -47,7 +49,7 @@ class ImageFolder:
             height=height,
             fps_nominal=fps,
             clock="replay",
-            codec=codec,
+            codec=self._pictures[0].suffix[1:].lower(),
         )
 
     @property
@@ -93,11 +95,11 @@ def list_pictures(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise SourceError(f"{folder} is {'not a folder' if folder.exists() else 'missing'}; give a folder of pictures")
     try:
-        names = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.name[0] != "."]
+        names = [path for path in folder.iterdir() if path.suffix.lower() in PICTURES and path.name[0] != "."]
     except OSError as error:
         raise SourceError(f"cannot list {folder}: {error.strerror}; check its permissions") from error
     if not names:
-        raise SourceError(f"{folder} holds no pictures; wanted are {', '.join(SUFFIXES)}")
+        raise SourceError(f"{folder} holds no pictures; wanted are {', '.join(PICTURES)}")
     return sorted(names, key=_natural)
 
 
@@ -107,7 +109,7 @@ def read_picture(path: Path) -> Image:
     Raises:
         SourceError: missing, damaged, of no known kind, or more than MAX_PIXELS.
     """
-    _checked_header(path)
+    _checked_size(path)
     try:
         picture = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR)
     except (cv2.error, OSError) as error:
@@ -119,7 +121,7 @@ def read_picture(path: Path) -> Image:
 
 def read_depth(path: Path) -> NDArray[np.uint16]:
     """One depth picture, u16 [H, W] millimetres. Raises SourceError as read_picture(), and for another type."""
-    _checked_header(path)
+    _checked_size(path)
     try:
         picture = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
     except (cv2.error, OSError) as error:
@@ -132,28 +134,31 @@ def read_depth(path: Path) -> NDArray[np.uint16]:
     return np.asarray(picture, np.uint16)
 
 
-def _checked_header(path: Path) -> PictureHeader:
+def _checked_size(path: Path) -> tuple[int, int]:
+    """Width and height as stored, before the picture is decoded: a small file may state a huge one."""
+    if path.exists() and not path.is_file():
+        raise SourceError(f"{path} is not a regular file; give a picture")
     try:
-        header = read_header(path)
+        with path.open("rb") as file:
+            width, height = imagesize.get(file, exif_rotation=False)
     except OSError as error:
         raise SourceError(f"cannot read the picture {path}: {error.strerror}; check the path") from error
-    if header is None:
+    if width < 1 or height < 1:
         raise _damaged(path)
-    if header.width * header.height > MAX_PIXELS:
+    if width * height > MAX_PIXELS or path.stat().st_size > _MAX_BYTES:
         raise SourceError(
-            f"{path} states {header.width} x {header.height} pixels, more than {MAX_PIXELS}; make it smaller first"
+            f"{path} states {width} x {height} pixels; make it smaller first: at most {MAX_PIXELS} of them in "
+            f"{_MAX_BYTES} bytes"
         )
-    return header
+    return width, height
 
 
-def _check_alike(pictures: list[Path]) -> str:
-    """The first picture's kind. Sides are compared in any order: metadata may turn a picture."""
-    first = _checked_header(pictures[0])
+def _check_alike(pictures: list[Path]) -> None:
+    """Sides are compared in any order: metadata may turn a picture."""
+    first = _checked_size(pictures[0])
     for path in pictures[1:]:
-        header = _checked_header(path)
-        if {header.width, header.height} != {first.width, first.height}:
-            raise _unlike(path, (header.width, header.height), (first.width, first.height))
-    return first.kind
+        if set(size := _checked_size(path)) != set(first):
+            raise _unlike(path, size, first)
 
 
 def _unlike(path: Path, size: tuple[int, int], wanted: tuple[int, int]) -> SourceError:
@@ -164,7 +169,7 @@ def _unlike(path: Path, size: tuple[int, int], wanted: tuple[int, int]) -> Sourc
 
 
 def _damaged(path: Path) -> SourceError:
-    return SourceError(f"{path} cannot be decoded: damaged, or no {', '.join(SUFFIXES)}; remove or replace it")
+    return SourceError(f"{path} cannot be decoded: damaged, or no {', '.join(PICTURES)}; remove or replace it")
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

@@ -4,17 +4,12 @@ DepthAI is imported when a camera is opened, not before. Three of its habits sha
 Python code on one of its threads ends the process: such code goes through a Guard. An unplugged camera is silence:
 the device's state explains it. A pipeline that is dropped before its threads have ended can block the whole
 interpreter: the thread that stops a pipeline holds it until then.
-
-Over 300 lines, because no other file may import DepthAI.
 """
 
 import logging
 import os
 import threading
-import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future
-from concurrent.futures import TimeoutError as OpenTimeoutError
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import TYPE_CHECKING, TypeAlias
@@ -22,23 +17,23 @@ from typing import TYPE_CHECKING, TypeAlias
 import cv2
 import numpy as np
 
-from gcd_node.config import SourceConfig
+from gcd_node.calibration import LensModel
 from gcd_node.errors import SourceAbsentError, SourceError
 from gcd_node.frame import Frame, Image, SourceInfo
-from gcd_node.optics.calibration import LensModel
-from gcd_node.sources.oak_lens import better_lens, to_lens
-from gcd_node.sources.oak_loss import Guard, Loss
-from gcd_node.sources.oak_search import find_device
+from gcd_node.source_config import OakSource
+from gcd_node.sources.live_camera import LiveCamera
+from gcd_node.sources.oak_device import Guard, Loss, better_lens, find_device, to_lens
 
 if TYPE_CHECKING:
     import depthai as dai
 
 _LOG = logging.getLogger(__name__)
-_WIDTH, _HEIGHT, _FPS = 1280, 720, 30.0
+_FPS = 30.0
 _PATIENCE = timedelta(milliseconds=100)
 _MICROSECOND = timedelta(microseconds=1)
 _EXPLAIN_S = 0.5
-_STOP_TIMEOUT_S = 0.7
+_HINT = "check its cable and power, or allow more with open_timeout_s in [source]"
+_IN_USE = threading.Lock()  # by the attempt before, even if nobody waits for that one any more
 _SYNCED_US = 500  # how well DepthAI keeps the device's clock aligned with the host's
 
 
@@ -61,99 +56,51 @@ class OakStream:
 
 PipelineFactory: TypeAlias = Callable[[Guard], OakStream]
 """Wires a pipeline. Host nodes in it run their bodies through the Guard. Called once, on a thread of its own."""
-_Opened: TypeAlias = "tuple[OakStream, dai.MessageQueue]"
 
 
-class OakCamera:
-    """A DepthAI pipeline as a live FrameSource. Stamps are mid-exposure, on this host's monotonic clock."""
+class _OakDriver:
+    """A DepthAI pipeline as a Driver. Stamps are mid-exposure, on this host's monotonic clock."""
 
-    def __init__(self, pipeline_factory: PipelineFactory, *, open_timeout_s: float = 5.0) -> None:
-        """Wire and start a pipeline, and wait for its first picture.
+    def __init__(self, factory: PipelineFactory) -> None:
+        """Wire and start a pipeline. Raises SourceAbsentError: there is no such camera, or it does not open."""
+        self.corrupt, self._loss = 0, Loss()
+        opened = _open(factory, self._loss)
+        if isinstance(opened, Exception):
+            raise opened
+        self._stream, self._queue = opened
+        self.fps, self._loss.name = self._stream.fps, self._stream.id
+        self._newest: dai.ImgFrame | None = None
 
-        Args:
-            pipeline_factory: `camera_pipeline` makes the one for a real camera.
-            open_timeout_s: for all of it. What DepthAI is still busy with then is left to a thread.
-        Raises:
-            SourceAbsentError: there is no such camera, or it does not open, or gives no picture in time.
-            SourceLostError: it went away at once. SourceError: DepthAI is not installed.
-        """
-        deadline = time.monotonic() + open_timeout_s
-        self._closed = threading.Event()
-        self._corrupt = 0
-        self._loss = Loss()
-        load_depthai()
-        self._stream, self._queue = _start(pipeline_factory, self._loss, open_timeout_s)
-        self._loss.name = self._stream.id
-        try:
-            self._info = _describe(self._first(deadline, open_timeout_s), self._stream)
-        except BaseException:
-            self.close()
-            raise
-
-    @property
-    def info(self) -> SourceInfo:
-        """Size, rate and lens, as the first picture had them."""
-        return self._info
-
-    @property
-    def corrupt(self) -> int:
-        """Messages so far that were no whole picture."""
-        return self._corrupt
-
-    def frames(self) -> Iterator[Frame]:
-        """The newest picture each time. See FrameSource.frames. Raises SourceLostError if device or pipeline ends."""
-        while not self._closed.is_set():
-            message = self._newest()
-            if message is not None and (frame := self._frame(message)) is not None:
-                yield frame
-
-    def close(self) -> None:
-        """End `frames` within a second, from any thread; a device that does not let go is left to a thread."""
-        if self._closed.is_set():
-            return
-        self._closed.set()
-        stopping = threading.Thread(target=_stop, args=(self._stream.pipeline,), name="oak-stop", daemon=True)
-        stopping.start()
-        stopping.join(_STOP_TIMEOUT_S)
-        if stopping.is_alive():
-            _LOG.warning("OAK %s does not stop; a thread goes on waiting for it", self._stream.id)
-
-    def _first(self, deadline: float, timeout_s: float) -> "dai.ImgFrame":
-        while time.monotonic() < deadline:
-            message = self._newest()
-            if message is not None and self._frame(message) is not None:
-                return message
-        raise SourceAbsentError(
-            f"OAK {self._stream.id} opened but gave no picture within {timeout_s:g} s ({self._corrupt} damaged ones); "
-            "check its cable and power, or allow more with open_timeout_s in [source]"
-        )
-
-    def _newest(self) -> "dai.ImgFrame | None":
-        """The newest picture; None if none came for a moment, or the source was closed."""
+    def read(self) -> Frame | None:
+        """See Driver. The newest picture each time."""
         import depthai as dai
 
-        if self._loss.told and not self._closed.is_set():  # in this order: closing, too, makes the device go away
+        if self._loss.told:
             raise self._loss.error()
         try:
             message = self._queue.get(_PATIENCE)
             later = self._queue.tryGetAll()
         except dai.MessageQueue.QueueException:  # pyright: ignore[reportGeneralTypeIssues] - the stub's own mistake
-            if self._closed.is_set():
-                return None
             self._loss.wait(_EXPLAIN_S)  # the state callback may be a moment behind, and knows why
             self._loss.tell("its pipeline ended")
             raise self._loss.error() from None
         except RuntimeError as error:  # what DepthAI makes of a link that broke
-            if self._closed.is_set():
-                return None
             self._loss.tell(f"reading from it failed ({error})")
             raise self._loss.error() from error
         newest = later[-1] if later else message
         if isinstance(newest, dai.ImgFrame):
-            return newest
-        if newest is not None:  # pyright: ignore[reportUnnecessaryComparison] - after a time-out it is None
-            self._corrupt += 1
+            return self._frame(newest)
+        self.corrupt += newest is not None  # pyright: ignore[reportUnnecessaryComparison] - after a time-out it is None
         return None
+
+    def describe(self, first: Frame, fps: float) -> SourceInfo:
+        """See Driver."""
+        assert self._newest is not None
+        return _describe(self._newest, self._stream)
+
+    def close(self) -> None:
+        """See Driver."""
+        _stop(self._stream.pipeline)
 
     def _frame(self, message: "dai.ImgFrame") -> Frame | None:
         """The message as a Frame; None, and counted, if it is damaged."""
@@ -162,22 +109,36 @@ class OakCamera:
         try:
             image = _picture(message)
         except (RuntimeError, cv2.error) as error:
-            self._corrupt += 1
+            self.corrupt += 1
             _LOG.debug("OAK %s: picture %d is damaged: %s", self._stream.id, message.getSequenceNum(), error)
             return None
+        self._newest = message
         stamp_us = message.getTimestamp(dai.CameraExposureOffset.MIDDLE) // _MICROSECOND
         return Frame(image=image, stamp_ns=stamp_us * 1000, seq=message.getSequenceNum())
 
 
-def open_oak(config: SourceConfig) -> OakCamera:
-    """The OAK camera a launch file asks for, open. Raises as OakCamera."""
-    factory = camera_pipeline(
-        device=config.device,
-        width=config.width or _WIDTH,
-        height=config.height or _HEIGHT,
-        fps=config.fps or _FPS,
+def open_oak(config: OakSource) -> LiveCamera:
+    """The OAK camera a launch file asks for, open. Raises as open_pipeline()."""
+    return open_pipeline(camera_pipeline(config), open_timeout_s=config.open_timeout_s)
+
+
+def open_pipeline(factory: PipelineFactory, *, open_timeout_s: float) -> LiveCamera:
+    """A started pipeline that has given its first picture. An attempt that was given up is over before the next begins:
+    two that open one device reset it under each other for ever.
+
+    Args:
+        factory: camera_pipeline() makes the one for a real camera.
+        open_timeout_s: for all of it. What DepthAI is still busy with then is left to a thread.
+    Raises:
+        SourceAbsentError: there is no such camera, or it does not open, or gives no picture in time.
+        SourceError: DepthAI is not installed.
+    """
+    load_depthai()
+    if not _IN_USE.acquire(timeout=open_timeout_s):
+        raise SourceAbsentError(f"DepthAI is still busy with the OAK after {open_timeout_s:g} s; {_HINT}")
+    return LiveCamera(
+        "the OAK camera", lambda: _OakDriver(factory), open_timeout_s=open_timeout_s, hint=_HINT, on_end=_IN_USE.release
     )
-    return OakCamera(factory, open_timeout_s=config.open_timeout_s)
 
 
 def load_depthai() -> None:
@@ -200,25 +161,26 @@ def load_depthai() -> None:
         )
 
 
-def camera_pipeline(*, device: str | None, width: int, height: int, fps: float) -> PipelineFactory:
-    """Wires a real camera: its default sensor, scaled to a size, what is over cut off, the lens from its memory.
+def camera_pipeline(config: OakSource) -> PipelineFactory:
+    """Wires a real camera: a sensor's pictures, scaled to a size, what is over cut off, not undistorted: that is done
+    here, by the lens that the device knows, with the user's calibration before the factory's.
 
-    Args:
-        device: id, name or address as DepthAI lists it; None takes the only one there is.
-        width, height: of the pictures. fps: of the sensor.
     Returns:
-        a factory that raises SourceAbsentError as `find_device`.
+        a factory that raises SourceAbsentError as `find_device`, or if there is no such socket.
     """
 
     def build(_: Guard) -> OakStream:
         import depthai as dai
 
-        opened = _open_device(device)
+        opened = _open_device(config.device)
         opened.setMaxReconnectionAttempts(0)  # the node reconnects, with a new epoch
         pipeline = dai.Pipeline(opened)
-        camera = pipeline.create(dai.node.Camera).build()
-        output = camera.requestOutput((width, height), dai.ImgFrame.Type.NV12, fps=fps)
-        memory, socket = opened.readCalibration(), camera.getBoardSocket()
+        sockets = () if config.socket is None else (dai.CameraBoardSocket.__members__[config.socket],)
+        camera = pipeline.create(dai.node.Camera).build(*sockets)
+        _set_up(camera.initialControl, config)
+        size, fps = (config.width, config.height), config.fps or _FPS
+        output = camera.requestOutput(size, dai.ImgFrame.Type.NV12, fps=fps, enableUndistortion=False)
+        memory, socket = _calibration(opened), camera.getBoardSocket()
 
         def lens(width: int, height: int) -> LensModel | None:
             return lens_in_memory(memory, socket, width, height)
@@ -226,6 +188,28 @@ def camera_pipeline(*, device: str | None, width: int, height: int, fps: float) 
         return OakStream(pipeline=pipeline, output=output, id=opened.getDeviceId(), fps=fps, lens=lens)
 
     return build
+
+
+def _calibration(device: "dai.Device") -> "dai.CalibrationHandler":
+    """The user's if the device has one, else the factory's."""
+    try:
+        return device.getCalibration()
+    except RuntimeError:
+        return device.readCalibration()  # the memory alone; of an empty one a default
+
+
+def _set_up(control: "dai.CameraControl", config: OakSource) -> None:
+    """Focus, exposure and anti-banding as stated; the rest as the camera has it."""
+    import depthai as dai
+
+    if config.focus is not None:
+        control.setManualFocus(config.focus)
+    if config.exposure_us is not None and config.iso is not None:
+        control.setManualExposure(config.exposure_us, config.iso)
+    if config.anti_banding is not None:
+        modes = dai.CameraControl.AntiBandingMode
+        known = {"off": modes.OFF, "50hz": modes.MAINS_50_HZ, "60hz": modes.MAINS_60_HZ, "auto": modes.AUTO}
+        control.setAntiBandingMode(known[config.anti_banding])
 
 
 def _open_device(wanted: str | None) -> "dai.Device":
@@ -245,7 +229,7 @@ def _open_device(wanted: str | None) -> "dai.Device":
 def lens_in_memory(
     memory: "dai.CalibrationHandler", socket: "dai.CameraBoardSocket", width: int, height: int
 ) -> LensModel | None:
-    """Factory calibration of one sensor for pictures that were scaled to width x height, what is over cut off.
+    """Calibration of one sensor for pictures that were scaled to width x height, what is over cut off.
 
     None if the memory holds none for it.
     """
@@ -288,38 +272,19 @@ def _picture(message: "dai.ImgFrame") -> Image:
     return np.asarray(cv2.cvtColor(pixels, code), np.uint8)
 
 
-def _start(factory: PipelineFactory, loss: Loss, timeout_s: float) -> _Opened:
-    """A started pipeline and its queue, made on a thread that is left behind when it takes too long."""
-    opening: Future[_Opened] = Future()
-    threading.Thread(target=_open, args=(factory, loss, opening), name="oak-open", daemon=True).start()
-    try:
-        return opening.result(timeout_s)
-    except OpenTimeoutError:
-        if not opening.cancel():
-            return opening.result()
-    raise SourceAbsentError(
-        f"the OAK camera did not open within {timeout_s:g} s; check its cable and power, or allow more with "
-        "open_timeout_s in [source]"
-    )
-
-
-def _open(factory: PipelineFactory, loss: Loss, opening: "Future[_Opened]") -> None:
+def _open(factory: PipelineFactory, loss: Loss) -> "tuple[OakStream, dai.MessageQueue] | Exception":
+    """A started pipeline and its queue, or why there is none: raised here, it would keep the device open."""
     stream: OakStream | None = None
     try:
         stream = factory(loss.guard)
         stream.pipeline.setDeviceStateCallback(loss.on_state)
         queue = stream.output.createOutputQueue(maxSize=4, blocking=False)
         stream.pipeline.start()
-    except Exception as error:  # the end of a thread: whoever opens gets it
+    except Exception as error:
         if stream is not None:
             _stop(stream.pipeline)
-        if opening.set_running_or_notify_cancel():
-            opening.set_exception(_opening_error(error))
-        return
-    if opening.set_running_or_notify_cancel():
-        opening.set_result((stream, queue))
-    else:
-        _stop(stream.pipeline)
+        return _opening_error(error)
+    return stream, queue
 
 
 def _opening_error(error: Exception) -> Exception:

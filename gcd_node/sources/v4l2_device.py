@@ -12,16 +12,8 @@ from pathlib import Path
 import cv2
 
 from gcd_node.errors import SourceAbsentError, SourceError
-from gcd_node.frame import Image
-from gcd_node.sources.opencv_camera import (
-    CameraPort,
-    CameraTraits,
-    Capture,
-    OpenCvCamera,
-    codec_name,
-    retrieve_picture,
-    sane_fps,
-)
+from gcd_node.sources.live_camera import LiveCamera
+from gcd_node.sources.opencv_camera import Capture, OpenCvDriver, codec_name
 
 _LOG = logging.getLogger(__name__)
 _DEVICES = Path("/dev")
@@ -46,7 +38,7 @@ def open_v4l2(
     *,
     open_timeout_s: float = 5.0,
     open_capture: Callable[[str, int], Capture] = cv2.VideoCapture,
-) -> OpenCvCamera:
+) -> LiveCamera:
     """A camera of this machine.
 
     Args:
@@ -58,14 +50,11 @@ def open_v4l2(
     """
     path = _device_path(device)
     _check_device(path)
-    port = CameraPort(
-        kind="v4l2",
-        id=path.name,
-        name=f"the camera {path}",
-        hint=_HINT,
-        connect=lambda: _V4l2Connection(path, request, open_capture),
-    )
-    return OpenCvCamera(port, open_timeout_s=open_timeout_s)
+
+    def open_driver() -> _V4l2Driver:
+        return _V4l2Driver(path, request, open_capture)
+
+    return LiveCamera(f"the camera {path}", open_driver, open_timeout_s=open_timeout_s, hint=_HINT)
 
 
 def list_v4l2() -> list[str]:
@@ -99,45 +88,41 @@ def _check_device(path: Path) -> None:
         raise SourceError(f"{path} may not be used by this user; add the user to the group `video` and log in again")
 
 
-class _V4l2Connection:
+class _V4l2Driver(OpenCvDriver):
     """An open device. Stamps are the driver's, where they are of the monotonic clock; else the time of arrival."""
 
+    kind, hint = "v4l2", _HINT
+
     def __init__(self, path: Path, request: V4l2Request, open_capture: Callable[[str, int], Capture]) -> None:
-        self._capture = open_capture(str(path), cv2.CAP_V4L2)
-        if not self._capture.isOpened():
+        self._path, self._request, self._driver_stamps = path, request, False
+        self.name, self.id = f"the camera {path}", path.name
+        super().__init__(lambda: open_capture(str(path), cv2.CAP_V4L2))
+
+    def check(self) -> None:
+        """See OpenCvDriver."""
+        if not self.capture.isOpened():
             there = ", ".join(list_v4l2()) or "none"
-            raise SourceAbsentError(f"the camera {path} cannot be opened; {_HINT}. There is {there}")
-        _ask_for(self._capture, request, path)
-        self._asked_fps = request.fps
-        self._driver_stamps = False
+            raise SourceAbsentError(f"{self.name} cannot be opened; {_HINT}. There is {there}")
+        _ask_for(self.capture, self._request, self._path)
 
     def grab(self) -> int | None:
-        """See Connection."""
-        if not self._capture.grab():
+        """See OpenCvDriver."""
+        if not self.capture.grab():
             return None
         arrival_ns = time.monotonic_ns()
-        stated_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
+        stated_ms = self.capture.get(cv2.CAP_PROP_POS_MSEC)
         stated_ns = round(stated_ms * 1e6) if math.isfinite(stated_ms) else 0
         self._driver_stamps = 0 <= arrival_ns - stated_ns <= _OLDEST_STAMP_NS
         return stated_ns if self._driver_stamps else arrival_ns
 
-    def retrieve(self) -> Image | None:
-        """See Connection."""
-        return retrieve_picture(self._capture)
+    @property
+    def fps(self) -> float | None:
+        """See Driver."""
+        return super().fps or self._request.fps
 
-    def traits(self) -> CameraTraits:
+    def uncertainty_us(self, fps: float) -> int:
         """A driver stamps the begin or the end of a picture, no more than half a period from mid-exposure."""
-        fps = sane_fps(self._capture.get(cv2.CAP_PROP_FPS)) or self._asked_fps
-        period_us = 1e6 / (fps or 30.0)
-        return CameraTraits(
-            fps=fps,
-            codec=codec_name(self._capture.get(cv2.CAP_PROP_FOURCC)),
-            stamp_uncertainty_us=round(period_us / 2 if self._driver_stamps else 2 * period_us),
-        )
-
-    def release(self) -> None:
-        """See Connection."""
-        self._capture.release()
+        return round(1e6 / fps * (0.5 if self._driver_stamps else 2))
 
 
 def _ask_for(capture: Capture, request: V4l2Request, path: Path) -> None:

@@ -10,16 +10,17 @@ import cv2
 import numpy as np
 
 from gcd_node.errors import SourceError
-from gcd_node.frame import MAX_FPS, Frame, Image, SourceInfo
-from gcd_node.pictures.picture_header import MAX_PIXELS
-from gcd_node.sources.container import check_video
-from gcd_node.sources.opencv_log import quiet_opencv
+from gcd_node.frame import MAX_FPS, MAX_PIXELS, Frame, Image, SourceInfo
+from gcd_node.sources.image_folder import PICTURES
+from gcd_node.sources.opencv_camera import codec_name, quiet_opencv
 from gcd_node.sources.pace import Pace, Pacer
 
 _LOG = logging.getLogger(__name__)
 _LOWEST_FPS = 0.1
 _LONGEST_STEP_S = 10.0
 _COMPLETE = 0.9
+_LOGS = (".mcap", ".db3", ".bag")
+_NO_VIDEO = ("ansi", "unknown")  # FFmpeg plays a text as pictures of its letters
 
 
 class VideoFile:
@@ -36,13 +37,13 @@ class VideoFile:
         Raises:
             SourceError: missing, empty, a folder, no video, truncated, or no frame of it can be decoded.
         """
+        _check_file(path)
         self._path = path.resolve()
         self._pacer = Pacer(pace)
         self._loop = loop
         self._stated_fps = fps
         if fps is not None and not 0 < fps <= MAX_FPS:
             raise SourceError(f"fps of a video must lie between 0 and {MAX_FPS:g}, got {fps:g}")
-        check_video(self._path)
         with closing(_Decoder(self._path)) as decoder:
             self._info = _describe(self._path, decoder, fps)
 
@@ -84,7 +85,6 @@ class VideoFile:
             begin_ns = newest_ns + stamps.period_ns
 
     def _one_pass(self) -> Iterator[tuple[Image, float]]:
-        check_video(self._path)
         count = 0
         with closing(_Decoder(self._path)) as decoder:
             while not self._pacer.stopped and (decoded := decoder.read()) is not None:
@@ -133,8 +133,8 @@ class _Decoder:
     def __init__(self, path: Path) -> None:
         with quiet_opencv():
             self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-        if not self._capture.isOpened():
-            raise SourceError(f"cannot open {path} as a video: truncated or damaged; copy or record it again")
+        if not self._capture.isOpened() or self.codec in _NO_VIDEO:
+            raise SourceError(f"cannot open {path} as a video: none, truncated or damaged; give a video file")
         self._check_size(path)
 
     def _check_size(self, path: Path) -> None:
@@ -148,9 +148,7 @@ class _Decoder:
     @property
     def codec(self) -> str:
         """Four characters, as the container names it."""
-        raw = (int(self._number(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF).to_bytes(4, "little")
-        text = raw.rstrip(b"\0 ").decode("ascii", "replace")
-        return text if text.isprintable() and text else "unknown"
+        return codec_name(self._number(cv2.CAP_PROP_FOURCC)) or "unknown"
 
     @property
     def fps(self) -> float | None:
@@ -179,6 +177,22 @@ class _Decoder:
     def _number(self, prop: int) -> float:
         value = self._capture.get(prop)
         return value if math.isfinite(value) else 0.0
+
+
+def _check_file(path: Path) -> None:
+    """Raise SourceError for what a decoder cannot be asked to open, or what belongs to another kind of source."""
+    if not path.exists():
+        raise SourceError(f"no such video: {path}; check the path")
+    if path.suffix.lower() in _LOGS or (path / "metadata.yaml").is_file():
+        raise SourceError(f'{path} is a log, not a video; say kind = "mcap"')
+    if path.is_dir():
+        raise SourceError(f'{path} is a folder, not a video; for a folder of pictures say kind = "folder"')
+    if not path.is_file():
+        raise SourceError(f"{path} is not a regular file; give a video file")
+    if path.suffix.lower() in PICTURES:
+        raise SourceError(f'{path} is a still picture, not a video; put pictures in a folder and say kind = "folder"')
+    if path.stat().st_size == 0:
+        raise SourceError(f"{path} is empty (0 bytes); copy or record it again")
 
 
 def _describe(path: Path, decoder: _Decoder, stated_fps: float | None) -> SourceInfo:

@@ -10,17 +10,9 @@ from dataclasses import dataclass
 import cv2
 
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError
-from gcd_node.frame import Image
-from gcd_node.pictures.picture_header import MAX_PIXELS
-from gcd_node.sources.opencv_camera import (
-    CameraPort,
-    CameraTraits,
-    Capture,
-    OpenCvCamera,
-    codec_name,
-    retrieve_picture,
-    sane_fps,
-)
+from gcd_node.frame import MAX_PIXELS
+from gcd_node.sources.live_camera import LiveCamera
+from gcd_node.sources.opencv_camera import Capture, OpenCvDriver
 
 _DEFAULT_PORTS = {"rtsp": 554, "rtsps": 322, "http": 80, "https": 443, "udp": None, "tcp": None}
 _UNCERTAINTY_US = 100_000
@@ -83,7 +75,7 @@ def open_stream(
     open_timeout_s: float = 5.0,
     read_timeout_s: float = 5.0,
     open_capture: OpenCapture = cv2.VideoCapture,
-) -> OpenCvCamera:
+) -> LiveCamera:
     """A network camera.
 
     Args:
@@ -100,14 +92,11 @@ def open_stream(
     parameters = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _milliseconds(open_timeout_s)]
     parameters += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, _milliseconds(read_timeout_s)]
     parameters += [cv2.CAP_PROP_N_THREADS, 1]  # every thread more delays pictures by one
-    port = CameraPort(
-        kind="rtsp",
-        id=address.place or address.scheme,
-        name=f"the stream {address}",
-        hint=_HINT,
-        connect=lambda: _StreamConnection(open_capture(url, cv2.CAP_FFMPEG, parameters), address, fps),
-    )
-    return OpenCvCamera(port, open_timeout_s=open_timeout_s)
+
+    def open_driver() -> _StreamDriver:
+        return _StreamDriver(lambda: open_capture(url, cv2.CAP_FFMPEG, parameters), address, fps)
+
+    return LiveCamera(f"the stream {address}", open_driver, open_timeout_s=open_timeout_s, hint=_HINT)
 
 
 class Backlog:
@@ -149,41 +138,43 @@ class Backlog:
         return round(step_ms * 1e6) if 0 < step_ms < 1000 else self._period_ns
 
 
-class _StreamConnection:
+class _StreamDriver(OpenCvDriver):
     """An open stream. Stamps are times of arrival: a stream's own clock has no known beginning."""
 
-    def __init__(self, capture: Capture, address: StreamAddress, fps: float | None) -> None:
-        if not capture.isOpened():
-            raise SourceAbsentError(f"no stream from {address}: {_why(address)}; {_HINT}")
-        self._capture = capture
-        self._fps = fps or sane_fps(capture.get(cv2.CAP_PROP_FPS))
-        self._backlog = Backlog(period_ns=round(1e9 / (self._fps or 25.0)))
-        width, height = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
+    kind, hint = "rtsp", _HINT
+
+    def __init__(self, open_capture: Callable[[], Capture], address: StreamAddress, fps: float | None) -> None:
+        self._address, self._fps = address, fps
+        self.name, self.id = f"the stream {address}", address.place or address.scheme
+        super().__init__(open_capture)
+        self._backlog = Backlog(period_ns=round(1e9 / (self.fps or 25.0)))
+
+    def check(self) -> None:
+        """See OpenCvDriver."""
+        if not self.capture.isOpened():
+            raise SourceAbsentError(f"no stream from {self._address}: {_why(self._address)}; {_HINT}")
+        width, height = self.capture.get(cv2.CAP_PROP_FRAME_WIDTH), self.capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
         if width * height > MAX_PIXELS:
             raise SourceError(
-                f"{address} states {width:.0f} x {height:.0f} pixels, more than {MAX_PIXELS}; choose a smaller stream"
+                f"{self._address} states {width:.0f} x {height:.0f} pixels, over {MAX_PIXELS}; choose a smaller stream"
             )
 
     def grab(self) -> int | None:
-        """See Connection."""
-        while self._capture.grab():
+        """See OpenCvDriver."""
+        while self.capture.grab():
             arrival_ns = time.monotonic_ns()
-            if not self._backlog.holds(arrival_ns, self._capture.get(cv2.CAP_PROP_POS_MSEC)):
+            if not self._backlog.holds(arrival_ns, self.capture.get(cv2.CAP_PROP_POS_MSEC)):
                 return arrival_ns
         return None
 
-    def retrieve(self) -> Image | None:
-        """See Connection."""
-        return retrieve_picture(self._capture)
+    @property
+    def fps(self) -> float | None:
+        """See Driver."""
+        return self._fps or super().fps
 
-    def traits(self) -> CameraTraits:
-        """See Connection. How long a network camera keeps a picture nobody knows; a tenth of a second is usual."""
-        codec = codec_name(self._capture.get(cv2.CAP_PROP_FOURCC))
-        return CameraTraits(fps=self._fps, codec=codec, stamp_uncertainty_us=_UNCERTAINTY_US)
-
-    def release(self) -> None:
-        """See Connection."""
-        self._capture.release()
+    def uncertainty_us(self, fps: float) -> int:
+        """How long a network camera keeps a picture nobody knows; a tenth of a second is usual."""
+        return _UNCERTAINTY_US
 
 
 def _why(address: StreamAddress) -> str:

@@ -1,14 +1,16 @@
-"""What a browser says to the node, and how what it hears is put into bytes. Pure.
+"""What a browser says to the viewer, and how what it is sent is put into bytes. Pure.
 
 From the page: one JSON object in a text message, one of Hello, Watch, Ask, Got.
 To the page: JSON objects with a `type` in text messages, and pictures in binary ones: the length of a JSON header as
 a 32-bit little-endian number, that header, and what it describes.
 """
 
+import asyncio
 import json
 import struct
 import time
 import zlib
+from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, TypeAlias
@@ -16,19 +18,15 @@ from typing import Annotated, Any, TypeAlias
 import msgspec
 from msgspec import Meta
 
-from gcd_node.envelope import ViewMessage, colours, images, kind_of
-from gcd_node.errors import MessageError
-from gcd_node.subscriber import ReceivedView
-from gcd_node.wire.header import ViewHeader
-from gcd_node.wire.jpeg import encode_frames
-from gcd_node.wire.record_json import to_json
+from gcd_client.images import colours, encode_jpegs, images
+from gcd_client.protocol import PREVIEW_ID, MessageError, ViewHeader, ViewMessage, kind_of, to_json
+from gcd_client.subscriber import ReceivedView
 
-MAX_REQUEST = 4096
-"""Bytes a message of a browser may have."""
-
+MAX_REQUEST = 4096  # bytes a message of a browser may have
+MOST_UNSEEN = 3  # pictures a browser may have on the way, sent and not yet shown
+MOST_WAITING = 64  # messages that wait for a browser
 _QUALITY = 85
 _LENGTH = struct.Struct("<I")
-_SECOND_NS = 1e9
 
 
 class Hello(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="type", tag="hello"):
@@ -72,25 +70,21 @@ def parse_request(text: str | bytes) -> Request:
         raise MessageError(f"this is no request of the page: {str(error)[:200]}") from error
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Note:
-    """A text message, ready to be sent."""
-
-    text: str
-
-
-def note(kind: str, fields: Mapping[str, Any]) -> Note:
-    """A note of a kind. fields: plain JSON."""
-    return Note(text=json.dumps({**fields, "type": kind}, allow_nan=False, separators=(",", ":")))
+def text_message(kind: str, fields: Mapping[str, Any]) -> str:
+    """A text message of a type. fields: plain JSON."""
+    return json.dumps({**fields, "type": kind}, allow_nan=False, separators=(",", ":"))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Picture:
     """A picture message for browsers, the same for all of them but for its number and its age.
 
-    age_ms, left_ms: how old its newest frame was, and how long it could still be used, at `born_s` (monotonic).
+    kind: of the topic, "src" for the input. age_ms, left_ms: how old its newest frame was, and how long it could still
+    be used, at `born_s` (monotonic).
     """
 
+    view: str
+    kind: str
     head: Mapping[str, Any]
     payload: bytes
     age_ms: float
@@ -100,14 +94,55 @@ class Picture:
     def part(self, number: int, now_s: float) -> bytes:
         """The binary message, as old as it is now."""
         since_ms = max(0.0, 1000 * (now_s - self.born_s))
-        told = {
-            **self.head,
-            "number": number,
-            "age_ms": round(self.age_ms + since_ms, 1),
-            "left_ms": round(self.left_ms - since_ms, 1),
-        }
-        head = json.dumps(told, allow_nan=False, separators=(",", ":")).encode()
+        ages = {"age_ms": round(self.age_ms + since_ms, 1), "left_ms": round(self.left_ms - since_ms, 1)}
+        fields = {**self.head, "view": self.view, "kind": self.kind, "number": number, **ages}
+        head = text_message("picture", fields).encode()
         return b"".join((_LENGTH.pack(len(head)), head, self.payload))
+
+
+class Mailbox:
+    """What waits to be sent to one browser: of everything the newest.
+
+    A newer message replaces an unread one of its slot and keeps its place in the row. Pictures wait until the browser
+    has shown earlier ones, so that what it is too slow for is left out here and never piles up on the way.
+    """
+
+    def __init__(self) -> None:
+        self.changed = asyncio.Event()
+        self._waiting: OrderedDict[str, str | Picture] = OrderedDict()
+        self._sent = self._shown = 0
+
+    def put(self, slot: str, what: str | Picture) -> None:
+        """Leave a message; when it gets too much, the oldest is given up."""
+        self._waiting[slot] = what
+        if len(self._waiting) > MOST_WAITING:
+            self._waiting.popitem(last=False)
+        self.changed.set()
+
+    def put_picture(self, shown: Picture) -> None:
+        """Leave a picture."""
+        self.put(f"picture/{shown.view}/{shown.kind}", shown)
+
+    def drop_views(self) -> None:
+        """Forget the pictures that still wait, but for those of the input."""
+        for slot, what in list(self._waiting.items()):
+            if isinstance(what, Picture) and what.view != PREVIEW_ID:
+                del self._waiting[slot]
+
+    def shown(self, number: int) -> None:
+        """The browser has shown the picture of this number, and so all before it."""
+        self._shown = max(self._shown, min(number, self._sent))
+        self.changed.set()
+
+    def take(self, now_s: float) -> str | bytes | None:
+        """The message to send now; None while nothing waits, or only pictures and the browser is behind."""
+        room = self._sent - self._shown < MOST_UNSEEN
+        slot = next((slot for slot, each in self._waiting.items() if room or isinstance(each, str)), None)
+        what = None if slot is None else self._waiting.pop(slot)
+        if not isinstance(what, Picture):
+            return what
+        self._sent += 1
+        return what.part(self._sent, now_s)
 
 
 def picture(view: ReceivedView) -> Picture:
@@ -117,19 +152,17 @@ def picture(view: ReceivedView) -> Picture:
     Raises:
         MessageError: pixels that do not fit the header.
     """
-    message, header = view.message, view.header
-    kind = "src" if header.view_id == "src" else kind_of(message.topic)
-    payload, offsets = _packed(message)
+    header = view.header
+    payload, offsets = _packed(view.message)
     since_ms = view.age_ms - header.age_ms
-    head = {
-        "type": "picture",
-        "kind": kind,
-        "view": header.view_id,
-        "offsets": offsets,
-        "skipped": view.skipped,
-        **_told(header),
-    }
-    return Picture(head=head, payload=payload, age_ms=view.age_ms, left_ms=header.valid_for_ms - since_ms)
+    return Picture(
+        view=header.view_id,
+        kind="src" if header.view_id == PREVIEW_ID else kind_of(view.message.topic),
+        head={"offsets": offsets, **_shown(header)},
+        payload=payload,
+        age_ms=view.age_ms,
+        left_ms=header.valid_for_ms - since_ms,
+    )
 
 
 def _packed(message: ViewMessage) -> tuple[bytes, tuple[int, ...] | None]:
@@ -138,12 +171,12 @@ def _packed(message: ViewMessage) -> tuple[bytes, tuple[int, ...] | None]:
     if header.encoding == "jpeg":
         return bytes(message.payload), header.offsets
     if header.encoding == "rgb8":
-        return encode_frames(images(message), _QUALITY)
+        return encode_jpegs(images(message), _QUALITY)
     levels = colours(message)[..., 0].tobytes() if header.encoding == "invdepth16" else message.payload
     return zlib.compress(levels, 1), None
 
 
-def _told(header: ViewHeader) -> dict[str, Any]:
+def _shown(header: ViewHeader) -> dict[str, Any]:
     """What the page shows of a header. Times are seconds, as doubles: for the eye."""
     return {
         "boot_id": header.boot_id,
@@ -155,10 +188,10 @@ def _told(header: ViewHeader) -> dict[str, Any]:
         "fps": header.src.fps_cond,
         "source": {"kind": header.src.kind, "id": header.src.id, "fps": header.src.fps_in},
         "epoch": header.src.epoch,
-        "captured_s": [stamp_ns / _SECOND_NS for stamp_ns in header.t_capture_ns],
+        "captured_s": [stamp_ns / 1e9 for stamp_ns in header.t_capture_ns],
         "clock": header.clock,
-        "at_s": header.t_publish_ns / _SECOND_NS,
-        "published": publishing_times(header),
+        "at_s": header.t_publish_ns / 1e9,
+        "published": _publishing_times(header),
         "valid_for_ms": header.valid_for_ms,
         "roles": list(header.frame_role),
         "pose": None if header.pose is None else to_json(header.pose[-1]),
@@ -171,15 +204,11 @@ def _told(header: ViewHeader) -> dict[str, Any]:
     }
 
 
-def publishing_times(header: ViewHeader) -> dict[str, float]:
+def _publishing_times(header: ViewHeader) -> dict[str, float]:
     """Where the age of a window at its publishing comes from, ms: it waited for the model, the model worked, and the
     rest until it left."""
     model_ms = (header.t_infer_end_ns - header.t_infer_start_ns) / 1e6
     after_ms = max(0.0, (header.t_publish_ns - header.t_infer_end_ns) / 1e6)
-    waited_ms = max(0.0, header.age_ms - model_ms - after_ms)
-    return {
-        "age_ms": round(header.age_ms, 1),
-        "waited_ms": round(waited_ms, 1),
-        "model_ms": round(model_ms, 1),
-        "after_ms": round(after_ms, 1),
-    }
+    times = {"age_ms": header.age_ms, "model_ms": model_ms, "after_ms": after_ms}
+    times["waited_ms"] = max(0.0, header.age_ms - model_ms - after_ms)
+    return {name: round(ms, 1) for name, ms in times.items()}

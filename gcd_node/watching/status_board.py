@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from gcd_node.envelope import NoteMessage
-from gcd_node.health.report import Level
+from gcd_client.protocol import StatusMessage
+from gcd_node.health import Level
 
 STALE_AFTER_S = 3.0
 """A node speaks once a second; silent for so long, what it said last holds no longer."""
@@ -33,14 +33,14 @@ class StatusBoard:
 
     def __init__(self, stale_after_s: float = STALE_AFTER_S) -> None:
         self._stale_after_s = stale_after_s
-        self._status: NoteMessage | None = None
+        self._status: StatusMessage | None = None
         self._heard_s = 0.0
         self._boot_id: str | None = None
         self.restarts = 0
         self.meta: Mapping[str, Any] = {}
         self.events: deque[EventLine] = deque(maxlen=_EVENTS)
 
-    def add(self, note: NoteMessage, now_s: float, wall_ns: int) -> None:
+    def add(self, note: StatusMessage, now_s: float, wall_ns: int) -> None:
         """Take note of a note. wall_ns: the wall clock now; the first status may be one that was kept for late
         readers, and is as old as its stamp says."""
         self._notice_boot(note.header.boot_id)
@@ -86,8 +86,15 @@ class StatusBoard:
         return Level.STALE if self.stale(now_s) else _level(self.fields.get("level"))
 
     def reasons(self) -> list[str]:
-        """The codes of the last status."""
-        found = self.fields.get("reasons")
+        """What is wrong, by the last status: codes."""
+        return self._codes("reasons")
+
+    def missing(self) -> list[str]:
+        """What keeps the node from being ready, by the last status: codes."""
+        return self._codes("not_ready")
+
+    def _codes(self, name: str) -> list[str]:
+        found = self.fields.get(name)
         return [each for each in found if isinstance(each, str)] if isinstance(found, list) else []
 
     def record(self, now_s: float) -> dict[str, Any]:

@@ -11,13 +11,12 @@ from rich.styled import Styled
 from rich.table import Table
 from rich.text import Text
 
-from gcd_node.envelope import NoteMessage
-from gcd_node.errors import MessageError, StaleError
-from gcd_node.health.report import Level
-from gcd_node.security.keys import ClientKeys
-from gcd_node.subscriber import NoteSubscriber
+from gcd_client.endpoints import ClientKeys, resolve_endpoint
+from gcd_client.protocol import StatusMessage
+from gcd_client.subscriber import StatusSubscriber
+from gcd_node.errors import StaleError
+from gcd_node.health import Level
 from gcd_node.watching.status_board import STALE_AFTER_S, StatusBoard
-from gcd_node.wire.endpoints import resolve_endpoint
 
 _REFRESH_MS = 250
 _LONGEST = 60
@@ -45,7 +44,6 @@ _SECTIONS: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
             ("gpu_mem_mb", " MB"),
             ("oom_count", " out of memory"),
             ("nan_windows", " NaN"),
-            ("backoff_s", " s backoff"),
         ),
     ),
     ("publish", (("sent", " sent"), ("subs", " subscribed"), ("bytes", " B"), ("dropped", " dropped"))),
@@ -65,20 +63,20 @@ class StatusRequest:
 
 
 def watch_status(
-    request: StatusRequest, on_change: Callable[[StatusBoard], None], on_note: Callable[[NoteMessage], None]
+    request: StatusRequest, on_change: Callable[[StatusBoard], None], on_note: Callable[[StatusMessage], None]
 ) -> None:
     """Receive notes, for ever or until the first fresh status; `on_note` gets each, `on_change` the board after each
     and four times a second in between, so that ages grow on the screen.
 
     Raises:
-        ConfigError: the endpoint is none. StaleError: `once`, and no status came in time. AuthError: the node does not
+        SetupError: no such endpoint. StaleError: `once`, and no status came in time. AuthError: the node does not
             let us in.
     """
     board = StatusBoard(request.timeout_s)
     until_s = time.monotonic() + request.timeout_s
-    with NoteSubscriber(request.endpoint, keys=request.keys) as notes:
+    with StatusSubscriber(request.endpoint, keys=request.keys) as notes:
         while True:
-            note = _next_note(notes)
+            note = notes.receive(_REFRESH_MS)
             now_s = time.monotonic()
             if note is not None:
                 board.add(note, now_s, time.time_ns())
@@ -108,13 +106,6 @@ def render_status(board: StatusBoard, now_s: float, endpoint: str = "") -> Group
     return Group(parts[0], *(Styled(part, stale) for part in parts[1:]))
 
 
-def _next_note(notes: NoteSubscriber) -> NoteMessage | None:
-    try:
-        return notes.receive(_REFRESH_MS)
-    except MessageError:
-        return None  # not of this protocol: as good as silence
-
-
 def _silence(request: StatusRequest, board: StatusBoard, now_s: float) -> str:
     silent_s = board.silent_s(now_s)
     last = "" if silent_s is None else f"; its last one is {silent_s:.0f} s old"
@@ -140,7 +131,7 @@ def _headline(board: StatusBoard, now_s: float, endpoint: str) -> Text:
         line.append(f"  before: {state}{f', {reasons}' if reasons else ''}", style="dim")
     else:
         line.append(f"  {state}")
-        line.append("  ready" if ready else "  not ready", style="dim")
+        line.append("  ready" if ready else f"  not ready: {_shown(', '.join(board.missing()))}", style="dim")
         line.append(f"  {reasons}" if reasons else "", style=_STYLES[level])
     if board.restarts:
         line.append(f"  restarted {board.restarts} times", style="dim")
@@ -151,7 +142,7 @@ def _sections(board: StatusBoard) -> Table:
     table = Table.grid(padding=(0, 2))
     for name, columns in _SECTIONS:
         section = board.section(name)
-        shown = [f"{_shown(section[key])}{unit}" for key, unit in columns if _says_something(key, section.get(key))]
+        shown = [f"{_shown(section[key])}{unit}" for key, unit in columns if section.get(key) is not None]
         if shown:
             table.add_row(Text(name, style="bold"), Text(", ".join(shown)))
     faults = board.section("window").get("reason_counts")
@@ -164,10 +155,6 @@ def _sections(board: StatusBoard) -> Table:
         shown = [f"{_shown(hop)} {_shown(count)}" for hop, count in drops.items()]
         table.add_row(Text("drops", style="bold"), Text(", ".join(shown)))
     return table
-
-
-def _says_something(key: str, value: object) -> bool:
-    return value is not None and (key, value) != ("backoff_s", 0)
 
 
 def _view(name: str, told: object) -> str:

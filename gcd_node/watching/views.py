@@ -14,14 +14,15 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from gcd_node.envelope import ViewKind, kind_of
-from gcd_node.errors import MessageError, OutputError
+from gcd_client.endpoints import ClientKeys
+from gcd_client.protocol import MessageError, ViewHeader, ViewKind, kind_of
+from gcd_client.subscriber import ReceivedView, ViewSubscriber
+from gcd_model import hatched
+from gcd_node.errors import OutputError
+from gcd_node.frame import Image
 from gcd_node.pictures.array_file import write_npy
-from gcd_node.pictures.comparison import hatched, legend
-from gcd_node.pictures.files import Image, video_writer, write_png
-from gcd_node.security.keys import ClientKeys
-from gcd_node.subscriber import ReceivedView, ViewSubscriber
-from gcd_node.wire.header import ViewHeader
+from gcd_node.pictures.comparison import legend
+from gcd_node.pictures.files import video_writer, write_png
 
 _REFRESH_MS = 250
 _RATE_SPAN = 10
@@ -197,7 +198,7 @@ def watch(request: WatchRequest, on_change: Callable[[Sequence[ViewRow]], None])
     four times a second in between, so that ages grow on the screen.
 
     Raises:
-        ConfigError, MessageError: the endpoint or the view id is none. OutputError: a picture cannot be written.
+        SetupError, MessageError: no such endpoint, or view id. OutputError: a picture cannot be written.
         AuthError: the node does not let us in.
     """
     with ViewSubscriber(request.endpoint, request.view, request.kind, conflate=False, keys=request.keys) as views:
@@ -244,31 +245,31 @@ class _Watch:
         return self._report()
 
     def _step(self) -> None:
+        view = self._views.receive(_REFRESH_MS)
+        if view is None:
+            return
+        self._heard_s = time.monotonic()
+        self._table.add(view, self._heard_s)
         try:
-            view = self._views.receive(_REFRESH_MS)
-            if view is not None:
-                self._table.add(view, time.monotonic())
-                if self._saver is not None:
-                    self._saver.add(view)
-                self._heard_s = time.monotonic()
-        except MessageError:
+            if self._saver is not None:
+                self._saver.add(view)
+        except MessageError:  # its pixels
             self._damaged += 1
 
     def _over(self) -> bool:
         limit, timeout_s = self._request.limit, self._request.timeout_s
-        enough = limit is not None and self._views.stats.received >= limit
+        enough = limit is not None and self._views.received >= limit
         silent = timeout_s is not None and time.monotonic() - self._heard_s >= timeout_s
         return self._views.ended or enough or silent
 
     def _report(self) -> WatchReport:
-        stats = self._views.stats
         rows = tuple(self._table.rows(time.monotonic(), ended=self._views.ended))
         return WatchReport(
             rows=rows,
-            received=stats.received,
+            received=self._views.received,
             ended=self._views.ended,
-            damaged=self._damaged,
-            restarts=stats.restarts,
+            damaged=self._damaged + self._views.damaged,
+            restarts=self._views.restarts,
             files=0 if self._saver is None else self._saver.files,
         )
 

@@ -1,6 +1,6 @@
 """What the bridge publishes: ROS 2 messages as plain records, and how the wire's headers become these. No ROS in here.
 
-Standard library, numpy and gcd_node's light parts, Python 3.10 syntax. cv2 only where pictures do not come as JPEG.
+Standard library, numpy and gcd_client, Python 3.10 syntax. cv2 only where pictures do not come as JPEG.
 """
 
 import math
@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_node.envelope import NoteMessage, ViewKind, depth_m
-from gcd_node.errors import ConfigError
-from gcd_node.subscriber import ReceivedView
-from gcd_node.wire.header import ViewHeader
+from gcd_client import ReceivedView, StatusMessage, ViewHeader
+from gcd_client.images import depth_m, encode_jpegs
+from gcd_client.protocol import ViewKind
 
 STALE_AFTER_S = 3.0
 """A node speaks once a second; silent for so long, it counts as stale."""
@@ -215,13 +214,13 @@ def to_compressed_image(view: ReceivedView, index: int) -> CompressedImage:
     """One frame as JPEG: the node's own bytes, or coded here.
 
     Raises:
-        ConfigError: the view is not JPEG, and cv2 is not there to make one of it.
+        SetupError: the view is not JPEG, and cv2 is not installed to make one of it.
     """
     header = view.header
     if header.offsets is not None:
         coded = bytes(view.message.payload[header.offsets[index] : header.offsets[index + 1]])
     else:
-        coded = _jpeg(view.images[index])
+        coded, _ = encode_jpegs(view.images[index : index + 1])
     return CompressedImage(header=to_header(header, index), data=array("B", coded))
 
 
@@ -294,7 +293,7 @@ def flat(told: Mapping[str, Any], before: str = "") -> Iterator[KeyValue]:
             yield KeyValue(key=f"{before}{key}", value=text)
 
 
-def to_diagnostic(note: NoteMessage | None, *, silent: bool) -> DiagnosticStatus:
+def to_diagnostic(note: StatusMessage | None, *, silent: bool) -> DiagnosticStatus:
     """What the node says of itself; STALE if it has been silent for too long, or has not spoken yet."""
     told: Mapping[str, Any] = {} if note is None else note.fields
     name = "" if note is None else note.header.node_id
@@ -308,13 +307,3 @@ def to_diagnostic(note: NoteMessage | None, *, silent: bool) -> DiagnosticStatus
         hardware_id=name,
         values=tuple(flat(told)),
     )
-
-
-def _jpeg(image: NDArray[np.uint8]) -> bytes:
-    try:
-        import cv2
-    except ImportError as error:
-        raise ConfigError(
-            f'these views are rgb8 and cv2 cannot be imported ({error}); let the node publish encoding = "jpeg"'
-        ) from error
-    return cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]))[1].tobytes()

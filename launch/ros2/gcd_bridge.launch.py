@@ -1,6 +1,6 @@
 """Starts the bridge beside a running node: ros2 launch launch/ros2/gcd_bridge.launch.py name:=topdown
 
-Unproven on a ROS machine, like the bridge. PYTHONPATH must hold the folder with gcd_node.
+Unproven on a ROS machine, like the bridge. Needs gcd-client.
 """
 
 from pathlib import Path

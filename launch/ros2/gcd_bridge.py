@@ -18,7 +18,7 @@ Every pixel is generated: never evidence of free space; depth under painted pixe
 `header.stamp` is when the real camera took the frame, so
 pictures come seconds old; what is past its `valid_for_ms` is not published. From a recording, stamps are its own time.
 
-Needs Python 3.10, numpy, pyzmq and the folder that holds gcd_node on PYTHONPATH. The node should publish
+Needs Python 3.10 and gcd-client (pip install ./client). The node should publish
 encoding = "jpeg": its pictures are passed on as they are. From rgb8 they are coded here, which needs cv2.
 """
 
@@ -54,9 +54,8 @@ from bridge_messages import (
     to_transform,
 )
 
-from gcd_node.envelope import NoteMessage, ViewKind
-from gcd_node.errors import AuthError, MessageError, NodeError, StaleError
-from gcd_node.subscriber import NoteSubscriber, ReceivedView, ViewSubscriber
+from gcd_client import AuthError, ClientError, ReceivedView, StatusMessage, StatusSubscriber, ViewSubscriber
+from gcd_client.protocol import ViewKind
 
 POLL_S = 0.02
 
@@ -88,20 +87,21 @@ class ViewFeed:
 
     def newest(self) -> ReceivedView | None:
         """The newest window that may be used, None if there is none. Never waits."""
-        counts = self.counts
+        if self._resting():
+            return None
+        counts, reader = self.counts, self._opened()
+        stale, damaged = reader.stale, reader.damaged
         try:
-            view = None if self._resting() else self._opened().receive(timeout_ms=0)
-        except StaleError:
-            counts.too_old += 1
-        except MessageError as error:
-            counts.damaged, counts.trouble = counts.damaged + 1, str(error)
+            view = reader.receive(timeout_ms=0)
         except AuthError as error:
             counts.trouble = str(error)
             self.close()
             self._rest_until_s = time.monotonic() + 1.0
-        else:
-            return None if view is None else self._usable(view)
-        return None
+            return None
+        counts.too_old += reader.stale - stale
+        if reader.damaged > damaged:
+            counts.damaged, counts.trouble = counts.damaged + reader.damaged - damaged, reader.last_error
+        return None if view is None else self._usable(view)
 
     def close(self) -> None:
         """Close the reader; the next newest() opens another."""
@@ -151,8 +151,8 @@ class Bridge:
         self.feeds = tuple(
             ViewFeed(view_id=each, settings=settings, kind=kind) for each in settings.views for kind in kinds
         )
-        self._notes = NoteSubscriber(settings.status, ("status",))
-        self._status: NoteMessage | None = None
+        self._notes = StatusSubscriber(settings.status, ("status",))
+        self._status: StatusMessage | None = None
         self._heard_s = -math.inf
         self._next_s = time.monotonic() + 1.0
 
@@ -188,7 +188,7 @@ class Bridge:
             return
         try:
             picture = to_compressed_image(view, index) if feed.kind == "win" else to_image(view, index)
-        except NodeError as error:
+        except ClientError as error:
             feed.counts.trouble = str(error)
             return
         feed.counts.published, feed.counts.trouble = feed.counts.published + 1, ""
@@ -206,11 +206,9 @@ class Bridge:
             while (note := self._notes.receive(timeout_ms=0)) is not None:
                 kept_s = max(0.0, (time.time_ns() - note.header.t_publish_ns) / 1e9)
                 self._status, self._heard_s = note, time.monotonic() - kept_s
-        except MessageError:
-            pass  # as good as silence
         except AuthError:
             self._notes.close()
-            self._notes = NoteSubscriber(self._settings.status, ("status",))
+            self._notes = StatusSubscriber(self._settings.status, ("status",))
 
 
 class Ros:

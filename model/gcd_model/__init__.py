@@ -8,14 +8,12 @@ The node imports from here only. Source: Van Hoorick et al., "Generative Camera 
 """
 
 from gcd_model.checkpoints import WeightsReport, convert_weights, inspect_weights
-from gcd_model.class_head import palette
 from gcd_model.clip import QUALITIES, SOLVERS, Augmentation, Clip, Quality, RenderOptions, SolverName, View
+from gcd_model.colours import hatched, palette
 from gcd_model.conditioning import SourceFeatures
 from gcd_model.config import (
     DRIVING_CLASSES,
-    DRIVING_SEMANTIC_SMALL,
-    DRIVING_SMALL,
-    OBJECTS_SMALL,
+    PLAIN_SMALL,
     SMALL,
     SVD_14,
     ModelConfig,
@@ -25,6 +23,7 @@ from gcd_model.errors import (
     Cancelled,
     CheckpointError,
     DeviceMemoryError,
+    FileError,
     ModelError,
     NonFiniteError,
     OptionError,
@@ -49,6 +48,7 @@ from gcd_model.geometry import (
     pose_trajectory,
     spherical_trajectory,
 )
+from gcd_model.live.ego_motion import require_motion
 from gcd_model.live.synthesizer import visibility_of
 from gcd_model.loading import ENGINES, EngineName, default_precision, load_synthesizer
 from gcd_model.measuring import (
@@ -72,19 +72,18 @@ from gcd_model.onnx_source import export_weights
 from gcd_model.quality import Sampler, sampler_of
 from gcd_model.schedule import Schedule
 from gcd_model.settings import explain_settings_error
-from gcd_model.synthesizer import Synthesizer, ViewSynthesizer, synthesize
+from gcd_model.small_files import decode_json, decode_toml, printable, read_json, read_small
+from gcd_model.synthesizer import FrameSynthesizer, Synthesizer, ViewSynthesizer, synthesize
 from gcd_model.traits import ASSUMED_SOURCE, Traits
 
 __all__ = [
     "ASSUMED_SOURCE",
     "DRIVING_CLASSES",
-    "DRIVING_SEMANTIC_SMALL",
-    "DRIVING_SMALL",
     "ENGINES",
     "FAMILIES",
     "IMPLEMENTATIONS",
     "LIVE_LENS_DEG",
-    "OBJECTS_SMALL",
+    "PLAIN_SMALL",
     "QUALITIES",
     "SMALL",
     "SOLVERS",
@@ -101,6 +100,8 @@ __all__ = [
     "EngineName",
     "ExportPrecision",
     "Family",
+    "FileError",
+    "FrameSynthesizer",
     "Implementation",
     "ImplementationName",
     "Intrinsics",
@@ -138,11 +139,14 @@ __all__ = [
     "bench_model",
     "center_crop_box",
     "convert_weights",
+    "decode_json",
+    "decode_toml",
     "default_precision",
     "driving_trajectory",
     "explain_settings_error",
     "export_weights",
     "fitted_trajectory",
+    "hatched",
     "inspect_weights",
     "is_export",
     "load_measured",
@@ -150,6 +154,10 @@ __all__ = [
     "nearest_delta",
     "palette",
     "pose_trajectory",
+    "printable",
+    "read_json",
+    "read_small",
+    "require_motion",
     "sampler_of",
     "save_random",
     "spherical_trajectory",

@@ -7,16 +7,17 @@ Source: Hu et al. 2022, "LoRA: Low-Rank Adaptation of Large Language Models", se
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Self
+from typing import Annotated, Self
 
 import msgspec
 import torch
 from torch import Tensor
 
 from gcd_model.carry_over import CAMERA, carried_over
-from gcd_model.errors import CheckpointError
+from gcd_model.errors import CheckpointError, FileError
 from gcd_model.networks import Networks, empty_networks, weights_digest
 from gcd_model.own_format import Card
+from gcd_model.small_files import decode_json
 
 ADAPTER_KEY = "gcd.adapter"
 """Metadata that only adapter files have."""
@@ -24,10 +25,12 @@ ADAPTER_KEY = "gcd.adapter"
 DOWN, UP = ".down", ".up"
 """Endings of an adapted layer's two factors, after the layer's own name."""
 
+_MOST_ALPHA = 1e6  # anything near the end of float32 makes weights infinite
+
 
 class _Facts(msgspec.Struct, frozen=True, kw_only=True):
-    rank: int
-    alpha: float
+    rank: Annotated[int, msgspec.Meta(ge=1)]
+    alpha: Annotated[float, msgspec.Meta(ge=-_MOST_ALPHA, le=_MOST_ALPHA)]
     base: str
 
 
@@ -59,9 +62,9 @@ class Adapter:
                 "is no adapter; wanted is a file that `gcd-train train` wrote with model.train = lora"
             )
         try:
-            facts = msgspec.json.decode(metadata[ADAPTER_KEY], type=_Facts)
-        except msgspec.DecodeError as error:
-            raise CheckpointError(f"its metadata cannot be used ({error}); export the adapter again") from error
+            facts = decode_json(metadata[ADAPTER_KEY], _Facts)
+        except FileError as error:
+            raise CheckpointError(f"its metadata {error}; export the adapter again") from error
         card = Card.from_metadata(metadata)
         return cls(rank=facts.rank, alpha=facts.alpha, base=facts.base, card=card, tensors=tensors)
 

@@ -17,8 +17,8 @@ from gcd_model.networks import Networks, empty_networks
 CAMERA = ("camera.", "unet.embed_camera.")
 """How names of the camera embedder and of its MLP in the U-Net begin."""
 
-DIFFUSION = ("unet.", "camera.", "class_head.", "plane_mix.")
-"""What the paper's "from scratch" leaves at random: the U-Net and the camera embedder; and what is ours beside them."""
+DIFFUSION = ("unet.", "camera.")
+"""What the paper's "from scratch" leaves at random: the U-Net and the camera embedder."""
 
 _ENCODER, _SECOND_ENCODER, _QUANT = "target_encoder.", "own_condition_encoder.", "target_encoder.quant."
 

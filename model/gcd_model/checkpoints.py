@@ -22,7 +22,7 @@ from torch import Tensor
 
 from gcd_model.adapter import Adapter, adapted
 from gcd_model.diffusers_folder import PARTS, chosen_file, folder_hints, shards
-from gcd_model.errors import CheckpointError, OptionError
+from gcd_model.errors import CheckpointError, FileError, OptionError
 from gcd_model.examination import (
     Examined,
     Options,
@@ -41,6 +41,7 @@ from gcd_model.networks import LoadedWeights, Networks, weights_digest
 from gcd_model.own_format import CONFIG_KEY, Card, Entry, precision
 from gcd_model.packed import divided
 from gcd_model.restricted_pickle import RestrictedPickle, check_storages
+from gcd_model.small_files import read_small
 from gcd_model.weights_export import Report, own_content, write_published, write_safetensors, written_dtype
 from gcd_model.weights_report import WeightsReport
 
@@ -309,7 +310,7 @@ def _read_folder(path: Path) -> WeightsFile:
         layout="diffusers",
         files=tuple(file for part in PARTS for file in files[part]),
         tensors=tensors,
-        hints=folder_hints(*(config.read_bytes() if config.is_file() else None for config in configs)),
+        hints=folder_hints(*(_text(config) if config.exists() else None for config in configs)),
     )
 
 
@@ -318,11 +319,18 @@ def _part_files(folder: Path) -> list[Path]:
     chosen = folder / chosen_file((entry.name for entry in folder.iterdir()), folder.name)
     if chosen.suffix != ".json":
         return [chosen]
-    files = [folder / name for name in shards(chosen.read_bytes(), folder.name)]
+    files = [folder / name for name in shards(_text(chosen), f"{folder.name}/{chosen.name}")]
     absent = [file.name for file in files if not file.exists()]
     if absent:
         raise CheckpointError(f"its folder {folder.name} lacks {len(absent)} shards, first: {absent[0]}; {FETCH_AGAIN}")
     return files
+
+
+def _text(file: Path) -> str:
+    try:
+        return read_small(file)
+    except FileError as error:
+        raise CheckpointError(f"its file {file.parent.name}/{file.name} {error}") from error
 
 
 def _read_part(file: Path) -> dict[str, Tensor]:

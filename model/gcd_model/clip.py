@@ -32,9 +32,7 @@ class Clip:
 
     video: float32 [T, 3, H, W], RGB in [-1, 1].
     fps: frames per second of the clip itself, not of the camera; the network is told this number.
-    mount: how the camera sits on its vehicle, for models that warp by the planes of a road and for the live model; None
-        for the mount of their training, for the live model: not known. Where the source camera of an orbit stands, the
-        path says.
+    mount: how the camera sits on its vehicle, for the live model; None: not known.
     lens, depth, odometry: for the live model, which makes up for what is left out; lens and depth also for
         `visibility_of`.
     lens: of these pictures; None: of the mount's field of view.

@@ -37,8 +37,7 @@ class SourceFeatures:
     model, which has none.
     extra: [T, C', h, w], further condition channels, or None. fps: what the network is told.
     augmentation: strength of the noise the VAE saw.
-    video: float32 [T, 3, H, W] in [-1, 1] and mount: what plane warps are made of, and the live model's points; None
-    for models without. geometry: of the live model; None for others.
+    video: float32 [T, 3, H, W] in [-1, 1], mount, geometry: what the live model's points are made of; None for others.
     """
 
     tokens: Tensor | None
@@ -161,17 +160,10 @@ class CameraEmbedder(nn.Module):
         return self.proj(camera_features(self.control, trajectory).to(self.proj.weight))
 
 
-def condition_latents(
-    features: SourceFeatures, views: int, warped: Tensor | None = None, *, unconditional: bool
-) -> Tensor:
-    """Condition channels of K views, [R*K*T, C', h, w]; the unconditional branch sees zeros, as released.
-
-    warped: [K*T, C'', h, w], channels that differ between the views, or None.
-    """
+def condition_latents(features: SourceFeatures, views: int, *, unconditional: bool) -> Tensor:
+    """Condition channels of K views, [R*K*T, C', h, w]; the unconditional branch sees zeros, as released."""
     rows = features.latents if features.extra is None else torch.cat([features.latents, features.extra], dim=1)
-    if warped is None:
-        return _with_unconditional(rows, views, unconditional)
-    return _with_unconditional(torch.cat([rows.repeat(views, 1, 1, 1), warped.to(rows)], dim=1), 1, unconditional)
+    return _with_unconditional(rows, views, unconditional)
 
 
 def condition_tokens(features: SourceFeatures, views: int, *, unconditional: bool) -> Tensor | None:

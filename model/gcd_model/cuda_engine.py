@@ -20,9 +20,9 @@ from gcd_model.conditioning import Conditioning
 from gcd_model.cuda_graphs import CudaGraphs, Pace, Recent, RecordedCall, Recorder, Unrecorded
 from gcd_model.decoder_check import checked_decoder
 from gcd_model.denoiser import TorchBackbone
-from gcd_model.engine import Sampled, TorchEngine
+from gcd_model.engine import TorchEngine
 from gcd_model.errors import Cancelled
-from gcd_model.fused_step import StepMemory, Update, solved, step_kinds
+from gcd_model.fused_step import StepMemory, Update, solved
 from gcd_model.geometry import Trajectory
 from gcd_model.image_encoder import clip_pixels
 from gcd_model.layers import prepare
@@ -95,7 +95,7 @@ class CudaEngine:
         update = _compiled(networks, options)
         self._networks, self._update = networks, update
         self._plain = TorchEngine(networks)
-        self._backbone = TorchBackbone(networks.unet, networks.class_head)
+        self._backbone = TorchBackbone(networks.unet)
         on_gpu = options.graphs and self.like.device.type == "cuda"
         self._recorder = recorder or (CudaGraphs() if on_gpu else Unrecorded())
         self._memories: Recent[StepMemory] = Recent()
@@ -134,41 +134,33 @@ class CudaEngine:
         return self._plain.camera(path)
 
     @_forgetful
-    def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Sampled:
+    def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
         """See Engine. With somebody to tell or to ask, each step is waited for before the next is queued."""
         start = start.to(self.like.device)
-        kinds = step_kinds(schedule, has_classes=self._networks.class_head is not None)
+        widths = [2 if guided else 1 for guided in schedule.guided]
         memory = self._memories.get(
             (start.shape, given.latents.shape, given.tokens is None),
             lambda: StepMemory(self._backbone, self._update, start, given, schedule),
         )
         memory.begin(start, given, schedule)
-        if memory.record(set(kinds), self._recorder):
+        if memory.record(set(widths), self._recorder):
             memory.begin(start, given, schedule)
         pace = Pace(self.like.device)
-        for i, kind in enumerate(kinds):
+        for i, branches in enumerate(widths):
             if options.cancel is not None and options.cancel.is_set():
-                raise Cancelled(f"stopped before step {i + 1} of {len(kinds)}")
+                raise Cancelled(f"stopped before step {i + 1} of {len(widths)}")
             memory.seek(i)
-            memory.advance(kind)
+            memory.advance(branches)
             if options.cancel is not None or options.progress is not None:
                 pace.wait()
             if options.progress is not None:
-                options.progress(i + 1, len(kinds))
-        latents, logits = memory.result()
-        return Sampled(latents=latents, class_logits=logits)
+                options.progress(i + 1, len(widths))
+        return memory.result()
 
     @_forgetful
     def decode(self, latents: Tensor) -> Tensor:
         """See Engine."""
         return self._decoder(latents.to(self._networks.decoder.stem.weight)).float()
-
-    @_forgetful
-    def mix(
-        self, decoded: Tensor, warped: Tensor, valid: Tensor, latents: Tensor, logits: Tensor | None
-    ) -> tuple[Tensor, Tensor | None]:
-        """See Engine."""
-        return self._plain.mix(decoded, warped, valid, latents, logits)
 
     def _tokens_of(self, pixels: Tensor) -> Tensor:
         tower = self._networks.image_encoder

@@ -1,35 +1,15 @@
-"""From latents to pictures: the VAE's decoder and, where the model has them, plane mix and class map."""
+"""From latents to pictures: the VAE's decoder and, where the model paints classes, their map."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from gcd_model.class_head import class_map, nearest_classes
+from gcd_model.colours import nearest_classes
 from gcd_model.config import SemanticClass
 from gcd_model.download import Download
 from gcd_model.engine import Engine
 from gcd_model.vae import to_pixels
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Denoised:
-    """What sampling gave, V views and S samples of each.
-
-    latents: [V, S, T, C, h, w], scaled. class_logits: [V, S, T, K, h', w'], or None without class head.
-    """
-
-    latents: Tensor
-    class_logits: Tensor | None
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class LayerStack:
-    """The source warped along one view's path: warped [T, L, 3, H, W] in [-1, 1], valid bool [T, L, H, W]."""
-
-    warped: Tensor
-    valid: Tensor
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -64,40 +44,23 @@ class _Coming:
     finite: Tensor
 
 
-def decode(
-    engine: Engine, scale: float, denoised: Denoised, stacks: Sequence[LayerStack | None], finish: Finish | None = None
-) -> list[Pictures]:
+def decode(engine: Engine, latents: Tensor, finish: Finish | None = None) -> list[Pictures]:
     """Decode view by view, one clip at a time; while one is decoded, the one before it arrives on the CPU.
 
-    scale: of the VAE. stacks: one per view; None for models without plane mix.
+    latents: [V, S, T, C, h, w], unscaled: V views, S samples of each.
     """
     finish = Finish() if finish is None else finish
-    views: list[list[_Coming]] = []
-    for v, stack in enumerate(stacks):
-        logits = denoised.class_logits
-        views.append(
-            [
-                _decoded_clip(engine, scale, latents, None if logits is None else logits[v, s], stack, finish)
-                for s, latents in enumerate(denoised.latents[v])
-            ]
-        )
+    views = [[_decoded_clip(engine, clip, finish) for clip in view] for view in latents]
     return [_arrived(clips) for clips in views]
 
 
-def _decoded_clip(
-    engine: Engine, scale: float, latents: Tensor, logits: Tensor | None, stack: LayerStack | None, finish: Finish
-) -> _Coming:
-    """latents: [T, C, h, w], scaled. Pixels [T, 3, H, W] and class ids [T, H, W]."""
-    decoded = engine.decode(latents / scale)
-    if stack is not None:
-        decoded, logits = engine.mix(decoded, stack.warped, stack.valid, latents, logits)
+def _decoded_clip(engine: Engine, latents: Tensor, finish: Finish) -> _Coming:
+    """latents: [T, C, h, w]. Pixels [T, 3, H, W] and class ids [T, H, W]."""
+    decoded = engine.decode(latents)
     pixels = to_pixels(decoded)
-    classes = None if logits is None else class_map(logits, *decoded.shape[-2:])
-    if finish.painted:
-        classes = nearest_classes(pixels, finish.painted)
     return _Coming(
         pixels=Download(whole_levels(pixels) if finish.whole_levels else pixels),
-        classes=None if classes is None else Download(classes),
+        classes=Download(nearest_classes(pixels, finish.painted)) if finish.painted else None,
         finite=decoded.isfinite().all(),
     )
 

@@ -1,10 +1,9 @@
-"""The network as the sampler calls it: preconditioned, guided, with the class logits of the last step."""
+"""The network as the sampler calls it: preconditioned and guided."""
 
 from typing import Protocol
 
 from torch import Tensor
 
-from gcd_model.class_head import ClassHead
 from gcd_model.conditioning import Conditioning
 from gcd_model.noise import preconditioning
 from gcd_model.sampler import guided
@@ -23,21 +22,12 @@ class Backbone(Protocol):
         """One evaluation, see `VideoUNet.forward`. rows: float32 [N, C, h, w] -> float32, the same shape."""
         ...
 
-    def predict_classes(
-        self, rows: Tensor, condition: Tensor, inputs: tuple[StageInputs, ...], branches: int
-    ) -> tuple[Tensor, Tensor | None]:
-        """The same, with class logits of the conditional branch, float32 [N / branches, K, h', w'].
-
-        None for a model without class head.
-        """
-        ...
-
 
 class TorchBackbone:
-    """U-Net and class head as they are, in the U-Net's own precision. Source: `Backbone`."""
+    """The U-Net as it is, in its own precision. Source: `Backbone`."""
 
-    def __init__(self, unet: VideoUNet, head: ClassHead | None) -> None:
-        self._unet, self._head = unet, head
+    def __init__(self, unet: VideoUNet) -> None:
+        self._unet = unet
 
     def plan(self, labels: Tensor, given: Conditioning) -> UNetPlan:
         """See Backbone."""
@@ -48,23 +38,9 @@ class TorchBackbone:
         """See Backbone."""
         return self._unet(rows.to(self._unet.stem.weight), condition, inputs).float()
 
-    def predict_classes(
-        self, rows: Tensor, condition: Tensor, inputs: tuple[StageInputs, ...], branches: int
-    ) -> tuple[Tensor, Tensor | None]:
-        """See Backbone."""
-        if self._head is None:
-            return self.predict(rows, condition, inputs), None
-        features = self._unet.features(rows.to(self._unet.stem.weight), condition, inputs)
-        logits = self._head(features.chunk(branches)[-1]).float()
-        return self._unet.project(features).float(), logits
-
 
 class Denoiser:
-    """D(x, sigma_i) with guidance, for one batch of views.
-
-    class_logits: [K*T, classes, h', w'], float32, of the conditional branch, once the last step is done; None
-        before that and without class head.
-    """
+    """D(x, sigma_i) with guidance, for one batch of views."""
 
     def __init__(self, backbone: Backbone, given: Conditioning, schedule: Schedule) -> None:
         self._backbone, self._given, self._schedule = backbone, given, schedule
@@ -72,7 +48,6 @@ class Denoiser:
         self._c_in, self._c_out, self._c_skip = (c.tolist() for c in (levels.c_in, levels.c_out, levels.c_skip))
         self._plan = backbone.plan(levels.c_noise.float(), given)
         self._guidance = schedule.guidance.to(given.latents.device)
-        self.class_logits: Tensor | None = None
 
     def __call__(self, x: Tensor, step: int) -> Tensor:
         """x: [K, T, C, h, w] float32 -> the same shape."""
@@ -87,10 +62,7 @@ class Denoiser:
         if branches < self._given.branches:
             condition = condition.chunk(self._given.branches)[-1]
             inputs = tuple(_conditional(each, self._given.branches) for each in inputs)
-        if step + 1 < len(self._c_in):
-            return self._backbone.predict(rows, condition, inputs)
-        raw, self.class_logits = self._backbone.predict_classes(rows, condition, inputs, branches)
-        return raw
+        return self._backbone.predict(rows, condition, inputs)
 
 
 def _conditional(inputs: StageInputs, branches: int) -> StageInputs:

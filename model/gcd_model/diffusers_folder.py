@@ -6,7 +6,8 @@ from typing import TypeVar
 import msgspec
 
 from gcd_model.architecture import Hints
-from gcd_model.errors import CheckpointError
+from gcd_model.errors import CheckpointError, FileError
+from gcd_model.small_files import decode_json
 
 Facts = TypeVar("Facts", bound=msgspec.Struct)
 
@@ -34,7 +35,7 @@ class _Index(msgspec.Struct, frozen=True, kw_only=True):
     weight_map: dict[str, str] = {}
 
 
-def folder_hints(unet: bytes | None, vae: bytes | None, image_encoder: bytes | None) -> Hints:
+def folder_hints(unet: str | None, vae: str | None, image_encoder: str | None) -> Hints:
     """What the three config.json files tell; each may be absent.
 
     Raises: CheckpointError for broken JSON, or an activation the image tower here does not compute.
@@ -51,11 +52,11 @@ def folder_hints(unet: bytes | None, vae: bytes | None, image_encoder: bytes | N
     )
 
 
-def _decoded(text: bytes | None, kind: type[Facts], name: str) -> Facts:
+def _decoded(text: str | None, kind: type[Facts], name: str) -> Facts:
     try:
-        return kind() if text is None else msgspec.json.decode(text, type=kind)
-    except msgspec.DecodeError as error:
-        raise CheckpointError(f"{name} cannot be used: {error}") from error
+        return kind() if text is None else decode_json(text, kind)
+    except FileError as error:
+        raise CheckpointError(f"{name} {error}") from error
 
 
 def chosen_file(names: Iterable[str], part: str) -> str:
@@ -78,10 +79,13 @@ def chosen_file(names: Iterable[str], part: str) -> str:
     )
 
 
-def shards(index: bytes, part: str) -> list[str]:
-    """File names an index lists, each once. Raises CheckpointError for names that leave the folder."""
-    files = _decoded(index, _Index, f"the index of {part}").weight_map.values()
-    for name in files:
-        if "/" in name or "\\" in name or name in ("", ".", ".."):
-            raise CheckpointError(f"the index of {part} names the shard {name!r}; wanted are plain file names")
+def shards(index: str, name: str) -> list[str]:
+    """File names an index lists, each once; `name` is its own, for messages.
+
+    Raises: CheckpointError for broken JSON, or names that leave the folder.
+    """
+    files = _decoded(index, _Index, f"its index {name}").weight_map.values()
+    for shard in files:
+        if "/" in shard or "\\" in shard or shard in ("", ".", ".."):
+            raise CheckpointError(f"its index {name} names the shard {shard!r}; wanted are plain file names")
     return sorted(set(files))

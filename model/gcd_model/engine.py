@@ -1,6 +1,5 @@
 """What computes the networks of a checkpoint, behind one interface: plain torch here, faster ones beside it."""
 
-from dataclasses import dataclass
 from typing import Protocol
 
 from torch import Tensor
@@ -13,17 +12,6 @@ from gcd_model.image_encoder import clip_pixels
 from gcd_model.networks import Networks
 from gcd_model.sampler import sample
 from gcd_model.schedule import Schedule
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Sampled:
-    """What sampling gave K views.
-
-    latents: float32 [K, T, C, h, w]. class_logits: float32 [K*T, classes, h', w'] or None.
-    """
-
-    latents: Tensor
-    class_logits: Tensor | None
 
 
 class Engine(Protocol):
@@ -49,7 +37,7 @@ class Engine(Protocol):
         """What the U-Net is told of a camera path, [T, W]; None for a model without camera control."""
         ...
 
-    def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Sampled:
+    def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
         """From noise [K, T, C, h, w] to clean latents; reports to `options.progress`, stops for `options.cancel`.
 
         Raises Cancelled.
@@ -60,19 +48,13 @@ class Engine(Protocol):
         """Unscaled latents of one clip [T, C, h, w] -> pictures float32 [T, 3, H, W], about [-1, 1]."""
         ...
 
-    def mix(
-        self, decoded: Tensor, warped: Tensor, valid: Tensor, latents: Tensor, logits: Tensor | None
-    ) -> tuple[Tensor, Tensor | None]:
-        """Pictures and class logits with pixels of the warped source in them, see `PlaneMix`."""
-        ...
-
 
 class TorchEngine:
     """The networks as torch runs them."""
 
     def __init__(self, networks: Networks) -> None:
         self._networks = networks
-        self._backbone = TorchBackbone(networks.unet, networks.class_head)
+        self._backbone = TorchBackbone(networks.unet)
 
     @property
     def like(self) -> Tensor:
@@ -95,23 +77,13 @@ class TorchEngine:
         embedder = self._networks.camera
         return None if embedder is None else embedder(path)
 
-    def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Sampled:
+    def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
         """See Engine."""
         denoiser = Denoiser(self._backbone, given, schedule)
-        latents = sample(
-            denoiser, start.to(self.like.device), schedule.steps, progress=options.progress, cancel=options.cancel
-        )
-        return Sampled(latents=latents, class_logits=denoiser.class_logits)
+        start = start.to(self.like.device)
+        return sample(denoiser, start, schedule.steps, progress=options.progress, cancel=options.cancel)
 
     def decode(self, latents: Tensor) -> Tensor:
         """See Engine."""
         decoder = self._networks.decoder
         return decoder(latents.to(decoder.stem.weight), len(latents))
-
-    def mix(
-        self, decoded: Tensor, warped: Tensor, valid: Tensor, latents: Tensor, logits: Tensor | None
-    ) -> tuple[Tensor, Tensor | None]:
-        """See Engine."""
-        mix = self._networks.plane_mix
-        assert mix is not None, "only models with a plane mix have warps to mix in"
-        return mix(decoded, warped, valid, latents.to(decoded), logits)

@@ -6,6 +6,7 @@
     │   ├── ViewRangeError    a view lies outside the limits the checkpoint was trained for
     │   └── ViewFixedError    the checkpoint has one fixed view and takes no camera command
     ├── CheckpointError   a file is missing, damaged, hostile or of another architecture
+    ├── FileError         a small text file cannot be read or decoded; also a ValueError
     ├── OptionError       a setting is missing, unknown or contradicts the checkpoint; also a ValueError
     ├── DeviceMemoryError the device ran out of memory; what it held for the call is free again
     ├── NonFiniteError    the network produced NaN or Inf
@@ -44,6 +45,10 @@ class ViewFixedError(PoseError):
 
 class CheckpointError(ModelError):
     """A file is missing, damaged, hostile or of another architecture. Nothing was loaded."""
+
+
+class FileError(ModelError, ValueError):
+    """A small text file cannot be read or decoded. The message begins where the file's name ends."""
 
 
 class OptionError(ModelError, ValueError):

@@ -5,7 +5,6 @@ device before the first step; the host waits for nothing and allocates nothing i
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -20,20 +19,6 @@ from gcd_model.unet import StageInputs, StagePlan, UNetPlan
 
 Update = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 """`solved`, as it is or compiled."""
-
-
-@dataclass(frozen=True, slots=True)
-class StepKind:
-    """Steps of one kind do the same work. guided: with the unconditional branch. classes: with class logits."""
-
-    guided: bool
-    classes: bool
-
-
-def step_kinds(schedule: Schedule, *, has_classes: bool) -> tuple[StepKind, ...]:
-    """The kind of each step. has_classes: the model has a class head, which looks at the last step."""
-    last = len(schedule.steps) - 1
-    return tuple(StepKind(wide, has_classes and i == last) for i, wide in enumerate(schedule.guided))
 
 
 def step_numbers(schedule: Schedule) -> Tensor:
@@ -128,8 +113,7 @@ class StepMemory:
         self._table = start.new_empty(0)
         self._numbers = start.new_empty(step_numbers(schedule).shape[1])
         self._plan: PlanMemory | None = None
-        self._logits: Tensor | None = None
-        self._replays: dict[StepKind, Replay] = {}
+        self._replays: dict[int, Replay] = {}
 
     def begin(self, start: Tensor, given: Conditioning, schedule: Schedule) -> None:
         """Load a batch."""
@@ -144,12 +128,13 @@ class StepMemory:
         self._condition.copy_(given.latents)
         self._guidance.copy_(schedule.guidance)
 
-    def record(self, kinds: set[StepKind], recorder: Recorder) -> bool:
-        """Record what is missing; then a batch that was loaded must be loaded again. Whether anything was."""
-        missing = [kind for kind in kinds if kind not in self._replays]
-        for kind in missing:
+    def record(self, branches: set[int], recorder: Recorder) -> bool:
+        """Record what is missing of steps of so many branches; then a batch that was loaded must be loaded again.
+        Whether anything was."""
+        missing = [each for each in branches if each not in self._replays]
+        for each in missing:
             self.seek(0)
-            self._replays[kind] = recorder.record(lambda kind=kind: self._advance(kind))
+            self._replays[each] = recorder.record(lambda each=each: self._advance(each))
         return bool(missing)
 
     def seek(self, step: int) -> None:
@@ -158,31 +143,23 @@ class StepMemory:
         self._numbers.copy_(self._table[step])
         self._plan.seek(step)
 
-    def advance(self, kind: StepKind) -> None:
+    def advance(self, branches: int) -> None:
         """Do the step."""
-        self._replays[kind]()
+        self._replays[branches]()
 
-    def result(self) -> tuple[Tensor, Tensor | None]:
-        """Latents and class logits, copies."""
-        return self._x.clone(), None if self._logits is None else self._logits.clone()
+    def result(self) -> Tensor:
+        """Latents, a copy."""
+        return self._x.clone()
 
-    def _advance(self, kind: StepKind) -> None:
-        branches = 2 if kind.guided else 1
-        raw = self._network(kind, branches).unflatten(0, (branches, *self._x.shape[:2]))
+    def _advance(self, branches: int) -> None:
+        raw = self._network(branches).unflatten(0, (branches, *self._x.shape[:2]))
         after, denoised = self._update(self._x, self._before, raw, self._numbers, self._guidance)
         self._x.copy_(after)
         self._before.copy_(denoised)
 
-    def _network(self, kind: StepKind, branches: int) -> Tensor:
+    def _network(self, branches: int) -> Tensor:
         assert self._plan is not None, "begin() comes first"
         rows = (self._x * self._numbers[0]).flatten(0, 1).repeat(branches, 1, 1, 1)
         condition = _last(self._condition, branches, self._branches)
         inputs = self._plan.inputs(branches, self._branches)
-        if not kind.classes:
-            return self._backbone.predict(rows, condition, inputs)
-        raw, logits = self._backbone.predict_classes(rows, condition, inputs, branches)
-        assert logits is not None, "only models with a class head have such steps"
-        if self._logits is None:
-            self._logits = torch.empty_like(logits)
-        self._logits.copy_(logits)
-        return raw
+        return self._backbone.predict(rows, condition, inputs)

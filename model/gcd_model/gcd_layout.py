@@ -42,7 +42,7 @@ def gcd_state(weights: Mapping[str, Tensor], config: ModelConfig, carried: Mappi
     Raises:
         OptionError: the published layout cannot say this architecture.
     """
-    if config.is_ours or config.plane_mix is not None:
+    if config.is_ours:
         raise OptionError("the published layout holds the paper's networks only; keep our own .safetensors for this")
     weights = unshared(weights) if config.vae.shared else weights
     levels, state = Levels.of(config), dict[str, Tensor]()

@@ -195,11 +195,10 @@ def _place(device: str, dtype: str | None, engine: EngineName = "torch") -> _Pla
 
 
 def default_precision(device: torch.device, *, live: bool) -> str:
-    """What networks compute in where nobody says: bfloat16 on CUDA; of the live model on a CPU with Intel AMX, too."""
+    """What networks compute in where nobody says: bfloat16 on CUDA; of the live model on a CPU that has it, too."""
     capabilities = getattr(torch.cpu, "get_capabilities", dict)()  # older versions of torch cannot tell
-    if device.type == "cuda" or (live and bool(capabilities.get("amx_bf16", False))):
-        return "bfloat16"
-    return "float32"
+    fast = any(bool(capabilities.get(name, False)) for name in ("amx_bf16", "avx512_bf16"))
+    return "bfloat16" if device.type == "cuda" or (live and fast) else "float32"
 
 
 def _device(name: str) -> torch.device:

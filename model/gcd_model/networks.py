@@ -8,7 +8,6 @@ from typing import overload
 import torch
 from torch import Tensor, nn
 
-from gcd_model.class_head import ClassHead
 from gcd_model.conditioning import CameraEmbedder
 from gcd_model.config import ModelConfig
 from gcd_model.errors import CheckpointError
@@ -17,14 +16,13 @@ from gcd_model.image_encoder import ImageEncoder
 from gcd_model.live.config import LiveConfig
 from gcd_model.live.view import LiveNetworks
 from gcd_model.own_format import NO_DIFFUSION
-from gcd_model.plane_mix import PlaneMix
 from gcd_model.unet import VideoUNet
 from gcd_model.vae import Encoder, TemporalDecoder
 from gcd_model.weights_report import Layout
 
 
 class Networks(nn.Module):
-    """U-Net, camera embedder, image tower and autoencoders; a class head and a plane mix where the config has them.
+    """U-Net, camera embedder, image tower and autoencoders.
 
     Attribute names are ours; `checkpoints.py` knows the published ones. With a shared VAE the target encoder is
     also the condition encoder.
@@ -39,8 +37,6 @@ class Networks(nn.Module):
         self.target_encoder = Encoder(config.vae, quant=config.vae.shared)
         self.own_condition_encoder = None if config.vae.shared else Encoder(config.vae, quant=True)
         self.decoder = TemporalDecoder(config.vae)
-        self.class_head = None if config.class_head is None else ClassHead(config.class_head, config.unet.width)
-        self.plane_mix = _plane_mix(config)
         if config.is_ours:
             self.unet.start_apart()
 
@@ -75,13 +71,6 @@ class LoadedWeights:
         if isinstance(self.networks, LiveNetworks):
             raise CheckpointError(f"{self.name} {NO_DIFFUSION}")
         return self.networks
-
-
-def _plane_mix(config: ModelConfig) -> PlaneMix | None:
-    if config.plane_mix is None or config.plane_warp is None:
-        return None
-    classes = 0 if config.class_head is None else len(config.class_head.classes)
-    return PlaneMix(config.plane_mix, config.plane_warp.layers, config.vae.latent_channels, classes)
 
 
 @overload

@@ -18,7 +18,6 @@ from gcd_model.clip import RenderOptions
 from gcd_model.conditioning import Conditioning, camera_features
 from gcd_model.config import ModelConfig
 from gcd_model.denoiser import Denoiser
-from gcd_model.engine import Sampled
 from gcd_model.errors import DeviceMemoryError, ModelError, OptionError
 from gcd_model.geometry import Trajectory
 from gcd_model.image_encoder import clip_pixels
@@ -36,12 +35,8 @@ _MEMORY_WORDS = ("failed to allocate", "bad allocation", "out of memory")
 class Graphs(Protocol):
     """The graphs of one export, ready to run."""
 
-    def __contains__(self, name: GraphName) -> bool:
-        """Whether the export has such a graph."""
-        ...
-
-    def run(self, name: GraphName, *inputs: Tensor, outputs: Sequence[str] | None = None) -> tuple[Tensor, ...]:
-        """One run. inputs: in the graph's order. outputs: names; None for all of them."""
+    def run(self, name: GraphName, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """One run. inputs: in the graph's order."""
         ...
 
 
@@ -81,25 +76,14 @@ class OnnxEngine:
         control = self._config.camera
         return None if control == "none" else camera_features(control, path)
 
-    def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Sampled:
+    def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
         """See Engine."""
         denoiser = Denoiser(self._backbone, given, schedule)
-        latents = sample(denoiser, start, schedule.steps, progress=options.progress, cancel=options.cancel)
-        return Sampled(latents=latents, class_logits=denoiser.class_logits)
+        return sample(denoiser, start, schedule.steps, progress=options.progress, cancel=options.cancel)
 
     def decode(self, latents: Tensor) -> Tensor:
         """See Engine."""
         return self._graphs.run("decoder", latents)[0]
-
-    def mix(
-        self, decoded: Tensor, warped: Tensor, valid: Tensor, latents: Tensor, logits: Tensor | None
-    ) -> tuple[Tensor, Tensor | None]:
-        """See Engine."""
-        inputs = (decoded, warped, valid, latents)
-        if logits is None:
-            return self._graphs.run("plane_mix", *inputs)[0], None
-        pictures, sharpened = self._graphs.run("plane_mix", *inputs, logits)
-        return pictures, sharpened
 
     def _frame_by_frame(self, name: GraphName, frames: Tensor) -> Tensor:
         return torch.cat([self._graphs.run(name, frame)[0] for frame in frames.split(1)])
@@ -128,19 +112,7 @@ class OnnxBackbone:
 
     def predict(self, rows: Tensor, condition: Tensor, inputs: tuple[StageInputs, ...]) -> Tensor:
         """See Backbone."""
-        return torch.cat([self._step(clip, ("prediction",))[0] for clip in self._clips(rows, condition, inputs)])
-
-    def predict_classes(
-        self, rows: Tensor, condition: Tensor, inputs: tuple[StageInputs, ...], branches: int
-    ) -> tuple[Tensor, Tensor | None]:
-        """See Backbone."""
-        if "class_head" not in self._graphs:
-            return self.predict(rows, condition, inputs), None
-        clips = self._clips(rows, condition, inputs)
-        made = [self._step(clip, ("prediction", "features")) for clip in clips]
-        conditional = made[len(made) // branches * (branches - 1) :]
-        logits = [self._graphs.run("class_head", features)[0] for _, features in conditional]
-        return torch.cat([prediction for prediction, _ in made]), torch.cat(logits)
+        return torch.cat([self._graphs.run("step", *clip)[0] for clip in self._clips(rows, condition, inputs)])
 
     def _embeddings(self, label: Tensor, given: Conditioning) -> tuple[Tensor, Tensor]:
         """Of one step, all views: [K*T, sum of C] each."""
@@ -163,9 +135,6 @@ class OnnxBackbone:
             given += [packed.spatial_cross.split(self._frames), packed.temporal_cross.split(1)]
         return list(zip(*given, strict=True))
 
-    def _step(self, clip: tuple[Tensor, ...], outputs: tuple[str, ...]) -> tuple[Tensor, ...]:
-        return self._graphs.run("step", *clip, outputs=outputs)
-
 
 class _Session(nn.Module):
     """A graph as a layer of torch, so that whatever looks between layers looks between graphs, too."""
@@ -175,12 +144,12 @@ class _Session(nn.Module):
         self.session = session
         self.names = [each.name for each in session.get_inputs()]
 
-    def forward(self, inputs: Sequence[Tensor], outputs: Sequence[str] | None) -> tuple[Tensor, ...]:
+    def forward(self, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
         """One run on the CPU's tensors."""
         arrays = {
             name: tensor.detach().cpu().contiguous().numpy() for name, tensor in zip(self.names, inputs, strict=True)
         }
-        found: list[np.ndarray] = self.session.run(outputs, arrays)
+        found: list[np.ndarray] = self.session.run(None, arrays)
         return tuple(torch.from_numpy(array) for array in found)
 
 
@@ -193,14 +162,10 @@ class Sessions:
         choice.require_there(runtime.get_available_providers())
         self._sessions = {name: _Session(_session(runtime, path, choice)) for name, path in files.items()}
 
-    def __contains__(self, name: GraphName) -> bool:
-        """See Graphs."""
-        return name in self._sessions
-
-    def run(self, name: GraphName, *inputs: Tensor, outputs: Sequence[str] | None = None) -> tuple[Tensor, ...]:
+    def run(self, name: GraphName, *inputs: Tensor) -> tuple[Tensor, ...]:
         """See Graphs. Raises: DeviceMemoryError, ModelError."""
         try:
-            return self._sessions[name](inputs, outputs)
+            return self._sessions[name](inputs)
         except Exception as error:
             if not type(error).__module__.startswith("onnxruntime"):
                 raise

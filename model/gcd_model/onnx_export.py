@@ -19,7 +19,7 @@ import msgspec
 import torch
 
 from gcd_model.checkpoints import digest
-from gcd_model.errors import CheckpointError, OptionError
+from gcd_model.errors import CheckpointError, FileError, OptionError
 from gcd_model.networks import LoadedWeights
 from gcd_model.onnx_graphs import Graph, graphs
 from gcd_model.onnx_manifest import (
@@ -36,6 +36,7 @@ from gcd_model.onnx_manifest import (
 )
 from gcd_model.onnx_precision import narrowed
 from gcd_model.own_format import FULL_PRECISION, Card
+from gcd_model.small_files import read_small
 
 OPSET = 20
 """Of the ONNX operators: what TensorRT 10 and onnxruntime 1.20 know."""
@@ -94,10 +95,12 @@ def read_manifest(folder: str | Path) -> Manifest:
     """
     folder = Path(folder)
     try:
-        manifest = from_bytes((folder / MANIFEST).read_bytes())
+        manifest = from_bytes(read_small(folder / MANIFEST))
         for graph in manifest.graphs.values():
             for file in graph.files:
                 _require_intact(folder, file)
+    except FileError as error:
+        raise CheckpointError(f"{folder}: its {MANIFEST} {error}; export it again") from error
     except CheckpointError as error:
         raise CheckpointError(f"{folder}: {error}") from error
     except OSError as error:
@@ -107,7 +110,7 @@ def read_manifest(folder: str | Path) -> Manifest:
 
 def is_export(path: str | Path) -> bool:
     """Whether a path is the folder of an export."""
-    return (Path(path) / MANIFEST).is_file()
+    return os.path.lexists(Path(path) / MANIFEST)
 
 
 def require_onnx() -> None:

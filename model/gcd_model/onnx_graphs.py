@@ -15,7 +15,6 @@ from gcd_model.config import CAMERA_FEATURES, ModelConfig
 from gcd_model.layers import Layers, TokenAttention, prepare
 from gcd_model.networks import Networks
 from gcd_model.onnx_manifest import GraphName
-from gcd_model.plane_mix import PlaneMix
 from gcd_model.temporal import SpatialBlock, TemporalBlock
 from gcd_model.unet import Stage, StageInputs, VideoUNet
 from gcd_model.vae import Encoder, TemporalDecoder
@@ -83,11 +82,11 @@ def _tokens(blocks: Iterable[SpatialBlock | TemporalBlock]) -> Layers[TokenAtten
 
 
 class Step(nn.Module):
-    """One evaluation of the U-Net over one clip. with_features: also give what a class head reads."""
+    """One evaluation of the U-Net over one clip."""
 
-    def __init__(self, unet: VideoUNet, *, with_features: bool) -> None:
+    def __init__(self, unet: VideoUNet) -> None:
         super().__init__()
-        self.unet, self.with_features = unet, with_features
+        self.unet = unet
         self.widths = [stage.res.spatial.norm2.num_channels for stage in unet.all_stages()]
         self.attends = [_sees_tokens(stage) for stage in unet.all_stages()]
 
@@ -99,10 +98,10 @@ class Step(nn.Module):
         temporal_embedding: Tensor,
         spatial_cross: Tensor | None = None,
         temporal_cross: Tensor | None = None,
-    ) -> tuple[Tensor, ...]:
+    ) -> Tensor:
         """latents: [T, C, h, w], condition: [T, C', h, w], see `VideoUNet`; the rest from `Embeddings`, `Crosses`.
 
-        Returns the prediction [T, C, h, w] and, if asked for, the features [T, width, h, w].
+        Returns the prediction [T, C, h, w].
         """
         inputs = [
             StageInputs(*each)
@@ -114,9 +113,7 @@ class Step(nn.Module):
                 strict=True,
             )
         ]
-        features = self.unet.features(latents, condition, inputs)
-        prediction = self.unet.project(features)
-        return (prediction, features) if self.with_features else (prediction,)
+        return self.unet(latents, condition, inputs)
 
     def _crosses(self, packed: Tensor | None) -> Sequence[Tensor | None]:
         if packed is None:
@@ -142,25 +139,10 @@ class Decoder(nn.Module):
         return self.decoder(latents, self.frames)
 
 
-class PlaneMixed(nn.Module):
-    """The plane mix, whose class logits come and go only where there are any."""
-
-    def __init__(self, mix: PlaneMix) -> None:
-        super().__init__()
-        self.mix = mix
-
-    def forward(
-        self, decoded: Tensor, warped: Tensor, valid: Tensor, latents: Tensor, class_logits: Tensor | None = None
-    ) -> tuple[Tensor, ...]:
-        """See `PlaneMix`."""
-        pictures, sharpened = self.mix(decoded, warped, valid, latents, class_logits)
-        return (pictures,) if sharpened is None else (pictures, sharpened)
-
-
 def graphs(networks: Networks) -> tuple[Graph, ...]:
     """Every graph of a checkpoint, at the size its config states."""
     sizes = _Sizes.of(networks.config)
-    made = (*_conditioning_graphs(networks, sizes), *_step_graphs(networks, sizes), *_picture_graphs(networks, sizes))
+    made = (*_conditioning_graphs(networks, sizes), _step_graph(networks, sizes), _decoder_graph(networks, sizes))
     for graph in made:
         prepare(graph.module)
     return made
@@ -215,15 +197,14 @@ def _conditioning_graphs(networks: Networks, sizes: _Sizes) -> Iterator[Graph]:
 
 def step_graph(networks: Networks) -> Graph:
     """The U-Net alone, which is most of what there is to export."""
-    (step, *_) = _step_graphs(networks, _Sizes.of(networks.config))
+    step = _step_graph(networks, _Sizes.of(networks.config))
     prepare(step.module)
     return step
 
 
-def _step_graphs(networks: Networks, sizes: _Sizes) -> Iterator[Graph]:
-    """What is computed once a step, or once at its end."""
-    config, head = networks.config.unet, networks.class_head
-    step = Step(networks.unet, with_features=head is not None)
+def _step_graph(networks: Networks, sizes: _Sizes) -> Graph:
+    """What is computed once a step."""
+    config, step = networks.config.unet, Step(networks.unet)
     embedding = torch.zeros(sizes.frames, sum(step.widths))
     inputs = {
         "latents": sizes.latents(config.latent_channels),
@@ -235,29 +216,11 @@ def _step_graphs(networks: Networks, sizes: _Sizes) -> Iterator[Graph]:
         crossed = sum(width for width, attends in zip(step.widths, step.attends, strict=True) if attends)
         inputs["spatial_cross"] = torch.zeros(sizes.frames, crossed)
         inputs["temporal_cross"] = torch.zeros(1, crossed)
-    outputs = ("prediction",) if head is None else ("prediction", "features")
-    yield Graph(name="step", module=step, inputs=inputs, outputs=outputs)
-    if head is not None:
-        features = {"features": sizes.latents(config.width)}
-        yield Graph(name="class_head", module=head, inputs=features, outputs=("logits",))
+    return Graph(name="step", module=step, inputs=inputs, outputs=("prediction",))
 
 
-def _picture_graphs(networks: Networks, sizes: _Sizes) -> Iterator[Graph]:
+def _decoder_graph(networks: Networks, sizes: _Sizes) -> Graph:
     """What is computed once a view."""
-    latents, mix, frames = sizes.latents(networks.config.vae.latent_channels), networks.plane_mix, sizes.frames
-    decoder = Decoder(networks.decoder, frames)
-    yield Graph(name="decoder", module=decoder, inputs={"latents": latents}, outputs=("pictures",))
-    if mix is None or networks.config.plane_warp is None:
-        return
-    layers, head = networks.config.plane_warp.layers, networks.config.class_head
-    inputs = {
-        "decoded": sizes.pictures(frames),
-        "warped": sizes.pictures(frames, layers),
-        "valid": torch.ones(frames, layers, sizes.height, sizes.width, dtype=torch.bool),
-        "latents": latents,
-    }
-    if head is not None:
-        finer = (sizes.rows * head.upscale, sizes.columns * head.upscale)
-        inputs["class_logits"] = torch.zeros(frames, len(head.classes), *finer)
-    outputs = ("pictures",) if head is None else ("pictures", "sharpened")
-    yield Graph(name="plane_mix", module=PlaneMixed(mix), inputs=inputs, outputs=outputs)
+    latents = sizes.latents(networks.config.vae.latent_channels)
+    decoder = Decoder(networks.decoder, sizes.frames)
+    return Graph(name="decoder", module=decoder, inputs={"latents": latents}, outputs=("pictures",))

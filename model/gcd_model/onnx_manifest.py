@@ -1,13 +1,13 @@
 """What an export says about itself: `manifest.json` in its folder. Pure: bytes in, bytes out."""
 
 import hashlib
-from collections.abc import Mapping
 from typing import Literal, get_args
 
 import msgspec
 
-from gcd_model.errors import CheckpointError
+from gcd_model.errors import CheckpointError, FileError
 from gcd_model.own_format import Card
+from gcd_model.small_files import decode_json
 
 MANIFEST = "manifest.json"
 """The file that makes a folder an export."""
@@ -20,9 +20,7 @@ GraphName = Literal[
     "condition_encoder",
     "embeddings",
     "step",
-    "class_head",
     "decoder",
-    "plane_mix",
 ]
 GRAPH_NAMES: tuple[GraphName, ...] = get_args(GraphName)
 
@@ -85,15 +83,18 @@ def to_bytes(manifest: Manifest) -> bytes:
     return msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n"
 
 
-def from_bytes(text: bytes) -> Manifest:
+class _Stated(msgspec.Struct, frozen=True):
+    format: str | None = None
+
+
+def from_bytes(text: str | bytes) -> Manifest:
     """Inverse of `to_bytes`. Raises CheckpointError for another format or a damaged text."""
     try:
-        stated = msgspec.json.decode(text, type=Mapping[str, msgspec.Raw]).get("format")
-        found = None if stated is None else msgspec.json.decode(stated)
+        found = decode_json(text, _Stated).format
         if found != FORMAT:
             raise CheckpointError(
                 f"its {MANIFEST} has format {found!r}, this version reads {FORMAT!r}; export it again"
             )
-        return msgspec.json.decode(text, type=Manifest)
-    except msgspec.DecodeError as error:
-        raise CheckpointError(f"its {MANIFEST} cannot be used ({error}); export it again") from error
+        return decode_json(text, Manifest)
+    except FileError as error:
+        raise CheckpointError(f"its {MANIFEST} {error}; export it again") from error

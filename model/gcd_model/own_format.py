@@ -12,6 +12,7 @@ import torch
 from gcd_model.config import ModelConfig
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.live.config import LiveConfig
+from gcd_model.small_files import decode_json
 
 FORMAT, PACKED_FORMAT = "1", "2"
 """Of files whose weights are numbers as they are, and of those that hold some in eight bits."""
@@ -28,7 +29,7 @@ PRECISIONS: dict[str, torch.dtype] = {
 }
 """What --dtype takes."""
 
-FULL_PRECISION = ("decoder", "plane_mix")
+FULL_PRECISION = ("decoder",)
 """Networks that compute in float32 whatever --dtype says: what they make is looked at."""
 
 _DTYPES = {torch.float64: "F64", torch.float32: "F32", torch.bfloat16: "BF16", torch.float16: "F16", torch.int8: "I8"}
@@ -102,7 +103,7 @@ class Card:
                 origin=metadata.get("gcd.origin", ""),
                 uncertainty_scale=None if _SCALE_KEY not in metadata else float(metadata[_SCALE_KEY]),
             )
-        except (msgspec.DecodeError, KeyError, ValueError, ArithmeticError) as error:
+        except (KeyError, ValueError, ArithmeticError) as error:
             raise CheckpointError(f"its metadata cannot be used ({error}); convert the weights again") from error
 
 
@@ -111,9 +112,7 @@ class _Kind(msgspec.Struct):
 
 
 def _config(text: str) -> ModelConfig | LiveConfig:
-    if msgspec.json.decode(text, type=_Kind).kind == "live":
-        return msgspec.json.decode(text, type=LiveConfig)
-    return msgspec.json.decode(text, type=ModelConfig)
+    return decode_json(text, LiveConfig if decode_json(text, _Kind).kind == "live" else ModelConfig)
 
 
 @dataclass(frozen=True, slots=True)

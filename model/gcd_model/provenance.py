@@ -12,6 +12,7 @@ from gcd_model.live.config import LiveConfig
 
 SVD_GUIDANCE = (1.0, 2.5)
 """Guidance of the first and last frame Stable Video Diffusion was published with; GCD uses 1.0 to 1.5."""
+_LONGEST_LINE = 1000
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -54,6 +55,8 @@ def told_by_yaml(text: str) -> Provenance:
 
     Only `key: value` lines with numbers are looked at, lists on one line or one item a line; nothing is executed.
     """
+    lines = (line.rstrip() for line in text.splitlines())  # searching takes the square of a line's length, or of a gap
+    text = "\n".join(line for line in lines if 0 < len(line) <= _LONGEST_LINE)
     move_time = re.search(r"^[ \t-]*move_time\s*:\s*(\d{1,4})\s*(#.*)?$", text, re.MULTILINE)
     family = _family_of_ranges(text) or _family_of_views(text)
     return Provenance(
@@ -91,7 +94,7 @@ def _family_of_views(text: str) -> FamilyName | None:
     """The driving checkpoints look from above the road; their target is colour or classes."""
     if re.search(r"pardom|parallel_?domain|ego_forward|topdown", text, re.IGNORECASE) is None:
         return None
-    semantic = re.search(r"^[ \t-]*\w*modality\w*\s*:\s*[\['\"\s]*segm", text, re.MULTILINE | re.IGNORECASE)
+    semantic = re.search(r"^[ \t-]*\w*modality\w*\s*:[\['\"\s]*segm", text, re.MULTILINE | re.IGNORECASE)
     return "driving" if semantic is None else "driving-semantic"
 
 

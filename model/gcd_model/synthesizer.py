@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import wraps
-from typing import ParamSpec, Protocol, TypeVar
+from typing import ParamSpec, Protocol, TypeVar, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -16,14 +16,13 @@ from gcd_model.conditioning import (
     condition_tokens,
     micro_conditioning,
 )
-from gcd_model.decoding import Denoised, Finish, LayerStack, Pictures, decode
+from gcd_model.decoding import Finish, Pictures, decode
 from gcd_model.engine import Engine, TorchEngine
 from gcd_model.errors import DeviceMemoryError, NonFiniteError, OptionError, ShapeError
-from gcd_model.geometry import CameraMount, Trajectory
+from gcd_model.geometry import Trajectory
 from gcd_model.layers import prepare
 from gcd_model.networks import Networks
 from gcd_model.noise import unit_noise
-from gcd_model.plane_warp import PathWarpCache, PathWarps
 from gcd_model.schedule import Schedule
 from gcd_model.traits import Traits
 
@@ -60,6 +59,19 @@ class ViewSynthesizer(Protocol):
         ...
 
 
+@runtime_checkable
+class FrameSynthesizer(ViewSynthesizer, Protocol):
+    """A model that can work frame by frame."""
+
+    def streaming(self) -> "FrameSynthesizer":
+        """The same weights for clips of one frame, each of which goes on where the one before ended."""
+        ...
+
+    def reset(self) -> None:
+        """Forget all frames: the next one is the first."""
+        ...
+
+
 def synthesize(
     synthesizer: ViewSynthesizer, clip: Clip, trajectory: Trajectory, options: RenderOptions | None = None
 ) -> View:
@@ -85,15 +97,13 @@ def out_of_memory_is_our_error(method: Callable[Given, Made]) -> Callable[Given,
 class Synthesizer:
     """A checkpoint ready to run.
 
-    The U-Net and the encoders compute in the networks' own precision; the sampler state, the decoder and the plane mix
-    in float32.
+    The U-Net and the encoders compute in the networks' own precision; the sampler state and the decoder in float32.
     """
 
     def __init__(self, networks: Networks, traits: Traits, engine: Engine | None = None) -> None:
         """engine: what computes the networks; torch itself where none is given."""
         self._networks, self._traits = networks, traits
-        self._config = config = networks.config
-        self._warps = None if config.plane_warp is None else PathWarpCache(config.plane_warp, config.vae.down_factor)
+        self._config = networks.config
         networks.requires_grad_(False)
         prepare(networks)
         self._engine: Engine = TorchEngine(networks) if engine is None else engine
@@ -134,8 +144,6 @@ class Synthesizer:
             extra=None if extra is None else extra.to(self._like),
             fps=clip.fps,
             augmentation=strength,
-            video=None if self._warps is None else clip.video,
-            mount=self._mount(clip),
         )
 
     @out_of_memory_is_our_error
@@ -147,11 +155,10 @@ class Synthesizer:
         options = RenderOptions() if options is None else options
         self._check_lengths(features, trajectories)
         buckets = [self._bucket(path, options) for path in trajectories]
-        warps = tuple(self._path_warps(features, path) for path in trajectories)
-        job = _Job(features, tuple(trajectories), tuple(buckets), options, warps)
-        denoised = self._denoise(job)
-        pictures = self._decode(job, denoised)
-        latents = denoised.latents.cpu()
+        job = _Job(features, tuple(trajectories), tuple(buckets), options)
+        made = self._denoise(job)
+        pictures = self._decode(job, made)
+        latents = made.cpu()
         return [
             View(
                 samples=pictures[v].pixels,
@@ -190,35 +197,20 @@ class Synthesizer:
         made = [each for each in chunks if each is not None]
         return torch.cat(made) if made else None
 
-    def _mount(self, clip: Clip) -> CameraMount | None:
-        """Of a camera on a vehicle; where an orbit's source camera stands, the path says."""
-        trained = self._traits.mount
-        return None if trained is None else clip.mount or trained
-
-    def _path_warps(self, features: SourceFeatures, trajectory: Trajectory) -> PathWarps | None:
-        if self._warps is None:
-            return None
-        if features.video is None:
-            raise ShapeError(f"{self._traits.name} warps the source video, which these features lack; encode it here")
-        height, width = features.video.shape[-2:]
-        return self._warps.warps(features.mount, trajectory, height, width, self._like.device)
-
-    def _denoise(self, job: "_Job") -> Denoised:
+    def _denoise(self, job: "_Job") -> Tensor:
+        """Scaled latents, [V, S, T, C, h, w]."""
         config, options = self._config, job.options
         schedule = Schedule.of(config, options)
         given = self._condition(job, unconditional=schedule.branches == 2)
         noise = job.noise(config.frames, shared=config.sampling.shared_noise)  # [S, T, C, h, w]
         start = schedule.start(noise.to(self._like.device), len(job.trajectories))
-        sampled = self._engine.sample(start, given, schedule, options)
-        if not sampled.latents.isfinite().all():
+        latents = self._engine.sample(start, given, schedule, options)
+        if not latents.isfinite().all():
             raise NonFiniteError(
                 f"{self._traits.name} produced NaN or Inf in the latents (precision {self._traits.precision}, seed "
                 f"{options.seed}); try --dtype float32, and look at the weights with `gcd-node weights inspect`"
             )
-        each, logits = (len(job.trajectories), options.samples), sampled.class_logits
-        if logits is not None:
-            logits = logits.unflatten(0, (*each, config.frames))
-        return Denoised(latents=sampled.latents.unflatten(0, each), class_logits=logits)
+        return latents.unflatten(0, (len(job.trajectories), options.samples))
 
     def _condition(self, job: "_Job", *, unconditional: bool) -> Conditioning:
         """Rows are ordered view by view, sample by sample."""
@@ -234,16 +226,13 @@ class Synthesizer:
             vector=torch.cat([vector.expand(per_frame, -1) for vector in vectors]).to(self._like),
             camera=torch.cat(cameras) if cameras else None,
             tokens=condition_tokens(job.features, views, unconditional=unconditional),
-            latents=condition_latents(job.features, views, job.channels(), unconditional=unconditional),
+            latents=condition_latents(job.features, views, unconditional=unconditional),
             branches=2 if unconditional else 1,
         )
 
-    def _decode(self, job: "_Job", denoised: Denoised) -> list[Pictures]:
-        mixes = self._config.plane_mix is not None
-        stacks = [job.layers(warps) if mixes else None for warps in job.warps]
-        scale = self._config.vae.scale
+    def _decode(self, job: "_Job", latents: Tensor) -> list[Pictures]:
         finish = Finish(painted=self._traits.painted_classes, whole_levels=job.options.whole_levels)
-        pictures = decode(self._engine, scale, denoised, stacks, finish)
+        pictures = decode(self._engine, latents / self._config.vae.scale, finish)
         if not all(view.finite for view in pictures):
             raise NonFiniteError(f"{self._traits.name} decoded to NaN or Inf; the weights are damaged")
         return pictures
@@ -251,13 +240,12 @@ class Synthesizer:
 
 @dataclass(frozen=True, slots=True)
 class _Job:
-    """What one call of `render` was asked for. warps: one per trajectory; None for models without."""
+    """What one call of `render` was asked for."""
 
     features: SourceFeatures
     trajectories: tuple[Trajectory, ...]
     buckets: tuple[float, ...]
     options: RenderOptions
-    warps: tuple[PathWarps | None, ...]
 
     def noise(self, frames: int, *, shared: bool) -> Tensor:
         """Unit noise the sampling starts from, [S, T, C, h, w]; the same for every view, and if `shared` frame."""
@@ -270,24 +258,3 @@ class _Job:
         if tuple(given.shape) != (samples, frames, *each):
             raise OptionError(f"initial noise must be {[samples, frames, *each]}, got {list(given.shape)}")
         return given.float()
-
-    def channels(self) -> Tensor | None:
-        """Warp channels of all views and samples, [V*S*T, C', h, w], or None."""
-        samples, frames = self.options.samples, torch.arange(self.features.frames)
-        made = [
-            warps.channels(self._source(warps), frames).repeat(samples, 1, 1, 1)
-            for warps in self.warps
-            if warps is not None
-        ]
-        return torch.cat(made) if made else None
-
-    def layers(self, warps: PathWarps | None) -> LayerStack | None:
-        """The source warped along one view's path."""
-        if warps is None:
-            return None
-        warped, valid = warps.layers(self._source(warps), torch.arange(self.features.frames))
-        return LayerStack(warped=warped, valid=valid)
-
-    def _source(self, warps: PathWarps) -> Tensor:
-        assert self.features.video is not None  # `_path_warps` looked
-        return self.features.video.to(warps.device)

@@ -4,10 +4,11 @@ import logging
 import math
 from dataclasses import dataclass, replace
 
+import msgspec
 import torch
 from torch import Tensor
 
-from gcd_model.config import ModelConfig, PlaneWarpConfig, SemanticClass
+from gcd_model.config import ModelConfig, SemanticClass
 from gcd_model.errors import OptionError, PoseError, ViewFixedError, ViewRangeError
 from gcd_model.families import Family
 from gcd_model.geometry import (
@@ -27,7 +28,6 @@ from gcd_model.geometry import (
 )
 from gcd_model.live.config import LiveConfig
 from gcd_model.own_format import NO_DIFFUSION
-from gcd_model.plane_warp import orbit_mount, trained_mount
 
 _LOG = logging.getLogger(__name__)
 _TOLERATED_M, _TOLERATED_DEG = 1e-3, 0.05
@@ -100,7 +100,7 @@ class Traits:
         """Ontology of the views' class maps, by id; empty for a model that makes none."""
         if isinstance(self.config, LiveConfig):
             return self.config.classes
-        return self.painted_classes if self.config.class_head is None else self.config.class_head.classes
+        return self.painted_classes
 
     @property
     def painted_classes(self) -> tuple[SemanticClass, ...]:
@@ -108,16 +108,10 @@ class Traits:
         paints = self.family is not None and self.family.output == "semantic"
         return self.config.semantic_classes if paints and isinstance(self.config, ModelConfig) else ()
 
-    @property
-    def plane_warp(self) -> PlaneWarpConfig | None:
-        """The known planes that a model warps by; None for others."""
-        return None if isinstance(self.config, LiveConfig) else self.config.plane_warp
-
-    @property
-    def mount(self) -> CameraMount | None:
-        """The camera mount a model that warps by the planes of a road was trained with; None for others."""
-        plane_warp = self.plane_warp
-        return trained_mount(plane_warp) if plane_warp is not None and plane_warp.frame == "vehicle" else None
+    def streaming(self) -> "Traits":
+        """Of the same model frame by frame: of clips of one frame. Itself for a model that cannot, see
+        FrameSynthesizer."""
+        return replace(self, config=msgspec.structs.replace(self.config, frames=1)) if self.live else self
 
     def check_size(self, height: int, width: int) -> None:
         """Raises OptionError if the network cannot take frames of this size."""
@@ -127,12 +121,6 @@ class Traits:
                 f"height and width must be multiples of {factor} for {self.name}, got {height}x{width}; "
                 f"the trained size is {self.config.height}x{self.config.width}"
             )
-
-    def check_source(self, source: Spherical) -> None:
-        """Raises OptionError if the source camera cannot stand there: below the ground that a model warps by."""
-        plane_warp = self.plane_warp
-        if plane_warp is not None and plane_warp.frame == "stage":
-            orbit_mount(plane_warp, source)
 
     def motion_bucket(self, trajectory: Trajectory) -> float:
         """The motion number for a camera path. Raises OptionError where only the user can know it.
@@ -167,28 +155,27 @@ class Traits:
                 and behind the vehicle, unless `source` is given.
             source: where the source camera stands, if known; absolute limits are checked only then.
             move_time: frame in which the goal is reached, instead of the checkpoint's.
-            mount: how the source camera sits on its vehicle, for the fixed driving view and for the live model, which
-                orbits about what the camera looks at; None as trained. The clip must name the same.
+            mount: how the source camera sits on its vehicle, for the live model, which orbits about what the camera
+                looks at; None as trained. The clip must name the same.
         Raises:
             ViewFixedError: the checkpoint takes no camera command.
             ViewRangeError: the goal lies outside the family's limits.
-            OptionError: a mount was given to a checkpoint whose view hangs on no vehicle; or as `check_source`.
+            OptionError: a mount was given to another model than the live one.
         """
         frames, move_time = self.config.frames, self.move_time if move_time is None else move_time
         if self.live and source is None and delta is None:
             return driving_trajectory(frames=frames, move_time=move_time, mount=mount or CameraMount())
         if self.live:
             source = source or _orbit_of(mount)
-        elif mount is not None and not (self.config.camera == "none" and self.knows_camera):
-            raise OptionError(f"{self.name} has no vehicle's view to place a camera mount in; leave the mount out")
+        elif mount is not None:
+            raise OptionError(f"{self.name} has no use for a camera mount; leave the mount out")
         if self.config.camera == "none":
-            return self._fixed_view(delta, move_time, mount)
+            return self._fixed_view(delta, move_time)
         delta = SphericalDelta() if delta is None else delta
         self._check_limits(delta, source)
         if interpolation is None:
             interpolation = "linear" if self.family is None else self.family.interpolation
         start = source or ASSUMED_SOURCE
-        self.check_source(start)
         return spherical_trajectory(start, delta, frames=frames, move_time=move_time, interpolation=interpolation)
 
     def plan_placed(
@@ -222,7 +209,6 @@ class Traits:
             raise PoseError(f"poses must be [{self.config.frames}, 4, 4], got {list(source_from_target.shape)}")
         if self.config.camera == "relative_pose" and (self.family is None or self.family.limits is None):
             return pose_trajectory(source_from_target)
-        self.check_source(source or ASSUMED_SOURCE)
         fitted, fits = fitted_trajectory(source_from_target, source or ASSUMED_SOURCE)
         assert fitted.delta is not None
         for azimuth, elevation, radius in fitted.delta.tolist():
@@ -233,13 +219,13 @@ class Traits:
         asked = pose_trajectory(source_from_target)
         return replace(fitted, source_from_target=asked.source_from_target, at_goal=asked.at_goal)
 
-    def _fixed_view(self, delta: SphericalDelta | None, move_time: int, mount: CameraMount | None) -> Trajectory:
+    def _fixed_view(self, delta: SphericalDelta | None, move_time: int) -> Trajectory:
         if delta is not None and delta != SphericalDelta():
             raise ViewFixedError(
                 f"{self.name} has one fixed view and takes no camera command; leave azimuth, elevation and radius out"
             )
         if self.knows_camera:
-            return driving_trajectory(frames=self.config.frames, move_time=move_time, mount=mount or self.mount)
+            return driving_trajectory(frames=self.config.frames, move_time=move_time)
         return pose_trajectory(torch.eye(4, dtype=torch.float64).repeat(self.config.frames, 1, 1))
 
     def _check_limits(self, delta: SphericalDelta, source: Spherical | None) -> None:

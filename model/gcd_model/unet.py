@@ -215,13 +215,6 @@ class VideoUNet(nn.Module):
             image_mode: leave out every layer across frames; the rows are then unrelated frames, any number of them.
         Returns:
             [B*T, C, h, w].
-        """
-        return self.project(self.features(latents, condition, inputs, image_mode=image_mode))
-
-    def features(
-        self, latents: Tensor, condition: Tensor, inputs: Sequence[StageInputs], *, image_mode: bool = False
-    ) -> Tensor:
-        """What the last norm sees, [B*T, width, h, w]; `project` makes the network's output of it. See `forward`.
 
         Clips that are large together go through it one after the other: nothing of one is held for the next.
         """
@@ -255,11 +248,7 @@ class VideoUNet(nn.Module):
                 x = stage(x, next(inputs_left), frames)
             if level.up is not None:
                 x = laid_out(level.up(x))
-        return x
-
-    def project(self, features: Tensor) -> Tensor:
-        """[B*T, width, h, w] -> [B*T, C, h, w]."""
-        return self.conv_out(silu(self.norm_out(features))).contiguous()
+        return self.conv_out(silu(self.norm_out(x))).contiguous()
 
     def start_apart(self) -> None:
         """Make all transformers across frames the identity too: for learning from single frames first, then clips."""

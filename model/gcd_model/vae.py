@@ -126,7 +126,7 @@ class DecoderLevel(nn.Module):
         self.blocks = Layers[VideoResBlock](
             _video_block(in_channels if i == 0 else width, width, config) for i in range(config.blocks_per_level + 1)
         )
-        self.up = Upsample(width) if level > config.left_out else nn.Identity()
+        self.up = Upsample(width) if level > 0 else nn.Identity()
 
     def forward(self, x: Tensor, frames: int | None) -> Tensor:
         """x: [B*T, C, h, w] -> [B*T, C', 2h, 2w]. frames: None for unrelated frames."""
@@ -149,12 +149,11 @@ class TemporalDecoder(nn.Module):
         self.middle_attention = PixelAttention(widths[-1], config.norm_groups)
         self.middle_out = _video_block(widths[-1], widths[-1], config)
         above = [*widths[1:], widths[-1]]
-        levels, last = range(config.left_out, len(widths)), widths[config.left_out]
-        self.levels = Layers[DecoderLevel](DecoderLevel(above[i], i, config) for i in reversed(levels))
-        self.norm_out = nn.GroupNorm(config.norm_groups, last, eps=1e-6)
-        self.patch = config.patch * 2**config.left_out
+        self.levels = Layers[DecoderLevel](DecoderLevel(above[i], i, config) for i in reversed(range(len(widths))))
+        self.norm_out = nn.GroupNorm(config.norm_groups, widths[0], eps=1e-6)
+        self.patch = config.patch
         colours = 3 * self.patch**2
-        self.conv_out = nn.Conv2d(last, colours, 3, padding=1)
+        self.conv_out = nn.Conv2d(widths[0], colours, 3, padding=1)
         self.mix_frames = FrameConv(colours, colours)
         _keep_frames_apart(self.mix_frames)
         self.block = config.down_factor

@@ -3,23 +3,18 @@
 from dataclasses import replace
 
 import torch
-from msgspec import structs
 from torch import Tensor, nn
 
 from gcd_model.clip import Clip
 from gcd_model.config import (
-    ClassHeadConfig,
     ImageEncoderConfig,
     ModelConfig,
-    PlaneMixConfig,
-    PlaneWarpConfig,
     SamplingConfig,
     SemanticClass,
     UNetConfig,
     VAEConfig,
-    warp_channels,
 )
-from gcd_model.families import DRIVING, KUBRIC90
+from gcd_model.families import DRIVING_SEMANTIC, KUBRIC90
 from gcd_model.networks import Networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
@@ -74,7 +69,7 @@ TINY_DRIVING = ModelConfig(
     camera="none",
     unet=UNetConfig(
         latent_channels=4,
-        condition_channels=4 + warp_channels(PlaneWarpConfig(), 4),
+        condition_channels=4,
         width=16,
         multipliers=(1, 2),
         attention=(False, True),
@@ -92,26 +87,9 @@ TINY_DRIVING = ModelConfig(
         steps=1, sigma_max=80.0, sigma_min=0.6, guidance=(1.0, 1.0), shared_noise=True, augmentation=0.0
     ),
     prediction="x0",
-    plane_warp=PlaneWarpConfig(),
-    plane_mix=PlaneMixConfig(width=16, dilations=(1, 2)),
-    class_head=ClassHeadConfig(classes=TINY_CLASSES, width=16, upscale=2),
+    semantic_classes=TINY_CLASSES,
 )
-"""The same with every switch that is ours."""
-
-
-STAGE = PlaneWarpConfig(frame="stage", hfov_deg=53.13, offsets_m=(-2.0, 0.0, 2.0))
-
-TINY_OBJECTS = structs.replace(
-    TINY_DRIVING,
-    camera="spherical",
-    unet=structs.replace(TINY_DRIVING.unet, condition_channels=4 + warp_channels(STAGE, 4), camera_width=8),
-    plane_warp=STAGE,
-    class_head=None,
-)
-"""The same for orbits: planes on a stage, a steered camera, no class map."""
-
-TINY_SEMANTIC = structs.replace(TINY_DRIVING, plane_mix=None, class_head=None, semantic_classes=TINY_CLASSES)
-"""A model that paints its classes."""
+"""The same with every switch that is ours; it paints its classes."""
 
 
 def draw(*shape: int, seed: int = 0) -> Tensor:
@@ -173,10 +151,10 @@ def tiny_synthesizer(config: ModelConfig = TINY, *, family_known: bool = True, s
 
 
 def tiny_driving(config: ModelConfig = TINY_DRIVING, seed: int = 0) -> Synthesizer:
-    """A random driving checkpoint with every switch of ours, ready to run."""
+    """A random driving checkpoint with every switch of ours, which paints its classes, ready to run."""
     networks = Networks(config)
     randomise(networks, seed)
-    return Synthesizer(networks, replace(tiny_traits(config), name="tiny-driving", family=DRIVING))
+    return Synthesizer(networks, replace(tiny_traits(config), name="tiny-driving", family=DRIVING_SEMANTIC))
 
 
 def random_clip(config: ModelConfig = TINY, *, frames: int | None = None, seed: int = 0) -> Clip:

@@ -1,10 +1,14 @@
-"""A model with every switch that is ours: warps, x0, shared noise, class map, plane mix, patches."""
+"""A small model with every switch that is ours: x0, shared noise, patches; and the class map of what it paints."""
 
 from dataclasses import replace
+from pathlib import Path
 
+import msgspec
 import pytest
 import torch
+from msgspec import structs
 from small_models import (
+    TINY,
     TINY_CLASSES,
     TINY_DRIVING,
     draw,
@@ -17,13 +21,16 @@ from small_models import (
 from torch import Tensor
 from torch.testing import assert_close
 
+from gcd_model.checkpoints import save_weights
 from gcd_model.clip import Augmentation, RenderOptions, View
-from gcd_model.conditioning import SourceFeatures
-from gcd_model.errors import OptionError, ShapeError
+from gcd_model.colours import nearest_classes, palette
+from gcd_model.config import DRIVING_CLASSES, PLAIN_SMALL, SMALL, SVD_14, ModelConfig, SemanticClass
+from gcd_model.errors import OptionError
+from gcd_model.families import DRIVING
 from gcd_model.geometry import CameraMount
-from gcd_model.networks import Networks
-from gcd_model.own_format import FULL_PRECISION
-from gcd_model.plane_warp import PathWarps
+from gcd_model.loading import load_synthesizer
+from gcd_model.networks import Networks, empty_networks
+from gcd_model.own_format import FULL_PRECISION, Card
 from gcd_model.synthesizer import Synthesizer
 
 FRAMES, HEIGHT, WIDTH = TINY_DRIVING.frames, TINY_DRIVING.height, TINY_DRIVING.width
@@ -35,13 +42,9 @@ def synthesizer() -> Synthesizer:
     return tiny_driving()
 
 
-def features_of(synthesizer: Synthesizer, mount: CameraMount | None = None) -> SourceFeatures:
-    return synthesizer.encode(replace(random_clip(TINY_DRIVING), mount=mount))
-
-
-def rendered(synthesizer: Synthesizer, mount: CameraMount | None = None, options: RenderOptions | None = None) -> View:
-    path = synthesizer.traits.plan_view(mount=mount)
-    return synthesizer.render(features_of(synthesizer, mount), [path], options)[0]
+def rendered(synthesizer: Synthesizer, options: RenderOptions | None = None) -> View:
+    features = synthesizer.encode(random_clip(TINY_DRIVING))
+    return synthesizer.render(features, [synthesizer.traits.plan_view()], options)[0]
 
 
 class Rows:
@@ -49,38 +52,29 @@ class Rows:
 
     def __init__(self, synthesizer: Synthesizer) -> None:
         self.noisy: list[Tensor] = []
-        self.condition: list[Tensor] = []
         synthesizer.networks.unet.stem.register_forward_pre_hook(self._keep)
 
     def _keep(self, _: object, given: tuple[Tensor, ...]) -> None:
         self.noisy.append(given[0][:, :4])
-        self.condition.append(given[0][:, 4:])
 
 
 # --- rendering -------------------------------------------------------------------------------------------------------
 
 
-def test_a_view_comes_with_a_class_map(synthesizer: Synthesizer) -> None:
+def test_a_painted_view_comes_with_the_classes_of_its_colours(synthesizer: Synthesizer) -> None:
     view = rendered(synthesizer, options=RenderOptions(samples=2))
-    assert view.samples.shape == (2, FRAMES, 3, HEIGHT, WIDTH)
-    assert view.classes is not None
-    assert view.classes.dtype == torch.uint8
-    assert view.classes.shape == (2, FRAMES, HEIGHT, WIDTH)
-    assert set(view.classes.unique().tolist()) <= set(range(len(TINY_CLASSES)))
-    assert len(view.classes.unique()) > 1
     assert synthesizer.traits.classes == TINY_CLASSES
+    assert view.classes is not None
+    assert view.classes.shape == (2, FRAMES, HEIGHT, WIDTH)
+    away = (view.samples.unsqueeze(3) - palette(TINY_CLASSES).T[:, :, None, None] / 255).square().sum(dim=2)
+    assert torch.equal(view.classes.long(), away.argmin(dim=2))
 
 
-def test_the_u_net_sees_source_latents_and_then_the_warps_of_the_clean_source() -> None:
-    synthesizer = tiny_driving()
-    rows, clip = Rows(synthesizer), random_clip(TINY_DRIVING)
-    features = synthesizer.encode(clip, Augmentation(strength=0.5))
-    path = synthesizer.traits.plan_view()
-    synthesizer.render(features, [path])
-    assert TINY_DRIVING.plane_warp is not None
-    warps = PathWarps(TINY_DRIVING.plane_warp, CameraMount(), path, HEIGHT, WIDTH, down_factor=4)
-    expected = torch.cat([features.latents, warps.channels(clip.video, torch.arange(FRAMES))], dim=1)
-    assert_close(rows.condition[0], expected)
+def test_classes_are_named_only_where_pictures_are_painted() -> None:
+    assert replace(tiny_driving().traits, family=DRIVING).classes == ()
+    unnamed = tiny_driving(structs.replace(TINY_DRIVING, semantic_classes=()))
+    assert unnamed.traits.classes == ()
+    assert rendered(unnamed).classes is None
 
 
 def test_every_frame_starts_from_the_same_noise() -> None:
@@ -102,18 +96,8 @@ def test_one_step_gives_what_the_network_says_the_clean_latents_are() -> None:
     assert_close(view.latents[0], said[0])
 
 
-def test_class_maps_are_read_at_the_last_step(synthesizer: Synthesizer) -> None:
-    calls: list[Tensor] = []
-    head = synthesizer.networks.class_head
-    assert head is not None
-    handle = head.register_forward_pre_hook(lambda _, given: calls.append(given[0]))
-    rendered(synthesizer, options=RenderOptions(steps=3, guidance=(1.0, 1.5)))
-    handle.remove()
-    assert [len(rows) for rows in calls] == [FRAMES]  # once, and of the conditional branch alone
-
-
 def test_views_and_samples_in_one_batch_equal_those_made_alone(synthesizer: Synthesizer) -> None:
-    features, traits = features_of(synthesizer), synthesizer.traits
+    features, traits = synthesizer.encode(random_clip(TINY_DRIVING)), synthesizer.traits
     gradual, direct = traits.plan_view(), traits.plan_view(move_time=0)
     options = RenderOptions(samples=2, steps=2)
     together = synthesizer.render(features, [gradual, direct], options)
@@ -124,14 +108,6 @@ def test_views_and_samples_in_one_batch_equal_those_made_alone(synthesizer: Synt
         assert view.classes is not None
         assert alone.classes is not None
         assert (view.classes == alone.classes).float().mean() > 0.99
-    assert relative_error(together[0].latents, together[1].latents) > 1e-3
-
-
-def test_the_mount_of_the_camera_changes_the_view(synthesizer: Synthesizer) -> None:
-    trained, same = rendered(synthesizer), rendered(synthesizer, CameraMount())
-    assert torch.equal(trained.samples, same.samples)
-    higher = rendered(synthesizer, CameraMount(height_m=1.9, tilt_deg=5.0))
-    assert relative_error(higher.latents, trained.latents) > 1e-4
 
 
 def test_networks_in_bfloat16_give_float32_views_near_those_of_float32(synthesizer: Synthesizer) -> None:
@@ -155,43 +131,70 @@ def test_the_checkpoint_names_its_augmentation(synthesizer: Synthesizer) -> None
     assert tiny_synthesizer().encode(random_clip()).augmentation == 0.02
 
 
-# --- features --------------------------------------------------------------------------------------------------------
+def test_a_mount_is_refused_where_the_view_hangs_on_no_vehicle(synthesizer: Synthesizer) -> None:
+    for traits in (synthesizer.traits, tiny_synthesizer().traits):
+        with pytest.raises(OptionError, match="leave the mount out"):
+            traits.plan_view(mount=CameraMount())
 
 
-def test_only_a_model_that_warps_keeps_the_video(synthesizer: Synthesizer) -> None:
-    features = features_of(synthesizer)
-    assert features.mount == CameraMount() == synthesizer.traits.mount
-    assert features.video is not None
-    plain = tiny_synthesizer().encode(replace(random_clip(), mount=CameraMount()))
-    assert plain.video is None
-    assert plain.mount is None
-    assert tiny_synthesizer().traits.mount is None
+# --- the config ------------------------------------------------------------------------------------------------------
 
 
-def test_features_are_cut_and_joined_with_their_video(synthesizer: Synthesizer) -> None:
-    features = features_of(synthesizer)
-    rejoined = features.rows(0, 1).followed_by(features.rows(1, FRAMES))
-    assert rejoined.video is not None
-    assert features.video is not None
-    assert torch.equal(rejoined.video, features.video)
-    with pytest.raises(ShapeError, match="mount"):
-        features.followed_by(features_of(synthesizer, CameraMount(height_m=2.0)))
+def test_a_model_stored_in_half_precision_comes_back_and_computes_in_float32(tmp_path: Path) -> None:
+    networks = Networks(TINY_DRIVING)
+    randomise(networks)
+    networks.half()
+    card = Card(name="tiny-driving", config=TINY_DRIVING, family="driving-semantic", move_time=FRAMES - 1)
+    save_weights(networks, tmp_path / "tiny.safetensors", card)
+    loaded = load_synthesizer(tmp_path / "tiny.safetensors", device="cpu")
+    assert isinstance(loaded, Synthesizer)
+    assert {parameter.dtype for parameter in loaded.networks.parameters()} == {torch.float32}
+    assert loaded.traits.config == TINY_DRIVING
+    expected, view = rendered(Synthesizer(networks.float(), loaded.traits)), rendered(loaded)
+    assert torch.equal(view.samples, expected.samples)
 
 
-def test_features_without_video_are_refused(synthesizer: Synthesizer) -> None:
-    bare = replace(features_of(synthesizer), video=None)
-    with pytest.raises(ShapeError, match="warps the source video"):
-        synthesizer.render(bare, [synthesizer.traits.plan_view()])
+@pytest.mark.parametrize("config", [SVD_14, SMALL, TINY])
+def test_the_published_model_has_nothing_of_ours(config: ModelConfig) -> None:
+    assert {name.partition(".")[0] for name in empty_networks(config).state_dict()} == {
+        "unet", "camera", "image_encoder", "target_encoder", "own_condition_encoder", "decoder",
+    }  # fmt: skip
+    assert not config.is_ours
+    assert (config.vae.patch, config.prediction, config.sampling.shared_noise) == (1, "v", False)
 
 
-def test_extra_channels_are_refused_where_the_warps_fill_them(synthesizer: Synthesizer) -> None:
-    with pytest.raises(ShapeError, match="wants 0 extra condition channels, got 2"):
-        synthesizer.encode(random_clip(TINY_DRIVING), extra=draw(FRAMES, 2, *LATENTS[2:]))
+def test_a_small_set_up_survives_its_file() -> None:
+    assert msgspec.json.decode(msgspec.json.encode(PLAIN_SMALL), type=ModelConfig) == PLAIN_SMALL
+    assert PLAIN_SMALL.is_ours
+    assert (PLAIN_SMALL.vae.down_factor, PLAIN_SMALL.size_factor) == (8, 32)
 
 
-def test_a_mount_is_refused_where_no_vehicle_carries_the_view() -> None:
-    with pytest.raises(OptionError, match="leave the mount out"):
-        tiny_synthesizer().traits.plan_view(mount=CameraMount())
+def test_an_ontology_that_cannot_be_told_apart_is_refused() -> None:
+    content = msgspec.to_builtins(TINY_DRIVING)
+    for classes, words in (([0, 0], "a colour of its own"), ([0], "2 to 256 classes, got 1")):
+        content["semantic_classes"] = [msgspec.to_builtins(TINY_CLASSES[i]) for i in classes]
+        with pytest.raises(msgspec.ValidationError, match=words):
+            msgspec.convert(content, ModelConfig)
+    with pytest.raises(OptionError, match="within 0-255"):
+        SemanticClass(name="car", colour=(0, 300, 0))
+
+
+@pytest.mark.parametrize("classes", [TINY_CLASSES, DRIVING_CLASSES])
+def test_a_painted_map_is_read_back_even_a_little_off_colour(classes: tuple[SemanticClass, ...]) -> None:
+    generator = torch.Generator().manual_seed(3)
+    truth = torch.randint(len(classes), (2, 7, 9), generator=generator)
+    painted = palette(classes)[truth].permute(0, 3, 1, 2) / 255
+    noisy = (painted + 0.03 * (torch.rand(painted.shape, generator=generator) - 0.5)).clamp(0, 1)
+    for pixels in (painted, noisy):
+        found = nearest_classes(pixels, classes)
+        assert found.dtype == torch.uint8
+        assert torch.equal(found.long(), truth)
+
+
+def test_the_driving_classes_are_told_apart_by_name_and_colour() -> None:
+    assert len({entry.name for entry in DRIVING_CLASSES}) == len(DRIVING_CLASSES) == 13
+    colours = palette(DRIVING_CLASSES).float()
+    assert (torch.cdist(colours, colours) + 1000 * torch.eye(13)).min() > 45
 
 
 # --- single frames first, then clips ---------------------------------------------------------------------------------

@@ -8,10 +8,8 @@ from small_models import UNET, draw, randomise
 from torch import Tensor, nn
 from torch.testing import assert_close
 
-from gcd_model import frugal, layers, plane_mix
-from gcd_model.config import PlaneMixConfig
+from gcd_model import frugal, layers
 from gcd_model.layers import Attention, FeedForward, ResBlock, Upsample, prepare
-from gcd_model.plane_mix import PlaneMix
 from gcd_model.unet import StageInputs, VideoUNet
 
 FRAMES, CLIPS = 3, 2
@@ -106,27 +104,6 @@ def test_layers_that_write_in_place_give_the_same_and_leave_what_they_are_given(
         frugally = layer(x)
     assert_close(frugally, whole)
     assert torch.equal(x, before)
-
-
-@pytest.mark.parametrize("floats", [1, 2 * 2 * 3 * 16 * 24, 2**20])
-@pytest.mark.parametrize("classes", [0, 3])
-def test_pictures_are_mixed_the_same_frame_by_frame(monkeypatch: pytest.MonkeyPatch, floats: int, classes: int) -> None:
-    frames, layers, height, width = 5, 2, 16, 24
-    mix = PlaneMix(PlaneMixConfig(width=8, dilations=(1, 2), norm_groups=2), layers, 4, classes)
-    randomise(mix)
-    valid = draw(frames, layers, height, width, seed=1) > 0
-    warped = draw(frames, layers, 3, height, width, seed=2) * valid[:, :, None]
-    given = (draw(frames, 3, height, width), warped, valid, draw(frames, 4, 2, 3, seed=3))
-    logits = draw(frames, classes, 4, 6, seed=4) if classes else None
-    picture, sharpened = mix(*given, logits)  # with gradient all at once
-    monkeypatch.setattr(plane_mix, "_CACHED_FLOATS", floats)
-    with torch.no_grad():
-        few, few_sharpened = mix(*given, logits)
-    assert_close(few, picture.detach())
-    if sharpened is None:
-        assert few_sharpened is None
-    else:
-        assert_close(few_sharpened, sharpened.detach())
 
 
 @pytest.mark.parametrize("floats", [1, 6 * 35 * 2, frugal.REUSED_FLOATS])

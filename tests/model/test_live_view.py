@@ -59,6 +59,23 @@ def test_a_window_is_its_frames_one_by_one(networks: LiveNetworks) -> None:
         assert torch.equal(window.classes[0, t], view.classes)
 
 
+def test_a_window_is_its_frames_when_they_stream(networks: LiveNetworks) -> None:
+    whole = LiveSynthesizer(networks, load_synthesizer("random:live", device="cpu").traits)
+    features = whole.encode(room())
+    window = whole.render(features, [path(0.5)], RenderOptions(seed=2))[0]
+    streaming = whole.streaming()
+    assert streaming.traits.config.frames == 1
+
+    def streamed() -> Tensor:
+        frames = [features.rows(t, t + 1) for t in range(FRAMES)]
+        return torch.cat([streaming.render(each, [path(0.5, 1)], RenderOptions(seed=2))[0].video for each in frames])
+
+    assert_close(streamed(), window.video, rtol=0, atol=1e-5)
+    assert not torch.equal(streamed(), window.video)  # it goes on from the last frame
+    streaming.reset()
+    assert_close(streamed(), window.video, rtol=0, atol=1e-5)
+
+
 def test_after_a_reset_nothing_is_known_of_what_was_before(networks: LiveNetworks) -> None:
     used, fresh = LiveView(networks), LiveView(networks)
     steps(used, range(4))

@@ -3,7 +3,6 @@
 import pytest
 import torch
 from diffusers.models.autoencoders.autoencoder_kl_temporal_decoder import AutoencoderKLTemporalDecoder
-from msgspec.structs import replace
 from naming import diffusers_state, levels_of
 from small_models import draw, randomise, relative_error
 from torch import Tensor, nn
@@ -170,23 +169,3 @@ def test_a_fresh_decoder_leaves_frames_apart() -> None:
 def test_a_patch_of_no_pixels_is_refused() -> None:
     with pytest.raises(OptionError, match="at least 1 pixel, got 0"):
         VAEConfig(patch=0)
-
-
-COARSE = replace(PATCHED, multipliers=(1, 2, 2), coarse=1, linear=True)
-
-
-def test_a_coarse_decoder_makes_pictures_of_the_same_size_in_fewer_levels() -> None:
-    fine, coarse = (TemporalDecoder(replace(COARSE, coarse=levels)) for levels in (0, 1))
-    latents = torch.randn(4, 6, 3, 5)
-    assert fine(latents, 4).shape == coarse(latents, 4).shape == (4, 3, 24, 40)
-    assert (len(fine.levels), len(coarse.levels)) == (3, 2)
-    assert coarse.conv_out.out_channels == 3 * 4**2
-    known = fine.state_dict()
-    shared = [name for name, value in coarse.state_dict().items() if value.shape == known[name].shape]
-    assert len(shared) > 0.9 * len(coarse.state_dict())
-
-
-@pytest.mark.parametrize("coarse", [-1, 3])
-def test_a_decoder_that_leaves_out_all_its_levels_is_refused(coarse: int) -> None:
-    with pytest.raises(OptionError, match="0 to 2 levels"):
-        replace(COARSE, coarse=coarse)

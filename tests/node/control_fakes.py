@@ -4,10 +4,11 @@ import threading
 import time
 from collections.abc import Callable
 
-from gcd_node.control.message import Code, Command, Outcome, RequestError
+from gcd_client.control import Code
+from gcd_node.auth import Role
+from gcd_node.control.message import Command, Outcome, RequestError
 from gcd_node.control.verbs import SetView
 from gcd_node.errors import NodeError
-from gcd_node.security.keys import Role
 
 
 class FakeCommands:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import typer
 
-from gcd_node.cli.commands import app as node_app
+from gcd_node.cli.main import COMMANDS, new_app
 from gcd_node.config import parse_config
 from gcd_node.control.verbs import VERBS
 from gcd_node.errors import ConfigError
@@ -19,7 +19,7 @@ from gcd_train.cli.main import app as train_app
 
 ROOT = Path(__file__).parent.parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-SOURCES = [ROOT / "gcd_node", ROOT / "model" / "gcd_model", ROOT / "train" / "gcd_train"]
+SOURCES = [ROOT / "client", ROOT / "gcd_node", ROOT / "model" / "gcd_model", ROOT / "train" / "gcd_train"]
 SHELL = ("", "sh", "bash", "console")
 GAP = "\0"  # stands for what a message fills in
 WHOLE = ("source.kind=synthetic", "model.weights=random:driving", "view.topdown.kind=fixed")
@@ -77,7 +77,7 @@ def dead_links(page: Path, text: str) -> list[str]:
 
 @cache
 def programs() -> dict[str, Any]:
-    return {"gcd-node": typer.main.get_command(node_app), "gcd-train": typer.main.get_command(train_app)}
+    return {"gcd-node": typer.main.get_command(new_app(COMMANDS)), "gcd-train": typer.main.get_command(train_app)}
 
 
 def said_commands(text: str) -> Iterator[list[str]]:
@@ -126,11 +126,14 @@ def _option(command: Any, word: str) -> Any:
 
 def _wrong_change(values: list[str]) -> list[str]:
     """A change of a key that no launch file has."""
-    try:
-        parse_config(b"", "here", [*WHOLE, *values])
-    except ConfigError as error:
-        return values if "unknown key" in str(error) else []
-    return []
+    for source in ("kind=synthetic", "path=x", "kind=v4l2", "kind=oak", "kind=push", "url=x"):
+        try:
+            parse_config(b"", "here", [f"source.{source}", *WHOLE[1:], *values])
+        except ConfigError as error:
+            if "unknown key" in str(error):
+                continue
+        return []
+    return values
 
 
 def wrong_commands(page: str, text: str) -> list[str]:

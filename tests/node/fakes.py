@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from msgspec.structs import replace as struct_replace
 
+from gcd_client.protocol import EndMessage, OriginHeader, StatusTopic, ViewMessage
 from gcd_model import (
-    DRIVING_SEMANTIC_SMALL,
-    DRIVING_SMALL,
+    DRIVING_CLASSES,
     FAMILIES,
-    OBJECTS_SMALL,
+    PLAIN_SMALL,
     SMALL,
     Augmentation,
     Clip,
@@ -24,16 +24,14 @@ from gcd_model import (
     Trajectory,
     View,
     ViewSynthesizer,
+    load_synthesizer,
 )
 from gcd_node.config import NodeConfig, parse_config
-from gcd_node.envelope import EndMessage, NoteTopic, ViewMessage
 from gcd_node.frame import Frame, FrameSource, SourceInfo
-from gcd_node.life.machinery import Parts
+from gcd_node.inference import WindowReport
 from gcd_node.node import Node, NodeOptions
-from gcd_node.publisher import PublisherStats
-from gcd_node.publishing.outbox import Outbox
-from gcd_node.rendering.model_worker import WindowReport
-from gcd_node.wire.header import OriginHeader
+from gcd_node.publisher import MessageSink, PublisherStats
+from gcd_node.transitions import Parts
 
 HEIGHT, WIDTH = 64, 96
 
@@ -54,22 +52,16 @@ def traits(family: str = "kubric90", *, move_time: int = 13) -> Traits:
     )
 
 
-def warping_traits() -> Traits:
-    """Of a model that warps by planes, uses its camera's mount and draws class maps."""
-    config = struct_replace(DRIVING_SMALL, height=HEIGHT, width=WIDTH)
-    return replace(traits("driving"), config=config)
-
-
-def orbiting_traits() -> Traits:
-    """Of a model that is steered by angles and warps by planes about the centre of its orbit."""
-    return replace(traits(), config=struct_replace(OBJECTS_SMALL, height=HEIGHT, width=WIDTH))
-
-
 def painting_traits() -> Traits:
-    """Of a model whose pictures are painted in class colours."""
-    return replace(
-        traits("driving-semantic"), config=struct_replace(DRIVING_SEMANTIC_SMALL, height=HEIGHT, width=WIDTH)
-    )
+    """Of a model whose pictures are painted in class colours, so that it draws class maps."""
+    config = struct_replace(PLAIN_SMALL, height=HEIGHT, width=WIDTH, semantic_classes=DRIVING_CLASSES)
+    return replace(traits("driving-semantic"), config=config)
+
+
+def live_traits() -> Traits:
+    """Of the live model, in windows: it uses its camera's mount and takes any pose."""
+    made = load_synthesizer("random:live", device="cpu").traits
+    return replace(made, config=struct_replace(made.config, height=HEIGHT, width=WIDTH))
 
 
 def fake_classes(made: Traits, samples: int) -> torch.Tensor | None:
@@ -174,7 +166,7 @@ def made_node(
     config: NodeConfig,
     synthesizer: ViewSynthesizer,
     source: FrameSource,
-    outbox: Outbox,
+    outbox: MessageSink,
     on_window: Callable[[WindowReport], None] | None = None,
 ) -> Node:
     """A node over parts that are there already; it ends with its source."""
@@ -198,15 +190,18 @@ class Box:
     def end(self, message: EndMessage, *, delay_ms: int | None = None) -> None:
         self.ends.append(message)
 
-    def note(self, topic: NoteTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
+    def note(self, topic: StatusTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
         self.notes.append((topic, fields))
 
-    def hurry(self) -> None:
+    def preview(self, made: Callable[[], ViewMessage]) -> None:
+        self.views.append(made())
+
+    def stop_waiting(self) -> None:
         self.hurried = True
 
     @property
     def stats(self) -> PublisherStats:
-        return PublisherStats(sent=len(self.views), dropped=0, subscribers=0, bytes=0)
+        return PublisherStats(sent=len(self.views))
 
     def of(self, kind: str, view: str = "main") -> list[ViewMessage]:
         return [message for message in self.views if message.topic == f"view/{view}/{kind}"]

@@ -13,10 +13,10 @@ from rig import rig_config
 
 from gcd_model import ViewSynthesizer
 from gcd_node.config import ModelSection
-from gcd_node.life.machinery import Parts
 from gcd_node.node import Node, NodeOptions
 from gcd_node.publisher import Publisher
 from gcd_node.session import publisher_options, run_until_signal
+from gcd_node.transitions import Parts
 
 
 def hang(_: object = None) -> None:

@@ -12,8 +12,9 @@ import tracemalloc
 from collections import Counter
 from collections.abc import Callable, Sequence
 
-from gcd_node.envelope import MAGIC
-from gcd_node.load.meter import memory_mb
+import psutil
+
+from gcd_client.protocol import MAGIC
 
 _LOG = logging.getLogger(__name__)
 ROUNDS = int(os.environ.get("GCD_MUTATIONS", "400"))
@@ -70,10 +71,10 @@ def outcomes(read: Callable[[bytes], str], inputs: Mutator, *refusals: type[Exce
     ended: Counter[str] = Counter()
     few = max(1, min(ROUNDS // 4, MOST_TRACED))
     grown = _traced_growth(lambda: _read(few, read, inputs, refusals, ended))
-    before_mb = memory_mb()
+    before_mb = psutil.Process().memory_info().rss / 2**20
     _read(ROUNDS - 2 * few, read, inputs, refusals, ended)
     gc.collect()
-    grown_mb = memory_mb() - before_mb
+    grown_mb = psutil.Process().memory_info().rss / 2**20 - before_mb
     _LOG.info("%s; grown by %d bytes, resident %.1f MiB", dict(ended), grown, grown_mb)
     assert ended.total() == ROUNDS
     assert grown < GROWN_BYTES

@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 from media import HEIGHT, WIDTH
 
+from gcd_node.calibration import LensModel
 from gcd_node.frame import Image
-from gcd_node.optics.calibration import LensModel
 from gcd_node.sources.oak_camera import OakStream, load_depthai
-from gcd_node.sources.oak_loss import Guard
+from gcd_node.sources.oak_device import Guard
 
 load_depthai()
 

@@ -13,7 +13,7 @@ from fakes import HEIGHT, WIDTH
 from recordings import files, recorder_config, salvaged
 
 from gcd_node.frame import Frame, SourceInfo
-from gcd_node.recording.recorder import Recorder
+from gcd_node.recorder import Recorder
 
 FPS = 100.0
 

@@ -13,20 +13,20 @@ from cameras import Bench, until
 from fakes import FakeSynthesizer, traits
 from numpy.typing import NDArray
 
+from gcd_client.control import ControlClient, Reply
+from gcd_client.protocol import ViewHeader
+from gcd_client.subscriber import ReceivedView, StatusSubscriber, ViewSubscriber
 from gcd_model import ViewSynthesizer
-from gcd_node.config import ModelSection, NodeConfig, SourceConfig, parse_config
-from gcd_node.control.client import ControlClient
-from gcd_node.control.message import Reply
+from gcd_node.config import ModelSection, NodeConfig, parse_config
 from gcd_node.control.server import ControlOptions, ControlServer
 from gcd_node.frame import FrameSource
-from gcd_node.health.systemd import ServiceManager
-from gcd_node.life.machinery import Parts
-from gcd_node.life.stream import Summary
 from gcd_node.node import Node, NodeOptions
+from gcd_node.pipeline import Summary
 from gcd_node.publisher import Publisher
+from gcd_node.service import ServiceManager
 from gcd_node.session import publisher_options
-from gcd_node.subscriber import NoteSubscriber, ReceivedView, ViewSubscriber
-from gcd_node.wire.header import ViewHeader
+from gcd_node.source_config import SourceConfig
+from gcd_node.transitions import Parts
 
 CAMERA = 'kind = "v4l2"'
 _SILENCE_MS = 300
@@ -100,6 +100,8 @@ class Rig:
             self.node.event,
             self.node.recorder.command,
         )
+        for watched_over in (self.publisher, self.control):
+            self.node.watch(watched_over.dead_threads)
         self.folder = folder
         self.notes: list[tuple[float, str, Mapping[str, Any]]] = []
         self.views: list[Seen] = []
@@ -144,7 +146,7 @@ class Rig:
             self.failure = error
 
     def _hear(self) -> None:
-        with NoteSubscriber(f"ipc://{self.folder}/status") as notes:
+        with StatusSubscriber(f"ipc://{self.folder}/status") as notes:
             while (note := notes.receive(_SILENCE_MS)) is not None or not self._done.is_set():
                 if note is not None:
                     self.notes.append((time.monotonic(), note.topic, note.fields))

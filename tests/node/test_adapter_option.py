@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from tiny_weights import write_tiny
 
 from gcd_model.adapter import Adapter, base_digest
 from gcd_model.checkpoints import load_weights
 from gcd_model.errors import CheckpointError
-from gcd_model.loading import packaged_weights
 from gcd_model.own_format import Card
 from gcd_model.weights_export import write_adapter
 from gcd_node.check import check
@@ -21,8 +21,9 @@ _RANK = 2
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """An adapter of the packaged weights, and one of others."""
-    folder, loaded = tmp_path_factory.mktemp("adapters"), load_weights(packaged_weights("driving-small"))
+    """Weights, an adapter of them, and one of others."""
+    folder = tmp_path_factory.mktemp("adapters")
+    loaded = load_weights(write_tiny(folder))
     state = loaded.networks.state_dict()
     layer = next(
         name for name in sorted(state) if name.endswith("query.weight") and state[name].ndim == 2
@@ -34,17 +35,17 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     for name, base in (("own", base_digest(state)), ("other", "0" * 12)):
         adapter = Adapter(rank=_RANK, alpha=1.0, base=base, card=card, tensors=factors)
         write_adapter(folder / f"{name}.safetensors", adapter, overwrite=False)
-    return {name: folder / f"{name}.safetensors" for name in ("own", "other")}
+    return {name: folder / f"{name}.safetensors" for name in ("tiny", "own", "other")}
 
 
-def launch(tmp_path: Path, adapter: Path | None) -> NodeConfig:
+def launch(tmp_path: Path, weights: Path, adapter: Path | None) -> NodeConfig:
     told = "" if adapter is None else f'adapter = "{adapter}"'
     return parse_config(
         f"""
         [source]
         path = "{tmp_path}/none.mkv"
         [model]
-        weights = "package:driving-small"
+        weights = "{weights}"
         device = "cpu"
         {told}
         [view.main]
@@ -54,16 +55,16 @@ def launch(tmp_path: Path, adapter: Path | None) -> NodeConfig:
 
 
 def test_the_node_runs_weights_with_their_adapter(tmp_path: Path, files: dict[str, Path]) -> None:
-    traits = load_model(launch(tmp_path, files["own"]).model).traits
+    traits = load_model(launch(tmp_path, files["tiny"], files["own"]).model).traits
     assert traits.name == "adapted"
-    assert traits.sha256_12 != load_model(launch(tmp_path, None).model).traits.sha256_12
+    assert traits.sha256_12 != load_model(launch(tmp_path, files["tiny"], None).model).traits.sha256_12
 
 
 def test_check_names_the_adapted_weights_and_refuses_the_adapter_of_others(
     tmp_path: Path, files: dict[str, Path]
 ) -> None:
     def said(adapter: Path) -> tuple[str, str]:
-        findings = {each.topic: each for each in check(launch(tmp_path, adapter))}
+        findings = {each.topic: each for each in check(launch(tmp_path, files["tiny"], adapter))}
         return findings["weights"].verdict, findings["weights"].detail
 
     verdict, detail = said(files["own"])
@@ -76,10 +77,10 @@ def test_check_names_the_adapted_weights_and_refuses_the_adapter_of_others(
 
 def test_an_adapter_of_other_weights_ends_a_run_before_it_begins(tmp_path: Path, files: dict[str, Path]) -> None:
     with pytest.raises(CheckpointError, match="these weights are"):
-        load_model(launch(tmp_path, files["other"]).model)
+        load_model(launch(tmp_path, files["tiny"], files["other"]).model)
 
 
 def test_views_of_an_adapter_have_a_name_of_their_own(tmp_path: Path, files: dict[str, Path]) -> None:
-    plain, adapted = launch(tmp_path, None), launch(tmp_path, files["own"])
+    plain, adapted = launch(tmp_path, files["tiny"], None), launch(tmp_path, files["tiny"], files["own"])
     traits = load_model(plain.model).traits
     assert config_digest(plain, traits) != config_digest(adapted, traits)

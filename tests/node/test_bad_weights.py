@@ -1,13 +1,12 @@
 """F25: a checkpoint that is not whole is refused whole, and says what it lacks."""
 
-from importlib.resources import files
 from pathlib import Path
 
-import pytest
 from cameras import Bench
 from rig import Rig
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
+from tiny_weights import write_tiny
 
 from gcd_model import ViewSynthesizer
 from gcd_node.config import ModelSection
@@ -17,9 +16,7 @@ WAITING = "life = {autostart = false}"
 
 
 def test_f25_weights_that_lack_some_are_refused_with_the_first_five_names_and_how_many(tmp_path: Path) -> None:
-    whole = Path(str(files("gcd_model").joinpath("weights", "driving-small.safetensors")))
-    if not whole.is_file():
-        pytest.skip("needs the packaged weights driving-small")
+    whole = write_tiny(tmp_path)
     damaged, tensors = tmp_path / "damaged.safetensors", load_file(whole)
     with safe_open(whole, "pt") as file:
         facts = file.metadata()

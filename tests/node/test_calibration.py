@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gcd_node.calibration import CameraInfo, LensModel, lens_of, load_lens, parse_lens
 from gcd_node.errors import ConfigError
-from gcd_node.optics.calibration import CameraInfo, LensModel, lens_of, load_lens, parse_lens
 
 FILE = b"""# as cameracalibrator writes it
 image_width: 640

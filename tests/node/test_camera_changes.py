@@ -11,10 +11,10 @@ from cameras import FPS, Bench, Camera, until
 from fakes import HEIGHT, WIDTH
 from rig import Rig, Seen
 
-from gcd_node.config import SourceConfig
-from gcd_node.control.message import Code
+from gcd_client.control import Code
 from gcd_node.errors import SourceAbsentError, SourceLostError
 from gcd_node.frame import SourceInfo
+from gcd_node.source_config import OakSource, SourceConfig, V4l2Source
 
 CALIBRATION = """
 image_width: 384
@@ -229,7 +229,7 @@ def test_a_node_can_be_stopped_and_started_while_its_camera_takes_for_ever_to_op
 def test_an_oak_is_opened_again_by_its_own_id_unless_its_place_was_stated(stated: str | None, tmp_path: Path) -> None:
     wanted: list[str | None] = []
 
-    def open_oak(config: SourceConfig) -> Steady:
+    def open_oak(config: OakSource) -> Steady:
         wanted.append(config.device)
         camera = Steady()
         camera.info = replace(camera.info, kind="oak", id="18443010A1B2")
@@ -248,8 +248,8 @@ def test_an_oak_is_opened_again_by_its_own_id_unless_its_place_was_stated(stated
 
 
 def test_only_an_oak_has_an_id_to_be_asked_for() -> None:
-    from gcd_node.sources.same_camera import same_camera
+    from gcd_node.transitions import same_camera
 
-    config = SourceConfig(kind="v4l2")
+    config = V4l2Source()
     before = SourceInfo(kind="v4l2", id="video0", width=96, height=64, fps_nominal=24.0, clock="realtime")
     assert same_camera(config, before) is config

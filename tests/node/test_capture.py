@@ -9,10 +9,10 @@ import pytest
 from cameras import until
 from media import frames_at
 
-from gcd_node.capture import Newest, WindowSlot, read
-from gcd_node.errors import SourceError, TooShortError
+from gcd_node.capture import LatestSlot, WindowSlot, read
+from gcd_node.errors import ReaderError, SourceError, TooShortError
 from gcd_node.frame import Frame, SourceInfo
-from gcd_node.window import Filling, FrameWindow, WindowBuilder
+from gcd_node.window import FrameWindow, PartialWindow, WindowBuilder
 
 GUARD_S = 5.0
 
@@ -72,14 +72,14 @@ def builder() -> WindowBuilder:
 
 
 def test_the_newest_item_wins_and_the_rest_is_counted() -> None:
-    slot = Newest[int]()
+    slot = LatestSlot[int]()
     assert [slot.put(i) for i in range(5)] == [True] * 5
     assert slot.take() == 4
     assert slot.dropped == 4
 
 
 def test_a_lossless_slot_hands_over_everything_in_order() -> None:
-    slot = Newest[int](lossless=True)
+    slot = LatestSlot[int](lossless=True)
     giver = started(lambda: ([slot.put(i) for i in range(200)], slot.finish()))
     got: list[int] = []
     while (item := slot.take()) is not None:
@@ -90,14 +90,14 @@ def test_a_lossless_slot_hands_over_everything_in_order() -> None:
 
 
 def test_what_was_left_can_be_taken_after_the_end() -> None:
-    slot = Newest[int]()
+    slot = LatestSlot[int]()
     slot.put(7)
     slot.finish()
     assert [slot.take(), slot.take(), slot.take()] == [7, None, None]
 
 
 def test_an_error_reaches_the_taker_after_the_last_item() -> None:
-    slot = Newest[int]()
+    slot = LatestSlot[int]()
     slot.put(7)
     slot.finish(SourceError("unplugged"))
     assert slot.take() == 7
@@ -108,7 +108,7 @@ def test_an_error_reaches_the_taker_after_the_last_item() -> None:
 
 @pytest.mark.parametrize("ending", ["close", "finish"])
 def test_a_taker_who_waits_is_let_go(ending: str) -> None:
-    slot = Newest[int]()
+    slot = LatestSlot[int]()
     got: list[int | None] = []
     taker = started(lambda: got.append(slot.take()))
     time.sleep(0.05)
@@ -118,7 +118,7 @@ def test_a_taker_who_waits_is_let_go(ending: str) -> None:
 
 
 def test_a_giver_who_waits_is_let_go_when_the_taker_closes() -> None:
-    slot = Newest[int](lossless=True)
+    slot = LatestSlot[int](lossless=True)
     answers: list[bool] = []
     giver = started(lambda: answers.extend([slot.put(1), slot.put(2)]))
     time.sleep(0.05)
@@ -131,7 +131,7 @@ def test_a_giver_who_waits_is_let_go_when_the_taker_closes() -> None:
 
 
 def test_nothing_is_lost_or_doubled_between_busy_threads() -> None:
-    slot = Newest[int]()
+    slot = LatestSlot[int]()
     giver = started(lambda: ([slot.put(i) for i in range(3000)], slot.finish()))
     got: list[int] = []
     while (item := slot.take()) is not None:
@@ -143,7 +143,7 @@ def test_nothing_is_lost_or_doubled_between_busy_threads() -> None:
 
 
 def test_who_waits_works_meanwhile_until_nothing_is_left_to_do_and_again_when_nudged() -> None:
-    slot, left, done, got = Newest[int](), [2], [], []
+    slot, left, done, got = LatestSlot[int](), [2], [], []
 
     def work() -> bool:
         if not left[0]:
@@ -155,7 +155,7 @@ def test_who_waits_works_meanwhile_until_nothing_is_left_to_do_and_again_when_nu
     taker = started(lambda: got.append(slot.take(work)))
     until(lambda: done == [1, 0])
     left[0] = 1
-    slot.nudge()
+    slot.notify()
     until(lambda: done == [1, 0, 0])
     slot.put(7)
     joined(taker)
@@ -163,7 +163,7 @@ def test_who_waits_works_meanwhile_until_nothing_is_left_to_do_and_again_when_nu
 
 
 def test_an_item_is_taken_before_anything_else_is_done() -> None:
-    slot, done = Newest[int](), []
+    slot, done = LatestSlot[int](), []
     slot.put(7)
     assert slot.take(lambda: bool(done.append(1))) == 7
     slot.finish()
@@ -172,12 +172,12 @@ def test_an_item_is_taken_before_anything_else_is_done() -> None:
 
 
 def test_a_nudge_while_there_is_work_under_way_is_not_lost() -> None:
-    slot, calls = Newest[int](), []
+    slot, calls = LatestSlot[int](), []
 
     def work() -> bool:
         calls.append(len(calls))
         if len(calls) == 1:
-            slot.nudge()  # from another thread, just now
+            slot.notify()  # from another thread, just now
         else:
             slot.put(7)
         return False
@@ -188,7 +188,7 @@ def test_a_nudge_while_there_is_work_under_way_is_not_lost() -> None:
 
 def test_what_goes_wrong_meanwhile_reaches_the_taker() -> None:
     with pytest.raises(SourceError, match="meanwhile"):
-        Newest[int]().take(lambda: (_ for _ in ()).throw(SourceError("meanwhile")))
+        LatestSlot[int]().take(lambda: (_ for _ in ()).throw(SourceError("meanwhile")))
 
 
 # --- the reader --------------------------------------------------------------------------------------------------
@@ -237,8 +237,9 @@ def test_a_lost_source_is_reported_after_its_last_window() -> None:
 def test_a_fault_in_the_source_is_not_swallowed() -> None:
     slot = WindowSlot()
     read(ScriptedSource([], failure=ZeroDivisionError("bug")), builder(), slot)
-    with pytest.raises(ZeroDivisionError, match="bug"):
+    with pytest.raises(ReaderError, match="ZeroDivisionError: bug") as caught:
         slot.take()
+    assert isinstance(caught.value.__cause__, ZeroDivisionError)
 
 
 def test_too_few_frames_are_an_error_that_counts_them() -> None:
@@ -279,7 +280,7 @@ def test_the_slot_shows_what_the_next_window_holds_so_far() -> None:
     source, windows = ScriptedSource(ten_fps(9)), builder()
 
     class Looking(WindowSlot):
-        def show(self, filling: Filling) -> None:
+        def show(self, filling: PartialWindow) -> None:
             super().show(filling)
             shown.append(filling.seqs)
 

@@ -3,6 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from media import write_video
+from tiny_weights import write_tiny
 
 from gcd_node.check import Resources, check
 from gcd_node.cli.main import run_app
@@ -10,7 +11,7 @@ from gcd_node.config import NodeConfig, load_config, parse_config
 from gcd_node.config_text import to_toml
 from gcd_node.errors import ConfigError
 from gcd_node.publisher import Publisher
-from gcd_node.publishing.options import PublisherOptions
+from gcd_node.sockets import PublisherOptions
 
 SIZE = (128, 192)  # smaller than any model takes unless it may be enlarged
 
@@ -95,10 +96,8 @@ def test_one_failure_does_not_hide_the_next(launch: Path) -> None:
     assert [findings[topic][0] for topic in ("endpoints", "source", "weights")] == ["ok", "failed", "failed"]
 
 
-def test_weights_that_do_not_fit_into_memory_are_refused_before_they_are_loaded(launch: Path) -> None:
-    packaged = "model.weights=package:driving-small"
-    if found(launch, packaged)["weights"][0] == "failed":
-        pytest.skip("needs the packaged weights driving-small")
+def test_weights_that_do_not_fit_into_memory_are_refused_before_they_are_loaded(launch: Path, tmp_path: Path) -> None:
+    packaged = f"model.weights={write_tiny(tmp_path)}"
     assert found(launch, packaged, memory=10_000)["memory"][0] == "failed"
     verdict, detail = found(launch, packaged, memory=2**40)["memory"]
     assert verdict == "ok"

@@ -10,12 +10,11 @@ import msgspec
 import pytest
 from control_fakes import Events, FakeCommands
 
+from gcd_client.endpoints import fingerprint, read_key_pair
+from gcd_node.auth import load_server_security, new_key_pair, write_key_pair
 from gcd_node.cli.main import run_app
 from gcd_node.config import SecurityConfig
 from gcd_node.control.server import ControlOptions, ControlServer
-from gcd_node.security.allow_list import load_server_security
-from gcd_node.security.gate import new_key_pair
-from gcd_node.security.keys import fingerprint, read_key_pair, write_key_pair
 
 pytestmark = pytest.mark.timeout(90)
 

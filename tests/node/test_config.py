@@ -77,3 +77,22 @@ def test_a_wrong_value_is_an_error_that_says_what_was_wanted(wrong: str, reason:
 def test_a_missing_launch_file_is_an_error_that_names_it(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"no\.toml"):
         load_config(tmp_path / "no.toml")
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        ('kind = "rtsp"\nurl = "rtsp://x"\ndevice = "0"', ["device", "v4l2", "oak"]),
+        ('kind = "v4l2"\nframes = 3', ["frames", "synthetic"]),
+        ('kind = "push"\nendpont = "ipc"', ["endpont", "`endpoint`"]),
+        ('kind = "orbital"', ["orbital", "file", "push"]),
+        ('kind = "oak"\npace = "lockstep"', ["does not wait", "pace"]),
+        ('kind = "folder"\npath = "p"', ["fps"]),
+        ('kind = "mcap"', ["path"]),
+    ],
+)
+def test_a_key_that_a_kind_of_source_has_not_is_refused_with_those_that_have_it(source: str, said: list[str]) -> None:
+    text = f'[source]\n{source}\n[model]\nweights = "w"\n[view.a]\n'
+    with pytest.raises(ConfigError) as caught:
+        parse_config(text.encode(), "file.toml")
+    assert [each for each in ("file.toml", *said) if each not in str(caught.value)] == []

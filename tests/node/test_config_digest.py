@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import msgspec
 import pytest
-from fakes import traits, warping_traits
+from fakes import live_traits, traits
 
 from gcd_model import RenderOptions, Traits, sampler_of
 from gcd_model.config import SamplingConfig
@@ -18,7 +18,7 @@ path = "drive.mp4"
 weights = "fake"
 [view.topdown]
 """
-STEERED, WARPING, UNSTEERED = traits(), warping_traits(), traits("svd")
+STEERED, LIVE, UNSTEERED = traits(), live_traits(), traits("svd")
 
 
 def parsed(text: str = MINIMAL, *changes: str) -> NodeConfig:
@@ -51,9 +51,7 @@ def digest(*changes: str, made: Traits = STEERED) -> str:
         (STEERED, "source.resize=released"),
         (STEERED, "source.pose={}"),
         (STEERED, "source.pose={elevation_deg = 5, radius = 15.0}"),
-        (WARPING, "source.pose={left_m = 0.0}"),
-        (WARPING, "source.pose={height_m = 1.55, tilt_deg = -0.0}"),
-        (WARPING, "model.motion_bucket=127"),
+        (UNSTEERED, "model.motion_bucket=127"),
         (UNSTEERED, "source.pose={}"),
     ],
 )
@@ -83,7 +81,7 @@ def test_a_default_that_is_written_out_changes_nothing(made: Traits, written_out
         (STEERED, "source.resize=area"),
         (STEERED, "source.hfov_deg=60.0"),
         (STEERED, "source.pose={radius = 14.0}"),
-        (WARPING, "source.pose={height_m = 1.6}"),
+        (LIVE, "source.pose={height_m = 1.6}"),
     ],
 )
 def test_what_changes_the_pixels_changes_the_name(made: Traits, change: str) -> None:

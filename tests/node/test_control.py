@@ -13,14 +13,12 @@ import pytest
 import zmq
 from control_fakes import Events, FakeCommands, wait_for
 
-from gcd_node.control.client import ControlClient
+from gcd_client.control import ControlClient, ControlError, Reply, decode_reply
+from gcd_client.protocol import PROTO
+from gcd_node.auth import Client, Socket
 from gcd_node.control.limits import FloodGuard, ReplyCache
-from gcd_node.control.message import MAX_REPLY, Code, Reply, decode_reply
 from gcd_node.control.server import Answers, ControlOptions, ControlServer
-from gcd_node.errors import ConfigError, ControlError, EndpointError
-from gcd_node.security.gate import Socket
-from gcd_node.security.keys import Client
-from gcd_node.wire.header import PROTO
+from gcd_node.errors import ConfigError, EndpointError
 
 pytestmark = pytest.mark.timeout(90)
 
@@ -96,12 +94,6 @@ def test_what_takes_long_is_accepted(client: ControlClient) -> None:
     assert (reply.ok, reply.code, reply.message) == (True, "ACCEPTED", "opening the source")
 
 
-def test_the_clocks_of_one_machine_agree(client: ControlClient) -> None:
-    clock = client.clock()
-    assert 0 < clock.delay_ns < 20_000_000_000
-    assert abs(clock.offset_ns) <= clock.delay_ns
-
-
 def test_time_never_waits_for_the_node(client: ControlClient, commands: FakeCommands) -> None:
     received, left = client.call("time")["t_rx"], client.call("time")["t_tx"]
     assert isinstance(received, list)
@@ -126,12 +118,6 @@ def test_a_view_that_moved_on_is_left_alone(client: ControlClient, commands: Fak
     late = client.request("set_view", {"view": "top"}, if_view_rev=1)
     assert (late.code, late.result) == ("WRONG_STATE", {"view_rev": 2})
     assert commands.view_rev == 2
-
-
-def test_call_raises_what_was_refused_with_its_code(client: ControlClient) -> None:
-    with pytest.raises(ControlError, match="UNKNOWN_VIEW: known are top") as caught:
-        client.call("set_view", {"view": "nose"})
-    assert caught.value.code == "UNKNOWN_VIEW"
 
 
 def test_an_error_of_the_node_is_internal_and_shows_no_code(client: ControlClient) -> None:
@@ -167,11 +153,6 @@ def test_a_result_that_is_no_json_is_internal(
     assert client.request("hello").ok
 
 
-def test_a_result_too_large_is_internal(client: ControlClient, commands: FakeCommands) -> None:
-    commands.result = {"a": "x" * MAX_REPLY}
-    assert client.request("stats").code == "INTERNAL"
-
-
 # Repeats
 
 
@@ -203,28 +184,6 @@ def test_one_clients_id_is_not_anothers(commands: FakeCommands) -> None:
     part = wire("hello")
     replies = [json.loads(answers.answer([part], who, 0).part)["result"] for who in (VIEWER, OPERATOR)]
     assert replies == [{"role": "viewer"}, {"role": "operator"}]
-
-
-def test_a_client_that_lost_the_reply_asks_again_under_the_same_id(tmp_path: Path, commands: FakeCommands) -> None:
-    endpoint = f"ipc://{tmp_path}/control"
-    with zmq.Context() as context, ControlClient(endpoint, timeout_s=20.0, attempts=40) as client:
-        router = context.socket(zmq.ROUTER)
-        router.bind(endpoint)
-
-        def answer_the_second() -> None:
-            answers = Answers(commands, lambda: "active", keep_s=60.0)
-            replies = [router.recv_multipart() for _ in range(2)]
-            peer, part = replies[1]
-            first = answers.answer([replies[0][1]], OPERATOR, 0).part
-            assert first == answers.answer([part], OPERATOR, 0).part
-            router.send_multipart((peer, first))
-
-        thread = threading.Thread(target=answer_the_second)
-        thread.start()
-        assert client.call("set_view", {"view": "top"}) == {"view_rev": 2}
-        thread.join()
-        router.close(0)
-    assert commands.view_rev == 2
 
 
 def test_replies_are_forgotten_in_time_and_kept_within_bounds() -> None:
@@ -292,25 +251,22 @@ def test_f16_the_guard_counts_each_peer_by_itself_and_only_the_last_second() -> 
     assert not guard.ignores(b"fast", 5.21)
 
 
-def test_f16_many_peers_need_no_more_memory() -> None:
-    guard = FloodGuard(20, 5.0, most_peers=8)
-    for i in range(1000):
-        assert not guard.bad(str(i).encode(), 0.0)
-    assert len(guard) == 8
-
-
-def test_f17_an_oversize_request_drops_its_sender_alone(
+def test_f17_an_oversize_request_is_refused_and_reported(
     stranger: Socket, client: ControlClient, events: Events, commands: FakeCommands
 ) -> None:
-    assert asked(stranger, wire("hello", "before")).ok
     too_large = wire("set_view", "big", args={"view": "top", "pad": "x" * 100_000})
-    for _ in range(
-        10
-    ):  # a connection that ends before the gate has looked at it is not told of: the machine may be busy
-        stranger.send(too_large)
-        if events.within("TOO_LARGE", 2.0):
-            break
+    assert asked(stranger, too_large).code == "TOO_LARGE"
     assert events.wait("TOO_LARGE") == {"level": 1, "channel": "control"}
+    assert client.request("hello").ok
+    assert commands.view_rev == 1
+
+
+def test_f17_a_huge_request_drops_its_sender_alone(
+    stranger: Socket, client: ControlClient, commands: FakeCommands
+) -> None:
+    assert asked(stranger, wire("hello", "before")).ok
+    stranger.send(wire("set_view", "big", args={"view": "top", "pad": "x" * 300_000}))
+    assert not stranger.poll(300)
     assert client.request("hello").ok
     wait_for(lambda: _answered(stranger))  # it reconnects by itself
     assert commands.view_rev == 1
@@ -333,14 +289,6 @@ def test_f17_who_leaves_or_talks_something_else_was_not_too_large(tmp_path: Path
                 assert client.request("hello").ok
         time.sleep(0.3)
     assert "TOO_LARGE" not in events.codes()
-
-
-def test_f17_the_client_refuses_before_anything_is_sent(client: ControlClient, commands: FakeCommands) -> None:
-    with pytest.raises(ControlError, match="at most 65536 bytes") as caught:
-        client.call("remove_view", {"view": "x" * 70_000})
-    assert caught.value.code == "TOO_LARGE"
-    assert client.request("hello").ok
-    assert [command.verb for command, _ in commands.heard] == ["hello"]
 
 
 def test_f19_control_beyond_this_machine_is_refused(commands: FakeCommands, events: Events) -> None:
@@ -380,35 +328,3 @@ def test_closing_lets_the_last_reply_out_and_leaves_nothing(
         server.close()
     assert not (tmp_path / "c").exists()
     assert threading.active_count() == threads
-
-
-def test_nobody_there_is_a_control_error(tmp_path: Path) -> None:
-    with (
-        ControlClient(f"ipc://{tmp_path}/nobody", timeout_s=0.1) as client,
-        pytest.raises(ControlError, match=r"is the node running") as caught,
-    ):
-        client.call("hello")
-    assert caught.value.code is None
-
-
-def test_connections_come_and_go_without_a_trace(server: ControlServer) -> None:
-    def handles() -> int:
-        return len(os.listdir("/proc/self/fd"))
-
-    def visit() -> None:
-        with ControlClient(server.endpoint, timeout_s=20.0) as client:
-            assert client.request("hello").ok
-
-    visit()
-    before = handles()
-    for _ in range(20):
-        visit()
-    wait_for(lambda: handles() <= before + 2)
-
-
-def test_codes_are_those_of_the_protocol() -> None:
-    named = (
-        "OK ACCEPTED BAD_JSON BAD_PROTO UNKNOWN_VERB BAD_ARG OUT_OF_RANGE VIEW_FIXED UNKNOWN_VIEW WRONG_STATE BUSY "
-        "FORBIDDEN TOO_LARGE NOT_READY INTERNAL"
-    )
-    assert [code.value for code in Code] == named.split()

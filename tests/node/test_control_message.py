@@ -6,27 +6,15 @@ import random
 import msgspec
 import pytest
 
-from gcd_node.control.message import (
-    MAX_REQUEST,
-    Code,
-    Command,
-    Outcome,
-    Reply,
-    Request,
-    RequestError,
-    decode_reply,
-    encode_request,
-    parse_command,
-    parse_request,
-    text_arguments,
-)
+from gcd_client.control import Code, Reply, Request, encode_request
+from gcd_client.protocol import PROTO
+from gcd_node.control.message import Command, Outcome, RequestError, parse_command, parse_request, text_arguments
 from gcd_node.control.verbs import VERBS, SetParam, SetView, schemas
-from gcd_node.errors import ControlError
-from gcd_node.wire.header import PROTO
 
 IDENTITY = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 EXAMPLES: dict[str, dict[str, object]] = {
     "set_view": {"view": "top", "kind": "orbit", "azimuth_deg": 10, "rate_deg_s": 5, "amplitude_deg": 30},
+    "set_pose": {"view": "top", "pose": [0, -2, -3, 0, 0, 0, 1]},
     "remove_view": {"view": "top"},
     "set_param": {"steps": 5, "guidance": [1, 1.5], "seed": 7, "publish": "jpeg", "jpeg_quality": 80},
 }
@@ -69,22 +57,6 @@ def test_a_request_survives_the_way_there() -> None:
     assert (back.id, back.verb, bytes(back.args), back.if_view_rev) == ("x", "remove_view", b'{"view":"a"}', 3)
 
 
-def test_a_reply_survives_the_way_back() -> None:
-    reply = Reply(id="x", ok=True, code=Code.ACCEPTED, message="", state="active", result={"view_rev": 2})
-    assert decode_reply(msgspec.json.encode(reply)) == reply
-
-
-def test_a_newer_nodes_reply_may_say_more() -> None:
-    reply = {"proto": "gcd/1.7", "id": "x", "ok": True, "code": "OK", "message": "", "state": "active", "new": 1}
-    assert decode_reply(json.dumps(reply).encode()).ok
-
-
-@pytest.mark.parametrize("part", [b"", b"[]", b"{}", b"\xff", b'{"proto":"gcd/2.0"}', b"[" * 5000])
-def test_what_is_no_reply_is_a_control_error(part: bytes) -> None:
-    with pytest.raises(ControlError, match="no reply of a gcd node"):
-        decode_reply(part)
-
-
 @pytest.mark.parametrize("code", list(Code))
 def test_only_done_and_begun_are_ok(code: Code) -> None:
     assert Outcome(code=code).ok is (code in (Code.OK, Code.ACCEPTED))
@@ -93,7 +65,6 @@ def test_only_done_and_begun_are_ok(code: Code) -> None:
 def test_every_looking_verb_is_a_viewers_and_every_other_an_operators() -> None:
     looking = {"hello", "describe", "state", "stats", "time", "views", "get_config", "get_calib"}
     assert {name for name, verb in VERBS.items() if verb.role == "viewer"} == looking
-    assert len(VERBS) == 18
 
 
 # What is refused, and how it is said
@@ -146,7 +117,7 @@ def test_f14_an_unknown_verb_names_the_nearest() -> None:
         ({"view": "top", "T_src_dst": IDENTITY, "radius": 1}, "state one of the two"),
         ({"view": "top", "source_from_view": IDENTITY}, "unknown argument 'source_from_view'"),
         ({"view": "top", "kind": "orbit"}, "rate_deg_s and amplitude_deg"),
-        ({"view": "top", "rate_deg_s": 3}, "fixed view"),
+        ({"view": "top", "rate_deg_s": 3}, "a view that stands"),
         ([], "Expected `object`, got `array`"),
     ],
 )
@@ -191,13 +162,6 @@ def test_setting_no_parameter_is_refused() -> None:
 def test_if_view_rev_goes_with_a_view_alone() -> None:
     assert read(wire("remove_view", {"view": "a"}, if_view_rev=2)).if_view_rev == 2
     assert "names no view" in str(refused(wire("activate", if_view_rev=2)))
-
-
-def test_f17_the_client_refuses_what_is_too_large() -> None:
-    args = msgspec.Raw(b'{"view":"' + b"a" * MAX_REQUEST + b'"}')
-    with pytest.raises(RequestError) as caught:
-        encode_request(Request(proto=PROTO, id="x", verb="remove_view", args=args))
-    assert caught.value.code == "TOO_LARGE"
 
 
 # Views and schemas

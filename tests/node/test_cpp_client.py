@@ -10,7 +10,7 @@ import signal
 import subprocess
 import threading
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,18 +18,18 @@ import pytest
 import zmq
 from fakes import HEIGHT, WIDTH, FakeSynthesizer, made_node, traits
 from media import write_video
+from msgspec.structs import replace
 from mutations import BYTE_PIECES, ROUNDS, TEXT_PIECES, Mutator
 from numpy.typing import NDArray
 from wire_messages import OTHER_BOOT, class_map, depth, end, pixels, visibility, window
 
+from gcd_client.images import encode_jpegs, inverse_depth
+from gcd_client.protocol import MAGIC, PREFIX, MessageError, ViewMessage, decode, encode
+from gcd_client.subscriber import ReceivedView, ViewSubscriber
 from gcd_node.config import NodeConfig, parse_config
-from gcd_node.envelope import MAGIC, PREFIX, ViewMessage, decode, encode, inverse_depth
-from gcd_node.errors import MessageError
 from gcd_node.publisher import Publisher
 from gcd_node.session import publisher_options
 from gcd_node.sources import open_source
-from gcd_node.subscriber import ReceivedView, ViewSubscriber
-from gcd_node.wire.jpeg import encode_frames
 
 SOURCE = Path(__file__).parents[2] / "launch" / "clients" / "subscriber.cpp"
 FLAGS = ["-std=c++17", "-g", "-Wall", "-Wextra", "-Werror", "-fsanitize=address,undefined"]
@@ -299,7 +299,7 @@ def test_a_picture_that_cannot_be_written_ends_it(client: Path, sender: Sender, 
 
 
 def jpeg_window() -> ViewMessage:
-    payload, offsets = encode_frames(pixels(0))
+    payload, offsets = encode_jpegs(pixels(0))
     made = window()
     return ViewMessage(topic=made.topic, header=replace(made.header, encoding="jpeg", offsets=offsets), payload=payload)
 

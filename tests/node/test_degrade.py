@@ -8,10 +8,10 @@ from fakes import FakeSynthesizer, traits
 from msgspec.structs import replace as struct_replace
 from rig import Rig
 
-from gcd_model import DRIVING_SMALL
-from gcd_node.health.wall_clock import WallClock
-from gcd_node.rendering.degrade import WHOLE, Ladder, rungs
-from gcd_node.rendering.idle import IdleRule
+from gcd_model import PLAIN_SMALL
+from gcd_node.fallback import FULL, OomFallback, oom_levels
+from gcd_node.model import IdleTimer
+from gcd_node.service import ClockWatch
 
 
 class Hand:
@@ -28,8 +28,8 @@ class Hand:
 
 
 def test_each_rung_keeps_what_the_ones_before_it_gave_up() -> None:
-    way = rungs(views=2, samples=2, steps=10, can_halve=True)
-    assert way[0] is WHOLE
+    way = oom_levels(views=2, samples=2, steps=10, can_halve=True)
+    assert way[0] is FULL
     assert [rung.name for rung in way[1:]] == ["views one by one", "bfloat16", "half the steps", "a single view"]
     for upper, lower in pairwise(way):
         assert lower.one_by_one >= upper.one_by_one
@@ -39,17 +39,20 @@ def test_each_rung_keeps_what_the_ones_before_it_gave_up() -> None:
 
 
 def test_rungs_that_would_change_nothing_are_left_out() -> None:
-    assert rungs(views=1, samples=1, steps=1, can_halve=False) == (WHOLE,)
-    assert [rung.name for rung in rungs(views=1, samples=1, steps=8, can_halve=False)] == ["as asked", "half the steps"]
+    assert oom_levels(views=1, samples=1, steps=1, can_halve=False) == (FULL,)
+    assert [rung.name for rung in oom_levels(views=1, samples=1, steps=8, can_halve=False)] == [
+        "as asked",
+        "half the steps",
+    ]
 
 
 def test_only_three_failures_within_a_minute_at_the_bottom_are_the_end() -> None:
     clock = Hand()
-    ladder = Ladder(rungs(views=2, samples=1, steps=1, can_halve=False), clock)
+    ladder = OomFallback(oom_levels(views=2, samples=1, steps=1, can_halve=False), clock)
     assert ladder.step_down()
     assert ladder.step_down()
     assert ladder.degraded
-    assert ladder.rung.single
+    assert ladder.level.single
     for clock.now in (0.0, 31.0, 62.0):
         assert ladder.step_down()
     clock.now = 90.0
@@ -57,32 +60,32 @@ def test_only_three_failures_within_a_minute_at_the_bottom_are_the_end() -> None
 
 
 def test_a_ladder_of_one_rung_fails_after_three() -> None:
-    ladder = Ladder((WHOLE,), Hand())
+    ladder = OomFallback((FULL,), Hand())
     assert [ladder.step_down() for _ in range(3)] == [True, True, False]
-    assert ladder.rung is WHOLE
+    assert ladder.level is FULL
     assert not ladder.degraded
 
 
 def test_a_node_rests_only_after_nobody_has_watched_for_long_enough() -> None:
     clock = Hand()
-    rule = IdleRule(2.0, clock)
+    rule = IdleTimer(2.0, clock)
     told = []
     for clock.now, subscribers in ((0.0, 0), (1.9, 0), (2.1, 0), (2.2, 1), (4.1, 0), (4.3, 0)):
-        told.append(rule.rests(subscribers))
+        told.append(rule.is_idle(subscribers))
     assert told == [False, False, True, False, False, True]
 
 
 def test_a_node_without_patience_never_rests() -> None:
     clock = Hand()
-    rule = IdleRule(0.0, clock)
+    rule = IdleTimer(0.0, clock)
     clock.now = 1e6
-    assert not rule.rests(0)
+    assert not rule.is_idle(0)
 
 
 @pytest.mark.parametrize(("step_s", "seen"), [(0.05, None), (-0.05, None), (3600.0, 3_600_000.0), (-2.0, -2000.0)])
 def test_a_clock_that_was_set_is_noticed_once(step_s: float, seen: float | None) -> None:
     utc, monotonic = Hand(), Hand()
-    wall = WallClock(utc.nanoseconds, monotonic.nanoseconds)
+    wall = ClockWatch(utc.nanoseconds, monotonic.nanoseconds)
     utc.now = monotonic.now = 5.0
     assert wall.step_ms() is None
     utc.now += step_s
@@ -92,7 +95,7 @@ def test_a_clock_that_was_set_is_noticed_once(step_s: float, seen: float | None)
 
 def test_a_clock_that_is_slewed_is_not_set() -> None:
     utc, monotonic = Hand(), Hand()
-    wall = WallClock(utc.nanoseconds, monotonic.nanoseconds)
+    wall = ClockWatch(utc.nanoseconds, monotonic.nanoseconds)
     for _ in range(100):
         monotonic.now += 1.0
         utc.now += 1.01
@@ -102,7 +105,7 @@ def test_a_clock_that_is_slewed_is_not_set() -> None:
 def test_a_look_that_was_interrupted_is_not_trusted() -> None:
     utc = Hand()
     looks = iter([0, 0, 0, 400_000_000, 500_000_000, 500_000_000])
-    wall = WallClock(utc.nanoseconds, lambda: next(looks))
+    wall = ClockWatch(utc.nanoseconds, lambda: next(looks))
     utc.now = 0.4
     assert wall.step_ms() is None
     utc.now = 0.5
@@ -113,7 +116,7 @@ def test_a_look_that_was_interrupted_is_not_trusted() -> None:
     ("device", "height", "size"), [("cpu", 128, (64, 96)), ("cpu", 96, (96, 192)), ("cuda:0", 128, (128, 192))]
 )
 def test_a_cpu_warms_up_with_less_where_it_can(device: str, height: int, size: tuple[int, int], tmp_path: Path) -> None:
-    config = struct_replace(DRIVING_SMALL, height=height, width=192)
+    config = struct_replace(PLAIN_SMALL, height=height, width=192)
     model = FakeSynthesizer(replace(traits("driving"), config=config, device=device))
     camera = Camera(size=(192, 128))
     with Rig(tmp_path, Bench(camera), model, views="[view.main]") as rig:

@@ -2,7 +2,7 @@
 unlike the training."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,14 +11,15 @@ import cv2
 import numpy as np
 import pytest
 from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, fake_config, made_node, traits
+from msgspec.structs import replace as struct_replace
 
+from gcd_client.protocol import to_json
 from gcd_model import RenderOptions, SourceFeatures, Trajectory, View, load_synthesizer
 from gcd_node.cli.main import run_app
 from gcd_node.errors import ConfigError, DepthError, SourceError, TooShortError, UsageError
-from gcd_node.frame import Image
+from gcd_node.frame import Frame, Image
 from gcd_node.offline_clip import ClipRequest, OfflineClip, read_clip
 from gcd_node.pictures.files import write_video
-from gcd_node.wire.record_json import to_json
 
 LIVE = load_synthesizer("random:live", device="cpu").traits
 FRAMES = 14
@@ -254,7 +255,7 @@ def bad(monkeypatch: pytest.MonkeyPatch) -> set[int]:
                 raise DepthError("no depth today")
             return pictures[0], np.full((HEIGHT, WIDTH), number, np.float32)
 
-    monkeypatch.setattr("gcd_node.rendering.preparation.OnnxDepth", Network)
+    monkeypatch.setattr("gcd_node.stream_context.OnnxDepth", Network)
     return failing
 
 
@@ -293,6 +294,45 @@ def test_windows_without_the_right_depth_are_dropped_where_that_is_asked_for(bad
     box = run(FakeSynthesizer(LIVE), 'depth_model = "net.onnx"\non_bad_depth = "stop"', frames=42)
     assert [message.header.window_id for message in box.of("win")] == [1, 2]
     assert statuses(box)[-1]["drops"]["model"] == 1
+
+
+class Measuring(FakeSource):
+    """Its frames have depth in their middle, and odometry 0.1 m ahead with each, except where a test puts others."""
+
+    def __init__(self, frames: int, depths: dict[int, np.ndarray], poses: dict[int, np.ndarray]) -> None:
+        super().__init__(frames, fps=10.0, size=(2 * WIDTH, HEIGHT))
+        self._depths, self._poses = depths, poses
+
+    def frames(self) -> Iterator[Frame]:
+        for frame in super().frames():
+            depth, pose = np.tile(np.arange(2 * WIDTH, dtype=np.float32), (HEIGHT, 1)), np.eye(4)
+            pose[2, 3] = 0.1 * frame.seq
+            depth, pose = self._depths.get(frame.seq, depth), self._poses.get(frame.seq, pose)
+            yield replace(frame, depth=depth, odometry=pose)
+
+
+def test_what_a_source_measures_reaches_the_live_model_frame_by_frame() -> None:
+    holes, far, torn = np.zeros((HEIGHT, 2 * WIDTH), np.float32), np.eye(4), np.full((4, 4), np.nan)
+    far[0, 3] = 100.0
+    streaming = replace(LIVE, config=struct_replace(LIVE.config, frames=1))
+    model, box = FakeSynthesizer(streaming), Box()
+    made_node(fake_config(), model, Measuring(14, {3: holes}, {5: far, 9: torn}), box).run()
+    assert [n for n, clip in enumerate(model.clips) if clip.depth is None] == [3]
+    assert [n for n, clip in enumerate(model.clips) if clip.odometry is None] == [5, 6, 9]  # there and back
+    depth, pose = model.clips[-1].depth, model.clips[-1].odometry
+    assert depth is not None
+    assert pose is not None
+    assert np.array_equal(depth[0, 0].numpy(), np.arange(WIDTH / 2, 3 * WIDTH / 2))  # cut as its picture
+    assert pose[0, 2, 3].item() == pytest.approx(1.3)
+    codes = [fields["code"] for topic, fields in box.notes if topic == "event"]
+    assert (codes.count("DEPTH_BAD"), codes.count("ODOMETRY_BAD")) == (1, 2)
+    assert len(box.of("win")) == 14
+
+
+def test_other_models_are_given_neither() -> None:
+    model = FakeSynthesizer(traits())
+    made_node(fake_config(), model, Measuring(28, {}, {}), Box()).run()
+    assert {(clip.depth, clip.odometry) for clip in model.clips} == {(None, None)}
 
 
 def test_a_node_refuses_depth_that_it_cannot_use(tmp_path: Path) -> None:

@@ -12,10 +12,10 @@ import pytest
 from numpy.typing import NDArray
 
 from gcd_model import CameraMount, Intrinsics
+from gcd_node.calibration import LensModel
 from gcd_node.errors import ConfigError, DepthError
 from gcd_node.frame import Image
-from gcd_node.optics.calibration import LensModel
-from gcd_node.optics.rectify import project
+from gcd_node.preprocess import project
 from gcd_node.sources.depth import OnnxDepth, clean_depth, known_share
 from gcd_node.sources.depth_stereo import StereoDepth
 

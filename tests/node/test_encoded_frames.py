@@ -29,9 +29,8 @@ from gcd_model import (
     load_synthesizer,
 )
 from gcd_node.config import NodeConfig, parse_config
+from gcd_node.encoded_frames import EncodedFrames, EncodeTerms, frame_seed, window_seed
 from gcd_node.frame import Frame
-from gcd_node.rendering.encoded_frames import EncodedFrames, EncodeTerms
-from gcd_node.rendering.seeds import frame_seed, window_seed
 from gcd_node.window import FrameWindow, WindowBuilder
 
 T = 14
@@ -157,7 +156,7 @@ def same(one: SourceFeatures, other: SourceFeatures) -> bool:
 
 
 def test_windows_that_overlap_agree_to_the_last_bit_on_the_frames_they_share() -> None:
-    model, encoded = load_synthesizer("package:driving-small", device="cpu"), kept()
+    model, encoded = load_synthesizer("random:driving", device="cpu"), kept()
     picture = np.random.default_rng(0).integers(0, 256, (128, 192, 3), np.uint8)
     frames = [changed(frame, image=np.roll(picture, frame.seq, axis=1)) for frame in frames_at([0, 100, 200, 300, 400])]
     one, two = placed(frames, builder=WindowBuilder(frames=4, fps=10.0, stride=1))

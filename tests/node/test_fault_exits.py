@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from importlib.resources import files
 from pathlib import Path
 
 import cv2
@@ -13,17 +12,18 @@ from cameras import Bench, Camera
 from fakes import FakeSource, FakeSynthesizer, traits
 from safetensors import safe_open
 from safetensors.torch import save_file
+from tiny_weights import write_tiny
 
 from gcd_model import ViewSynthesizer
 from gcd_node import session
 from gcd_node.cli.main import run_app
-from gcd_node.config import ModelSection, SourceConfig
+from gcd_node.config import ModelSection
 from gcd_node.errors import SourceLostError
 from gcd_node.frame import FrameSource
 from gcd_node.publisher import Publisher
-from gcd_node.publishing.options import PublisherOptions
+from gcd_node.sockets import PublisherOptions
+from gcd_node.source_config import SourceConfig
 
-PACKAGED = Path(str(files("gcd_model"))) / "weights" / "driving-small.safetensors"
 SLACK_S = 10.0  # what a machine that does other things may add
 LIVE = 'kind = "v4l2"\ndevice = "/dev/video-none"'
 
@@ -152,7 +152,7 @@ def test_f25_weights_that_do_not_fit_are_exit_65_and_the_first_five_are_named(
     run: Outcome, damage: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "bad.safetensors"
-    with safe_open(PACKAGED, "pt") as packaged:
+    with safe_open(write_tiny(tmp_path), "pt") as packaged:
         weights = {name: packaged.get_tensor(name) for name in packaged.keys()}  # noqa: SIM118  it is no dict
         told = packaged.metadata()
     count = len(weights)

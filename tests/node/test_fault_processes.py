@@ -21,8 +21,8 @@ from torch import Tensor
 from wire_messages import start_reader
 
 import gcd_node
+from gcd_client.subscriber import ViewSubscriber
 from gcd_model import Augmentation, Clip, SourceFeatures
-from gcd_node.subscriber import ViewSubscriber
 
 LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
 REALTIME = 'kind = "synthetic"\npace = "realtime"'
@@ -65,7 +65,9 @@ def test_f9_a_stalled_reader_disturbs_nobody(tmp_path: Path) -> None:
             after_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
             reader.send_signal(signal.SIGCONT)
             newest = rig.of()[-1].header.window_id
-            seen = [int(reader.stdout.readline().split()[0]) for _ in range(5)]
+            seen: list[int] = []  # what it printed before it was stopped comes first
+            while not seen or seen[-1] < newest:
+                seen.append(int(reader.stdout.readline().split()[0]))
         finally:
             reader.kill()
             reader.communicate()
@@ -73,7 +75,7 @@ def test_f9_a_stalled_reader_disturbs_nobody(tmp_path: Path) -> None:
     assert sum(view.skipped for view in healthy) == 0
     assert sorted(view.age_ms for view in healthy)[30] < 50 + 1000 * SLACK_S
     assert after_kb - before_kb < 64 * 1024
-    assert max(seen) >= newest  # it did not have to work off what it had slept through
+    assert sum(begun < window_id < newest for window_id in seen) <= 10  # of 60 it slept through
 
 
 def test_f20_an_endpoint_in_use_is_refused_and_a_dead_ones_file_is_cleared_away(tmp_path: Path) -> None:

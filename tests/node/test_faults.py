@@ -16,6 +16,8 @@ from cameras import FPS, Bench, Camera, until
 from fakes import HEIGHT, WIDTH, FakeSource, FakeSynthesizer, Steady, traits
 from rig import Rig
 
+from gcd_client.control import Code
+from gcd_client.subscriber import ViewSubscriber
 from gcd_model import (
     DeviceMemoryError,
     NonFiniteError,
@@ -26,13 +28,11 @@ from gcd_model import (
     ViewSynthesizer,
 )
 from gcd_node.config import ModelSection
-from gcd_node.control.message import Code
 from gcd_node.errors import ConfigError, SourceLostError, TooShortError
 from gcd_node.frame import Frame
-from gcd_node.health.systemd import ServiceManager
+from gcd_node.service import ServiceManager
 from gcd_node.session import load_model
 from gcd_node.sources import open_source
-from gcd_node.subscriber import ViewSubscriber
 
 WAITING = "life = {autostart = false}"
 LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
@@ -315,6 +315,26 @@ def test_f11_a_model_that_never_finds_memory_fails_and_the_node_stays(tmp_path: 
     assert rig.failure is None
 
 
+def test_a_failed_model_is_refused_whatever_the_health_says(tmp_path: Path) -> None:
+    def broken(_: RenderOptions) -> None:
+        raise RuntimeError("shapes differ")
+
+    with Rig(tmp_path, lambda _: Steady(), FakeSynthesizer(traits(), broken), config=LOCKSTEP) as rig:
+        assert "RuntimeError: shapes differ" in rig.await_event("MODEL_FAILED")["message"]
+        rig.await_state("inactive")
+        rig.node.health.model("ready")  # it reports; it decides nothing
+        assert rig.ask("activate").code is Code.NOT_READY
+
+
+def test_a_camera_that_fails_the_health_does_not_ask_for_another_model(tmp_path: Path) -> None:
+    with Rig(tmp_path, lambda _: Steady(), FakeSynthesizer(traits()), config=LOCKSTEP) as rig:
+        rig.await_views(1)
+        assert rig.ask("deactivate").code is Code.ACCEPTED
+        rig.await_state("inactive")
+        rig.node.health.model("failed")
+        assert rig.ask("activate").code is Code.ACCEPTED
+
+
 def test_f12_pictures_that_are_no_numbers_are_never_published(tmp_path: Path) -> None:
     seeds: list[int] = []
 
@@ -429,6 +449,31 @@ def test_f21_a_model_that_hangs_is_an_error_and_the_watchdog_is_not_fed(tmp_path
             until(lambda: "MODEL_HUNG" not in rig.statuses()[-1]["reasons"])
             until(lambda: "WATCHDOG=1" in heard_of(listener))
     assert status["level"] == 2
+
+
+def test_a_control_thread_that_died_is_an_error_and_the_watchdog_is_not_fed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    address = str(tmp_path / "notify")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind(address)
+        listener.setblocking(False)
+        service = ServiceManager({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "200000"})
+        with Rig(tmp_path, lambda _: Steady(), config=LOCKSTEP, service=service) as rig:
+            rig.await_status(lambda status: status["ready"])
+            monkeypatch.setattr(rig.control._guard, "report_failures", Broken())
+            assert rig.await_event("THREAD_DIED")["thread"] == "control"
+            status = rig.await_status(lambda status: "THREAD_DIED" in status["reasons"])
+            heard_of(listener)
+            rig.await_status(lambda later: later["heartbeat_seq"] >= status["heartbeat_seq"] + 2)
+            assert "WATCHDOG=1" not in heard_of(listener)
+    assert (status["level"], status["ready"], status["not_ready"]) == (2, False, ["THREAD_DIED"])
+    assert len(rig.events("THREAD_DIED")) == 1
+
+
+class Broken:
+    def __call__(self) -> None:
+        raise RuntimeError("nobody foresaw this")
 
 
 def heard_of(listener: socket.socket) -> list[str]:

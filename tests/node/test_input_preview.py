@@ -1,8 +1,6 @@
 """The preview of the input on src/frm: who gets it, what it says, and that nobody else pays for it."""
 
-import threading
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,20 +10,18 @@ from fakes import Box, FakeSource, FakeSynthesizer, traits
 from rig import Rig, rig_config
 from wire_messages import window
 
+from gcd_client.images import images
+from gcd_client.protocol import PREVIEW_TOPIC, MessageError, ViewMessage, topic_key, view_topic
+from gcd_client.subscriber import ReceivedView, ViewSubscriber
 from gcd_model import ViewSynthesizer
-from gcd_node.config import SourceConfig
-from gcd_node.envelope import PREVIEW_TOPIC, ViewMessage, images, topic_key, view_topic
-from gcd_node.errors import ConfigError, MessageError
+from gcd_node.errors import ConfigError
 from gcd_node.frame import Frame, FrameSource
-from gcd_node.optics.calibration import LensModel
-from gcd_node.publisher import Publisher, PublisherOptions
-from gcd_node.publishing.input_preview import InputPreview
-from gcd_node.publishing.options import PublisherStats
-from gcd_node.publishing.subscriptions import Readers, Subscriptions
-from gcd_node.rendering.preparation import prepare_run
-from gcd_node.subscriber import ReceivedView, ViewSubscriber
-from gcd_node.wire.input_preview import PREVIEW_WIDTH, Shot, preview_message
-from gcd_node.wire.view_message import Run
+from gcd_node.messages import Run
+from gcd_node.preview import PREVIEW_WIDTH, CapturedFrame, InputPreview, preview_message
+from gcd_node.publisher import Publisher, PublisherStats
+from gcd_node.sockets import PublisherOptions, Readers, Subscriptions
+from gcd_node.source_config import SourceConfig
+from gcd_node.stream_context import prepare_run
 
 pytestmark = pytest.mark.timeout(90)
 REALTIME = 'kind = "synthetic"\npace = "realtime"'
@@ -48,7 +44,7 @@ class Watched(Box):
     @property
     def stats(self) -> PublisherStats:
         readers = Readers(total=self.previews, previews=self.previews, previews_alone=self.previews)
-        return PublisherStats(sent=0, dropped=0, subscribers=self.previews, bytes=0, readers=readers)
+        return PublisherStats(readers=readers)
 
 
 def run_of(folder: Path, source: FrameSource, model: ViewSynthesizer | None = None, **settings: float) -> Run:
@@ -57,9 +53,11 @@ def run_of(folder: Path, source: FrameSource, model: ViewSynthesizer | None = No
     return prepare_run(config, traits() if model is None else model.traits, source.info)[0]
 
 
-def shot(width: int, height: int, *, seq: int = 7) -> Shot:
+def shot(width: int, height: int, *, seq: int = 7) -> CapturedFrame:
     image = np.full((height, width, 3), (200, 100, 50), np.uint8)
-    return Shot(frame=Frame(image=image, stamp_ns=5_000_000_000, seq=seq), arrival_ns=time.monotonic_ns(), epoch=3)
+    return CapturedFrame(
+        frame=Frame(image=image, stamp_ns=5_000_000_000, seq=seq), arrival_ns=time.monotonic_ns(), epoch=3
+    )
 
 
 def preview(folder: Path, width: int, height: int, **settings: float) -> ViewMessage:
@@ -90,12 +88,12 @@ def test_a_preview_is_the_whole_picture_and_never_wider_than_said(tmp_path: Path
 def test_whoever_subscribes_is_counted_by_what_they_get_until_they_leave(topics: list[bytes]) -> None:
     counted = Subscriptions()
     for topic in topics:
-        counted.hear(b"\1" + topic)
+        counted.count(b"\1" + topic)
     assert counted.now.total == len(topics)
     assert counted.now.previews == sum(PREVIEW_KEY.startswith(topic) for topic in topics)
     assert counted.now.watchers == sum(VIEW_KEY.startswith(topic) for topic in topics)
     for topic in topics:
-        counted.hear(b"\0" + topic)
+        counted.count(b"\0" + topic)
     assert counted.now == Readers()
 
 
@@ -120,26 +118,9 @@ def test_the_camera_matrix_is_that_of_the_smaller_picture(tmp_path: Path) -> Non
     assert preview(tmp_path, 1280, 720).header.intrinsics is None
 
 
-def test_a_lens_that_distorts_has_no_camera_matrix_in_its_preview(tmp_path: Path) -> None:
-    lens = LensModel(
-        fx=50.0,
-        fy=50.0,
-        cx=48.0,
-        cy=32.0,
-        width=96,
-        height=64,
-        distortion="plumb_bob",
-        coefficients=(0.1, 0.0, 0.0, 0.0),
-    )
-    source = FakeSource(1)
-    run = run_of(tmp_path, source)
-    distorting = replace(run, source=replace(source.info, lens=lens, hfov_deg=80.0))
-    assert preview_message(distorting, shot(96, 64)).header.intrinsics is None
-
-
 def test_the_input_has_one_topic_and_no_view_takes_its_name(tmp_path: Path) -> None:
     assert view_topic("src", "frm") == PREVIEW_TOPIC
-    with pytest.raises(MessageError, match="src/frm"):
+    with pytest.raises(MessageError, match="src of kind frm"):
         view_topic("src", "win")
     with pytest.raises(ConfigError, match="view"):
         rig_config(tmp_path, REALTIME, "[view.src]", "")
@@ -154,26 +135,17 @@ def test_nothing_is_made_while_nobody_looks_and_at_most_five_a_second_then(tmp_p
     for seq in range(48):
         now[0] = seq / 24
         shown.offer(shot(96, 64, seq=seq))
-    assert not any(thread.name == "input preview" for thread in threading.enumerate())
+    assert box.views == []
     box.previews = 1
     for seq in range(48, 48 + 240):  # 10 s
         now[0] = seq / 24
-        before = len(box.views)
         shown.offer(shot(96, 64, seq=seq))
-        if seq % 12 == 0:  # let the thread keep up now and then; what it is too slow for is replaced
-            until(lambda before=before: len(box.views) > before or not shown_waits(shown))
-    shown.close()
-    shown.join(20.0)
     shown.announce_end(delay_ms=None)
     seqs = [message.header.src.seq[0] for message in box.views]
     assert 0 < len(seqs) <= 50
     assert seqs == sorted(set(seqs))
     assert min(seqs) >= 48
     assert [message.topic for message in box.ends] == [PREVIEW_TOPIC]
-
-
-def shown_waits(shown: InputPreview) -> bool:
-    return bool(shown._newest._slot)  # pyright: ignore[reportPrivateUsage]
 
 
 def test_a_subscriber_sees_the_input_and_is_told_of_its_end(tmp_path: Path) -> None:
@@ -218,7 +190,8 @@ def test_a_reader_of_previews_that_hangs_does_not_hold_up_a_lockstep_run(tmp_pat
     noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
     frame = Frame(image=noise, stamp_ns=0, seq=0)
     picture = preview_message(
-        run_of(tmp_path, FakeSource(1, size=(640, 480))), Shot(frame=frame, arrival_ns=time.monotonic_ns(), epoch=0)
+        run_of(tmp_path, FakeSource(1, size=(640, 480))),
+        CapturedFrame(frame=frame, arrival_ns=time.monotonic_ns(), epoch=0),
     )
     options = PublisherOptions(data=f"ipc://{tmp_path}/data", status=None, lockstep=True, min_subscribers=1)
     with (
@@ -231,7 +204,7 @@ def test_a_reader_of_previews_that_hangs_does_not_hold_up_a_lockstep_run(tmp_pat
         for number in range(20):
             publisher.send(window(number))
         assert [next_preview(views).header.window_id for _ in range(20)] == list(range(20))
-        publisher.hurry()
+        publisher.stop_waiting()
 
 
 def fill(publisher: Publisher, picture: ViewMessage) -> None:
@@ -239,7 +212,7 @@ def fill(publisher: Publisher, picture: ViewMessage) -> None:
     refused = 0
     while refused < 5:
         before, until_s = publisher.stats.sent, time.monotonic() + 0.1
-        publisher.send(picture)
+        publisher.preview(lambda: picture)
         while publisher.stats.sent == before and time.monotonic() < until_s:
             time.sleep(0.001)
         refused += publisher.stats.sent == before

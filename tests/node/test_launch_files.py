@@ -19,9 +19,10 @@ from typer.main import get_command
 
 from gcd_node import check as checking
 from gcd_node.check import Resources, check
-from gcd_node.cli.commands import app
+from gcd_node.cli.main import COMMANDS, new_app
 from gcd_node.config import NodeConfig, load_config
 from gcd_node.errors import ConfigError, SourceError, TooShortError, UsageError
+from gcd_node.source_config import RecordedSource, SyntheticSource
 
 ROOT = Path(__file__).parents[2]
 LAUNCH = ROOT / "launch"
@@ -36,16 +37,14 @@ SHIPPED = {"demo.toml", "orbit.toml", "oak-topdown.toml", "oak-orbit.toml", "rts
 
 
 def rehearsed(config: NodeConfig, folder: Path) -> NodeConfig:
-    """As it is, but with frames of our own instead of a camera or a log, endpoints here, and random weights where a
-    checkpoint must be downloaded."""
-    source = msgspec.structs.replace(
-        config.source, kind="synthetic", path=None, url=None, device=None, topic=None, loop=False, frames=1
-    )
+    """As it is, but with frames of our own instead of a camera or a log, endpoints here, and random
+    weights."""
+    common = {name: getattr(config.source, name) for name in RecordedSource.__struct_fields__}
+    source = SyntheticSource(**common | {"loop": False}, frames=1)
     here = {name: f"ipc://{folder}/{name}" for name in ("data", "status", "control")}
     model = config.model
-    if model.weights.startswith("/"):
-        assert model.family is not None
-        model = msgspec.structs.replace(model, weights=f"random:{model.family}", family=None, device="cpu")
+    family = model.family or "live"
+    model = msgspec.structs.replace(model, weights=f"random:{family}", family=None, device="cpu")
     return msgspec.structs.replace(
         config,
         source=source,
@@ -66,8 +65,7 @@ def test_a_launch_file_passes_every_check_that_needs_no_hardware(path: Path, tmp
     assert list(findings) == ["endpoints", "source", "weights", "memory", "views", "time"]
     errors = {topic: str(each.error) for topic, each in findings.items() if each.error is not None}
     assert errors == {}
-    random = config.model.weights.startswith("random:")
-    assert findings["weights"].verdict == ("warning" if random else "ok")
+    assert findings["weights"].verdict == "warning"
 
 
 @pytest.mark.parametrize("path", TOMLS, ids=lambda path: path.name)
@@ -249,7 +247,7 @@ def test_the_container_installs_what_the_project_names() -> None:
 
 
 def test_the_container_runs_as_nobody_special_and_calls_commands_that_exist() -> None:
-    commands = get_command(app).commands  # type: ignore[attr-defined]
+    commands = get_command(new_app(COMMANDS)).commands  # type: ignore[attr-defined]
     (health,), (start,), (entry,) = all_of("HEALTHCHECK"), all_of("CMD"), all_of("ENTRYPOINT")
     tested = msgspec.json.decode(health.partition("CMD ")[2], type=list[str])
     assert tested == ["gcd-node", "status", "--once"]

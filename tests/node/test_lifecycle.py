@@ -3,8 +3,8 @@ from typing import get_args
 
 import pytest
 
-from gcd_node.errors import ControlError
-from gcd_node.life.lifecycle import PATHS, Lifecycle, State, Verb
+from gcd_client.control import ControlError
+from gcd_node.lifecycle import PATHS, Lifecycle, State, Verb
 
 VERBS: tuple[Verb, ...] = get_args(Verb)
 WAYS: dict[State, tuple[Verb, ...]] = {

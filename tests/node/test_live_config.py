@@ -3,7 +3,7 @@ from fakes import traits
 
 from gcd_node.config import NodeConfig, ViewConfig, parse_config
 from gcd_node.config_digest import config_digest
-from gcd_node.life.live_config import LiveConfig
+from gcd_node.views import LiveConfig
 
 
 def config() -> NodeConfig:

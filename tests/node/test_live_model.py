@@ -1,5 +1,6 @@
 """The live model in a node: replayed to the bit, placed on the vehicle, steered to any pose."""
 
+import math
 from pathlib import Path
 
 import pytest
@@ -8,15 +9,16 @@ from msgspec.structs import replace
 
 from gcd_model import CameraMount, OptionError, load_synthesizer
 from gcd_node.cli.main import run_app
-from gcd_node.config import NodeConfig, SourcePose, ViewConfig, parse_config
+from gcd_node.config import NodeConfig, ViewConfig, parse_config
 from gcd_node.config_digest import config_digest
 from gcd_node.control.verbs import SetView
 from gcd_node.errors import ConfigError
 from gcd_node.frame import SourceInfo
-from gcd_node.optics.source_pose import assumed_hfov_deg, stated_mount
-from gcd_node.rendering.preparation import prepare_run
-from gcd_node.rendering.virtual_view import VirtualView
-from gcd_node.replay.run_folder import open_run
+from gcd_node.preprocess import assumed_hfov_deg, stated_mount
+from gcd_node.replay.run import open_run
+from gcd_node.source_config import SourcePose
+from gcd_node.stream_context import prepare_run
+from gcd_node.views import VirtualView
 
 LAUNCH = """
 [source]
@@ -50,10 +52,10 @@ def test_a_replay_of_the_live_model_is_the_same_twice_with_all_its_maps(tmp_path
     for name in ("a", "b"):
         assert run_app(["replay", str(tmp_path / "launch.toml"), "--out", str(tmp_path / name)]) == 0
     windows = [open_run(tmp_path / name).manifest.windows for name in ("a", "b")]
-    digests = [[{view_id: view.digests for view_id, view in each.views.items()} for each in run] for run in windows]
+    digests = [[{view_id: view.sha256 for view_id, view in each.views.items()} for each in run] for run in windows]
     assert digests[0] == digests[1]
-    assert set(windows[0][0].views["placed"].maps_sha256) == {"vis", "depth"}
-    assert windows[0][0].views["placed"].classes_sha256 is not None
+    assert set(windows[0][0].views["placed"].sha256) == {"win", "cls", "vis", "depth"}
+    assert [len(each.stamps) for each in windows[0]] == [1] * 14  # a view of every frame
 
 
 def test_views_stand_at_their_goals_and_are_placed_from_the_mount() -> None:
@@ -68,9 +70,30 @@ def test_views_stand_at_their_goals_and_are_placed_from_the_mount() -> None:
 
 def test_a_view_takes_any_rigid_pose_as_it_is() -> None:
     rolled = (0.0, -1.0, 0.0, 2.0, 1.0, 0.0, 0.0, -1.0, 0.0, 0.0, 1.0, 3.0, 0.0, 0.0, 0.0, 1.0)
-    view = ViewConfig(source_from_view=rolled)
-    planned = VirtualView("main", replace(config(), view={"main": view}), TRAITS).planned()
-    assert torch.equal(planned.source_from_target[7].flatten(), torch.tensor(rolled, dtype=torch.float64))
+    as_numbers = (2.0, -1.0, 3.0, 0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))  # the same as position and quaternion
+    for pose in (rolled, as_numbers):
+        view = ViewConfig(kind="pose", pose=pose)
+        planned = VirtualView("main", replace(config(), view={"main": view}), TRAITS).planned()
+        wanted = torch.tensor(rolled, dtype=torch.float64)
+        assert torch.allclose(planned.source_from_target[7].flatten(), wanted, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "reason"),
+    [
+        ('kind = "pose"', "needs pose"),
+        ("pose = [0, 0, 1, 0, 0, 0, 1]", 'say kind = "pose"'),
+        ('kind = "pose"\npose = [0, 0, 1, 0, 0, 0, 1]\nradius = 2.0', "state one of them"),
+        ('kind = "pose"\npose = [0, 0, 1]', "7 numbers"),
+        ('kind = "pose"\npose = [0, 0, 1, 0, 0, 0, 0]', "length 1"),
+        ('kind = "pose"\npose = [0, 0, nan, 0, 0, 0, 1]', "finite"),
+        ('kind = "pose"\npose = [0, 0, 2e4, 0, 0, 0, 1]', "10000"),
+        ("source_from_view = [1]", 'kind = "pose"'),
+    ],
+)
+def test_what_is_no_pose_is_refused_with_what_would_be_one(wrong: str, reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        config(f"[view.wrong]\n{wrong}\n")
 
 
 def test_places_are_for_models_that_take_any_pose_and_cameras_on_vehicles() -> None:

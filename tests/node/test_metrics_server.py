@@ -1,9 +1,8 @@
 """The metrics server as a probe and a scraper meet it, over real HTTP on loopback."""
 
-import builtins
 import contextlib
-import http.client
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -12,20 +11,18 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from typing import Any
+from pathlib import Path
 
 import pytest
 
-from gcd_node.errors import ConfigError, EndpointError
-from gcd_node.health.metrics_server import MetricsServer, loopback_address
-from gcd_node.health.monitor import Health
-from gcd_node.health.report import Level
+from gcd_node.errors import ConfigError
+from gcd_node.health import Health, Level
+from gcd_node.service import loopback_address
 
 prometheus = pytest.importorskip("prometheus_client", reason="needs the extra `metrics`")
-from prometheus_client.openmetrics.parser import (  # noqa: E402
-    text_string_to_metric_families as open_metrics_families,
-)
 from prometheus_client.parser import text_string_to_metric_families  # noqa: E402
+
+from gcd_node.metrics import MetricsServer  # noqa: E402
 
 pytestmark = pytest.mark.timeout(60)
 S = 1_000_000_000
@@ -100,10 +97,9 @@ def test_metrics_hold_what_the_health_was_told(server: MetricsServer, health: He
     for seconds in (0.1, 0.2, 0.3):
         health.stage("render", seconds)
     health.windows(4, {"WIN_GAP": 2})
-    health.drop("slot", 5)
+    health.totals(slot=5, sent=31, subs=2, bytes=4130)
     health.corrupt(1)
-    health.model_load(gpu_mem_mb=812.5)
-    health.sent(31, 2, 4130)
+    health.measure("gpu_mem_mb", 812.5)
     health.raise_reason("fps", Level.WARN)
     found = samples(server)
     expected = {
@@ -145,29 +141,11 @@ def test_metrics_of_a_node_that_knows_nothing_yet_leave_out_what_is_unknown(serv
     assert not [key for key in found if key[0].startswith(("gcd_stage", "gcd_model_gpu", "gcd_view"))]
 
 
-@pytest.mark.parametrize(
-    ("accept", "kind"),
-    [
-        ("*/*", "text/plain"),
-        ("application/openmetrics-text; version=1.0.0; charset=utf-8,text/plain;q=0.5", "application/openmetrics-text"),
-        ("application/openmetrics-text; version=\u00e9;escaping==", "application/openmetrics-text"),
-        ("text/plain; version=abc", "text/plain"),
-    ],
-)
-def test_a_scraper_gets_the_format_it_asks_for(server: MetricsServer, health: Health, accept: str, kind: str) -> None:
-    make_ready(health)
-    status, content_type, body = get(server, "/metrics", accept)
-    parse = open_metrics_families if kind.startswith("application") else text_string_to_metric_families
-    names = {family.name for family in parse(body.decode())}
-    assert (status, content_type.partition(";")[0]) == (200, kind)
-    assert {"gcd_level", "gcd_stage_seconds", "gcd_dropped"} <= names | {name.removesuffix("_total") for name in names}
-
-
 def test_every_metric_is_explained_in_the_docs(
     server: MetricsServer, health: Health, request: pytest.FixtureRequest
 ) -> None:
     make_ready(health)
-    health.model_load(gpu_mem_mb=1.0)
+    health.measure("gpu_mem_mb", 1.0)
     body = get(server, "/metrics")[2].decode()
     ours = {family.name for family in text_string_to_metric_families(body) if family.name.startswith("gcd_")}
     text = (request.config.rootpath / "docs" / "reliability.md").read_text()
@@ -175,23 +153,11 @@ def test_every_metric_is_explained_in_the_docs(
     assert [name for name in sorted(ours) if f"`{name}" not in text] == []
 
 
-def test_head_and_unknown_paths_and_methods(server: MetricsServer) -> None:
-    assert get(server, "/healthz?probe=1", method="HEAD") == (200, "application/json", b"")
-    status, _, body = get(server, "/etc/passwd")
-    assert (status, body) == (404, b"there are /healthz, /readyz, /metrics\n")
-    assert get(server, "/metrics", method="POST")[0] == 501
-
-
-def test_the_server_does_not_say_what_it_runs_on(server: MetricsServer) -> None:
-    with urllib.request.urlopen(server.url + "/healthz", timeout=20) as answer:
-        assert answer.headers["Server"].strip() == "gcd-node"
-
-
 def test_callers_that_say_nothing_neither_grow_the_node_nor_lock_probes_out_for_good(
     server: MetricsServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gcd_node.health.metrics_server._Handler.timeout", 0.5)
-    host, port = loopback_address(server.url.removeprefix("http://"))
+    monkeypatch.setattr("gcd_node.metrics._Handler.timeout", 0.5)
+    host, port = loopback_address(server.url.removeprefix("http://"), "")
     before = threading.active_count()
     silent = [socket.create_connection((host, port), timeout=20) for _ in range(30)]
     try:
@@ -208,7 +174,7 @@ def test_callers_that_say_nothing_neither_grow_the_node_nor_lock_probes_out_for_
 
 @pytest.mark.parametrize("sent", [b"\x00\xff" * 40, b"GET " + b"/" * 70_000, b"GET /metrics HTTP/9.9\r\n\r\n", b"\r\n"])
 def test_junk_is_refused_and_the_next_caller_served(server: MetricsServer, sent: bytes) -> None:
-    host, port = loopback_address(server.url.removeprefix("http://"))
+    host, port = loopback_address(server.url.removeprefix("http://"), "")
     with socket.create_connection((host, port), timeout=20) as caller:
         caller.sendall(sent)
         caller.shutdown(socket.SHUT_WR)
@@ -217,66 +183,22 @@ def test_junk_is_refused_and_the_next_caller_served(server: MetricsServer, sent:
     assert get(server, "/healthz")[0] == 200
 
 
-def test_close_frees_the_port_and_may_be_called_twice(health: Health) -> None:
-    server = MetricsServer("127.0.0.1:0", health)
-    address = server.url.removeprefix("http://")
-    held = http.client.HTTPConnection(address, timeout=20)
-    held.connect()
-    server.close()
-    server.close()
-    with pytest.raises(OSError, match="refused"):
-        socket.create_connection(loopback_address(address), timeout=20)
-    with MetricsServer(address, health) as again:
-        assert get(again, "/healthz")[0] == 200
-    held.close()
-
-
-def test_a_port_in_use_is_named(server: MetricsServer, health: Health) -> None:
-    address = server.url.removeprefix("http://")
-    with pytest.raises(EndpointError, match=f"{address}.*in use.*another port"):
-        MetricsServer(address, health)
-
-
 @pytest.mark.parametrize("address", ["0.0.0.0:9100", "192.168.1.4:9100", "[::]:9100", "robot.local:9100", "*:9100"])
 def test_other_machines_are_refused(address: str, health: Health) -> None:
     with pytest.raises(ConfigError, match=r"other machines.*127\.0\.0\.1"):
         MetricsServer(address, health)
 
 
-@pytest.mark.parametrize("address", ["", "9100", "127.0.0.1", ":9100", "127.0.0.1:", "127.0.0.1:x", "127.0.0.1:65536"])
-def test_what_is_no_address_is_refused(address: str, health: Health) -> None:
-    with pytest.raises(ConfigError, match=r"127\.0\.0\.1:PORT"):
-        MetricsServer(address, health)
-
-
-@pytest.mark.parametrize(
-    ("address", "expected"),
-    [("127.0.0.1:9100", ("127.0.0.1", 9100)), ("[::1]:0", ("::1", 0)), ("localhost:1", ("localhost", 1))],
-)
-def test_loopback_has_three_spellings(address: str, expected: tuple[str, int]) -> None:
-    assert loopback_address(address) == expected
-
-
-def test_without_the_extra_the_error_names_it(health: Health, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = builtins.__import__
-
-    def blocked(name: str, *args: Any, **kwargs: Any) -> object:
-        if name.startswith("prometheus_client"):
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.delitem(sys.modules, "gcd_node.health.metrics", raising=False)
-    monkeypatch.setattr(builtins, "__import__", blocked)
-    with pytest.raises(ConfigError, match=r"prometheus_client.*gcd-node\[metrics\]"):
-        MetricsServer("127.0.0.1:0", health)
-
-
-def test_the_core_imports_without_the_extra() -> None:
+def test_without_the_extra_a_launch_file_that_asks_for_it_is_refused(tmp_path: Path) -> None:
     code = (
         "import sys; sys.modules['prometheus_client'] = None\n"
-        "import gcd_node.health.monitor, gcd_node.health.metrics_server, gcd_node.health.logs\n"
-        "import gcd_node.health.systemd, gcd_node.cli.status\n"
-        "print('imported')"
+        "from rig import rig_config\n"
+        "from pathlib import Path\n"
+        "from gcd_node.session import open_session\n"
+        f"with open_session(rig_config(Path({str(tmp_path)!r}), 'kind = \"v4l2\"', '[view.main]', "
+        "'[health]\\nhttp = \"127.0.0.1:0\"')): pass"
     )
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=50, check=False)
-    assert (ended.returncode, ended.stdout) == (0, "imported\n"), ended.stderr
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(Path(__file__).parent), *sys.path))}
+    command = [sys.executable, "-c", code]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=50, check=False, env=environment)
+    assert "ConfigError: [health] http needs the package prometheus_client" in ended.stderr

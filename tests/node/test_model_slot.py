@@ -22,7 +22,7 @@ from gcd_model import (
     ViewSynthesizer,
 )
 from gcd_node.config import ModelSection
-from gcd_node.rendering.model_slot import ModelSlot
+from gcd_node.model import ModelSlot
 from gcd_node.session import load_model
 
 LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'

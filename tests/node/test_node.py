@@ -6,30 +6,42 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, made_node, traits
 from tiny_weights import write_tiny
 
+from gcd_client.images import images
+from gcd_client.protocol import OriginHeader, StatusTopic
 from gcd_model import (
     Cancelled,
+    CheckpointError,
     DeviceMemoryError,
     NonFiniteError,
     OptionError,
     RenderOptions,
+    ShapeError,
     ViewFixedError,
     ViewRangeError,
 )
 from gcd_node.config import NodeConfig, parse_config
-from gcd_node.envelope import NoteTopic, images
-from gcd_node.errors import ConfigError, ModelFailedError, NodeError, SourceError, TooShortError
+from gcd_node.errors import (
+    ConfigError,
+    EndpointError,
+    ModelFailedError,
+    NodeError,
+    PublisherError,
+    SourceError,
+    TooShortError,
+)
 from gcd_node.frame import Frame
 from gcd_node.node import Node
+from gcd_node.pipeline import ending
 from gcd_node.publisher import Publisher
-from gcd_node.publishing.options import PublisherOptions
 from gcd_node.session import load_model
+from gcd_node.sockets import PublisherOptions
 from gcd_node.sources import open_source
-from gcd_node.wire.header import OriginHeader
 
 
 def config(
@@ -108,20 +120,6 @@ def test_every_frame_of_a_direct_view_is_at_its_goal() -> None:
     _, box = run(config("azimuth_deg = 26.0", model="move_time = 0"), FakeSource(14))
     assert len(box.of("frm")) == 14
     assert box.of("win")[0].header.frame_role == ("at_goal",) * 14
-
-
-def test_single_frames_of_a_live_view_leave_at_the_windows_rhythm() -> None:
-    settings = config("azimuth_deg = 20.0", pace="realtime", model="move_time = 0")
-    box = Box()
-    sent_s: list[float] = []
-    keep = box.send
-    box.send = lambda message: (sent_s.append(time.monotonic()), keep(message))[1]  # type: ignore[method-assign]
-    made_node(settings, FakeSynthesizer(traits()), FakeSource(14), box).run()
-    frames = [at for at, message in zip(sent_s, box.views, strict=True) if message.topic.endswith("frm")]
-    assert len(frames) == 14
-    assert frames[-1] - frames[0] >= 0.9 * 13 / 24
-    stamps = [message.header.t_publish_ns for message in box.of("frm")]
-    assert stamps == sorted(stamps)
 
 
 def test_several_samples_publish_their_deviation_with_its_scale() -> None:
@@ -374,6 +372,9 @@ def test_the_driving_path_is_stated_as_rigid_transforms() -> None:
         (None, SourceError("unplugged"), "SRC_LOST", "lost", "ready"),
         (NonFiniteError("NaN"), None, "MODEL_FAILED", "closed", "failed"),
         (DeviceMemoryError("full"), None, "MODEL_FAILED", "closed", "failed"),
+        (RuntimeError("shapes differ"), None, "MODEL_FAILED", "closed", "failed"),
+        (None, cv2.error("assertion failed"), "SRC_FAILED", "closed", "ready"),
+        (None, ShapeError("no such picture"), "SRC_FAILED", "closed", "ready"),
     ],
 )
 def test_the_last_status_says_how_it_ended(
@@ -393,6 +394,20 @@ def test_the_last_status_says_how_it_ended(
     last = [fields for topic, fields in box.notes if topic == "status"][-1]
     assert (last["source"]["state"], last["model"]["state"]) == (source, model)
     assert last["level"] == (0 if code == "SRC_ENDED" else 2)
+
+
+@pytest.mark.parametrize(
+    ("failure", "code"),
+    [
+        (PublisherError("died"), "PUBLISH_FAILED"),
+        (EndpointError("not taken"), "NOT_DELIVERED"),
+        (KeyError("ours"), "INTERNAL"),
+        (CheckpointError("halved"), "MODEL_FAILED"),
+    ],
+)
+def test_a_failure_keeps_its_own_code(failure: Exception, code: str) -> None:
+    assert ending(failure, stopped=False) == (code, "closed")
+    assert ending(failure, stopped=True) == (code, "closed")
 
 
 def test_a_full_device_drops_the_window_and_says_so() -> None:
@@ -436,7 +451,7 @@ def test_an_orbit_waits_where_stamps_cannot_be_compared() -> None:
 
 def test_an_outbox_that_fails_ends_the_run_and_every_thread() -> None:
     class Broken(Box):
-        def note(self, topic: NoteTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
+        def note(self, topic: StatusTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
             if len(self.notes) >= 3:
                 raise NodeError("the publisher stopped")
             super().note(topic, header, fields)

@@ -9,9 +9,9 @@ from cameras import Bench, Camera, until
 from fakes import FakeSource, FakeSynthesizer, traits
 from rig import Rig
 
+from gcd_client.control import Code
 from gcd_model import RenderOptions, SphericalDelta
-from gcd_node.control.message import Code
-from gcd_node.health.systemd import ServiceManager
+from gcd_node.service import ServiceManager
 
 TWO_VIEWS = '[view.main]\nazimuth_deg = 10.0\n[view.swing]\nkind = "orbit"\nrate_deg_s = 24.0\namplitude_deg = 30.0'
 LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'

@@ -4,16 +4,18 @@ import logging
 import sys
 import time
 from contextlib import closing
+from threading import Event
 from unittest.mock import create_autospec
 
 import pytest
 from media import HEIGHT, WIDTH
 
-from gcd_node.config import SourceConfig
-from gcd_node.errors import SourceAbsentError, SourceError
-from gcd_node.optics.calibration import LensModel
-from gcd_node.sources.oak_camera import OakCamera, camera_pipeline, lens_in_memory, load_depthai, open_oak
-from gcd_node.sources.oak_search import find_device
+from gcd_node.calibration import LensModel
+from gcd_node.config import parse_config
+from gcd_node.errors import ConfigError, SourceAbsentError, SourceError
+from gcd_node.source_config import OakSource
+from gcd_node.sources.oak_camera import camera_pipeline, lens_in_memory, load_depthai, open_oak, open_pipeline
+from gcd_node.sources.oak_device import Guard, find_device
 
 try:
     import oak_pipelines as pipelines
@@ -80,7 +82,7 @@ def no_device() -> None:
 def test_no_device_is_said_within_three_seconds() -> None:
     begin = time.monotonic()
     with pytest.raises(SourceAbsentError, match="wanted an OAK camera, found none") as caught:
-        open_oak(SourceConfig(kind="oak", open_timeout_s=PATIENT_S))
+        open_oak(OakSource(open_timeout_s=PATIENT_S))
     assert caught.value.exit_code == 69
     assert time.monotonic() - begin < 6  # 1.1 s on a machine that is not busy
 
@@ -89,7 +91,7 @@ def test_no_device_is_said_within_three_seconds() -> None:
 def test_an_address_where_nobody_answers_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DEPTHAI_SEARCH_TIMEOUT", "300")
     with pytest.raises(SourceAbsentError, match=r"no OAK camera answers at 127\.0\.0\.1"):
-        open_oak(SourceConfig(kind="oak", device="127.0.0.1", open_timeout_s=PATIENT_S))
+        open_oak(OakSource(device="127.0.0.1", open_timeout_s=PATIENT_S))
 
 
 def test_a_real_camera_is_wired_by_depthais_own_names(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -97,18 +99,25 @@ def test_a_real_camera_is_wired_by_depthais_own_names(monkeypatch: pytest.Monkey
     camera = create_autospec(dai.node.Camera, instance=True)
     pipeline = create_autospec(dai.Pipeline, instance=True)
     opened.getDeviceId.return_value, camera.getBoardSocket.return_value = ONE.deviceId, SOCKET
-    opened.readCalibration.return_value = memory(coefficients=[0.0] * 14, model="Perspective")
+    camera.initialControl = create_autospec(dai.CameraControl, instance=True)
+    opened.getCalibration.return_value = memory(coefficients=[0.0] * 14, model="Perspective")
     pipeline.create.return_value = camera.build.return_value = camera
     devices = create_autospec(dai.Device, return_value=opened)
     devices.getAllAvailableDevices.return_value = [ONE]
     monkeypatch.setattr(dai, "Device", devices)
     monkeypatch.setattr(dai, "Pipeline", lambda device: pipeline if device is opened else None)
-    stream = camera_pipeline(device=None, width=1280, height=720, fps=15.0)(lambda body: body)
+    config = OakSource(fps=15.0, socket="CAM_B", focus=130, exposure_us=8000, iso=400, anti_banding="50hz")
+    stream = camera_pipeline(config)(lambda body: body)
     lens = stream.lens(1280, 720)
     devices.assert_called_once_with(ONE)
     opened.setMaxReconnectionAttempts.assert_called_once_with(0)
     pipeline.create.assert_called_once_with(dai.node.Camera)
-    camera.requestOutput.assert_called_once_with((1280, 720), dai.ImgFrame.Type.NV12, fps=15.0)
+    camera.build.assert_called_once_with(dai.CameraBoardSocket.CAM_B)
+    size, nv12 = (1280, 720), dai.ImgFrame.Type.NV12
+    camera.requestOutput.assert_called_once_with(size, nv12, fps=15.0, enableUndistortion=False)
+    camera.initialControl.setManualFocus.assert_called_once_with(130)
+    camera.initialControl.setManualExposure.assert_called_once_with(8000, 400)
+    camera.initialControl.setAntiBandingMode.assert_called_once_with(dai.CameraControl.AntiBandingMode.MAINS_50_HZ)
     assert (stream.id, stream.fps, stream.pipeline) == (ONE.deviceId, 15.0, pipeline)
     assert lens is not None
     assert lens.fx == pytest.approx(3100 * 1280 / 4056, rel=1e-5)
@@ -117,13 +126,41 @@ def test_a_real_camera_is_wired_by_depthais_own_names(monkeypatch: pytest.Monkey
 def test_a_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "depthai", None)
     with pytest.raises(SourceError, match=r"pip install 'gcd-node\[oak\]'"):
-        open_oak(SourceConfig(kind="oak"))
+        open_oak(OakSource())
 
 
 def test_an_older_depthai_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(dai.Pipeline, "setDeviceStateCallback")
     with pytest.raises(SourceError, match=r"3\.12 or newer"):
         load_depthai()
+
+
+def test_an_attempt_that_was_given_up_ends_before_the_next_one_begins() -> None:
+    first, second, answer = pipelines.Scripted(pipelines.steady()), pipelines.Scripted(pipelines.steady()), Event()
+    running: list[bool] = []
+
+    def slow(guard: Guard) -> pipelines.OakStream:
+        answer.wait(PATIENT_S)
+        return first(guard)
+
+    def next_one(guard: Guard) -> pipelines.OakStream:
+        running.append(first.pipeline is None or first.pipeline.isRunning())
+        return second(guard)
+
+    with pytest.raises(SourceAbsentError, match="no picture within"):
+        open_pipeline(slow, open_timeout_s=0.2)
+    with pytest.raises(SourceAbsentError, match="still busy"):
+        open_pipeline(next_one, open_timeout_s=0.2)
+    answer.set()
+    open_pipeline(next_one, open_timeout_s=PATIENT_S).close()
+    assert running == [False]
+
+
+@pytest.mark.parametrize("wrong", ["exposure_us = 8000", 'socket = "left"', "focus = 300", 'anti_banding = "100hz"'])
+def test_a_setting_that_no_oak_has_is_refused(wrong: str) -> None:
+    text = f'[source]\nkind = "oak"\n{wrong}\n[model]\nweights = "w"\n[view.a]\n'
+    with pytest.raises(ConfigError, match=wrong.split()[0]):
+        parse_config(text.encode(), "test")
 
 
 # The lens.
@@ -194,7 +231,7 @@ def test_the_lens_of_the_picture_itself_comes_before_the_memory(caplog: pytest.L
     first.transformation = dai.ImgTransformation(WIDTH, HEIGHT, matrix, dai.CameraModel.Perspective, RATIONAL)
     stored = LensModel(width=WIDTH, height=HEIGHT, fx=50.0, fy=50.0, cx=32.0, cy=24.0)
     factory = pipelines.Scripted(pipelines.Handed(first), lens=lambda width, height: stored)
-    with caplog.at_level(logging.WARNING), closing(OakCamera(factory, open_timeout_s=PATIENT_S)) as camera:
+    with caplog.at_level(logging.WARNING), closing(open_pipeline(factory, open_timeout_s=PATIENT_S)) as camera:
         lens = camera.info.lens
     assert lens is not None
     assert (lens.fx, lens.fy, lens.cx, lens.cy) == (80.0, 81.0, 32.0, 24.0)
@@ -210,6 +247,6 @@ def test_the_memory_is_asked_for_the_size_of_the_picture_if_that_knows_no_lens()
         return LensModel(width=width, height=height, fx=50.0, fy=50.0, cx=32.0, cy=24.0)
 
     factory = pipelines.Scripted(pipelines.steady(), lens=lens)
-    with closing(OakCamera(factory, open_timeout_s=PATIENT_S)) as camera:
+    with closing(open_pipeline(factory, open_timeout_s=PATIENT_S)) as camera:
         assert camera.info.lens == lens(WIDTH, HEIGHT)
     assert asked[0] == (WIDTH, HEIGHT)

@@ -8,9 +8,10 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from gcd_node.config import SourceConfig
 from gcd_node.errors import SourceError
-from gcd_node.sources.oak_camera import OakCamera, camera_pipeline, load_depthai, open_oak
+from gcd_node.source_config import OakSource
+from gcd_node.sources.live_camera import LiveCamera
+from gcd_node.sources.oak_camera import camera_pipeline, load_depthai, open_oak, open_pipeline
 
 try:
     load_depthai()
@@ -23,14 +24,14 @@ PATIENT_S = 30.0  # for a machine that is busy with something else
 
 
 @pytest.fixture(scope="module")
-def oak() -> OakCamera:
+def oak() -> LiveCamera:
     if not dai.Device.getAllAvailableDevices():
         pytest.skip("hardware: needs an OAK camera that is plugged in and free")
-    return OakCamera(camera_pipeline(device=None, width=1280, height=720, fps=30.0), open_timeout_s=PATIENT_S)
+    return open_pipeline(camera_pipeline(OakSource(fps=30.0)), open_timeout_s=PATIENT_S)
 
 
 @pytest.mark.hardware
-def test_hardware_gives_the_size_and_rate_it_was_asked_for(oak: OakCamera) -> None:
+def test_hardware_gives_the_size_and_rate_it_was_asked_for(oak: LiveCamera) -> None:
     frames = list(islice(oak.frames(), 90))
     rate = (frames[-1].seq - frames[0].seq) / ((frames[-1].stamp_ns - frames[0].stamp_ns) / 1e9)
     assert frames[0].size == (1280, 720)
@@ -39,7 +40,7 @@ def test_hardware_gives_the_size_and_rate_it_was_asked_for(oak: OakCamera) -> No
 
 
 @pytest.mark.hardware
-def test_hardware_stamps_lie_shortly_before_arrival(oak: OakCamera) -> None:
+def test_hardware_stamps_lie_shortly_before_arrival(oak: LiveCamera) -> None:
     frames, ages_ms = oak.frames(), list[float]()
     for frame in islice(frames, 60):
         ages_ms.append((time.monotonic_ns() - frame.stamp_ns) / 1e6)
@@ -49,7 +50,7 @@ def test_hardware_stamps_lie_shortly_before_arrival(oak: OakCamera) -> None:
 
 
 @pytest.mark.hardware
-def test_hardware_knows_its_lens(oak: OakCamera) -> None:
+def test_hardware_knows_its_lens(oak: LiveCamera) -> None:
     lens = oak.info.lens
     assert lens is not None
     hfov_deg = 2 * math.degrees(math.atan(lens.width / 2 / lens.fx))
@@ -59,9 +60,9 @@ def test_hardware_knows_its_lens(oak: OakCamera) -> None:
 
 
 @pytest.mark.hardware
-def test_hardware_lets_go_in_a_second_and_opens_again(oak: OakCamera) -> None:
+def test_hardware_lets_go_in_a_second_and_opens_again(oak: LiveCamera) -> None:
     begin = time.monotonic()
     oak.close()
     assert time.monotonic() - begin < 1
-    with closing(open_oak(SourceConfig(kind="oak", device=oak.info.id, open_timeout_s=PATIENT_S))) as again:
+    with closing(open_oak(OakSource(device=oak.info.id, open_timeout_s=PATIENT_S))) as again:
         assert len(list(islice(again.frames(), 3))) == 3

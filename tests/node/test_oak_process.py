@@ -35,7 +35,7 @@ FAILING_NODE = """
 from contextlib import closing
 import oak_pipelines as pipelines
 from gcd_node.errors import SourceLostError
-from gcd_node.sources.oak_camera import OakCamera
+from gcd_node.sources.oak_camera import open_pipeline
 
 def script(camera):
     camera.out.send(pipelines.picture(0))
@@ -43,7 +43,7 @@ def script(camera):
 
 for wrong in ({errors},):
     try:
-        with closing(OakCamera(pipelines.Scripted(script, guarded={guarded}), open_timeout_s=30)) as camera:
+        with closing(open_pipeline(pipelines.Scripted(script, guarded={guarded}), open_timeout_s=30)) as camera:
             list(camera.frames())
     except SourceLostError as error:
         print("lost:", error)
@@ -82,7 +82,7 @@ def ours():
 before = ours()
 import oak_pipelines as pipelines
 from contextlib import closing
-with closing(oak_camera.OakCamera(pipelines.Scripted(pipelines.steady()), open_timeout_s=30)) as camera:
+with closing(oak_camera.open_pipeline(pipelines.Scripted(pipelines.steady()), open_timeout_s=30)) as camera:
     next(camera.frames())
     assert ours() == before, (ours(), before)
     for number in (signal.SIGTERM, signal.SIGINT):

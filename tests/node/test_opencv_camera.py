@@ -10,18 +10,18 @@ import pytest
 from fake_camera import FakeVideoCapture
 from media import flat
 
-from gcd_node.config import SourceConfig
 from gcd_node.errors import SourceAbsentError, SourceError, SourceLostError
+from gcd_node.source_config import V4l2Source
 from gcd_node.sources import open_source, v4l2_device
-from gcd_node.sources.opencv_camera import OpenCvCamera, codec_name, sane_fps
-from gcd_node.sources.opencv_log import quiet_opencv
+from gcd_node.sources.live_camera import LiveCamera, sane_fps
+from gcd_node.sources.opencv_camera import codec_name, quiet_opencv
 from gcd_node.sources.v4l2_device import V4l2Request, list_v4l2, open_v4l2
 
 RED = flat(250, 10, 20)
 GUARD_S = 20.0
 
 
-def camera(fake: FakeVideoCapture, request: V4l2Request | None = None, open_timeout_s: float = GUARD_S) -> OpenCvCamera:
+def camera(fake: FakeVideoCapture, request: V4l2Request | None = None, open_timeout_s: float = GUARD_S) -> LiveCamera:
     """A Video4Linux source over a fake; /dev/null stands in for the device file."""
     return open_v4l2("/dev/null", request or V4l2Request(), open_timeout_s=open_timeout_s, open_capture=fake.open)
 
@@ -161,16 +161,16 @@ def test_an_absent_camera_is_told_with_those_there_are(tmp_path: Path, monkeypat
     (tmp_path / "names" / "video2" / "name").write_text("Front camera\n")
     assert list_v4l2() == [f"{tmp_path}/video2 (Front camera)", f"{tmp_path}/video10"]
     with pytest.raises(SourceAbsentError, match=r"no camera .*/video0; there is .*video2 \(Front camera\), .*video10"):
-        open_source(SourceConfig(kind="v4l2"))
+        open_source(V4l2Source())
     with pytest.raises(SourceError, match="video10 is no camera device"):
-        open_source(SourceConfig(kind="v4l2", device="10"))
+        open_source(V4l2Source(device="10"))
 
 
 @pytest.mark.hardware
 def test_a_real_camera_gives_a_second_of_pictures() -> None:
     if not Path("/dev/video0").exists():
         pytest.skip("needs a camera at /dev/video0")
-    source = open_source(SourceConfig(kind="v4l2"))
+    source = open_source(V4l2Source())
     frames = list(islice(source.frames(), 15))
     source.close()
     assert all(b.stamp_ns > a.stamp_ns for a, b in pairwise(frames))

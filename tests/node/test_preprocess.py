@@ -6,7 +6,7 @@ import pytest
 
 from gcd_model import Intrinsics, center_crop_box
 from gcd_node.errors import ConfigError
-from gcd_node.optics.preprocess import Fit, to_clip_tensor
+from gcd_node.preprocess import Fit, to_clip_tensor
 
 
 def noise(width: int, height: int) -> np.ndarray:

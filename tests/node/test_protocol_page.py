@@ -6,9 +6,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from gcd_node.control.message import Code, decode_reply, parse_command, parse_request
+from gcd_client.control import Code, decode_reply
+from gcd_node.control.message import parse_command, parse_request
 from gcd_node.control.verbs import VERBS
-from gcd_node.health.monitor import Health
+from gcd_node.health import Health
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "protocol.md").read_text()
@@ -74,7 +75,7 @@ def test_every_row_of_the_failure_table_is_there_once() -> None:
 
 def test_every_key_of_a_status_is_there() -> None:
     health = Health()
-    health.model_load(gpu_mem_mb=1.0)
+    health.measure("gpu_mem_mb", 1.0)
     health.stage("render", 0.1)
     for i in range(3):
         health.frame(i * 100_000_000, i * 100_000_000)

@@ -1,6 +1,5 @@
 """The publisher, read by a real second process over ipc and tcp, and by plain ZeroMQ sockets."""
 
-import os
 import socket
 import stat
 import subprocess
@@ -14,11 +13,12 @@ import pytest
 import zmq
 from wire_messages import OTHER_BOOT, end, lines_of, origin, pixels, start_reader, window
 
-from gcd_node.envelope import NoteMessage, decode, topic_key
-from gcd_node.errors import ConfigError, EndpointError, MessageError, NodeError
-from gcd_node.publisher import Publisher, PublisherOptions
-from gcd_node.subscriber import NoteSubscriber, ViewSubscriber
-from gcd_node.wire.endpoints import runtime_folder
+from gcd_client.endpoints import SetupError
+from gcd_client.protocol import MessageError, StatusMessage, decode, topic_key
+from gcd_client.subscriber import StatusSubscriber, ViewSubscriber
+from gcd_node.errors import ConfigError, EndpointError, NodeError
+from gcd_node.publisher import Publisher
+from gcd_node.sockets import PublisherOptions
 
 pytestmark = pytest.mark.timeout(30)
 
@@ -133,7 +133,7 @@ def test_a_reader_survives_a_restart_and_is_told_once(tmp_path) -> None:
                 received = [views.receive(5000) for _ in range(2)]
             assert [view.restarted for view in received] == wanted
             assert [view.message.sequence for view in received] == [0, 1]
-        assert views.stats.restarts == 1
+        assert views.restarts == 1
 
 
 # Sockets as the protocol has them
@@ -186,17 +186,17 @@ def test_who_comes_late_gets_the_last_note_of_a_topic(tmp_path, topic) -> None:
     with Publisher(options(tmp_path, status=True)) as publisher:
         for level in range(3):
             publisher.note(topic, origin(), {"level": level})
-        with NoteSubscriber(publisher.status_endpoint, (topic,)) as first:
+        with StatusSubscriber(publisher.status_endpoint, (topic,)) as first:
             note = until_level(first, 2)
             assert note.sequence == 2
-            with NoteSubscriber(publisher.status_endpoint, (topic,)) as second:
+            with StatusSubscriber(publisher.status_endpoint, (topic,)) as second:
                 assert until_level(second, 2).sequence == 2
             assert first.receive(50) is None  # the repeat for the second is no news to the first
             publisher.note(topic, origin(), {"level": 3})
             assert until_level(first, 3).sequence == 3
 
 
-def until_level(notes: NoteSubscriber, level: int) -> NoteMessage:
+def until_level(notes: StatusSubscriber, level: int) -> StatusMessage:
     while (note := notes.receive(5000)) is not None:
         if note.fields["level"] == level:
             return note
@@ -258,7 +258,7 @@ def test_a_slow_reader_cannot_stretch_the_end_of_a_node_that_was_told_to_stop(tm
     monkeypatch.setattr(publisher._data, "send", room_now_and_then)
     for _ in range(60):
         publisher.send(window())
-    publisher.hurry()
+    publisher.stop_waiting()
     publisher.close()
     assert len(tries) < 60  # all 60 messages would take two tries each
 
@@ -268,7 +268,7 @@ def test_a_full_queue_loses_no_end_of_a_node_that_was_told_to_stop(tmp_path, mon
     ready, left = threading.Event(), []
     monkeypatch.setattr(publisher._data, "send", lambda parcel: ready.is_set() and not left.append(parcel))
     publisher.send(window())
-    publisher.hurry()
+    publisher.stop_waiting()
     for view_id in ("left", "right", "top"):
         publisher.end(end(view_id=view_id))
     ready.set()
@@ -276,21 +276,13 @@ def test_a_full_queue_loses_no_end_of_a_node_that_was_told_to_stop(tmp_path, mon
     assert [parcel.follow_s is not None for parcel in left] == [False, True, True, True]
 
 
-def test_closing_twice_is_harmless_and_sending_afterwards_is_an_error(tmp_path) -> None:
-    publisher = Publisher(options(tmp_path))
-    publisher.close()
-    publisher.close()
-    assert not (tmp_path / "data").exists()
-    with pytest.raises(NodeError, match="closed"):
-        publisher.send(window())
-
-
 def test_what_stops_the_thread_reaches_the_caller(tmp_path, monkeypatch) -> None:
     publisher = Publisher(options(tmp_path))
     monkeypatch.setattr(publisher._data, "serve", lambda: 1 / 0)
+    publisher._wake()
     publisher._thread.join(5)
     for call in (publisher.check, lambda: publisher.send(window()), publisher.close):
-        with pytest.raises(NodeError, match="thread stopped: division by zero"):
+        with pytest.raises(NodeError, match="thread died: division by zero"):
             call()
 
 
@@ -351,11 +343,6 @@ def test_a_file_that_is_no_socket_is_left_alone(tmp_path) -> None:
     assert (tmp_path / "data").read_text() == "precious"
 
 
-def test_a_missing_folder_is_named(tmp_path) -> None:
-    with pytest.raises(EndpointError, match="absent, which does not exist"):
-        Publisher(options(tmp_path / "absent"))
-
-
 @pytest.mark.parametrize("endpoint", ["tcp://0.0.0.0:5580", "tcp://*:5580", "tcp://192.168.1.4:1", "tcp://robot:1"])
 def test_tcp_beyond_this_machine_is_refused(endpoint) -> None:
     with pytest.raises(ConfigError, match="CURVE keys and a list of allowed clients") as caught:
@@ -363,14 +350,8 @@ def test_tcp_beyond_this_machine_is_refused(endpoint) -> None:
     assert caught.value.exit_code == 78
 
 
-@pytest.mark.parametrize("endpoint", ["", "data", "udp://1.2.3.4:5", "ipc://", "tcp://127.0.0.1", "inproc://x"])
-def test_what_is_no_endpoint_is_refused(endpoint) -> None:
-    with pytest.raises(ConfigError, match="an endpoint is"):
-        Publisher(PublisherOptions(data=endpoint, status=None))
-
-
 def test_a_failed_status_endpoint_frees_the_data_endpoint(tmp_path) -> None:
-    with pytest.raises(ConfigError):
+    with pytest.raises(SetupError):
         Publisher(PublisherOptions(data=f"ipc://{tmp_path}/data", status="nonsense"))
     with Publisher(options(tmp_path)) as publisher:
         assert publisher.endpoint == f"ipc://{tmp_path}/data"
@@ -385,16 +366,6 @@ def test_the_runtime_folder_is_private_and_shared_by_both_sides(tmp_path, monkey
         with ViewSubscriber("ipc", "top", conflate=False) as views:
             publisher.send(window(7))
             assert views.receive(5000).header.window_id == 7
-
-
-def test_the_runtime_folder_is_looked_up_in_order(monkeypatch) -> None:
-    monkeypatch.setenv("RUNTIME_DIRECTORY", "/run/gcd:/run/other")
-    monkeypatch.setenv("XDG_RUNTIME_DIR", "/run/user/1")
-    assert runtime_folder() == Path("/run/gcd")
-    monkeypatch.delenv("RUNTIME_DIRECTORY")
-    assert runtime_folder() == Path("/run/user/1/gcd")
-    monkeypatch.delenv("XDG_RUNTIME_DIR")
-    assert runtime_folder() == Path(f"/tmp/gcd-{os.getuid()}")
 
 
 def test_a_runtime_folder_anyone_may_write_is_refused(tmp_path, monkeypatch) -> None:

@@ -13,13 +13,12 @@ from fakes import HEIGHT, WIDTH, traits
 from numpy.typing import NDArray
 
 from gcd_model import Intrinsics
+from gcd_node.calibration import LensModel
 from gcd_node.config import NodeConfig, parse_config
 from gcd_node.errors import ConfigError
 from gcd_node.frame import Image, SourceInfo
-from gcd_node.optics.calibration import LensModel
-from gcd_node.optics.preprocess import Fit
-from gcd_node.optics.rectify import Rectifier, project, widest_camera
-from gcd_node.rendering.preparation import fit_of, prepare_run
+from gcd_node.preprocess import Fit, Rectifier, project, widest_camera
+from gcd_node.stream_context import fit_of, prepare_run
 
 BARREL = LensModel(
     width=1280,
@@ -379,3 +378,15 @@ def test_without_calibration_nothing_changes() -> None:
     fit = fit_of(config('resize = "area"'), traits(), info())
     assert isinstance(fit, Fit)
     assert fit.resize == "area"
+
+
+@ALL_LENSES
+def test_depth_goes_where_its_picture_goes_and_nothing_between_is_made_up(lens: LensModel) -> None:
+    near = np.add.outer(np.arange(lens.height) // 40, np.arange(lens.width) // 40) % 2 == 0
+    fit = Rectifier(lens, width=WIDTH, height=HEIGHT, hfov_deg=None)
+    image = fit.image(np.repeat(np.where(near, 255, 0).astype(np.uint8)[..., None], 3, axis=2))[..., 0]
+    depth = fit.depth(np.where(near, 2.0, 7.0).astype(np.float32))
+    assert set(np.unique(depth)) <= {0.0, 2.0, 7.0}
+    clear = (image < 5) | (image > 250)
+    assert clear.mean() > 0.2
+    assert np.mean(depth[clear] == np.where(image[clear] > 128, 2.0, 7.0)) > 0.995

@@ -8,7 +8,7 @@ import sys
 import time
 from array import array
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -17,13 +17,14 @@ import cv2
 import numpy as np
 import pytest
 import zmq
+from msgspec.structs import replace
 from wire_messages import OTHER_BOOT, depth, origin, pixels, visibility, window
 
-import gcd_node
-from gcd_node.envelope import Message, NoteMessage, ViewMessage, encode, inverse_depth
-from gcd_node.errors import AuthError, ConfigError
-from gcd_node.subscriber import ReceivedView
-from gcd_node.wire.jpeg import encode_frames
+import gcd_client
+from gcd_client.endpoints import AuthError, SetupError
+from gcd_client.images import encode_jpegs, inverse_depth
+from gcd_client.protocol import Message, StatusMessage, ViewMessage, encode
+from gcd_client.subscriber import ReceivedView
 
 ROS2 = Path(__file__).parents[2] / "launch" / "ros2"
 sys.path.insert(0, str(ROS2))
@@ -45,7 +46,7 @@ def with_header(message: ViewMessage, **changes: Any) -> ViewMessage:
 
 
 def jpeg_window(window_id: int = 0) -> ViewMessage:
-    payload, offsets = encode_frames(pixels(window_id, height=16, width=24))
+    payload, offsets = encode_jpegs(pixels(window_id, height=16, width=24))
     made = window(window_id)
     header = replace(made.header, encoding="jpeg", offsets=offsets, shape=(2, 16, 24, 3))
     return ViewMessage(topic=made.topic, header=header, payload=payload)
@@ -107,10 +108,11 @@ def test_a_raw_picture_is_coded_with_red_where_it_was() -> None:
 
 
 def test_without_cv2_a_raw_picture_is_refused_and_the_remedy_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    coded = received(jpeg_window())
     monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(ConfigError, match='encoding = "jpeg"'):
+    with pytest.raises(SetupError, match="cv2"):
         ros.to_compressed_image(received(window()), 1)
-    assert ros.to_compressed_image(received(jpeg_window()), 1).format == "jpeg"
+    assert ros.to_compressed_image(coded, 1).format == "jpeg"
 
 
 def test_the_newest_frame_at_the_goal_is_chosen() -> None:
@@ -162,8 +164,8 @@ def test_scene_units_become_metres_only_if_somebody_says_how_long_they_are() -> 
     assert ros.to_transform(replace(posed("m"), source_from_view=None), 1, Settings()) is None
 
 
-def status(**told: object) -> NoteMessage:
-    return NoteMessage(topic="status", header=origin(), fields={"state": "active", "level": 0, "reasons": [], **told})
+def status(**told: object) -> StatusMessage:
+    return StatusMessage(topic="status", header=origin(), fields={"state": "active", "level": 0, "reasons": [], **told})
 
 
 def test_a_status_becomes_a_diagnostic_with_every_field() -> None:
@@ -204,7 +206,7 @@ class Sender:
         until(lambda: self.sockets[name].poll(10) and self.sockets[name].recv()[:1] == b"\1", poll)
 
     def send(self, message: Message, sequence: int = 0) -> None:
-        name = "status" if isinstance(message, NoteMessage) else "data"
+        name = "status" if isinstance(message, StatusMessage) else "data"
         self.sockets[name].send(encode(replace(message, sequence=sequence)))
 
 
@@ -294,9 +296,10 @@ def test_a_restarted_node_gets_a_new_reader(bench: Bench) -> None:
 def test_a_view_that_arrives_nowhere_and_one_that_cannot_be_coded_are_trouble_in_the_diagnostics(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    in_transit = with_header(jpeg_window(), frame_role=("in_transit",) * 2)
     monkeypatch.setitem(sys.modules, "cv2", None)
     for sequence, message, said in (
-        (0, with_header(jpeg_window(), frame_role=("in_transit",) * 2), "at its goal"),
+        (0, in_transit, "at its goal"),
         (1, window(1), "cv2"),
     ):
         bench.sender.send(message, sequence)
@@ -322,7 +325,7 @@ def test_a_node_that_does_not_let_us_in_is_asked_again_later(bench: Bench, monke
         raise AuthError("no key")
 
     bench.feed._reader.close()
-    bench.feed._reader = SimpleNamespace(receive=refuse, close=lambda: None)
+    bench.feed._reader = SimpleNamespace(receive=refuse, close=lambda: None, stale=0, damaged=0)
     bench.bridge.poll()
     assert bench.feed.counts.trouble == "no key"
     assert bench.feed._reader is None
@@ -555,7 +558,7 @@ def parts_of(value: Any) -> list[Any]:
 
 # What it needs.
 
-BLOCKED = {"torch", "cv2", "kornia", "msgspec", "rich", "typer", "gcd_model", "rclpy"}
+BLOCKED = {"torch", "cv2", "kornia", "rich", "typer", "gcd_model", "gcd_node", "rclpy"}
 LIGHT = f"""
 import sys
 class Blocker:
@@ -568,8 +571,8 @@ print(gcd_bridge.Settings().views)
 """
 
 
-def test_it_imports_with_numpy_and_zeromq_alone_and_ros_only_when_it_runs() -> None:
-    environment = os.environ | {"PYTHONPATH": f"{Path(gcd_node.__file__).parent.parent}:{ROS2}"}
+def test_it_imports_with_the_client_alone_and_ros_only_when_it_runs() -> None:
+    environment = os.environ | {"PYTHONPATH": f"{Path(gcd_client.__file__).parent.parent}:{ROS2}"}
     done = subprocess.run(
         [sys.executable, "-c", LIGHT], env=environment, capture_output=True, text=True, timeout=60, check=False
     )

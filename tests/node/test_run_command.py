@@ -1,5 +1,6 @@
 """How `gcd-node run` behaves beside others on its machine, and how the process ends."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -8,7 +9,7 @@ import cv2
 import pytest
 import torch
 
-from gcd_node.cli.node import be_considerate
+from gcd_node.cli.node import apply_scheduling
 from gcd_node.config import LifeConfig, ModelSection
 from gcd_node.session import load_model, model_threads
 
@@ -41,11 +42,13 @@ def test_a_node_is_as_nice_as_it_is_told_and_its_threads_take_turns_quickly(monk
     monkeypatch.setattr(os, "nice", nice.append)
     before = sys.getswitchinterval()
     try:
-        be_considerate(LifeConfig(nice=7))
+        apply_scheduling(LifeConfig(nice=7))
         assert nice == [7]
         assert sys.getswitchinterval() == pytest.approx(0.001)
+        assert gc.get_freeze_count() > 0
     finally:
         sys.setswitchinterval(before)
+        gc.unfreeze()
 
 
 def test_a_thread_that_hangs_changes_neither_the_exit_code_nor_what_was_said() -> None:

@@ -10,19 +10,38 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-from fakes import FakeSource, traits, warping_traits
+from fakes import FakeSource, painting_traits, traits
 from rich.console import Console
 from runs import FRAMES, WINDOWS, LevelModel, copied, made_run, nan_model
 
 from gcd_model import View
 from gcd_node.cli.main import run_app
 from gcd_node.errors import DamagedRunError, UsageError
-from gcd_node.replay.diff_pictures import WORST, gain_for, write_report
-from gcd_node.replay.diff_report import describe, divergence, facts_table, report_text, to_plain, verdict, views_table
-from gcd_node.replay.manifest import Manifest, SizeEntry, WindowEntry
-from gcd_node.replay.pixel_file import PixelWriter, pixel_digest
-from gcd_node.replay.run_diff import Missing, RunComparison, Tolerance, ViewComparison, compare, psnr_db
-from gcd_node.replay.run_folder import MANIFEST, RunFolder, map_path, open_run, pictures_path, write_manifest
+from gcd_node.replay.compare import Missing, RunComparison, Tolerance, ViewComparison, compare, psnr_db
+from gcd_node.replay.diff_report import (
+    WORST,
+    describe,
+    divergence,
+    gain_for,
+    report_text,
+    tables,
+    to_plain,
+    verdict,
+    write_report,
+)
+from gcd_node.replay.run import (
+    MANIFEST,
+    KeptKind,
+    Manifest,
+    PixelWriter,
+    RunFolder,
+    SizeEntry,
+    WindowEntry,
+    open_run,
+    pixel_digest,
+    pixels_path,
+    write_manifest,
+)
 
 pytestmark = pytest.mark.timeout(60)
 EXACT = Tolerance()
@@ -38,7 +57,7 @@ def lowered(folder: Path, lower: Mapping[tuple[int, int], int]) -> RunFolder:
 
 
 def classed(folder: Path, columns: Mapping[int, int]) -> RunFolder:
-    return made_run(folder, LevelModel(warping_traits(), classes=columns), FakeSource(42, fps=10.0))
+    return made_run(folder, LevelModel(painting_traits(), classes=columns), FakeSource(42, fps=10.0))
 
 
 def restated(run: RunFolder, folder: Path, **changes: object) -> RunFolder:
@@ -49,20 +68,19 @@ def restated(run: RunFolder, folder: Path, **changes: object) -> RunFolder:
     return open_run(folder)
 
 
-def resized(run: RunFolder, folder: Path, *, honest: bool, kind: str = "pictures") -> RunFolder:
+def resized(run: RunFolder, folder: Path, *, honest: bool, kind: KeptKind = "win") -> RunFolder:
     """A copy whose pictures or class maps are black, with true digests. honest: the manifest states their size."""
     frames, height, width = run.manifest.size.frames, 16, 24
     copied(run, folder)
-    grey = kind == "classes"
-    pixels = np.zeros((frames, height, width) if grey else (frames, height, width, 3), np.uint8)
-    path = map_path(folder, "main", "cls") if grey else pictures_path(folder, "main")
+    pixels = np.zeros((frames, height, width, 3) if kind == "win" else (frames, height, width), np.uint8)
+    path = pixels_path(folder, "main", kind)
     path.unlink()
     writer = PixelWriter(path, height=height, width=width, fps=10.0)
-    digest = {"classes_sha256" if grey else "sha256": pixel_digest(pixels)}
     windows: list[WindowEntry] = []
     for window in run.manifest.windows:
         writer.write(pixels)
-        view = msgspec.structs.replace(window.views["main"], **digest)
+        view = window.views["main"]
+        view = msgspec.structs.replace(view, sha256=view.sha256 | {kind: pixel_digest(pixels)})
         windows.append(msgspec.structs.replace(window, views={"main": view}))
     writer.close()
     said = SizeEntry(frames=frames, height=height, width=width) if honest else run.manifest.size
@@ -130,7 +148,7 @@ def test_class_pixels_have_a_bound_of_their_own(tmp_path: Path) -> None:
     view = compare(a, b).views[1]
     assert view.distance is not None
     share = 24 / 96 / FRAMES  # a quarter of the columns, in one frame
-    assert view.distance.class_share == pytest.approx(share)
+    assert view.distance.shares == {"cls": pytest.approx(share)}
     assert view.distance.worst_class_frame == 0
     assert view.distance.largest == 0
     assert not view.within(Tolerance(min_psnr_db=10.0))
@@ -163,11 +181,11 @@ def test_depth_and_visibility_count_like_class_pixels(tmp_path: Path) -> None:
     assert near.within(Tolerance(max_class_share=0.001))
     far = compare(usual, made_run(tmp_path / "far", MovedMaps(1.05, 24))).views[0]
     assert far.distance is not None
-    shares = dict(far.distance.shares)
+    shares = far.distance.shares
     assert shares["depth"] == pytest.approx(6 / 7, abs=0.01)  # the others have none
     assert shares["vis"] == pytest.approx(24 / 96 * 2 / 3, abs=0.01)
     assert not far.within(Tolerance(max_class_share=0.8))
-    assert "of the depth pixels" in describe(far)
+    assert "of the depth" in describe(far)
     plain = compare(usual, made_run(tmp_path / "plain")).views[0]
     assert plain.facts == ("visibility", "depth")
 
@@ -234,8 +252,8 @@ def test_pictures_of_another_size_cannot_be_near(golden: RunFolder, tmp_path: Pa
     assert len(comparison.failures(Tolerance(min_psnr_db=1.0))) == WINDOWS
 
 
-@pytest.mark.parametrize("kind", ["pictures", "classes"])
-def test_a_manifest_that_lies_about_the_size_is_damage(kind: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["win", "cls"])
+def test_a_manifest_that_lies_about_the_size_is_damage(kind: KeptKind, tmp_path: Path) -> None:
     golden = classed(tmp_path / "golden", {})
     with pytest.raises(DamagedRunError, match=r"manifest\.json says"):
         compare(golden, resized(golden, tmp_path / "run", honest=False, kind=kind))
@@ -251,25 +269,24 @@ def test_bounds_that_make_no_sense_are_refused(bounds: dict[str, float]) -> None
 
 
 def test_what_the_runs_were_made_from_is_named_first(golden: RunFolder, tmp_path: Path) -> None:
-    other = made_run(tmp_path / "run", changes=["model.steps=3", "source.seed=7"])
-    weights = msgspec.structs.replace(other.manifest.weights, sha256_12="f" * 12)
-    versions = {**other.manifest.versions, "torch": "0.1"}
-    other = restated(other, tmp_path / "restated", weights=weights, versions=versions)
+    other = made_run(tmp_path / "run", changes=["model.steps=3", "source.resize=area"])
+    made_from = other.manifest.made_from | {"weights sha256_12": "f" * 12, "version torch": "0.1"}
+    other = restated(other, tmp_path / "restated", made_from=made_from)
     comparison = compare(golden, other)
     assert [(fact.name, fact.a, fact.b) for fact in comparison.facts] == [
-        ("config source.seed", "0", "7"),
+        ("config source.resize", "released", "area"),
         ("config model.steps", "1", "3"),
         ("weights sha256_12", "0" * 12, "f" * 12),
-        ("version torch", golden.manifest.versions["torch"], "0.1"),
+        ("version torch", golden.manifest.made_from["version torch"], "0.1"),
     ]
     text = report_text(comparison, EXACT)
     assert text.index("model.steps: 1, 3") < text.index("first divergence: window 0, view main")
 
 
 def test_what_a_strange_manifest_says_cannot_command_a_terminal(golden: RunFolder, tmp_path: Path) -> None:
-    weights = msgspec.structs.replace(golden.manifest.weights, name="\x1b]0;mine\x07")
-    comparison = compare(golden, restated(golden, tmp_path / "run", weights=weights))
-    assert [(fact.name, fact.b) for fact in comparison.facts] == [("weights name", "?]0;mine?")]
+    made_from = golden.manifest.made_from | {"weights name": "\x1b]0;mine\x07"}
+    comparison = compare(golden, restated(golden, tmp_path / "run", made_from=made_from))
+    assert [(fact.name, fact.b) for fact in comparison.facts] == [("weights name", "\\x1b]0;mine\\x07")]
 
 
 def test_settings_a_replay_does_not_use_are_no_difference(golden: RunFolder, tmp_path: Path) -> None:
@@ -308,11 +325,10 @@ def test_the_verdict_has_three_words(golden: RunFolder, tmp_path: Path) -> None:
 def test_tables_show_every_view(golden: RunFolder, tmp_path: Path) -> None:
     other = made_run(tmp_path / "run", source=FakeSource(56), changes=["model.steps=2"])
     comparison, console = compare(golden, other), Console(record=True, width=120)
-    console.print(facts_table(comparison))
-    console.print(views_table(comparison, EXACT))
+    console.print(*tables(comparison, EXACT))
     shown = console.export_text()
     assert "config model.steps" in shown
-    assert shown.count("48.13 dB") == WINDOWS
+    assert shown.count("up to 1 levels") == WINDOWS
     assert "only in B" in shown
 
 
@@ -320,9 +336,10 @@ def test_json_says_the_same_and_knows_no_infinity(golden: RunFolder, tmp_path: P
     comparison = compare(golden, lowered(tmp_path / "run", {(1, 4): 5}))
     plain = json.loads(msgspec.json.encode(to_plain(comparison, EXACT)))
     assert (plain["passed"], plain["identical"]) == (False, False)
-    assert plain["first_divergence"] == {"window_id": 1, "view": "main"}
-    assert [view["psnr_db"] is None for view in plain["views"]] == [True, False, True]
-    assert plain["views"][1]["worst_frame"] == 4
+    assert plain["first_divergence"] == {"window_id": 1, "view_id": "main"}
+    distances = [view["distance"] for view in plain["views"]]
+    assert [distance["psnr_db"] is None for distance in distances] == [True, False, True]
+    assert distances[1]["worst_frame"] == 4
 
 
 # What is shown.
@@ -383,5 +400,5 @@ def test_exit_codes_tell_same_different_damaged_and_missing(
     assert run_app(["diff", str(tmp_path / "nowhere"), b]) == 66
     capsys.readouterr()
     assert run_app(["diff", a, b, "--json"]) == 1
-    assert json.loads(capsys.readouterr().out)["views"][1]["largest"] == 5
+    assert json.loads(capsys.readouterr().out)["views"][1]["distance"]["largest"] == 5
     assert (tmp_path / "out" / "window-000001-view-main.png").stat().st_size > 1000

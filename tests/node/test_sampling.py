@@ -9,7 +9,7 @@ from fakes import traits
 from gcd_model import QUALITIES, SOLVERS, RenderOptions, Sampler, sampler_of
 from gcd_model.config import SamplingConfig
 from gcd_node.config import ModelSection
-from gcd_node.rendering.sampling import drawing_options, sampler_in_use
+from gcd_node.model import drawing_options, sampler_in_use
 
 MANY_STEPS = replace(traits(), config=msgspec.structs.replace(traits().config, sampling=SamplingConfig()))
 

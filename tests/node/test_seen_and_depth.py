@@ -6,12 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fakes import Box, FakeSource, FakeSynthesizer, fake_config, fake_maps, made_node, traits, warping_traits
+from fakes import Box, FakeSource, FakeSynthesizer, fake_config, fake_maps, made_node, painting_traits, traits
 
+from gcd_client.images import depth_m, images, inverse_depth
+from gcd_client.subscriber import ReceivedView, ViewSubscriber
 from gcd_model import View
-from gcd_node.envelope import depth_m, images, inverse_depth
-from gcd_node.publisher import Publisher, PublisherOptions
-from gcd_node.subscriber import ReceivedView, ViewSubscriber
+from gcd_node.publisher import Publisher
+from gcd_node.sockets import PublisherOptions
 
 pytestmark = pytest.mark.timeout(30)
 HELD = ("visibility", "inverse_depth")
@@ -20,7 +21,7 @@ HELD = ("visibility", "inverse_depth")
 def published(*holds: str, frames: int = 28, **options: int | str) -> Box:
     box = Box()
     made_node(
-        fake_config(**options), FakeSynthesizer(warping_traits(), holds=holds), FakeSource(frames, fps=10.0), box
+        fake_config(**options), FakeSynthesizer(painting_traits(), holds=holds), FakeSource(frames, fps=10.0), box
     ).run()
     return box
 

@@ -12,10 +12,10 @@ from fakes import FakeSource, FakeSynthesizer, traits
 from rig import Rig
 from torch import nn
 
+from gcd_client.control import Code
 from gcd_model import Augmentation, Cancelled, Clip, RenderOptions, SourceFeatures, Trajectory, View, ViewSynthesizer
 from gcd_node.config import ModelSection
-from gcd_node.control.message import Code
-from gcd_node.rendering.interruption import interruptible
+from gcd_node.model import interruptible
 
 LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
 WAITING = "life = {autostart = false}"

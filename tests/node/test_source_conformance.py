@@ -13,21 +13,35 @@ from itertools import count, islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
+import msgspec
 import numpy as np
 import pytest
 from fake_camera import FakeVideoCapture
 from media import HEIGHT, WIDTH, flat, write_pictures, write_video
 from rtsp_server import serving, write_transport_stream
 
-from gcd_node.config import LIVE_KINDS, SourceConfig, SourceKind
+from gcd_client import FramePusher
 from gcd_node.errors import SourceAbsentError, SourceError
 from gcd_node.frame import Frame, FrameSource, Image
-from gcd_node.sources import SyntheticDrive, open_source
+from gcd_node.source_config import (
+    LIVE_KINDS,
+    FileSource,
+    FolderSource,
+    McapSource,
+    OakSource,
+    PushSource,
+    RtspSource,
+    SourceConfig,
+    SourceKind,
+    SyntheticSource,
+    V4l2Source,
+)
+from gcd_node.sources import MovingPattern, open_source
 from gcd_node.sources.v4l2_device import V4l2Request, open_v4l2
 
 if TYPE_CHECKING:
     from gcd_node.sources.oak_camera import PipelineFactory
-    from gcd_node.sources.oak_loss import Guard
+    from gcd_node.sources.oak_device import Guard
 
 COUNT = 12
 COLOUR = (200, 60, 20)
@@ -52,10 +66,10 @@ def is_red(image: Image) -> None:
     assert np.abs(image[8:-8, 8:-8].astype(int) - COLOUR).max() <= 8
 
 
-def is_street(image: Image) -> None:
-    """The sky is blue, not orange."""
-    red, _, blue = image[0, WIDTH // 2 - 4 : WIDTH // 2 + 4].astype(int).mean(axis=0)
-    assert blue > red + 40
+def is_striped(image: Image) -> None:
+    """Red stripes, not blue ones, are the brightest in red."""
+    red, green, blue = image[-1, np.argmax(image[-1, :, 0].astype(int) - image[-1, :, 2])].astype(int)
+    assert red > max(green, blue) + 100
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +98,8 @@ def closing(source: FrameSource, hush: Callable[[], None] = nothing) -> Generato
 
 def play(kind: SourceKind, path: Path, slow: bool, fps: float | None = None) -> AbstractContextManager[Opened]:
     pace = "realtime" if slow else "lockstep"
-    return closing(open_source(SourceConfig(kind=kind, path=str(path), pace=pace, fps=fps)))
+    section = {"kind": kind, "path": str(path), "pace": pace} | ({} if fps is None else {"fps": fps})
+    return closing(open_source(msgspec.convert(section, SourceConfig)))
 
 
 def open_file(folder: Path, slow: bool) -> AbstractContextManager[Opened]:
@@ -99,7 +114,7 @@ def open_folder(folder: Path, slow: bool) -> AbstractContextManager[Opened]:
 
 def open_synthetic(folder: Path, slow: bool) -> AbstractContextManager[Opened]:
     pace, fps = ("realtime", 0.5) if slow else ("lockstep", 25.0)
-    return closing(SyntheticDrive(width=WIDTH, height=HEIGHT, fps=fps, frames=COUNT, pace=pace))
+    return closing(MovingPattern(size=(WIDTH, HEIGHT), fps=fps, frames=COUNT, pace=pace))
 
 
 @contextmanager
@@ -114,7 +129,7 @@ def open_v4l2_camera(folder: Path, slow: bool) -> Generator[Opened]:
 @contextmanager
 def open_rtsp(folder: Path, slow: bool) -> Generator[Opened]:
     with serving(write_transport_stream(folder / "live.ts", [RED] * 600), burst=40) as server:
-        source = open_source(SourceConfig(kind="rtsp", url=server.url, open_timeout_s=OPEN_S))
+        source = open_source(RtspSource(url=server.url, open_timeout_s=OPEN_S))
         with closing(source, server.stall) as opened:
             yield opened
 
@@ -122,11 +137,11 @@ def open_rtsp(folder: Path, slow: bool) -> Generator[Opened]:
 @contextmanager
 def open_oak(folder: Path, slow: bool) -> Generator[Opened]:
     """DepthAI on this host alone: a scripted node stands in for the camera."""
-    from gcd_node.sources.oak_camera import OakCamera
+    from gcd_node.sources.oak_camera import open_pipeline
 
     awake = threading.Event()
     awake.set()
-    with closing(OakCamera(scripted_pipeline(awake), open_timeout_s=OPEN_S), awake.clear) as opened:
+    with closing(open_pipeline(scripted_pipeline(awake), open_timeout_s=OPEN_S), awake.clear) as opened:
         yield opened
 
 
@@ -153,6 +168,31 @@ def scripted_pipeline(awake: threading.Event) -> "PipelineFactory":
     return build
 
 
+@contextmanager
+def open_push(folder: Path, slow: bool) -> Generator[Opened]:
+    """Somebody pushes on an even grid, before and after the node listens."""
+    endpoint, done, awake = f"ipc://{folder}/frames", threading.Event(), threading.Event()
+    awake.set()
+
+    def push() -> None:
+        with FramePusher(endpoint) as pusher:
+            start_ns = time.time_ns()
+            for i in count():
+                stamp_ns = start_ns + i * 40_000_000
+                if done.wait(max(0.0, (stamp_ns - time.time_ns()) / 1e9)):
+                    return
+                if awake.is_set():
+                    pusher.push(RED, stamp_ns)
+
+    pushing = threading.Thread(target=push, daemon=True)
+    pushing.start()
+    source = open_source(PushSource(endpoint=endpoint, open_timeout_s=OPEN_S))
+    with closing(source, awake.clear) as opened:
+        yield opened
+    done.set()
+    pushing.join(GUARD_S)
+
+
 def open_mcap(folder: Path, slow: bool) -> AbstractContextManager[Opened]:
     """A ROS 2 log, written by the reference library."""
     from robot_logs import START_NS, TOPIC, compressed, ros_log
@@ -166,33 +206,34 @@ def open_mcap(folder: Path, slow: bool) -> AbstractContextManager[Opened]:
 
 
 KINDS: dict[SourceKind, Kind] = {
-    "file": Kind(open=open_file, missing=lambda folder: SourceConfig(path=str(folder / "none.mp4"))),
-    "folder": Kind(
-        open=open_folder, missing=lambda folder: SourceConfig(kind="folder", path=str(folder / "none"), fps=5.0)
-    ),
-    "synthetic": Kind(
-        open=open_synthetic, missing=lambda folder: SourceConfig(kind="synthetic", fps=5000.0), check=is_street
-    ),
+    "file": Kind(open=open_file, missing=lambda folder: FileSource(path=str(folder / "none.mp4"))),
+    "folder": Kind(open=open_folder, missing=lambda folder: FolderSource(path=str(folder / "none"), fps=5.0)),
+    "synthetic": Kind(open=open_synthetic, missing=lambda folder: SyntheticSource(fps=5000.0), check=is_striped),
     "mcap": Kind(
         open=open_mcap,
-        missing=lambda folder: SourceConfig(kind="mcap", path=str(folder / "none.mcap")),
+        missing=lambda folder: McapSource(path=str(folder / "none.mcap")),
         needs=("mcap", "mcap_ros2", "mcap_protobuf", "foxglove_schemas_protobuf"),
     ),
     "v4l2": Kind(
         open=open_v4l2_camera,
-        missing=lambda folder: SourceConfig(kind="v4l2", device=str(folder / "video7")),
+        missing=lambda folder: V4l2Source(device=str(folder / "video7")),
         error=SourceAbsentError,
     ),
     "rtsp": Kind(
         open=open_rtsp,
-        missing=lambda folder: SourceConfig(kind="rtsp", url="rtsp://127.0.0.1:1/live"),
+        missing=lambda folder: RtspSource(url="rtsp://127.0.0.1:1/live"),
         error=SourceAbsentError,
     ),
     "oak": Kind(
         open=open_oak,
-        missing=lambda folder: SourceConfig(kind="oak", device="14442C10NOSUCHDEVICE"),
+        missing=lambda folder: OakSource(device="14442C10NOSUCHDEVICE"),
         error=SourceAbsentError,
         needs=("depthai",),
+    ),
+    "push": Kind(
+        open=open_push,
+        missing=lambda folder: PushSource(endpoint=f"ipc://{folder}/frames", open_timeout_s=0.3),
+        error=SourceAbsentError,
     ),
 }
 LIVE: list[SourceKind] = [kind for kind in KINDS if kind in LIVE_KINDS]

@@ -1,17 +1,17 @@
 """Where the source camera stands: on a sphere or on its vehicle, and which model takes which."""
 
-import logging
 from pathlib import Path
 
 import numpy as np
 import pytest
-from fakes import WIDTH, Box, FakeSource, FakeSynthesizer, made_node, orbiting_traits, traits, warping_traits
+from fakes import WIDTH, Box, FakeSource, FakeSynthesizer, live_traits, made_node, traits
 
-from gcd_model import CameraMount, OptionError, Traits, load_synthesizer
-from gcd_node.config import NodeConfig, SourcePose, load_config, parse_config
+from gcd_model import CameraMount, OptionError, Traits
+from gcd_node.config import NodeConfig, load_config, parse_config
 from gcd_node.config_digest import config_digest
 from gcd_node.errors import ConfigError
-from gcd_node.optics.source_pose import in_words, is_foreign, require_usable, stated_mount, stated_sphere
+from gcd_node.preprocess import in_words, require_usable, stated_mount, stated_sphere
+from gcd_node.source_config import SourcePose
 
 
 def config(pose: str | None = None, *, source: str = "", more: str = "") -> NodeConfig:
@@ -42,10 +42,10 @@ def matrices(box: Box) -> np.ndarray:
     return np.array(found).reshape(-1, 4, 4)
 
 
-@pytest.mark.parametrize("pose", ["height_m = 2.4", "tilt_deg = 12.0", "left_m = 0.4\nforward_m = -1.0", ""])
+@pytest.mark.parametrize("pose", ["height_m = 2.4", "tilt_deg = 12.0", "left_m = 0.4\nforward_m = -1.0"])
 def test_the_view_stays_where_it_is_on_the_vehicle_however_the_camera_is_mounted(pose: str) -> None:
-    _, usual = run(config(), warping_traits())
-    model, box = run(config(pose), warping_traits())
+    _, usual = run(config(), live_traits())
+    model, box = run(config(pose), live_traits())
     mount = model.clips[0].mount
     assert mount is not None
     moved = mount.vehicle_from_camera.numpy() @ matrices(box)
@@ -53,7 +53,7 @@ def test_the_view_stays_where_it_is_on_the_vehicle_however_the_camera_is_mounted
 
 
 def test_clip_and_path_are_given_the_same_mount() -> None:
-    made = warping_traits()
+    made = live_traits()
     model, _ = run(config("height_m = 2.0\ntilt_deg = 5.0"), made)
     mount = CameraMount(height_m=2.0, tilt_deg=5.0)
     assert model.clips[0].mount == mount
@@ -62,66 +62,33 @@ def test_clip_and_path_are_given_the_same_mount() -> None:
 
 
 def test_what_is_left_out_is_as_the_model_was_trained() -> None:
-    assert stated_mount(SourcePose(height_m=2.0), None, warping_traits()) == CameraMount(height_m=2.0)
-    assert stated_mount(SourcePose(), None, warping_traits()) == CameraMount()
-    assert stated_mount(None, None, warping_traits()) is None
-    assert stated_mount(None, 70.0, warping_traits()) == CameraMount(hfov_deg=70.0)
+    assert stated_mount(SourcePose(height_m=2.0), None, live_traits()) == CameraMount(height_m=2.0)
+    assert stated_mount(SourcePose(height_m=2.0), 70.0, live_traits()) == CameraMount(height_m=2.0, hfov_deg=70.0)
+    assert stated_mount(SourcePose(), None, live_traits()) is None
+    assert stated_mount(SourcePose(height_m=2.0), 60.0, traits()) is None
 
 
 def test_nothing_stated_leaves_the_mount_to_the_model() -> None:
-    model, box = run(config(), warping_traits())
+    model, box = run(config(), live_traits())
     assert model.clips[0].mount is None
     assert box.of("win")[0].header.quality.ood == ()
-    meta = next(fields for topic, fields in box.notes if topic == "meta")
-    assert meta["mount"] == {
-        "height_m": 1.55,
-        "forward_m": 1.6,
-        "left_m": 0.0,
-        "tilt_deg": 0.0,
-        "hfov_deg": 85.0,
-        "assumed": True,
-    }
 
 
-def test_the_mounts_field_of_view_is_that_of_the_cropped_picture_and_the_views_is_the_trained_one() -> None:
+def test_the_mounts_field_of_view_is_that_of_the_cropped_picture() -> None:
     wide = FakeSource(14, fps=10.0, size=(4 * WIDTH, 2 * WIDTH))  # 2:1, cropped to 3:2
-    model, box = run(config(source="hfov_deg = 90.0"), warping_traits(), wide)
-    mount, header = model.clips[0].mount, box.of("win")[0].header
+    model, _ = run(config("height_m = 2.0", source="hfov_deg = 90.0"), live_traits(), wide)
+    mount = model.clips[0].mount
     assert mount is not None
     assert mount.hfov_deg == pytest.approx(2 * np.degrees(np.arctan(0.75)))  # three quarters of the width are left
-    assert "hfov" in header.quality.ood
-    assert header.intrinsics is not None
-    assert header.intrinsics[0] == pytest.approx(WIDTH / 2 / np.tan(np.radians(42.5)))
 
 
 def test_meta_tells_a_stated_mount() -> None:
-    _, box = run(config("height_m = 2.0"), warping_traits())
+    _, box = run(config("height_m = 2.0"), live_traits())
     meta = next(fields for topic, fields in box.notes if topic == "meta")
     assert meta["mount"]["height_m"] == 2.0
     assert meta["mount"]["assumed"] is False
     _, box = run(config(), traits("driving"))
     assert next(fields for topic, fields in box.notes if topic == "meta")["mount"] is None
-
-
-@pytest.mark.parametrize(
-    ("pose", "foreign"),
-    [("height_m = 1.56", False), ("height_m = 1.9", True), ("tilt_deg = 3.0", True), ("left_m = -0.5", True)],
-)
-def test_a_mount_unlike_the_trained_one_is_flagged_and_refused_when_strict(
-    pose: str, foreign: bool, caplog: pytest.LogCaptureFixture
-) -> None:
-    with caplog.at_level(logging.WARNING):
-        _, box = run(config(pose), warping_traits())
-    assert ("view" in box.of("win")[0].header.quality.ood) == foreign
-    assert ("camera mount" in caplog.text) == foreign
-    if foreign:
-        with pytest.raises(ConfigError, match="strict: camera mount"):
-            run(config(pose, more="strict = true"), warping_traits())
-
-
-def test_a_model_that_does_not_warp_has_no_foreign_mount() -> None:
-    assert not is_foreign(CameraMount(height_m=3.0), traits())
-    assert stated_mount(None, 60.0, traits()) is None
 
 
 @pytest.mark.parametrize(
@@ -131,15 +98,13 @@ def test_a_model_that_does_not_warp_has_no_foreign_mount() -> None:
         ("driving", "tilt_deg = 2.0", "nothing but the pictures.*leave it out"),
         ("svd", "left_m = 0.0", "nothing but the pictures.*leave it out"),
         ("driving", "radius = 15.0", "not steered by angles.*leave them out"),
-        ("small", "elevation_deg = 5.0", "not steered by angles.*state the mount instead"),
     ],
 )
 def test_a_pose_in_words_the_model_does_not_know_is_refused_before_the_first_frame(
     family: str, pose: str, words: str
 ) -> None:
-    made = warping_traits() if family == "small" else traits(family)
     with pytest.raises(ConfigError, match=rf"\[source\.pose\]: fake .*{words}"):
-        made_node(config(pose), FakeSynthesizer(made), FakeSource(14, fps=10.0), Box()).run()
+        made_node(config(pose), FakeSynthesizer(traits(family)), FakeSource(14, fps=10.0), Box()).run()
 
 
 def test_the_pose_of_every_launch_file_suits_its_model() -> None:
@@ -147,16 +112,12 @@ def test_the_pose_of_every_launch_file_suits_its_model() -> None:
     assert paths
     for path in paths:
         settings = load_config(path)
-        kind, _, name = settings.model.weights.partition(":")
-        if kind == "package" or name == "live":
-            require_usable(settings.source.pose, load_synthesizer(settings.model.weights, device="cpu").traits)
-        else:
-            family = name if kind == "random" else settings.model.family
-            require_usable(settings.source.pose, warping_traits() if family is None else traits(family))
+        family = settings.model.family
+        require_usable(settings.source.pose, live_traits() if family is None else traits(family))
 
 
 def test_a_pose_that_says_nothing_suits_every_model() -> None:
-    for made in (warping_traits(), traits(), traits("driving"), traits("svd")):
+    for made in (live_traits(), traits(), traits("driving"), traits("svd")):
         require_usable(SourcePose(), made)
         require_usable(None, made)
 
@@ -166,7 +127,7 @@ def test_a_pose_that_says_nothing_suits_every_model() -> None:
     [
         ("radius = 15.0\nheight_m = 1.5", "state one of the two"),
         ("height_m = 0.0", "> 0"),
-        ("height_m = inf", "<= 100"),
+        ("height_m = 200.0", "<= 100"),
         ("tilt_deg = 90.0", "< 90"),
         ("forward_m = 'far'", "Expected `float"),
         ("hight_m = 1.5", "did you mean `height_m`"),
@@ -180,7 +141,7 @@ def test_an_impossible_pose_is_refused_by_its_key(pose: str, reason: str) -> Non
 
 def test_numbers_that_are_none_are_refused() -> None:
     with pytest.raises((OptionError, ConfigError)):
-        run(config("tilt_deg = nan"), warping_traits())
+        run(config("tilt_deg = nan"), live_traits())
 
 
 def test_a_sphere_is_filled_with_what_is_assumed() -> None:
@@ -191,11 +152,8 @@ def test_a_sphere_is_filled_with_what_is_assumed() -> None:
     assert stated_sphere(SourcePose(height_m=2.0)) is None
 
 
-# --- orbits of a model that warps ------------------------------------------------------------------------------------
-
-
 def test_an_orbit_is_planned_from_where_the_camera_is_said_to_stand() -> None:
-    model, box = run(config("elevation_deg = 25.0\nradius = 13.0"), orbiting_traits(), FakeSource(14, fps=12.0))
+    model, box = run(config("elevation_deg = 25.0\nradius = 13.0"), traits(), FakeSource(14, fps=12.0))
     source = model.asked[0][0][0].source
     assert source is not None
     assert (source.elevation_deg, source.radius_m) == (25.0, 13.0)
@@ -206,40 +164,24 @@ def test_an_orbit_is_planned_from_where_the_camera_is_said_to_stand() -> None:
 
 
 def test_meta_tells_an_assumed_source_and_none_where_the_view_is_fixed() -> None:
-    for made, told in ((orbiting_traits(), {"el_deg": 5.0, "r": 15.0, "assumed": True}), (warping_traits(), None)):
+    for made, told in ((traits(), {"el_deg": 5.0, "r": 15.0, "assumed": True}), (traits("driving"), None)):
         _, box = run(config(), made, FakeSource(14, fps=made.fps))
         assert next(fields for topic, fields in box.notes if topic == "meta")["src_pose"] == told
 
 
-def test_a_camera_below_the_ground_is_refused_where_the_ground_is_warped() -> None:
-    below = config("elevation_deg = -20.0")
-    with pytest.raises(ConfigError, match=r"\[source\.pose\]: a camera must stand above the ground"):
-        run(below, orbiting_traits())
-    require_usable(below.source.pose, traits())
-
-
-def test_the_view_of_a_model_that_warps_is_as_wide_as_in_training() -> None:
-    _, box = run(config(source="hfov_deg = 40.0"), orbiting_traits(), FakeSource(14))
-    header = box.of("win")[0].header
-    assert "hfov" in header.quality.ood
-    assert header.intrinsics is not None
-    assert header.intrinsics[0] == pytest.approx(WIDTH / 2 / np.tan(np.radians(53.13 / 2)))
-
-
 @pytest.mark.parametrize(
-    ("made", "pose", "words"),
+    ("pose", "words"),
     [
-        (orbiting_traits(), SourcePose(radius=13.0), "an elevation of 5 degrees and a radius of 13 (stated)"),
-        (orbiting_traits(), None, "a radius of 15 (assumed: state it in [source.pose])"),
-        (warping_traits(), SourcePose(height_m=2.0), "2 m above the ground, 1.6 m ahead, tilted 0 degrees (stated)"),
-        (warping_traits(), None, "1.55 m above the ground, 1.6 m ahead, tilted 0 degrees (assumed"),
+        (SourcePose(radius=1.3), "an elevation of 5 degrees and a radius of 1.3 m"),
+        (SourcePose(height_m=2.0), "2 m above the ground, 1.6 m ahead, tilted 0 degrees"),
     ],
 )
-def test_where_the_camera_is_taken_to_stand_is_said_in_words(made: Traits, pose: SourcePose | None, words: str) -> None:
+def test_where_the_camera_is_taken_to_stand_is_said_in_words(pose: SourcePose, words: str) -> None:
+    made = live_traits()
     assert words in in_words(stated_mount(pose, None, made), pose, made)
-    assert in_words(None, pose, traits()) == ""
+    assert in_words(None, None, made) == in_words(None, pose, traits()) == ""
 
 
 def test_the_mount_is_part_of_what_the_digest_names() -> None:
-    lower, higher = (config_digest(config(f"height_m = {height}"), warping_traits()) for height in (2.0, 2.1))
+    lower, higher = (config_digest(config(f"height_m = {height}"), live_traits()) for height in (2.0, 2.1))
     assert lower != higher

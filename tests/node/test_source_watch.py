@@ -10,7 +10,7 @@ from fakes import FakeSource
 
 from gcd_node.errors import ConfigError, SourceError, SourceLostError
 from gcd_node.frame import Frame, FrameSource, SourceInfo
-from gcd_node.health.report import SourceState
+from gcd_node.health import SourceState
 from gcd_node.life.source_watch import Backoff, Patience, SourceWatch
 from gcd_node.window import Reason
 

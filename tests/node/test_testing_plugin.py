@@ -15,9 +15,9 @@ from runs import LAUNCH, parts
 from typer.main import get_command
 
 import gcd_node.testing  # noqa: F401  loaded before the inner sessions, which put sys.modules back
-from gcd_node.cli.commands import app
-from gcd_node.replay import diff_pictures, golden, lockstep  # noqa: F401  the same
-from gcd_node.replay.run_folder import MANIFEST
+from gcd_node.cli.main import COMMANDS, new_app
+from gcd_node.replay import diff_report, lockstep  # noqa: F401  the same
+from gcd_node.replay.run import MANIFEST
 
 pytest_plugins = ["pytester"]
 pytestmark = pytest.mark.timeout(60)
@@ -179,7 +179,7 @@ def test_the_workflows_of_the_page_are_yaml_with_jobs() -> None:
 
 
 def test_every_command_of_the_page_exists_with_its_options() -> None:
-    known = get_command(app).commands  # type: ignore[attr-defined]
+    known = get_command(new_app(COMMANDS)).commands  # type: ignore[attr-defined]
     found = commands()
     assert {words[1] for words in found} >= {"replay", "diff"}
     for words in found:

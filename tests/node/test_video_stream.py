@@ -16,8 +16,8 @@ from fake_camera import FakeVideoCapture
 from media import HEIGHT, WIDTH, flat
 from rtsp_server import RtspServer, serving, split_pictures, write_transport_stream
 
-from gcd_node.config import SourceConfig
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError, SourceLostError
+from gcd_node.source_config import RtspSource
 from gcd_node.sources import open_source
 from gcd_node.sources.video_stream import Backlog, open_stream, parse_address
 
@@ -53,7 +53,7 @@ def test_an_address_is_shown_without_what_may_be_secret(url: str, shown: str) ->
 )
 def test_what_is_no_address_of_a_stream_is_refused_and_not_repeated(url: str) -> None:
     with pytest.raises(ConfigError, match="url") as caught:
-        open_source(SourceConfig(kind="rtsp", url=url))
+        open_source(RtspSource(url=url))
     assert SECRET not in str(caught.value)
 
 
@@ -109,7 +109,7 @@ def server(recording: Path) -> Iterator[RtspServer]:
 
 
 def test_an_rtsp_camera_gives_its_pictures_in_the_right_colours(server: RtspServer) -> None:
-    source = open_source(SourceConfig(kind="rtsp", url=server.url, open_timeout_s=GUARD_S))
+    source = open_source(RtspSource(url=server.url, open_timeout_s=GUARD_S))
     frame = next(source.frames())
     source.close()
     info = source.info
@@ -179,10 +179,10 @@ def test_a_password_opens_the_stream_and_a_wrong_one_is_never_repeated(recording
 
 def test_no_password_reaches_the_terminal(recording: Path) -> None:
     code = (
-        "import logging, sys; from gcd_node.config import SourceConfig; from gcd_node.errors import SourceError\n"
+        "import logging, sys; from gcd_node.source_config import RtspSource; from gcd_node.errors import SourceError\n"
         "from gcd_node.sources import open_source\n"
         "logging.basicConfig(level=logging.DEBUG)\n"
-        "try: open_source(SourceConfig(kind='rtsp', url=sys.argv[1], open_timeout_s=20))\n"
+        "try: open_source(RtspSource(url=sys.argv[1], open_timeout_s=20))\n"
         "except SourceError as error: print('refused:', error)\n"
     )
     with serving(recording, password="other") as server:
@@ -234,7 +234,7 @@ def test_a_udp_stream_is_read_with_the_same_code(recording: Path) -> None:
 
         thread = threading.Thread(target=send, daemon=True)
         thread.start()
-        source = open_source(SourceConfig(kind="rtsp", url=f"udp://127.0.0.1:{port}", open_timeout_s=GUARD_S))
+        source = open_source(RtspSource(url=f"udp://127.0.0.1:{port}", open_timeout_s=GUARD_S))
         assert next(source.frames()).size == (WIDTH, HEIGHT)
         source.close()
         stop.set()

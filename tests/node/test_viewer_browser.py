@@ -12,14 +12,14 @@ from typing import Any
 
 import pytest
 from cameras import Bench, Camera, until
-from fakes import FakeSynthesizer, warping_traits
+from fakes import FakeSynthesizer, painting_traits
 from rig import Rig
 from wire_messages import origin
 
-from gcd_node.publisher import Publisher, PublisherOptions
-from gcd_node.viewer.access import Access
-from gcd_node.viewer.hub import NodeEndpoints
-from gcd_node.viewer.server import ViewerOptions, ViewerServer
+from gcd_node.publisher import Publisher
+from gcd_node.sockets import PublisherOptions
+from gcd_node.viewer.node_link import NodeEndpoints
+from gcd_node.viewer.server import ViewerServer
 
 CHROMIUM, DRIVER = Path("/usr/bin/chromium"), Path("/usr/bin/chromedriver")
 webdriver = pytest.importorskip("selenium.webdriver", reason="needs the Python package selenium, of the extra `dev`")
@@ -146,15 +146,16 @@ def page(driver: Any) -> Page:
     return shown
 
 
+@dataclass(frozen=True)
 class Steered:
-    """A node in a process of its own that is steered by angles."""
+    """A node that is steered by angles, and its viewer, each in a process of its own."""
 
-    def __init__(self, process: "subprocess.Popen[str]") -> None:
-        self.process = process
-        assert process.stdout is not None
-        self.operator_url = process.stdout.readline().strip()
-        assert self.operator_url.startswith("http"), "the node did not start"
-        self.url = self.operator_url.partition("#")[0]
+    process: "subprocess.Popen[str]"
+    operator_url: str
+
+    @property
+    def url(self) -> str:
+        return self.operator_url.partition("#")[0]
 
 
 @pytest.fixture(scope="module")
@@ -167,8 +168,17 @@ def starting(tmp_path_factory: pytest.TempPathFactory) -> "Iterator[subprocess.P
 
 
 @pytest.fixture(scope="module")
-def steered(starting: "subprocess.Popen[str]") -> Steered:
-    return Steered(starting)
+def steered(starting: "subprocess.Popen[str]") -> Iterator[Steered]:
+    assert starting.stdout is not None
+    assert starting.stdout.readline() == "there\n", "the node did not start"
+    folder = str(starting.args[-1])  # type: ignore[index]
+    endpoints = [f"--{name}=ipc://{folder}/{name}" for name in ("data", "status", "control")]
+    command = [sys.executable, "-m", "gcd_node", "viewer", "--http", "127.0.0.1:0", *endpoints]
+    viewer = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    assert viewer.stderr is not None
+    yield Steered(starting, viewer.stderr.readline().removeprefix("page ").strip())
+    viewer.terminate()
+    viewer.communicate()
 
 
 def test_the_pictures_move_and_say_how_old_they_are(page: Page, steered: Steered) -> None:
@@ -272,18 +282,18 @@ def test_a_killed_node_is_shown_as_dead(page: Page, steered: Steered) -> None:
     _require_prompt_death(page)
     page.wait(lambda: page.text("view-veil") == "DEAD")
     assert page.text("state") == "dead"
-    assert "last heard" in page.text("why")
+    assert "silent" in page.text("why")
 
 
 def test_a_fixed_view_has_its_classes_and_says_why_it_cannot_be_steered(page: Page, tmp_path: Path) -> None:
     camera = Camera(fps=10.0)
-    model = FakeSynthesizer(warping_traits())
+    model = FakeSynthesizer(painting_traits())
     node = NodeEndpoints(
         data=f"ipc://{tmp_path}/data", status=f"ipc://{tmp_path}/status", control=f"ipc://{tmp_path}/control"
     )
     with (
         Rig(tmp_path, Bench(camera), model, views="[view.main]", watched=False) as rig,
-        ViewerServer(ViewerOptions(http="127.0.0.1:0", node=node, access=Access())) as viewer,
+        ViewerServer("127.0.0.1:0", node) as viewer,
     ):
         rig.await_state("active")
         page.open(viewer.operator_url)
@@ -309,8 +319,8 @@ def test_a_fixed_view_has_its_classes_and_says_why_it_cannot_be_steered(page: Pa
 
 
 def test_who_comes_to_a_node_that_is_not_there_is_told_so(page: Page, tmp_path: Path) -> None:
-    node = NodeEndpoints(data=f"ipc://{tmp_path}/data", status=f"ipc://{tmp_path}/status")
-    with ViewerServer(ViewerOptions(http="127.0.0.1:0", node=node)) as viewer:
+    node = NodeEndpoints(data=f"ipc://{tmp_path}/data", status=f"ipc://{tmp_path}/status", control=None)
+    with ViewerServer("127.0.0.1:0", node) as viewer:
         page.open(viewer.url)
         page.wait(lambda: "has not spoken" in page.text("why"))
         assert page.state == "connecting"

@@ -8,13 +8,14 @@ import cv2
 import numpy as np
 import pytest
 from rich.console import Console
-from wire_messages import CLASSES, class_map, depth, end, numbers, pixels, view_header, visibility, window
+from wire_messages import CLASSES, class_map, depth, end, numbers, pixels, visibility, window
 
-from gcd_node.envelope import ViewMessage
+from gcd_client.protocol import ViewMessage
+from gcd_client.subscriber import ReceivedView
+from gcd_model import hatched
 from gcd_node.errors import OutputError
-from gcd_node.pictures.comparison import hatched
-from gcd_node.publisher import Publisher, PublisherOptions
-from gcd_node.subscriber import ReceivedView
+from gcd_node.publisher import Publisher
+from gcd_node.sockets import PublisherOptions
 from gcd_node.watching.views import ViewSaver, ViewTable, WatchReport, WatchRequest, render, watch
 
 pytestmark = pytest.mark.timeout(30)
@@ -108,16 +109,6 @@ def test_a_watch_sees_all_views_until_the_stream_ends(tmp_path) -> None:
     ]
 
 
-def test_a_watch_stops_at_its_limit(tmp_path) -> None:
-    report = watched(tmp_path, WatchRequest(endpoint=f"ipc://{tmp_path}/data", view="top", limit=2), 4, ending=False)
-    assert (report.received, report.ended) == (2, False)
-
-
-def test_a_watch_stops_when_nothing_comes(tmp_path) -> None:
-    report = watch(WatchRequest(endpoint=f"ipc://{tmp_path}/nobody", timeout_s=0.05), lambda rows: None)
-    assert (report.received, report.ended, report.rows) == (0, False, ())
-
-
 def test_saved_pictures_and_video_are_the_published_pixels(tmp_path) -> None:
     request = WatchRequest(endpoint=f"ipc://{tmp_path}/data", save=tmp_path / "out", timeout_s=10)
     report = watched(tmp_path, request, 2, ending=True)
@@ -132,14 +123,6 @@ def test_saved_pictures_and_video_are_the_published_pixels(tmp_path) -> None:
     assert np.array_equal(read_video(out / "top.mkv"), sent)
     last = cv2.cvtColor(cv2.imread(str(out / "top" / "000001_01.png")), cv2.COLOR_BGR2RGB)
     assert np.array_equal(last, sent[3])
-
-
-def test_grey_views_are_saved_as_grey(tmp_path) -> None:
-    grey = pixels(3, height=16, width=16, channels=1)
-    header = view_header(shape=grey.shape)
-    with ViewSaver(tmp_path) as saver:
-        saver.add(received(ViewMessage(topic="view/top/win", header=header, payload=grey.tobytes())))
-    assert np.array_equal(read_video(tmp_path / "top.mkv"), np.broadcast_to(grey, (2, 16, 16, 3)))
 
 
 def test_class_maps_are_saved_in_colour_with_a_legend_and_as_numbers(tmp_path) -> None:
@@ -185,14 +168,6 @@ def test_saved_windows_are_hatched_where_they_are_painted_and_all_over_where_nob
     blank = np.zeros_like(SEEN)
     wanted = [hatched(image, seen) for image, seen in zip(shown, (SEEN, blank, blank), strict=True)]
     assert np.array_equal(saved, np.concatenate(wanted))
-
-
-def test_a_visibility_of_another_size_hatches_all(tmp_path) -> None:
-    with ViewSaver(tmp_path, hatch=True) as saver:
-        saver.add(received(window(0, images=pixels(0, height=16, width=16))))
-        saver.add(received(visibility(0, seen=SEEN[:, :8])))
-    wanted = hatched(pixels(0, height=16, width=16), np.zeros_like(SEEN))
-    assert np.array_equal(read_video(tmp_path / "top.mkv"), wanted)
 
 
 def test_a_watch_for_hatching_takes_windows_with_their_visibility(tmp_path) -> None:

@@ -9,12 +9,15 @@ from media import frames_at
 
 from gcd_node.errors import ConfigError, SourceError
 from gcd_node.frame import Frame
-from gcd_node.optics.preprocess import to_clip_tensor
-from gcd_node.window import Filling, FrameWindow, WindowBuilder, choose_fps
+from gcd_node.preprocess import to_clip_tensor
+from gcd_node.window import FrameWindow, PartialWindow, WindowBuilder, choose_fps
 
 
-def run(builder: WindowBuilder, frames: Sequence[Frame], *, flush: bool = True) -> list[FrameWindow]:
-    windows = [window for frame in frames for window in builder.push(frame, frame.stamp_ns + 5)]
+def run(
+    builder: WindowBuilder, frames: Sequence[Frame], *, flush: bool = True, at_once: bool = False
+) -> list[FrameWindow]:
+    """at_once: they arrive together, whatever their stamps say."""
+    windows = [w for frame in frames for w in builder.push(frame, 5 if at_once else frame.stamp_ns + 5)]
     return windows + (builder.flush() if flush else [])
 
 
@@ -29,6 +32,48 @@ def jittered(count: int, fps: float, spread: float, seed: int = 0) -> list[Frame
 
 def seqs(windows: Sequence[FrameWindow]) -> list[int]:
     return [seq for window in windows for seq in window.seqs]
+
+
+# --- windows of one frame ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.3, 0.45])
+def test_every_frame_is_a_window_of_one_at_once(spread: float) -> None:
+    builder = WindowBuilder(frames=1, fps=10.0, source_fps=10.0)
+    for frame in jittered(60, 10.0, spread):
+        (window,) = builder.push(frame, frame.stamp_ns + 5)
+        assert window.stamps_ns == (frame.stamp_ns,)
+
+
+def test_windows_of_one_frame_go_on_after_a_hole() -> None:
+    late = [*even(5, 10.0), *frames_at(2000.0 + 100 * i for i in range(5))]
+    builder = WindowBuilder(frames=1, fps=10.0, source_fps=10.0)
+    assert len(run(builder, late, flush=False)) == 10
+
+
+@pytest.mark.parametrize("source_fps", [24.0, 30.0, 60.0])
+def test_windows_of_one_frame_keep_a_lower_rate(source_fps: float) -> None:
+    windows = run(WindowBuilder(frames=1, fps=10.0, source_fps=source_fps), even(int(10 * source_fps), source_fps))
+    assert len(windows) == pytest.approx(100, abs=1)
+    steps_ms = np.diff([window.stamps_ns[0] for window in windows]) / 1e6
+    assert steps_ms.max() <= 100 + 1000 / source_fps
+
+
+def test_a_camera_that_was_silent_is_no_clock_that_was_set() -> None:
+    builder = WindowBuilder(frames=14, fps=24.0, source_fps=24.0)
+    frames = [*even(5, 24.0), *even(20, 24.0, first_ms=1700.0)]
+    run(builder, frames)  # they arrive as they were taken
+    assert builder.counts.reasons == {"WIN_GAP": 1}
+    for frame in frames_at([4000.0, 9000.0]):
+        builder.push(frame, frames[-1].stamp_ns + 10**8)  # these do not
+    assert builder.counts.reasons["CLOCK_STEP"] == 2
+
+
+def test_a_picture_like_the_one_before_is_told() -> None:
+    first, second, third = even(3, 10.0)
+    builder = WindowBuilder(frames=1, fps=10.0, source_fps=10.0)
+    again = replace(second, image=first.image)
+    assert [window.static for window in run(builder, [first, again, third])] == [False, True, False]
 
 
 # --- laws --------------------------------------------------------------------------------------------------------
@@ -100,7 +145,7 @@ def test_a_variable_rate_is_resampled_by_its_stamps() -> None:
 def test_the_clip_of_a_window_is_its_pictures_as_the_network_takes_them(stride: int) -> None:
     frames = even(20, 10.0)
     stepped = [*frames[:9], *(replace(frame, stamp_ns=frame.stamp_ns + 10**10) for frame in frames[9:])]
-    windows = run(WindowBuilder(frames=4, fps=10.0, stride=stride), stepped)
+    windows = run(WindowBuilder(frames=4, fps=10.0, stride=stride), stepped, at_once=True)
     assert {window.epoch for window in windows} == {0, 1}
     for window in windows:
         assert window.images[:, 0, 0, 0].tolist() == list(window.seqs)
@@ -110,7 +155,7 @@ def test_the_clip_of_a_window_is_its_pictures_as_the_network_takes_them(stride: 
 @pytest.mark.parametrize("stride", [1, 3, 4, 6])
 def test_what_a_window_holds_so_far_is_how_the_whole_one_will_begin(stride: int) -> None:
     frames, builder = even(30, 10.0), WindowBuilder(frames=4, fps=10.0, stride=stride)
-    seen: list[tuple[Filling, np.ndarray]] = []
+    seen: list[tuple[PartialWindow, np.ndarray]] = []
     for frame in frames:
         for window in builder.push(frame, frame.stamp_ns):
             begun = [(filling, clip) for filling, clip in seen if filling.seqs == window.seqs[: len(filling.seqs)]]
@@ -210,7 +255,7 @@ def test_duplicate_and_backward_stamps_are_dropped_and_counted() -> None:
 def test_a_step_of_the_clock_begins_a_new_epoch(step_ms: float) -> None:
     builder = WindowBuilder(frames=4, fps=10.0, source_fps=10.0)
     early = 10_000 + np.arange(6) * 100.0
-    windows = run(builder, frames_at([*early, *(early + step_ms)]))
+    windows = run(builder, frames_at([*early, *(early + step_ms)]), at_once=True)
     assert [(window.epoch, window.seqs) for window in windows] == [(0, (0, 1, 2, 3)), (1, (6, 7, 8, 9))]
     assert builder.counts.reasons == {"CLOCK_STEP": 1}
 

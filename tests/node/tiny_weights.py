@@ -1,23 +1,23 @@
-"""A real weight file of a tiny driving model at random: warps by planes, draws class maps, and takes no time."""
+"""A real weight file of a tiny driving model at random: paints class colours, and takes no time."""
 
 from pathlib import Path
 
 from msgspec.structs import replace
 
-from gcd_model import DRIVING_SMALL
+from gcd_model import DRIVING_CLASSES, PLAIN_SMALL
 from gcd_model.checkpoints import save_weights
 from gcd_model.networks import random_networks
 from gcd_model.own_format import Card
 
 HEIGHT, WIDTH = 64, 96
-UNET = replace(DRIVING_SMALL.unet, width=16, head_width=16, embedding_width=32)
-VAE = replace(DRIVING_SMALL.vae, width=8)
-TINY = replace(DRIVING_SMALL, height=HEIGHT, width=WIDTH, unet=UNET, vae=VAE)
+UNET = replace(PLAIN_SMALL.unet, width=16, head_width=16, embedding_width=32)
+VAE = replace(PLAIN_SMALL.vae, width=8)
+TINY = replace(PLAIN_SMALL, height=HEIGHT, width=WIDTH, unet=UNET, vae=VAE, semantic_classes=DRIVING_CLASSES)
 
 
 def write_tiny(folder: Path) -> Path:
     """`tiny.safetensors` in a folder."""
     path = folder / "tiny.safetensors"
-    card = Card(name="tiny", config=TINY, family="driving", move_time=13, trained=False)
+    card = Card(name="tiny", config=TINY, family="driving-semantic", move_time=13, trained=False)
     save_weights(random_networks(TINY, seed=0), path, card)
     return path

@@ -16,11 +16,10 @@ from rig import Rig
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
-from gcd_node.envelope import ViewMessage
-from gcd_node.subscriber import ReceivedView
-from gcd_node.viewer.access import Access
-from gcd_node.viewer.hub import NodeEndpoints
-from gcd_node.viewer.server import ViewerOptions, ViewerServer
+from gcd_client.protocol import ViewMessage
+from gcd_client.subscriber import ReceivedView
+from gcd_node.viewer.node_link import NodeEndpoints
+from gcd_node.viewer.server import ViewerServer
 
 TOKEN = "a-token-of-the-tests"
 WAIT_S = 30.0
@@ -35,14 +34,13 @@ def nobody(folder: Path, *, control: bool = True) -> NodeEndpoints:
 @contextlib.contextmanager
 def lonely_viewer(folder: Path) -> Iterator[ViewerServer]:
     """A page's server at whose endpoints no node answers."""
-    with ViewerServer(ViewerOptions(http="127.0.0.1:0", node=nobody(folder), access=Access(token=TOKEN))) as opened:
+    with ViewerServer("127.0.0.1:0", nobody(folder), TOKEN) as opened:
         yield opened
 
 
 @contextlib.contextmanager
 def viewer_of(rig: Rig) -> Iterator[ViewerServer]:
-    options = ViewerOptions(http="127.0.0.1:0", node=nobody(rig.folder), access=Access(token=TOKEN))
-    with ViewerServer(options) as opened:
+    with ViewerServer("127.0.0.1:0", nobody(rig.folder), TOKEN) as opened:
         yield opened
 
 

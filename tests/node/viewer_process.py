@@ -1,5 +1,5 @@
-"""A node in a process of its own, steered by angles and with a page; prints the page's address and runs until it is
-killed. Not a test: started by test_viewer_browser.py."""
+"""A node in a process of its own, steered by angles; says when it is there and runs until it is killed. Not a test:
+started by test_viewer_browser.py."""
 
 import sys
 import time
@@ -12,12 +12,10 @@ from rig import rig_config
 
 from gcd_node.control.server import ControlOptions, ControlServer
 from gcd_node.frame import Frame, SourceInfo
-from gcd_node.life.machinery import Parts
 from gcd_node.node import Node, NodeOptions
 from gcd_node.publisher import Publisher
 from gcd_node.session import publisher_options
-from gcd_node.viewer.hub import NodeEndpoints
-from gcd_node.viewer.server import ViewerOptions, ViewerServer
+from gcd_node.transitions import Parts
 
 VIEWS = "[view.left]\nazimuth_deg = -30.0\n[view.swing]\nkind = 'orbit'\nrate_deg_s = 10.0\namplitude_deg = 20.0"
 SOURCE = 'kind = "synthetic"\npace = "realtime"'
@@ -62,13 +60,9 @@ def main(folder: Path) -> None:
             NodeOptions(once=False),
         )
         options = ControlOptions(endpoint=f"ipc://{folder}/control")
-        with ControlServer(options, node, lambda: node.state.label, node.event) as control:
-            reached = NodeEndpoints(
-                data=publisher.endpoint, status=publisher.status_endpoint or "", control=control.endpoint
-            )
-            with ViewerServer(ViewerOptions(http="127.0.0.1:0", node=reached)) as viewer:
-                print(viewer.operator_url, flush=True)
-                node.run()
+        with ControlServer(options, node, lambda: node.state.label, node.event):
+            print("there", flush=True)
+            node.run()
 
 
 if __name__ == "__main__":

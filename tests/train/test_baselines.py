@@ -6,9 +6,7 @@ import torch
 from driving_plane import STAGE_SOURCE, PlaneClips, plane_clip, without_learning
 from torch.testing import assert_close
 
-from gcd_model.config import PlaneWarpConfig
 from gcd_model.geometry import CameraMount, SphericalDelta, spherical_trajectory, to_pose
-from gcd_model.plane_warp import plane_warp
 from gcd_train.baselines import (
     CameraPair,
     CopySource,
@@ -22,7 +20,7 @@ from gcd_train.baselines import (
 )
 from gcd_train.baselines.cameras import pixel_rays, to_pixels
 from gcd_train.baselines.depth_reprojection import splat
-from gcd_train.baselines.ground_homography import ground_grid, plane_homography
+from gcd_train.baselines.ground_homography import plane_homography
 from gcd_train.baselines.predictor import SourceClip
 from gcd_train.datasets.paired import PairedClip
 from gcd_train.errors import DataError
@@ -114,15 +112,6 @@ def test_a_homography_takes_target_pixels_to_the_source_pixels_of_the_same_groun
     moved = torch.einsum("tij,tj->ti", homography, in_target / in_target[:, 2:])
     expected = to_pixels(in_source, pair.source).expand(FRAMES, 2)
     assert_close(to_pixels(moved, pair.source), expected, rtol=0, atol=1e-8)
-
-
-def test_the_homography_agrees_with_the_models_own_ground_warp() -> None:
-    pair = cameras()
-    grid, seen = ground_grid(pair)
-    warps = plane_warp(PlaneWarpConfig(), CameraMount(), pair.source_from_target, HEIGHT, WIDTH)
-    assert (seen == warps.valid[:, 0]).float().mean() > 0.999
-    both = seen & warps.valid[:, 0]
-    assert_close(grid[both], warps.grid[:, 0][both], rtol=0, atol=1e-4)
 
 
 def test_the_nearer_surface_hides_the_farther_one() -> None:

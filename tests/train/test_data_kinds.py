@@ -108,7 +108,7 @@ def test_a_cache_is_read_with_the_encoders_that_made_it(driving: Path, tmp_path:
     data = msgspec.structs.replace(DRIVING, kind="cache")
     own = recipe(data, fps=10.0, source="cache", image_share=0.0, augmentation=0.02, loss=LossRecipe())
     model = msgspec.structs.replace(own.model, weights=CHOICE.weights)
-    told = msgspec.structs.replace(own, model=model, vae=None, latents=None, decoder=None)
+    told = msgspec.structs.replace(own, model=model, vae=None, latents=None)
     networks = random_weights("driving", frames=CLIP).networks
     config = msgspec.structs.replace(networks.config, height=HEIGHT, width=WIDTH)
     run = open_data(told, config, FAMILIES["driving"], DataPlaces(data=tmp_path, valid=driving))

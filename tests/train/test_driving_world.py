@@ -29,7 +29,7 @@ RECORDED = (
 SEEDS = (0, 3, 17, 42, 1_000_000)
 
 
-def test_the_first_labels_are_the_ontology_of_the_class_head() -> None:
+def test_the_first_labels_are_the_ontology() -> None:
     assert [label.name.lower() for label in Label][: len(DRIVING_CLASSES)] == [kind.name for kind in DRIVING_CLASSES]
     assert {coarse(label) for label in Label} == set(range(len(DRIVING_CLASSES)))
 

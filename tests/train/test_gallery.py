@@ -5,7 +5,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -18,12 +18,11 @@ from typer import Typer
 from typer.testing import CliRunner
 
 from gcd_model import (
-    DRIVING_SMALL,
     FAMILIES,
     SMALL,
     Augmentation,
+    CameraMount,
     Clip,
-    OptionError,
     RenderOptions,
     SourceFeatures,
     SphericalDelta,
@@ -31,12 +30,13 @@ from gcd_model import (
     Trajectory,
     View,
     ViewRangeError,
+    load_synthesizer,
 )
 from gcd_train.cli.gallery import gallery_command
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.gallery import ViewRecipe, WindowChoice, Windowed, find_videos, read_windows, view_window
 from gcd_train.gallery.real_video import fitted, kept_share
-from gcd_train.gallery.viewed import mounted, paths
+from gcd_train.gallery.viewed import mounted
 
 T, H, W = 4, 32, 64
 REAL = Path(os.environ.get("GCD_REAL_VIDEOS", "no folder of videos"))
@@ -257,19 +257,11 @@ def test_samples_come_with_their_uncertainty() -> None:
     assert float(shown[1]) == pytest.approx(2.0 * 0.05 * 100 / 255, abs=1e-3)  # scale x half the difference
 
 
-def test_a_driving_view_knows_how_the_camera_is_mounted() -> None:
-    warping = replace(traits("driving"), config=msgspec.structs.replace(DRIVING_SMALL, frames=T, height=H, width=W))
-    usual = warping.mount
-    assert usual is not None
-    assert mounted(warping, ViewRecipe(), None) is None
-    assert mounted(warping, ViewRecipe(tilt_deg=4.0), 60.0) == replace(usual, tilt_deg=4.0, hfov_deg=60.0)
-    ((name, path),) = paths(warping, ViewRecipe(height_m=2.0))
-    ((_, trained),) = paths(warping, ViewRecipe())
-    lower = trained.source_from_target[-1, 1, 3] - path.source_from_target[-1, 1, 3]  # y is down
-    assert name == "view"
-    assert float(lower) == pytest.approx(-(2.0 - usual.height_m), abs=1e-6)
-    with pytest.raises(OptionError, match="has no vehicle's view"):
-        paths(traits(), ViewRecipe(height_m=2.0))
+def test_the_live_models_view_knows_how_the_camera_is_mounted() -> None:
+    live = load_synthesizer("random:live", device="cpu").traits
+    assert mounted(live, ViewRecipe(), None) is None
+    assert mounted(live, ViewRecipe(tilt_deg=4.0), 60.0) == CameraMount(tilt_deg=4.0, hfov_deg=60.0)
+    assert mounted(traits(), ViewRecipe(height_m=2.0), None) is None
 
 
 def test_a_goal_outside_the_family_is_refused() -> None:
@@ -307,7 +299,7 @@ def test_the_command_shows_good_videos_and_names_bad_ones(tmp_path: Path, weight
     assert all((out / name).is_file() for name in named)
     sheet = cv2.imread(str(out / "a_b-0.png"))
     assert sheet is not None
-    assert sheet.shape[0] >= 3 * H  # input, view, classes
+    assert sheet.shape[0] >= 2 * H  # input, view
 
 
 @pytest.mark.parametrize(
@@ -329,6 +321,6 @@ def test_what_cannot_be_shown_is_one_line(tmp_path: Path, weights: Path, more: l
 @pytest.mark.skipif(not REAL.is_dir(), reason="needs a folder of real videos, named in GCD_REAL_VIDEOS")
 def test_real_videos_are_shown_by_the_packaged_model(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    code, said = run(REAL, "--weights", "package:driving-small", "--windows", 1, "--out", out)
+    code, said = run(REAL, "--weights", "package:live-small", "--windows", 1, "--out", out)
     assert code == 0, said
     assert len(list(out.glob("*.png"))) == len(list(REAL.glob("*.mp4"))) == len(list(out.glob("*.mp4")))

@@ -166,7 +166,7 @@ def test_drawn_places_follow_the_published_odds(folder: Path) -> None:
 def test_batches_tell_each_clip_its_own_frame_rate(folder: Path) -> None:
     cache = CachedLatents.open(folder)
     unet = msgspec.structs.replace(
-        tiny_recipe().unet, image_share=0.0, augmentation=0.02, loss=LossRecipe(class_map=0.0), dropout=0.0
+        tiny_recipe().unet, image_share=0.0, augmentation=0.02, loss=LossRecipe(), dropout=0.0
     )
     config = msgspec.structs.replace(tiny_encoders().config, frames=CLIP, height=HEIGHT, width=WIDTH)
     precision = Precision(CPU, half=False, channels_last=False)

@@ -15,7 +15,7 @@ from gcd_model.live.config import LiveConfig
 from gcd_train.errors import DataError
 from gcd_train.live.clips import LiveClip
 from gcd_train.live.judge import Moments, frechet_distance, random_judge
-from gcd_train.live.measure import SetResult, differences, hatched, methods_of, open_networks, to_json, to_markdown
+from gcd_train.live.measure import SetResult, differences, methods_of, open_networks, to_json, to_markdown
 from gcd_train.live.measure_figures import (
     BEFORE,
     NEVER,
@@ -229,14 +229,6 @@ def test_reports_hold_every_method_and_the_lead_of_the_live_one() -> None:
     assert lead["scenes_within"] == 0
     assert "|old|" in to_markdown([result])
     assert set(json.loads(json.dumps(to_json([result])))["tiny"]["methods"]) == {"live", "old"}
-
-
-def test_only_painted_pixels_are_hatched() -> None:
-    of = truth()
-    never = of.visibility == NEVER
-    changed = (hatched(of.video, never) != of.video).any(dim=1)
-    assert changed[never].any()
-    assert not changed[~never].any()
 
 
 def test_unknown_methods_and_other_weights_are_refused(tmp_path: Path) -> None:

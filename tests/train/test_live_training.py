@@ -34,8 +34,9 @@ from gcd_train.live.depth_training import DepthTask, edge_matches, measure_depth
 from gcd_train.live.inputs import exact_geometry, make_inputs, read_inputs, splats_of
 from gcd_train.live.measure_figures import SpreadHistogram
 from gcd_train.live.measure_methods import LiveModel
-from gcd_train.live.paint_training import HeldOutViews, PaintTask, ViewBatches, carry, views_of
+from gcd_train.live.paint_training import HeldOutViews, PaintTask
 from gcd_train.live.recipe import LiveRecipe, LiveStage, live_recipes, load_live_recipe
+from gcd_train.live.target_views import ViewBatches, carry, views_of
 from gcd_train.live.training import LivePlaces, train_live
 from gcd_train.loop import Progress
 from gcd_train.recipe import Budget, ComputeRecipe, LogRecipe, OptimiserRecipe
@@ -130,6 +131,26 @@ def test_the_detail_stage_leaves_all_other_weights_as_they_are(places: LivePlace
     changed = {name for name in with_detail if not torch.equal(with_detail[name], without[name])}
     assert changed
     assert all(name.startswith("paint.detail.") for name in changed)
+
+
+def test_a_training_begins_from_a_weight_file_and_leaves_what_it_is_told_to_keep(places: LivePlaces) -> None:
+    from safetensors.torch import load_file
+
+    begun = train_live(RECIPE, places, threading.Event())
+    more = msgspec.structs.replace(RECIPE, weights=str(begun), keep=frozenset({"depth"}))
+    ended = load_file(train_live(more, replace(places, out=places.out.with_name("more")), threading.Event()))
+    head = {"depth.head.out.bias"}  # calibrated anew
+    changed = {name for name, value in load_file(begun).items() if not torch.equal(value, ended[name])} - head
+    assert any(name.startswith("paint.") for name in changed)
+    assert not any(name.startswith("depth.") for name in changed)
+    wider = msgspec.structs.replace(TINY, paint=msgspec.structs.replace(TINY.paint, widths=(16, 16, 16)))
+    with pytest.raises(DataError, match="other networks"):
+        train_live(msgspec.structs.replace(more, model=wider), places, threading.Event())
+
+
+def test_nothing_is_kept_of_no_weights() -> None:
+    with pytest.raises(RecipeError, match="needs weights"):
+        msgspec.structs.replace(RECIPE, keep=frozenset({"depth"}))
 
 
 def in_one_of_two(rank: int, places: LivePlaces, port: int) -> None:

@@ -1,5 +1,3 @@
-import math
-
 import pytest
 import torch
 from torch import Tensor
@@ -12,7 +10,6 @@ from gcd_train.losses import (
     ClassWeight,
     FocalBlend,
     class_emphasis,
-    class_frequency_weights,
     edm_weight,
     focal_fraction,
     focal_mean,
@@ -92,17 +89,6 @@ def test_a_colour_more_than_three_levels_off_is_no_class() -> None:
 
 def test_living_beings_weigh_seven_and_vehicles_three() -> None:
     assert sorted(weight.weight for weight in PARALLEL_DOMAIN_WEIGHTS) == [3.0] * 9 + [7.0] * 5
-
-
-def test_frequency_weights_are_one_on_average_and_fall_with_frequency() -> None:
-    counts = torch.tensor([1000, 100, 10])
-    weights = class_frequency_weights(counts, 0.35)
-    assert float((weights * counts).sum() / counts.sum()) == pytest.approx(1.0)
-    assert float(weights[2] / weights[0]) == pytest.approx(100**0.35, rel=1e-5)
-
-
-def test_a_class_that_never_occurs_gets_a_finite_weight() -> None:
-    assert all(map(math.isfinite, class_frequency_weights(torch.tensor([5, 0]), 0.35).tolist()))
 
 
 def test_the_plain_blend_is_the_mean_of_the_hardest_of_the_weighted_error() -> None:

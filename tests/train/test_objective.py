@@ -15,7 +15,7 @@ from gcd_train.batches import PixelBatches
 from gcd_train.datasets.clip_source import to_network
 from gcd_train.draws import Draws
 from gcd_train.model_setup import model_config
-from gcd_train.objective import Batch, Denoiser, Weights, diffusion_loss, draw_noise, draw_sigma, drop_streams
+from gcd_train.objective import Batch, Denoiser, diffusion_loss, draw_noise, draw_sigma, drop_streams
 from gcd_train.precision import Precision
 from gcd_train.recipe import LossRecipe, NoiseRecipe, UNetRecipe
 
@@ -41,7 +41,6 @@ def batch_of(networks: Networks, clips: int) -> Batch:
         condition=made.normal(rows, unet.condition_channels, 4, 8),
         vector=made.normal(rows, unet.vector_width),
         tokens=None,
-        classes=None,
         emphasis=None,
         frames=FRAMES,
     )
@@ -57,8 +56,8 @@ def network_output(networks: Networks, noisy: Tensor, sigma: Tensor, batch: Batc
 def test_loss_and_gradient_equal_the_papers_formula_on_fixed_noise(step: int) -> None:
     networks = tiny_networks("v")
     batch, noise = batch_of(networks, 2), NoiseRecipe()
-    denoiser = Denoiser(networks.unet, None, "v")
-    loss = diffusion_loss(denoiser, batch, draws(), PRECISION, noise=noise, loss=PAPER, weights=Weights(), step=step)
+    denoiser = Denoiser(networks.unet, "v")
+    loss = diffusion_loss(denoiser, batch, draws(), PRECISION, noise=noise, loss=PAPER, channel_weights=None, step=step)
     probe = networks.unet.conv_out.weight
     (gradient,) = torch.autograd.grad(loss.total, probe)
 
@@ -82,8 +81,8 @@ def test_an_x0_network_is_asked_for_the_clean_latents() -> None:
     batch = batch_of(networks, 1)
     noise, recipe = NoiseRecipe(fixed_share=1.0), LossRecipe(focal=False, weight_limit=5.0)
     loss = diffusion_loss(
-        Denoiser(networks.unet, None, "x0"), batch, draws(), PRECISION,
-        noise=noise, loss=recipe, weights=Weights(), step=0,
+        Denoiser(networks.unet, "x0"), batch, draws(), PRECISION,
+        noise=noise, loss=recipe, channel_weights=None, step=0,
     )  # fmt: skip
     again = draws()
     sigma = draw_sigma(again, 1, noise).repeat_interleave(FRAMES)
@@ -212,7 +211,7 @@ def test_without_dropout_nothing_is_drawn() -> None:
 def test_the_recipe_chooses_the_blend() -> None:
     networks = tiny_networks("v")
     batch, noise = batch_of(networks, 1), NoiseRecipe()
-    denoiser = Denoiser(networks.unet, None, "v")
+    denoiser = Denoiser(networks.unet, "v")
     released, plain = (
         diffusion_loss(
             denoiser,
@@ -221,7 +220,7 @@ def test_the_recipe_chooses_the_blend() -> None:
             PRECISION,
             noise=noise,
             loss=LossRecipe(focal_blend=blend),
-            weights=Weights(),
+            channel_weights=None,
             step=5000,
         ).total.detach()
         for blend in ("released", "plain")
@@ -232,9 +231,9 @@ def test_the_recipe_chooses_the_blend() -> None:
 def test_how_long_the_data_took_is_told_beside_the_loss() -> None:
     networks = tiny_networks("v")
     batch = replace(batch_of(networks, 1), wait_s=0.25, ids=("a",))
-    denoiser = Denoiser(networks.unet, None, "v")
+    denoiser = Denoiser(networks.unet, "v")
     loss = diffusion_loss(
-        denoiser, batch, draws(), PRECISION, noise=NoiseRecipe(), loss=PAPER, weights=Weights(), step=0
+        denoiser, batch, draws(), PRECISION, noise=NoiseRecipe(), loss=PAPER, channel_weights=None, step=0
     )
     assert float(loss.parts["wait_s"]) == 0.25
     assert loss.ids == ("a",)

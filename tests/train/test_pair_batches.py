@@ -28,7 +28,7 @@ from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.pair_batches import PairBatches, told_motion
 from gcd_train.precision import Precision
-from gcd_train.recipe import LoaderRecipe, LossRecipe, UNetRecipe
+from gcd_train.recipe import LoaderRecipe, UNetRecipe
 from gcd_train.recipe.optimiser import OptimiserRecipe
 from gcd_train.recipe.values import Budget
 from gcd_train.sample_loader import LoadedBatch, SampleLoader, SampleOrder
@@ -218,8 +218,6 @@ def test_what_samples_cannot_give_is_refused() -> None:
     model = networks()
     with pytest.raises(RecipeError, match="image_share"):
         batches(model, image_share=0.5)
-    with pytest.raises(RecipeError, match="class_map"):
-        batches(model, loss=LossRecipe(class_map=0.1))
     other = random_networks(msgspec.structs.replace(config(), frames=4), seed=1)
     with pytest.raises(DataError, match=r"\[4, 16, 32\] for this model, got \[3, 16, 32\]"):
         batches(other).whole_clips(draws(0), 1)

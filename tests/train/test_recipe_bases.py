@@ -51,7 +51,7 @@ def test_a_recipe_states_only_what_differs_from_its_base(tmp_path: Path) -> None
     assert recipe.unet.ema is None
     assert recipe.vae is not None
     assert (recipe.vae.budget.minutes, recipe.vae.budget.updates) == (2, None)
-    assert (recipe.seed, recipe.model, recipe.decoder) == (below.seed, below.model, below.decoder)
+    assert (recipe.seed, recipe.model, recipe.latents) == (below.seed, below.model, below.latents)
 
 
 def test_a_base_is_looked_for_beside_the_file_that_names_it(tmp_path: Path) -> None:

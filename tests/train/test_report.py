@@ -11,7 +11,7 @@ from driving_plane import PlaneClips, without_learning
 from typer.testing import CliRunner
 
 from gcd_model.checkpoints import save_weights
-from gcd_model.config import DRIVING_SMALL
+from gcd_model.config import PLAIN_SMALL
 from gcd_model.geometry import SphericalDelta
 from gcd_model.networks import random_networks
 from gcd_model.own_format import Card
@@ -141,11 +141,6 @@ def test_what_nobody_has_is_left_out() -> None:
     text = to_markdown(made)
     assert "| drop 4 (00000013) az +40 el +0 r -1.0 |" in text
     assert [word for word in ("mIoU", "accuracy", "IoU of", "declared", "Class figures", "nan") if word in text] == []
-    assert [bar.name for bar in made.bars] == [
-        "PSNR over copy_source, dB",
-        "PSNR over ground_homography, dB",
-        "gradient energy",
-    ]
 
 
 def test_json_holds_every_figure_and_null_for_none(report: Report, tmp_path: Path) -> None:
@@ -157,16 +152,8 @@ def test_json_holds_every_figure_and_null_for_none(report: Report, tmp_path: Pat
     assert len(majority["clips"]) == len(majority["without"]) == 2
     assert read["conditions"]["declared_mount"] == {"height_m": 1.8, "tilt_deg": 2.0}
     assert [shot["scene"] for shot in read["conditions"]["shots"]] == [7, 8]
-    assert (read["model"], read["bars"]) == ([], [])
+    assert read["model"] == []
     assert (tmp_path / "evaluation.md").read_text() == "text"
-
-
-def test_json_says_what_was_wanted_and_reached(report: Report, tmp_path: Path) -> None:
-    write_report(told_of(report), "", tmp_path)
-    first = json.loads((tmp_path / "evaluation.json").read_text())["bars"][0]
-    assert (first["name"], first["least"], first["most"]) == ("PSNR over depth_reprojection, dB", 3.0, None)
-    assert first["reached"] is False
-    assert first["margin"] == pytest.approx(first["value"] - 3.0)
 
 
 def test_a_contact_sheet_stacks_source_view_best_baselines_and_target(tmp_path: Path) -> None:
@@ -226,7 +213,9 @@ def test_clips_from_a_folder_measure_as_they_do_in_memory(tmp_path: Path) -> Non
 
 
 def test_weights_are_evaluated_from_the_command_line_with_a_declared_mount(tmp_path: Path) -> None:
-    config = msgspec.structs.replace(DRIVING_SMALL, frames=4, height=32, width=64)
+    config = msgspec.structs.replace(
+        PLAIN_SMALL, frames=4, height=32, width=64, sampling=msgspec.structs.replace(PLAIN_SMALL.sampling, steps=1)
+    )
     card = Card(name="untrained", config=config, family="driving", move_time=3, trained=False)
     save_weights(random_networks(config, seed=0), tmp_path / "untrained.safetensors", card)
     held_out = PlaneClips.make(1, width=64).write(tmp_path / "a")
@@ -238,11 +227,8 @@ def test_weights_are_evaluated_from_the_command_line_with_a_declared_mount(tmp_p
     found, more = read["model"]
     assert (found["name"], more["name"]) == ("untrained", "untrained (2 steps)")
     assert 0 < found["total"]["psnr_db"] < 30
-    assert 0 <= found["total"]["miou"] < 0.5
     assert read["conditions"]["declared_mount"]["height_m"] == 1.8
     assert read["conditions"]["true_mount"]["height_m"] == 1.55
-    assert "Wanted:" in output
-    assert "mIoU" in output
 
 
 @pytest.mark.parametrize(

@@ -186,7 +186,7 @@ def test_what_is_counted_has_ticks_at_whole_numbers(
 
 
 @pytest.mark.parametrize("width", [32, 64, 192])
-@pytest.mark.parametrize("name", ["source", "depth_reprojection_on_mean", "driving-small (4 steps)", "W" * 40])
+@pytest.mark.parametrize("name", ["source", "depth_reprojection_on_mean", "plain-small (4 steps)", "W" * 40])
 def test_a_caption_is_no_wider_than_its_picture_and_nothing_of_it_is_lost(name: str, width: int) -> None:
     found = caption(name, width)
     assert found.width <= width

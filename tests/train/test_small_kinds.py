@@ -1,4 +1,4 @@
-"""Runs of the small models that are not `driving-small`, at a tiny size: steered orbits, and painted classes."""
+"""Runs of small models that do more than show a road, at a tiny size: steered orbits, and painted classes."""
 
 import json
 from dataclasses import dataclass
@@ -37,8 +37,8 @@ CPU = torch.device("cpu")
 PRECISION = Precision(CPU, half=False, channels_last=False)
 
 
-def small_recipe(name: str, base: str, family: str, loss: dict[str, object], **changes: object) -> Recipe:
-    """The tiny recipe for another base, with still smaller networks and few updates."""
+def small_recipe(name: str, family: str, loss: dict[str, object]) -> Recipe:
+    """The tiny recipe for another family, with still smaller networks and few updates."""
     tiny = tiny_recipe()
     assert tiny.vae is not None
     unet = msgspec.structs.replace(tiny.model.unet, multipliers=(1, 1, 1), embedding_width=16)
@@ -46,7 +46,7 @@ def small_recipe(name: str, base: str, family: str, loss: dict[str, object], **c
     told = msgspec.structs.replace(tiny.unet.loss, **loss)
     return tiny_recipe(
         name=name,
-        model=msgspec.structs.replace(tiny.model, base=base, family=family, unet=unet, vae=vae),
+        model=msgspec.structs.replace(tiny.model, camera=FAMILIES[family].camera, family=family, unet=unet, vae=vae),
         vae=msgspec.structs.replace(tiny.vae, budget=Budget(updates=2), normalise_at=0.5),
         unet=msgspec.structs.replace(
             tiny.unet,
@@ -55,20 +55,15 @@ def small_recipe(name: str, base: str, family: str, loss: dict[str, object], **c
             loss=told,
             fps=FAMILIES[family].fps,
         ),
-        **changes,
     )
 
 
 def orbit_recipe() -> Recipe:
-    decoder = tiny_recipe().decoder
-    assert decoder is not None
-    short = msgspec.structs.replace(decoder, budget=Budget(updates=1), class_map=0.0)
-    return small_recipe("tiny-orbits", "objects-small", "kubric90", {"class_map": 0.0}, decoder=short)
+    return small_recipe("tiny-orbits", "kubric90", {})
 
 
 def painted_recipe() -> Recipe:
-    loss: dict[str, object] = {"class_map": 0.0, "class_weights": "driving"}
-    return small_recipe("tiny-painted", "driving-semantic-small", "driving-semantic", loss, decoder=None)
+    return small_recipe("tiny-painted", "driving-semantic", {"class_weights": "driving"})
 
 
 def trainer(
@@ -115,7 +110,7 @@ def test_a_run_on_orbits_ends_in_a_file_that_is_steered(orbit_run: Path) -> None
     assert first.video.shape == (FRAMES, 3, HEIGHT, WIDTH)
     assert not torch.equal(first.video[-1], second.video[-1])
     assert traits.family is FAMILIES["kubric90"]
-    assert set(measured(orbit_run)) == {"vae", "unet", "decoder", "export"}
+    assert set(measured(orbit_run)) == {"vae", "unet", "export"}
 
 
 def test_what_steers_is_trained_too(orbit_run: Path) -> None:
@@ -141,12 +136,12 @@ def test_a_run_on_painted_clips_ends_in_a_file_that_makes_class_maps(painted_run
 def test_the_target_of_a_painted_clip_is_what_the_latents_hold(painted_run: Path) -> None:
     meta = LatentClips.open(painted_run / "latents").meta
     assert meta.emphasis
-    assert (meta.class_upscale, meta.control) == (0, 0)
+    assert meta.control == 0
 
 
 @pytest.mark.slow
 def test_a_resumed_run_on_orbits_equals_an_uninterrupted_one(orbit_run: Path, tmp_path: Path) -> None:
-    """Bit for bit, what is steered and warped included; slow because other runs show the same of fixed paths."""
+    """Bit for bit, what is steered included; slow because other runs show the same of fixed paths."""
     (tmp_path / "vae").symlink_to(orbit_run / "vae")
     for stage in ("latents", "unet"):
         with pytest.raises(Interrupted):
@@ -226,11 +221,6 @@ def test_a_mirrored_row_is_the_row_of_the_mirrored_scene(name: str, tmp_path: Pa
     assert torch.equal(one.motion, other.motion)
     assert_alike(one.control, other.control)
     assert_alike(one.emphasis, other.emphasis)
-    assert one.pictures is not None
-    assert other.pictures is not None
-    for pictures in ("half", "ground", "distant", "rays"):
-        difference = (getattr(one.pictures, pictures) - getattr(other.pictures, pictures)).abs()
-        assert difference.mean() < 2e-3, pictures  # a pixel of the rim may be seen on one side alone
 
 
 def assert_alike(one: Tensor | None, other: Tensor | None) -> None:
@@ -289,9 +279,7 @@ def test_late_noise_takes_over_where_the_recipe_says() -> None:
     assert unet.noise_at(0.79).fixed_share == 1.0
     assert unet.noise_at(0.8) is mixed
     config = model_config(tiny_recipe().model)
-    assert sampled_as_trained(config, unet).sampling.steps == 1  # sigma 80 is among the late ones
-    several = model_config(msgspec.structs.replace(tiny_recipe().model, steps=4))
-    assert sampled_as_trained(several, unet).sampling.steps == 4
+    assert sampled_as_trained(config, unet).sampling.steps == 4  # sigma 80 is among the late ones
 
 
 @pytest.mark.parametrize(

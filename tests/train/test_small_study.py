@@ -9,19 +9,17 @@ from pathlib import Path
 
 import msgspec
 import pytest
-import torch
 from headless import needs_egl
 from made_records import FRAMES, note, record, region
 from typer.testing import CliRunner
 
-from gcd_model.config import DRIVING_SMALL
+from gcd_model.config import PLAIN_SMALL
 from gcd_train.cli.main import app
 from gcd_train.errors import RunError
 from gcd_train.model_setup import model_config, sampled_as_trained
 from gcd_train.recipe import Recipe, load_recipe
 from gcd_train.reports.findings import Claim, findings, study_claims, to_markdown
 from gcd_train.reports.material import Run
-from gcd_train.start import loaded_base, start_networks
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "launch" / "small-study.sh"
@@ -31,9 +29,8 @@ VIEWS = tuple(f"study-{path}-{start}" for path in ("gradual", "direct") for star
 def without_what_is_studied(recipe: Recipe) -> Recipe:
     model = msgspec.structs.replace(recipe.model, weights=None, scratch=False)
     data = msgspec.structs.replace(recipe.data, path="gradual")
-    return msgspec.structs.replace(
-        recipe, name="study", model=model, data=data, vae=load_recipe("package:driving-small").vae
-    )
+    vae = load_recipe("package:study-pretrain").vae
+    return msgspec.structs.replace(recipe, name="study", model=model, data=data, vae=vae)
 
 
 @pytest.mark.parametrize("small", [False, True])
@@ -43,31 +40,23 @@ def test_the_four_trainings_differ_in_path_and_start_alone(small: bool) -> None:
     for name, each in recipes.items():
         assert each.data.path == name.split("-")[1]
         assert each.model.scratch == name.endswith("scratch")
-        assert (each.model.weights == "package:driving-small") == name.endswith("scratch")
+        assert (each.model.weights, each.vae) == ("study-pretrain.safetensors", None)
 
 
-def test_pretraining_sees_the_same_clips_through_the_same_autoencoder() -> None:
+def test_pretraining_sees_the_same_clips_and_trains_the_autoencoder_of_all() -> None:
     first, then = load_recipe("package:study-pretrain"), load_recipe("package:study-gradual-scratch")
-    assert (first.latents, first.seed, first.model.weights) == (then.latents, then.seed, "package:driving-small")
-    assert first.data.task == "image-to-video"
+    assert (first.latents, first.seed, first.model.weights) == (then.latents, then.seed, None)
+    assert (first.data.task, first.export.dtype) == ("image-to-video", "float32")
+    assert first.vae is not None
     assert model_config(first.model) == model_config(then.model)
-    packaged = loaded_base("package:driving-small").networks
-    assert model_config(first.model).vae == packaged.config.vae
-    begun = start_networks(first.model, model_config(first.model), first.seed).decoder.state_dict()
-    assert all(torch.equal(begun[name], value.float()) for name, value in packaged.decoder.state_dict().items())
 
 
 def test_the_models_have_the_papers_form() -> None:
     recipe = load_recipe("package:study-gradual-pretrained")
     config = sampled_as_trained(model_config(recipe.model), recipe.unet)
-    assert (config.plane_warp, config.plane_mix, config.class_head, config.extra_condition_channels) == (
-        None,
-        None,
-        None,
-        0,
-    )
+    assert config.extra_condition_channels == 0
     assert config.sampling.steps > 1
-    assert config.unet.widths == DRIVING_SMALL.unet.widths
+    assert config.unet.widths == PLAIN_SMALL.unet.widths
     assert 0 < recipe.unet.noise.fixed_share < 1
 
 

@@ -17,7 +17,7 @@ from gcd_model.weights_export import write_published
 from gcd_train.draws import Draws
 from gcd_train.errors import RecipeError
 from gcd_train.model_setup import model_config
-from gcd_train.objective import Batch, Denoiser, Weights, diffusion_loss
+from gcd_train.objective import Batch, Denoiser, diffusion_loss
 from gcd_train.precision import Precision
 from gcd_train.recipe import LossRecipe, ModelRecipe, NoiseRecipe, load_recipe
 from gcd_train.start import fresh_networks, start_networks
@@ -112,7 +112,6 @@ def random_batch(config: ModelConfig) -> Batch:
         condition=draws.normal(rows, 4, 4, 4),
         vector=draws.normal(rows, config.unet.vector_width),
         tokens=draws.normal(rows, config.image_encoder.output_width),
-        classes=None,
         emphasis=None,
         frames=rows,
         camera=draws.normal(rows, 13),
@@ -122,7 +121,7 @@ def random_batch(config: ModelConfig) -> Batch:
 def updated(networks: Networks, *, half: bool = False) -> set[str]:
     """One update with a large rate; the names of all weights whose bits changed. half: arithmetic in bfloat16."""
     before = {name: value.clone() for name, value in networks.state_dict().items()}
-    denoiser = Denoiser(networks.unet, None, "v", networks.camera)
+    denoiser = Denoiser(networks.unet, "v", networks.camera)
     trained = [parameter for parameter in denoiser.parameters() if parameter.requires_grad]
     optimiser = torch.optim.Adam(trained, lr=0.01)
     for update in range(2):  # what stands behind a layer that starts at zero moves with the second
@@ -133,7 +132,7 @@ def updated(networks: Networks, *, half: bool = False) -> set[str]:
             Precision(CPU, half=half, channels_last=False),
             noise=NoiseRecipe(),
             loss=LossRecipe(),
-            weights=Weights(),
+            channel_weights=None,
             step=0,
         )
         optimiser.zero_grad()
@@ -173,7 +172,7 @@ def test_training_what_is_temporal_leaves_the_spatial_layers_alone() -> None:
 def test_states_hold_only_what_is_trained_and_go_back_where_they_were() -> None:
     networks = given()
     let_train(networks, ModelRecipe(base="small", family="kubric90", train="temporal"), SEED)
-    denoiser = Denoiser(networks.unet, None, "v", networks.camera)
+    denoiser = Denoiser(networks.unet, "v", networks.camera)
     whole = set(denoiser.state_dict())
     keep_trained_alone(denoiser)
     state: dict[str, Tensor] = {name: torch.full_like(value, 0.5) for name, value in denoiser.state_dict().items()}

@@ -2,6 +2,7 @@
 
 import logging
 import os
+import pickle
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -12,10 +13,12 @@ import pytest
 import torch
 from tiny_world import Never
 from torch import nn
+from torch.distributed.checkpoint.filesystem import FileSystemWriter
+from torch.distributed.checkpoint.state_dict_saver import save
 
 from gcd_train.checkpoint import DamagedStateError, load_state
 from gcd_train.engine import sealed
-from gcd_train.engine.sharded import FolderNote, checked_note, close_folder
+from gcd_train.engine.sharded import FolderNote, checked_note, close_folder, read_weights
 from gcd_train.engine.states import newest_weights
 from gcd_train.errors import RunError
 from gcd_train.loop import Loop, LoopOptions, Progress, StepLoss
@@ -252,3 +255,39 @@ def test_a_folder_with_a_damaged_file_is_refused(
     harm(folder / name)
     with pytest.raises(DamagedStateError, match=words):
         checked_note(folder, "unet")
+
+
+class Hostile:
+    """Whoever unpickles it leaves a file."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return Path.touch, (self.mark,)
+
+
+def written_state(path: Path, values: dict[str, object]) -> Path:
+    unfinished = path / "0001250.part"
+    save(values, storage_writer=FileSystemWriter(unfinished), no_dist=True)
+    return unfinished
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_folder_that_somebody_else_made_runs_nothing(tmp_path: Path) -> None:
+    unfinished, mark = written_state(tmp_path, {"module.weight": torch.ones(2)}), tmp_path / "ran"
+    (unfinished / ".metadata").write_bytes(pickle.dumps(Hostile(mark)))
+    close_folder(unfinished, tmp_path / "0001250", NOTE)
+    with pytest.raises(DamagedStateError):
+        read_weights(tmp_path / "0001250", "unet")
+    assert not mark.exists()
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_folder_holds_tensors_alone(tmp_path: Path) -> None:
+    mark = tmp_path / "ran"
+    unfinished = written_state(tmp_path, {"module.weight": torch.ones(2), "module.note": Hostile(mark)})
+    close_folder(unfinished, tmp_path / "0001250", NOTE)
+    with pytest.raises(DamagedStateError):
+        read_weights(tmp_path / "0001250", "unet")
+    assert not mark.exists()

@@ -64,7 +64,7 @@ def test_another_error_of_the_program_stays_a_traceback() -> None:
 def test_architectures_lists_all_set_ups() -> None:
     result = CliRunner().invoke(app, ["architectures"], env={"COLUMNS": "200"})
     assert "320, 640, 1280, 1280" in result.stdout
-    assert "DRIVING_SMALL" in result.stdout
+    assert "PLAIN_SMALL" in result.stdout
 
 
 @pytest.mark.parametrize("module", ["gcd_model", "gcd_node", "gcd_node.cli.main", "gcd_train.cli.main"])

@@ -21,15 +21,15 @@ def test_a_missing_recipe_ends_with_the_exit_code_of_a_bad_configuration(tmp_pat
 
 def test_a_missing_data_folder_ends_with_the_exit_code_of_missing_data(tmp_path: Path) -> None:
     where = [f"--{name}={tmp_path / 'none'}" for name in ("data", "valid", "out")]
-    result = CliRunner().invoke(app, ["train", "package:driving-small", *where])
+    result = CliRunner().invoke(app, ["train", "package:study-pretrain", *where])
     assert result.exit_code == 66
 
 
 def test_an_unknown_stage_is_refused_with_the_known_ones(tmp_path: Path) -> None:
     where = [f"--{name}={tmp_path}" for name in ("data", "valid", "out")]
-    result = CliRunner().invoke(app, ["train", "package:driving-small", *where, "--stage", "gan"])
+    result = CliRunner().invoke(app, ["train", "package:study-pretrain", *where, "--stage", "gan"])
     assert result.exit_code != 0
-    assert "decoder" in result.output
+    assert "export" in result.output
 
 
 def test_the_recipes_that_ship_are_listed_and_one_is_shown_whole() -> None:

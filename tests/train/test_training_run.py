@@ -4,7 +4,6 @@ import json
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -13,8 +12,6 @@ import torch
 from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips, tiny_recipe
 
 from gcd_model import Clip, load_synthesizer
-from gcd_model.config import DRIVING_CLASSES
-from gcd_model.geometry import CameraMount
 from gcd_train.checkpoint import load_state
 from gcd_train.datasets.clip_source import to_network
 from gcd_train.datasets.latents import LatentClips
@@ -54,8 +51,6 @@ def test_a_run_ends_in_a_weight_file_that_renders(run: Path) -> None:
     features = synthesizer.encode(Clip(video=to_network(source), fps=10.0))
     view = synthesizer.render(features, [synthesizer.traits.plan_view()])[0]
     assert view.video.shape == (FRAMES, 3, HEIGHT, WIDTH)
-    assert view.classes is not None
-    assert view.classes.shape == (1, FRAMES, HEIGHT, WIDTH)
     assert synthesizer.traits.family is not None
     assert (synthesizer.traits.family.name, synthesizer.traits.move_time) == ("driving", FRAMES - 1)
     assert synthesizer.traits.trained
@@ -71,11 +66,10 @@ def test_the_weight_file_holds_the_averaged_weights_in_half_precision(run: Path)
 def test_every_stage_writes_metrics_and_samples(run: Path) -> None:
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     measured = {line["stage"]: line for line in lines if line["kind"] == "measured"}
-    assert set(measured) == {"vae", "unet", "decoder", "export"}
+    assert set(measured) == {"vae", "unet", "export"}
     assert all(5 < line["psnr"] < 60 for line in measured.values())
-    assert all(0 <= measured[stage]["miou_full"] <= 1 for stage in ("unet", "decoder", "export"))
-    assert {line["stage"] for line in lines if line["kind"] == "loss"} == {"vae", "unet", "decoder"}
-    for stage in ("vae", "unet", "decoder"):
+    assert {line["stage"] for line in lines if line["kind"] == "loss"} == {"vae", "unet"}
+    for stage in ("vae", "unet"):
         assert len(list((run / stage / "samples").glob("*.png"))) == 1
     assert measured["export"]["bytes"] == (run / "tiny.safetensors").stat().st_size
 
@@ -91,21 +85,14 @@ def test_latents_have_zero_mean_and_unit_spread(run: Path) -> None:
     assert np.abs(meta.mean).max() < 1.0
     assert 0.3 < min(meta.std) <= max(meta.std) < 3.0
     assert sum(meta.sensitivity) / len(meta.sensitivity) == pytest.approx(1.0)
-    assert sum(meta.class_counts) == 2 * FRAMES * (HEIGHT // 2) * (WIDTH // 2)
 
 
 def test_rows_are_the_encoded_frames_and_mirroring_mirrors_the_rest(run: Path) -> None:
     clips = LatentClips.open(run / "latents")
     both, frame = torch.tensor([1, 1]), torch.tensor([2, 2])
     rows = clips.rows(both, frame, torch.tensor([False, True]), torch.device("cpu"))
-    assert rows.classes is not None
-    assert rows.pictures is not None
-    for pictures in (rows.pictures.half, rows.pictures.ground, rows.pictures.distant):
-        assert torch.equal(pictures[1], pictures[0].flip(-1))
-    assert torch.equal(rows.classes[1], rows.classes[0].flip(-1))
     assert not torch.equal(rows.source[0], rows.source[1])
-    source = to_network(TinyClips().rgb(1)[0])[2]
-    assert rows.pictures.half[0].mean().item() == pytest.approx(source.mean().item(), abs=0.01)
+    assert not torch.equal(rows.target[0], rows.target[1])
 
 
 def assert_same(first: object, second: object, where: str = "state") -> None:
@@ -138,7 +125,6 @@ def folder_with(run: Path, path: Path, *parts: str) -> Path:
         ("vae", (), 5),
         ("unet", ("vae", "latents"), 2),
         ("unet", ("vae", "latents"), 5),
-        ("decoder", ("vae", "latents", "unet", "predictions"), 2),
     ],
 )
 def test_a_resumed_stage_equals_an_uninterrupted_one_bit_for_bit(
@@ -163,7 +149,7 @@ def test_encoding_goes_on_where_it_stopped(run: Path, tmp_path: Path) -> None:
     with pytest.raises(RunError, match="no finished latents"):
         LatentClips.open(path / "latents")
     trainer(path, clips=3).run("latents")  # the data has grown; the run keeps the clips it began with
-    for name in ("source", "target", "half", "classes"):
+    for name in ("source", "target"):
         first, second = (np.load(folder / "latents" / f"{name}.npy") for folder in (path, run))
         assert np.array_equal(first, second), name
 
@@ -211,8 +197,9 @@ def test_a_stage_wants_the_one_before_it(tmp_path: Path) -> None:
 
 
 def test_a_stage_the_recipe_lacks_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(RecipeError, match="no stage 'decoder'"):
-        trainer(tmp_path, recipe=tiny_recipe(decoder=None)).run("decoder")
+    model = msgspec.structs.replace(tiny_recipe().model, weights="none.safetensors")
+    with pytest.raises(RecipeError, match="no stage 'vae'"):
+        trainer(tmp_path, recipe=tiny_recipe(vae=None, model=model)).run("vae")
 
 
 def test_clips_of_another_size_are_refused(run: Path, tmp_path: Path) -> None:
@@ -223,39 +210,19 @@ def test_clips_of_another_size_are_refused(run: Path, tmp_path: Path) -> None:
         trainer(path, recipe=tiny_recipe(model=larger)).run("latents")
 
 
-def test_without_decoder_stage_the_file_has_no_plane_mix(run: Path, tmp_path: Path) -> None:
-    path = folder_with(run, tmp_path / "again", "vae", "latents", "unet")
-    trainer(path, recipe=tiny_recipe(decoder=None)).run("export")
-    config: Any = load_synthesizer(path / "tiny.safetensors", device="cpu").traits.config
-    assert config.plane_mix is None
-    assert config.class_head is not None
-
-
-def test_predicting_goes_on_where_it_stopped(run: Path, tmp_path: Path) -> None:
-    torch.set_num_threads(1)
-    path = folder_with(run, tmp_path / "again", "vae", "latents", "unet")
-    with pytest.raises(Interrupted, match="predicting 1 of 2"):
-        trainer(path, stop=After(1)).run("decoder")
-    assert not (path / "predictions" / "meta.json").exists()
-    trainer(path).run("decoder")
-    for name in ("latents", "decoded", "logits"):
-        first, second = (np.load(folder / "predictions" / f"{name}.npy") for folder in (path, run))
-        assert np.array_equal(first, second), name
-
-
 def test_a_kill_between_the_last_renames_of_the_latents_loses_nothing(run: Path, tmp_path: Path) -> None:
     path = folder_with(run, tmp_path / "again", "vae")
     shutil.copytree(run / "latents", path / "latents")
     meta = json.loads((path / "latents" / "meta.json").read_text())
     (path / "latents" / "meta.json").unlink()
     (path / "latents" / "clips.json").write_text(json.dumps({"meta": meta, "done": 2}))
-    (path / "latents" / "half.npy").rename(path / "latents" / "half.npy.part")  # the others had their names already
+    (path / "latents" / "motion.npy").rename(path / "latents" / "motion.npy.part")  # the others had their names already
     trainer(path).run("latents")
     assert LatentClips.open(path / "latents").meta == LatentClips.open(run / "latents").meta
 
 
 def test_weights_of_two_runs_are_never_exported_together(run: Path, tmp_path: Path) -> None:
-    other, path = tmp_path / "other", folder_with(run, tmp_path / "mixed", "latents", "unet", "decoder")
+    other, path = tmp_path / "other", folder_with(run, tmp_path / "mixed", "latents", "unet")
     shorter = msgspec.structs.replace(tiny_recipe().vae, budget=Budget(updates=2))
     trainer(other, recipe=tiny_recipe(vae=shorter)).run("vae")
     (path / "vae").symlink_to(other / "vae")
@@ -275,9 +242,7 @@ def test_a_stage_killed_before_its_last_measurement_measures_when_run_again(run:
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
-        ("mount", CameraMount(height_m=1.2), "generate clips with the model's mount"),
         ("fps", 5.0, "the clips have 5"),
-        ("classes", DRIVING_CLASSES[:5], "classes are not the model's"),
     ],
 )
 def test_clips_the_model_does_not_fit_are_refused_before_training(

@@ -1,12 +1,12 @@
-"""An untrained driving model with every switch of ours, for tiny pictures, as a file."""
+"""An untrained small driving model, for tiny pictures."""
 
 from pathlib import Path
 
 import msgspec
 
-from gcd_model import DRIVING_SMALL
+from gcd_model import PLAIN_SMALL
 from gcd_model.checkpoints import save_weights
-from gcd_model.config import DRIVING_CLASSES, ClassHeadConfig, ModelConfig
+from gcd_model.config import ModelConfig
 from gcd_model.networks import random_networks
 from gcd_model.own_format import Card
 
@@ -16,12 +16,13 @@ FRAMES, HEIGHT, WIDTH = 4, 32, 64
 def write_untrained(folder: Path) -> Path:
     """`untrained.safetensors`: four frames of 64 x 32."""
     config = msgspec.structs.replace(
-        DRIVING_SMALL,
+        PLAIN_SMALL,
         frames=FRAMES,
         height=HEIGHT,
         width=WIDTH,
-        unet=msgspec.structs.replace(DRIVING_SMALL.unet, width=16, embedding_width=32, head_width=16),
-        vae=msgspec.structs.replace(DRIVING_SMALL.vae, width=16),
+        unet=msgspec.structs.replace(PLAIN_SMALL.unet, width=16, embedding_width=32, head_width=16),
+        vae=msgspec.structs.replace(PLAIN_SMALL.vae, width=16),
+        sampling=msgspec.structs.replace(PLAIN_SMALL.sampling, steps=1),
     )
     path = folder / "untrained.safetensors"
     card = Card(name="untrained", config=config, family="driving", move_time=FRAMES - 1, trained=False)
@@ -29,12 +30,11 @@ def write_untrained(folder: Path) -> Path:
     return path
 
 
-def without_warps(frames: int, height: int, width: int) -> ModelConfig:
-    """A still smaller one with a class head, and neither plane warps nor a plane mix."""
+def smaller(frames: int, height: int, width: int) -> ModelConfig:
+    """A still smaller one."""
     change = msgspec.structs.replace
     unet = change(
-        DRIVING_SMALL.unet,
-        condition_channels=12,
+        PLAIN_SMALL.unet,
         width=8,
         multipliers=(1, 2),
         attention=(False, True),
@@ -42,13 +42,10 @@ def without_warps(frames: int, height: int, width: int) -> ModelConfig:
         head_width=8,
     )
     return change(
-        DRIVING_SMALL,
+        PLAIN_SMALL,
         frames=frames,
         height=height,
         width=width,
-        plane_warp=None,
-        plane_mix=None,
-        class_head=ClassHeadConfig(classes=DRIVING_CLASSES),
         unet=unet,
-        vae=change(DRIVING_SMALL.vae, width=8, multipliers=(1, 1, 2)),
+        vae=change(PLAIN_SMALL.vae, width=8, multipliers=(1, 1, 2)),
     )

@@ -3,8 +3,7 @@
 import msgspec
 import numpy as np
 
-from gcd_model.class_head import SemanticClass
-from gcd_model.config import DRIVING_CLASSES, CameraControl
+from gcd_model.config import DRIVING_CLASSES, CameraControl, SemanticClass
 from gcd_model.geometry import (
     CameraMount,
     Spherical,
@@ -50,13 +49,7 @@ augmentation = 0.0
 optimiser = { rate = 1e-3, warm_up = 2, flat = 0.3, final = 0.02, clip = 1.0 }
 ema = { limit = 0.998, horizon = 0.15 }
 noise = { fixed_share = 0.5, shared = 1.0 }
-loss = { weight_limit = 5.0, sensitivity = true, class_map = 0.25 }
-[decoder]
-budget = { updates = 4 }
-clips = 2
-batch = 2
-optimiser = { rate = 1e-3 }
-ema = { limit = 0.9 }
+loss = { weight_limit = 5.0, sensitivity = true }
 """
 
 

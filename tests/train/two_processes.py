@@ -28,7 +28,7 @@ from gcd_train.engine.states import newest_weights
 from gcd_train.errors import Interrupted, TrainError
 from gcd_train.loop import Loop, LoopOptions, Progress, StepLoss
 from gcd_train.model_setup import model_config
-from gcd_train.objective import Batch, Weights, diffusion_loss
+from gcd_train.objective import Batch, diffusion_loss
 from gcd_train.precision import Precision
 from gcd_train.recipe import Budget, ComputeRecipe, LogRecipe, Recipe
 from gcd_train.run_folder import RunFolder
@@ -56,7 +56,6 @@ class Noise:
             condition=draws.normal(rows, unet.condition_channels, 4, 8),
             vector=draws.normal(rows, unet.vector_width),
             tokens=None,
-            classes=None,
             emphasis=None,
             frames=frames,
         )
@@ -83,7 +82,7 @@ class Task(UNetTask):
 
     def __init__(self, recipe: Recipe, dies_at: int | None = None) -> None:
         networks = random_networks(model_config(recipe.model), seed=1)
-        super().__init__(networks, Noise(), None, recipe.unet, Weights(), PRECISION, recipe.seed)  # pyright: ignore
+        super().__init__(networks, Noise(), None, recipe.unet, None, PRECISION, recipe.seed)  # pyright: ignore
         self._dies_at = dies_at
 
     def step_loss(self, progress: Progress) -> StepLoss:
@@ -119,13 +118,13 @@ class TwiceTheBatch(Task):
         batch = made(draws, 2 * (recipe.image_batch if single else recipe.clip_batch))  # pyright: ignore
         return diffusion_loss(
             self._network, batch, draws, PRECISION,  # pyright: ignore
-            noise=recipe.noise, loss=recipe.loss, weights=Weights(), step=progress.updates,
+            noise=recipe.noise, loss=recipe.loss, channel_weights=None, step=progress.updates,
         )  # fmt: skip
 
 
 def recipe_of() -> Recipe:
     recipe = tiny_recipe()
-    loss = msgspec.structs.replace(recipe.unet.loss, sensitivity=False, class_map=0.0)
+    loss = msgspec.structs.replace(recipe.unet.loss, sensitivity=False)
     # half the published rate: where a gradient is next to nothing, Adam makes a whole step of its rounding
     optimiser = msgspec.structs.replace(recipe.unet.optimiser, kind="adam", rate=1e-5)
     budget = Budget(updates=UPDATES)

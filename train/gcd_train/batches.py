@@ -8,8 +8,6 @@ from torch import Tensor
 
 from gcd_model import Family, ModelConfig
 from gcd_model.networks import Networks
-from gcd_model.plane_warp import WarpPictures
-from gcd_train.clip_warps import ClipWarps
 from gcd_train.conditioner import Conditioner
 from gcd_train.datasets.clip_source import ClipSource, to_network
 from gcd_train.datasets.latents import EncodedClips, LatentRows
@@ -72,7 +70,6 @@ class EncodedBatches:
             condition=condition,
             vector=self.vector(rows),
             tokens=None,
-            classes=rows.classes,
             emphasis=rows.emphasis,
             frames=per_clip,
             camera=rows.control,
@@ -85,14 +82,14 @@ class EncodedBatches:
 
     def condition(self, rows: LatentRows) -> Tensor:
         """Condition channels [N, C', h, w] of some frames."""
-        return self._conditioner.channels(rows.source, rows.pictures)
+        return self._conditioner.channels(rows.source)
 
 
 class PixelBatches:
     """Whole clips encoded anew each time: fresh augmentation noise, targets drawn from the posterior, image tokens.
 
     family: says what the network is told of a camera's way; None for the recipe's motion number.
-    Raises RecipeError for single frames and class maps.
+    Raises RecipeError for single frames.
     """
 
     def __init__(
@@ -103,13 +100,10 @@ class PixelBatches:
         precision: Precision,
         family: Family | None = None,
     ) -> None:
-        if recipe.image_share or recipe.loss.class_map:
-            raise RecipeError(
-                'unet.source "pixels" takes whole clips and no class map; set image_share, class_map to 0'
-            )
+        if recipe.image_share:
+            raise RecipeError('unet.source "pixels" takes whole clips only; set image_share to 0')
         self._clips, self._networks, self._recipe, self._precision = clips, networks, recipe, precision
         self._conditioner = Conditioner(networks.config, recipe, precision, family)
-        self._warps = ClipWarps(clips, networks.config, precision.device)
 
     def single_frames(self, draws: Draws, count: int) -> Batch:
         """Not offered; refused when this was made."""
@@ -124,8 +118,8 @@ class PixelBatches:
         """The batch of these clips."""
         source, target = self._pictures(numbers)
         encoded = encode_frames(self._networks, self._recipe, source, target, draws)
-        frames, pictures = self._networks.config.frames, self._warped(numbers, source)
-        condition = self._conditioner.channels(encoded.source, pictures)
+        frames = self._networks.config.frames
+        condition = self._conditioner.channels(encoded.source)
         condition, tokens = drop_streams(condition, encoded.tokens, frames, draws, self._recipe)
         motion, camera = self._told(numbers)
         return Batch(
@@ -133,7 +127,6 @@ class PixelBatches:
             condition=condition,
             vector=self._conditioner.vector(motion.repeat_interleave(frames), source.shape[0]),
             tokens=tokens,
-            classes=None,
             emphasis=encoded.emphasis,
             frames=frames,
             camera=camera,
@@ -149,18 +142,6 @@ class PixelBatches:
             raise DataError(f"clips must be T, H, W = {wanted} for this model, got {given}; generate them anew")
         source, target = (torch.cat([to_network(pair[side]) for pair in pairs]) for side in (0, 1))
         return self._precision.frames(source), self._precision.frames(target)
-
-    def _warped(self, numbers: Sequence[int], source: Tensor) -> WarpPictures | None:
-        """What the condition is made of beside latents, of all clips; None for a model that does not warp."""
-        clips = zip(numbers, source.chunk(len(numbers)), strict=True)
-        made = [self._warps.pictures(number, frames) for number, frames in clips]
-        there = [pictures for pictures in made if pictures is not None]
-        if not there:
-            return None
-        half, ground, distant, rays = (
-            torch.cat([getattr(pictures, name) for pictures in there]) for name in ("half", "ground", "distant", "rays")
-        )
-        return WarpPictures(half=half, ground=ground, distant=distant, rays=rays)
 
     def _told(self, numbers: Sequence[int]) -> tuple[Tensor, Tensor | None]:
         """Motion number of each clip, [B], and camera features of each frame, [N, K], if the model is steered."""

@@ -22,7 +22,7 @@ from gcd_train.engine.blocks import recompute_blocks
 from gcd_train.engine.optimisers import build_optimiser
 from gcd_train.lora import add_lora, is_adapted
 from gcd_train.memory_account import PLANS, Account, Kept, Plan, account, kept_by_update
-from gcd_train.objective import Batch, Denoiser, Weights, diffusion_loss, drop_streams
+from gcd_train.objective import Batch, Denoiser, diffusion_loss, drop_streams
 from gcd_train.pixel_encoding import encode_frames
 from gcd_train.precision import Precision
 from gcd_train.recipe import (
@@ -203,7 +203,7 @@ class _Updates:
         if precision.half:
             halve_frozen(networks)
         self._networks: Networks = precision.placed(networks)
-        self._denoiser = Denoiser(networks.unet, networks.class_head, config.prediction, networks.camera)
+        self._denoiser = Denoiser(networks.unet, config.prediction, networks.camera)
         if options.recompute:
             recompute_blocks(self._denoiser, 1)
         trained = [parameter for parameter in self._denoiser.parameters() if parameter.requires_grad]
@@ -223,7 +223,7 @@ class _Updates:
             self._precision,
             noise=self._recipe.noise,
             loss=self._recipe.loss,
-            weights=Weights(),
+            channel_weights=None,
             step=number,
         )
         loss.total.backward()
@@ -241,7 +241,6 @@ class _Updates:
             condition=condition,
             vector=self._conditioner.vector(torch.full((rows,), 100.0), rows),
             tokens=tokens,
-            classes=None,
             emphasis=made.emphasis,
             frames=config.frames,
             camera=draws.normal(rows, 13),

@@ -1,7 +1,6 @@
 """Whether clips are what a model takes them for."""
 
 from gcd_model import ModelConfig
-from gcd_model.plane_warp import trained_mount
 from gcd_train.datasets.clip_source import ClipSource
 from gcd_train.errors import DataError
 
@@ -14,17 +13,6 @@ def require_fit(clips: ClipSource, config: ModelConfig, fps: float) -> None:
         raise DataError("the model is steered by angles and radius, and these clips have no orbits; take drop clips")
     if config.camera == "none" and clips.camera != "none":
         raise DataError("the model has one fixed view, and each of these clips has its own; take driving clips")
-    require_mount(clips, config)
-    classes = config.semantic_classes if config.class_head is None else config.class_head.classes
+    classes = config.semantic_classes
     if classes and [kind.name for kind in classes] != [kind.name for kind in clips.classes]:
         raise DataError("the clips' classes are not the model's; generate them with this version")
-
-
-def require_mount(clips: ClipSource, config: ModelConfig) -> None:
-    """Raises DataError if the model warps by planes about a vehicle, and the clips were taken from another place."""
-    plane = config.plane_warp
-    if plane is not None and plane.frame == "vehicle" and clips.mount != trained_mount(plane):
-        raise DataError(
-            f"the model warps for {trained_mount(plane)}, the clips were taken with {clips.mount}; "
-            "generate clips with the model's mount"
-        )

@@ -7,7 +7,6 @@ from gcd_model import Family, ModelConfig
 from gcd_model.conditioning import micro_conditioning, relative_pose_features, spherical_features
 from gcd_model.geometry import Trajectory, motion_bucket
 from gcd_model.layers import sinusoid
-from gcd_model.plane_warp import WarpPictures, channels_of
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.precision import Precision
 from gcd_train.recipe import UNetRecipe
@@ -25,8 +24,8 @@ class Conditioner:
     ) -> None:
         if config.extra_condition_channels:
             raise RecipeError(
-                f"the model wants {config.extra_condition_channels} condition channels beside latents and warps, which "
-                "no data here has; take another base model"
+                f"the model wants {config.extra_condition_channels} condition channels beside latents, which no data "
+                "here has; take another base model"
             )
         self._config, self._recipe, self._precision, self._family = config, recipe, precision, family
         width = config.unet.vector_width
@@ -42,12 +41,9 @@ class Conditioner:
         told = sinusoid(motion.to(self._precision.device).float(), third)
         return torch.cat([vector[:, :third], told, vector[:, 2 * third :]], dim=1)
 
-    def channels(self, latents: Tensor, pictures: WarpPictures | None) -> Tensor:
-        """Source latents [N, C, h, w] and, for a model that warps, what it is shown of the warps."""
-        if pictures is None:
-            return self._precision.frames(latents)
-        warped = channels_of(pictures, self._config.vae.down_factor)
-        return self._precision.frames(torch.cat([latents, warped.to(latents.device)], dim=1))
+    def channels(self, latents: Tensor) -> Tensor:
+        """Source latents [N, C, h, w] as the network takes them."""
+        return self._precision.frames(latents)
 
     def motion(self, path: Trajectory) -> float:
         """The number that tells the network how far the camera goes: the family's for the path, else the recipe's.

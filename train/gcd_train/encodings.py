@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-
 from gcd_model import Family, ModelConfig
 from gcd_model.networks import Networks, weights_digest
 from gcd_train.conditioner import Conditioner
@@ -12,7 +10,7 @@ from gcd_train.datasets.clip_source import ClipSource
 from gcd_train.datasets.latent_videos import LatentVideos
 from gcd_train.datasets.latents import EncodedClips, LatentClips
 from gcd_train.errors import RunError
-from gcd_train.losses import COLOUR_WEIGHTS, class_frequency_weights
+from gcd_train.losses import COLOUR_WEIGHTS
 from gcd_train.model_setup import digest_of
 from gcd_train.precision import Precision
 from gcd_train.recipe import LatentsRecipe, Recipe
@@ -88,7 +86,7 @@ class Encodings:
 
     def _identity(self, networks: Networks, clips: ClipSource) -> str:
         recipe, config = self.recipe, self.config
-        steered = (config.plane_warp, config.camera, _told_motion(self.family), recipe.unet.motion_bucket)
+        steered = (config.camera, _told_motion(self.family), recipe.unet.motion_bucket)
         told = digest_of(self._latents, recipe.seed, clips.origin, steered, recipe.unet.loss.class_weights)
         return f"{autoencoder_digest(networks)}-{told}"
 
@@ -96,13 +94,6 @@ class Encodings:
     def _latents(self) -> LatentsRecipe:
         assert self.recipe.latents is not None, "clips are encoded only if the recipe has the table"
         return self.recipe.latents
-
-
-def class_weights(clips: EncodedClips, power: float, device: torch.device) -> torch.Tensor | None:
-    """Weights of the classes by their frequency in the encoded clips, [K]; None without class maps."""
-    if not clips.meta.class_counts:
-        return None
-    return class_frequency_weights(torch.tensor(clips.meta.class_counts), power).to(device)
 
 
 def autoencoder_digest(networks: Networks) -> str:

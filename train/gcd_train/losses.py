@@ -141,13 +141,3 @@ def frame_losses(
     bias = raw * emphasis
     chosen = focal_mean(raw + blend.bias_before * bias, fraction, blend.hardest)
     return chosen + (1 - blend.bias_before) * bias.flatten(1).mean(1)
-
-
-def class_frequency_weights(frequencies: Tensor, power: float) -> Tensor:
-    """Weights of the classes in a cross-entropy, frequency^-power, one on average over pixels: [K] -> [K].
-
-    A class that never occurs is treated as one pixel in a hundred thousand. Ours, for the class-map head.
-    """
-    shares = (frequencies.double() / frequencies.sum()).clamp(min=1e-5)
-    raw = shares**-power
-    return (raw / (raw * shares).sum()).float()

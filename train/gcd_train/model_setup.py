@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from gcd_model import FAMILIES, SMALL, SVD_14, Family, ModelConfig
-from gcd_model.config import DRIVING_SEMANTIC_SMALL, DRIVING_SMALL, OBJECTS_SMALL, PLAIN_SMALL, CameraControl
+from gcd_model.config import DRIVING_CLASSES, PLAIN_SMALL, CameraControl
 from gcd_model.errors import OptionError
 from gcd_model.gcd_layout import gcd_state
 from gcd_model.networks import Networks, empty_networks
@@ -19,19 +19,15 @@ from gcd_train.recipe import AnyStageName, ComputeRecipe, ModelRecipe, Recipe, U
 from gcd_train.run_folder import RunFolder
 
 _BASES: dict[str, ModelConfig] = {
-    "driving-small": DRIVING_SMALL,
-    "driving-semantic-small": DRIVING_SEMANTIC_SMALL,
-    "objects-small": OBJECTS_SMALL,
     "plain-small": PLAIN_SMALL,
     "svd-14": SVD_14,
     "small": SMALL,
 }
-_DENOISER = ("unet.", "class_head.", "camera.")
+_DENOISER = ("unet.", "camera.")
 _PREFIXES: dict[AnyStageName, tuple[str, ...]] = {
     "vae": ("target_encoder.", "decoder."),
     "unet": _DENOISER,
     "paired": _DENOISER,
-    "decoder": ("plane_mix.",),
 }
 
 
@@ -48,6 +44,7 @@ def model_config(recipe: ModelRecipe) -> ModelConfig:
             frames=recipe.frames or base.frames,
             height=recipe.height or base.height,
             width=recipe.width or base.width,
+            semantic_classes=DRIVING_CLASSES if recipe.base == "plain-small" and _paints(recipe) else (),
         )
         # msgspec does not check what `replace` makes; a round trip does
         config = msgspec.json.decode(msgspec.json.encode(changed), type=ModelConfig)
@@ -60,6 +57,10 @@ def model_config(recipe: ModelRecipe) -> ModelConfig:
             f"numbers; got {config.height} and {config.width}"
         )
     return config
+
+
+def _paints(recipe: ModelRecipe) -> bool:
+    return family_of(recipe).output == "semantic"
 
 
 def require_exportable(recipe: Recipe, config: ModelConfig) -> None:
@@ -168,10 +169,9 @@ def _given(changes: UNetChanges | VAEChanges) -> dict[str, object]:
     return {name: value for name, value in msgspec.structs.asdict(changes).items() if value is not None}
 
 
-def copy_of(networks: Networks, *, plane_mix: bool) -> Networks:
-    """The same weights once more, on the CPU, adapters merged. plane_mix: keep that switch; it is useless untrained."""
-    config = networks.config if plane_mix else msgspec.structs.replace(networks.config, plane_mix=None)
-    copy = Networks(config)
+def copy_of(networks: Networks) -> Networks:
+    """The same weights once more, on the CPU, adapters merged."""
+    copy = Networks(networks.config)
     known = copy.state_dict()
     copy.load_state_dict({name: value for name, value in plain_weights(networks).items() if name in known})
     return copy

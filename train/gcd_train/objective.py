@@ -7,10 +7,8 @@ conditioning augmentation in pixel space; x0-prediction, fixed noise levels, sha
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gcd_model.class_head import ClassHead
 from gcd_model.conditioning import CameraEmbedder
 from gcd_model.config import Prediction
 from gcd_model.networks import Networks
@@ -26,40 +24,32 @@ _BLENDS: dict[FocalBlendName, FocalBlend] = {"released": RELEASED_BLEND, "plain"
 
 
 class Denoiser(nn.Module):
-    """U-Net, class head and camera embedder under the names they have in `Networks`."""
+    """U-Net and camera embedder under the names they have in `Networks`."""
 
-    def __init__(
-        self,
-        unet: VideoUNet,
-        class_head: ClassHead | None,
-        prediction: Prediction,
-        camera: CameraEmbedder | None = None,
-    ) -> None:
+    def __init__(self, unet: VideoUNet, prediction: Prediction, camera: CameraEmbedder | None = None) -> None:
         super().__init__()
-        self.unet, self.class_head, self.camera = unet, class_head, camera
+        self.unet, self.camera = unet, camera
         self.prediction: Prediction = prediction
 
-    def forward(self, noisy: Tensor, sigma: Tensor, batch: "Batch") -> tuple[Tensor, Tensor | None]:
-        """D(x, sigma) and the class logits.
+    def forward(self, noisy: Tensor, sigma: Tensor, batch: "Batch") -> Tensor:
+        """D(x, sigma).
 
         Args:
             noisy: [N, C, h, w]. sigma: [N].
         Returns:
-            [N, C, h, w] and [N, K, H', W'] or None, float32.
+            [N, C, h, w], float32.
         """
         levels = preconditioning(sigma, self.prediction)
         camera = None if self.camera is None or batch.camera is None else self.camera.proj(batch.camera)
         plan = self.unet.plan(levels.c_noise[None], batch.vector, camera, batch.tokens)
         scaled, image_mode = _column(levels.c_in) * noisy, batch.frames == 1
-        features = self.unet.features(scaled, batch.condition, plan.step(0), image_mode=image_mode)
-        raw = self.unet.project(features).float()
-        logits = None if self.class_head is None else self.class_head(features).float()
-        return _column(levels.c_skip) * noisy + _column(levels.c_out) * raw, logits
+        raw = self.unet(scaled, batch.condition, plan.step(0), image_mode=image_mode).float()
+        return _column(levels.c_skip) * noisy + _column(levels.c_out) * raw
 
 
 def denoiser_of(networks: Networks) -> Denoiser:
-    """What is trained to denoise: U-Net, class head and camera embedder."""
-    return Denoiser(networks.unet, networks.class_head, networks.config.prediction, networks.camera)
+    """What is trained to denoise: U-Net and camera embedder."""
+    return Denoiser(networks.unet, networks.config.prediction, networks.camera)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -67,7 +57,7 @@ class Batch:
     """N rows, time fastest: whole clips of `frames` frames, or unrelated frames with `frames` 1.
 
     target: [N, C, h, w], scaled latents. condition: [N, C', h, w]. vector: [N, V]. tokens: [N, D] or None.
-    classes: int64 [N, H', W'] or None. emphasis: [N, 1, h, w] of `class_emphasis`, or None.
+    emphasis: [N, 1, h, w] of `class_emphasis`, or None.
     camera: [N, F], the features a model with camera control is steered by, see `CameraEmbedder`; None without.
     ids: what the rows were made from, one name a clip, for messages. wait_s: seconds that were waited for the data,
     None where it was not measured.
@@ -77,20 +67,11 @@ class Batch:
     condition: Tensor
     vector: Tensor
     tokens: Tensor | None
-    classes: Tensor | None
     emphasis: Tensor | None
     frames: int
     camera: Tensor | None = None
     ids: tuple[str, ...] = ()
     wait_s: float | None = None
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Weights:
-    """Constant weights of the loss. channels: [C] or None. classes: [K] or None."""
-
-    channels: Tensor | None = None
-    classes: Tensor | None = None
 
 
 def draw_sigma(draws: Draws, clips: int, recipe: NoiseRecipe) -> Tensor:
@@ -146,45 +127,32 @@ def diffusion_loss(
     *,
     noise: NoiseRecipe,
     loss: LossRecipe,
-    weights: Weights,
+    channel_weights: Tensor | None,
     step: int,
 ) -> StepLoss:
-    """The loss of one batch: mean over frames of w(sigma) * frame loss, plus the class map's cross-entropy.
+    """The loss of one batch: mean over frames of w(sigma) * frame loss.
 
-    denoiser: a Denoiser, or what wraps one. step: updates of the optimiser so far, for the focal schedule.
+    denoiser: a Denoiser, or what wraps one. channel_weights: [C] or None. step: updates of the optimiser so far, for
+    the focal schedule.
     """
     sigma = draw_sigma(draws, batch.target.shape[0] // batch.frames, noise).repeat_interleave(batch.frames)
     unit = draw_noise(draws, batch.target.shape, batch.frames, noise.shared)
     with precision.arithmetic():
-        denoised, logits = denoiser(batch.target + _column(sigma) * unit, sigma, batch)
+        denoised = denoiser(batch.target + _column(sigma) * unit, sigma, batch)
     fraction = focal_fraction(step, final=loss.focal_fraction, steps=loss.focal_steps) if loss.focal else 1.0
     rows = frame_losses(
         denoised,
         batch.target,
         fraction=fraction,
         emphasis=batch.emphasis,
-        channel_weights=weights.channels,
+        channel_weights=channel_weights,
         blend=_BLENDS[loss.focal_blend],
     )
     total = (rows * edm_weight(sigma, loss.weight_limit)).mean()
     parts = {"latent": total.detach()}
     if batch.wait_s is not None:
         parts["wait_s"] = total.new_tensor(batch.wait_s)
-    if logits is not None and batch.classes is not None and loss.class_map:
-        parts["class_map"] = class_map_loss(logits, batch.classes, sigma >= loss.class_from_sigma, weights.classes)
-        total = total + loss.class_map * parts["class_map"]
     return StepLoss(total, parts, batch.target.shape[0], batch.ids)
-
-
-def class_map_loss(logits: Tensor, classes: Tensor, counted: Tensor, weights: Tensor | None) -> Tensor:
-    """Weighted cross-entropy, mean over pixels of the counted rows.
-
-    Args:
-        logits: [N, K, H, W]. classes: int64 [N, H, W]. counted: bool [N]. weights: [K] or None.
-    """
-    pixels = F.cross_entropy(logits, classes, weight=weights, reduction="none")  # [N, H, W]
-    rows = pixels.flatten(1).mean(1) * counted
-    return rows.sum() / counted.sum().clamp(min=1)
 
 
 def _column(values: Tensor) -> Tensor:

@@ -23,7 +23,7 @@ class PairBatches:
     """A `BatchSource` of whole clips. Batch n, by `Draws.number`, always has the same samples.
 
     samples: `ViewPairs`, `LeRobotPairs`. family: says what the network is told of a camera's way.
-    Raises RecipeError for single frames, class maps, or a model that warps: those learn from pairs of clips.
+    Raises RecipeError for single frames: those learn from pairs of clips.
     """
 
     def __init__(
@@ -36,12 +36,10 @@ class PairBatches:
         loader: LoaderRecipe,
         seed: int,
     ) -> None:
-        if recipe.image_share or recipe.loss.class_map:
-            raise RecipeError(
-                "samples of a data set are whole clips without class maps; set image_share, class_map to 0"
-            )
-        if networks.config.plane_warp is not None or networks.config.extra_condition_channels:
-            raise RecipeError('a model with warp channels learns from data.kind "pairs"; take a base without them')
+        if recipe.image_share:
+            raise RecipeError("samples of a data set are whole clips; set image_share to 0")
+        if networks.config.extra_condition_channels:
+            raise RecipeError("no data here has further condition channels; take a base without them")
         self._networks, self._recipe, self._family, self._precision = networks, recipe, family, precision
         self._loader = SampleLoader(samples, seed, loader)
 
@@ -69,7 +67,6 @@ class PairBatches:
             condition=condition,
             vector=torch.stack(told).repeat_interleave(frames, dim=0).to(self._precision.device),
             tokens=tokens,
-            classes=None,
             emphasis=encoded.emphasis,
             frames=frames,
             camera=None if camera is None else camera.to(self._precision.device),

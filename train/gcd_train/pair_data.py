@@ -39,11 +39,6 @@ def require_image_to_video(recipe: Recipe, config: ModelConfig) -> None:
             f'data.task "image-to-video" makes a model without views, model.family is {model.family!r}: give '
             f'model.family "{_VIDEO_FAMILY}"'
         )
-    if config.plane_warp is not None or config.class_head is not None:
-        raise RecipeError(
-            'data.task "image-to-video" has no camera\'s way to warp along and no class maps; take a base without '
-            'them, such as model.base "plain-small"'
-        )
 
 
 def _videos(recipe: Recipe, config: ModelConfig, data: Path, valid: Path) -> RunData:

@@ -8,7 +8,7 @@ from gcd_model.networks import Networks
 from gcd_train.lora import add_lora, is_adapted
 from gcd_train.recipe import ModelRecipe
 
-_ALL = ("unet.", "camera.", "class_head.")
+_ALL = ("unet.", "camera.")
 _CAMERA = ("camera.", "unet.embed_camera.")
 _TEMPORAL = (".temporal.", ".positions.", ".share.")
 _DORMANT = ".dormant."

@@ -9,22 +9,19 @@ import torch
 
 from gcd_model import ModelConfig
 from gcd_model.adapter import Adapter, base_digest
-from gcd_model.networks import Networks, weights_digest
+from gcd_model.networks import Networks
 from gcd_model.own_format import Card
 from gcd_train.batches import BatchMaker, BatchSource, EncodedBatches, PixelBatches
 from gcd_train.clip_fit import require_fit
-from gcd_train.datasets.clip_source import ClipSource, KeptClips, numbers_of
-from gcd_train.datasets.latents import EncodedClips, LatentClips
-from gcd_train.datasets.predictions import Predictions, PredictionsMeta, write_predictions
-from gcd_train.draws import Draws
-from gcd_train.encodings import Encodings, autoencoder_digest, class_weights
+from gcd_train.datasets.clip_source import ClipSource
+from gcd_train.datasets.latents import EncodedClips
+from gcd_train.encodings import Encodings, autoencoder_digest
 from gcd_train.engine.engine import Engine
 from gcd_train.engine.processes import ALONE, Processes
 from gcd_train.errors import RecipeError
 from gcd_train.loop import Loop, LoopOptions, Task
 from gcd_train.lora import adapter_of, merge_lora
 from gcd_train.model_setup import (
-    copy_of,
     digest_of,
     family_of,
     fill,
@@ -32,11 +29,9 @@ from gcd_train.model_setup import (
     require_exportable,
     sampled_as_trained,
 )
-from gcd_train.objective import Weights
 from gcd_train.precision import Precision
-from gcd_train.recipe import DecoderRecipe, Recipe, StageName, UNetRecipe, VAERecipe
+from gcd_train.recipe import Recipe, StageName, UNetRecipe, VAERecipe
 from gcd_train.run_folder import RunFolder
-from gcd_train.stages.decoder import DecoderData, DecoderTask, Predictor
 from gcd_train.stages.export import ExportJob, export
 from gcd_train.stages.unet import UNetTask
 from gcd_train.stages.vae import VAETask
@@ -107,7 +102,6 @@ class Trainer:
             "vae": self._train_vae,
             "latents": self._encode,
             "unet": self._train_unet,
-            "decoder": self._train_decoder,
             "export": self._export,
         }
         for stage in (only,) if only else self._recipe.stages:
@@ -147,17 +141,11 @@ class Trainer:
         config, seed = self._config, self._recipe.seed
         if stage == "vae":
             return digest_of(config.vae, seed)
-        if stage == "unet":
-            shape = digest_of(config.unet, config.prediction, config.plane_warp, seed)
-            model = self._recipe.model
-            part = "" if model.train == "all" else f"-{base_digest(networks.state_dict())}-{digest_of(model.lora)}"
-            return f"{autoencoder_digest(networks)}-{shape}{part}"
-        mix = digest_of(config.plane_warp, config.plane_mix, config.sampling)
-        return f"{weights_digest(networks.unet.state_dict())}-{digest_of(seed)}-{mix}"
+        shape, model = digest_of(config.unet, config.prediction, seed), self._recipe.model
+        part = "" if model.train == "all" else f"-{base_digest(networks.state_dict())}-{digest_of(model.lora)}"
+        return f"{autoencoder_digest(networks)}-{shape}{part}"
 
-    def _loop(
-        self, task: Task, stage: StageName, recipe: VAERecipe | UNetRecipe | DecoderRecipe, identity: str
-    ) -> None:
+    def _loop(self, task: Task, stage: StageName, recipe: VAERecipe | UNetRecipe, identity: str) -> None:
         options = LoopOptions(
             stage=stage,
             identity=identity,
@@ -193,7 +181,7 @@ class Trainer:
         task = UNetTask(
             networks,
             self._batches(networks, clips),
-            self._validation(plane_mix=False),
+            self._validation(),
             recipe,
             self._weights(clips),
             self._precision,
@@ -201,39 +189,11 @@ class Trainer:
         )
         self._loop(task, "unet", recipe, identity)
 
-    def _train_decoder(self) -> None:
-        recipe, networks = _present(self._recipe.decoder), self._networks("vae", "unet")
-        identity = self._identity("decoder", networks)
-        clips = self._encodings.pairs(networks)
-        self._precision.placed(networks)
-        data = DecoderData(
-            clips=KeptClips(self._inputs.clips, numbers_of(self._inputs.clips, clips.meta.seeds)),
-            latents=clips,
-            predictions=self._predictions(networks, clips, recipe, identity),
-            class_weights=class_weights(clips, recipe.class_power, self._precision.device),
-        )
-        task = DecoderTask(networks, data, self._validation(plane_mix=True), recipe, self._precision, self._recipe.seed)
-        self._loop(task, "decoder", recipe, identity)
-
-    def _predictions(self, networks: Networks, clips: LatentClips, recipe: DecoderRecipe, identity: str) -> Predictions:
-        """What the U-Net makes of some clips; made now unless they are there."""
-        folder = self._folder.path / "predictions"
-        order = Draws(self._recipe.seed, "decoder-clips", 0, torch.device("cpu")).order(clips.meta.clips)
-        meta = PredictionsMeta(identity=identity, clips=tuple(order[: recipe.clips]))
-        batches = EncodedBatches(clips, self._config, self._recipe.unet, self._precision)
-        predictor = Predictor(networks, clips, batches, self._precision, self._recipe.seed)
-        write_predictions(folder, meta, predictor.predict, self._inputs.stop)
-        return Predictions.open(folder)
-
     def _export(self) -> None:
-        mixes = "decoder" in self._recipe.stages
         recipe, networks = self._recipe, self._networks("vae")
         updates = self._fill_unet(networks)
         merge_lora(networks)
         thaw(networks)
-        if mixes:
-            fill(networks, self._folder, "decoder", self._identity("decoder", networks))
-        networks = networks if mixes else copy_of(networks, plane_mix=False)
         job = ExportJob(
             name=recipe.name,
             family=self._family,
@@ -243,11 +203,10 @@ class Trainer:
             leftovers=lambda: carried_leftovers(recipe.model),
             adapter=self._adapter if recipe.model.train == "lora" else None,
         )
-        export(networks, self._folder, job, self._validation(plane_mix=mixes))
+        export(networks, self._folder, job, self._validation())
 
-    def _validation(self, *, plane_mix: bool) -> Validation:
-        count = self._recipe.log.valid_clips
-        return Validation(self._inputs.valid, self._family, count=count, plane_mix=plane_mix)
+    def _validation(self) -> Validation:
+        return Validation(self._inputs.valid, self._family, count=self._recipe.log.valid_clips)
 
     def _batches(self, networks: Networks, clips: EncodedClips | None) -> BatchSource:
         recipe, made = self._recipe.unet, self._inputs.batches
@@ -257,12 +216,11 @@ class Trainer:
             return PixelBatches(self._inputs.clips, networks, recipe, self._precision, self._family)
         return EncodedBatches(clips, self._config, recipe, self._precision)
 
-    def _weights(self, clips: EncodedClips | None) -> Weights:
-        loss, device = self._recipe.unet.loss, self._precision.device
-        if clips is None:
-            return Weights()
-        channels = torch.tensor(clips.meta.sensitivity, device=device) if loss.sensitivity else None
-        return Weights(channels=channels, classes=class_weights(clips, loss.class_power, device))
+    def _weights(self, clips: EncodedClips | None) -> torch.Tensor | None:
+        """Of latent channels."""
+        if clips is None or not self._recipe.unet.loss.sensitivity:
+            return None
+        return torch.tensor(clips.meta.sensitivity, device=self._precision.device)
 
 
 def _present(table: Table | None) -> Table:

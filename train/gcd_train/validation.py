@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from gcd_model import Clip, Family, Synthesizer, Traits
-from gcd_model.class_head import palette
+from gcd_model.colours import palette
 from gcd_model.networks import Networks
 from gcd_train.datasets.clip_source import ClipSource, to_network
 from gcd_train.metrics import confusion_matrix, mean_iou, psnr
@@ -17,16 +17,16 @@ _SHOWN_CLIPS = 4
 
 
 class Validation:
-    """Held-out clips and how the model takes them. plane_mix: whether that switch counts yet."""
+    """Held-out clips and how the model takes them."""
 
-    def __init__(self, clips: ClipSource, family: Family, *, count: int, plane_mix: bool) -> None:
-        self._clips, self._family, self._plane_mix = clips, family, plane_mix
+    def __init__(self, clips: ClipSource, family: Family, *, count: int) -> None:
+        self._clips, self._family = clips, family
         self._count = min(count, len(clips))
 
     def measure(self, networks: Networks, picture: Path) -> dict[str, float]:
         """PSNR over frames 2 to T and of the last, mean IoU of the class map at picture size; writes a sample sheet.
 
-        One row shows source, view, target and, with a class head, predicted and true class map of a frame.
+        One row shows source, view, target and, of a model that paints classes, predicted and true class map of a frame.
         """
         synthesizer = self._synthesizer(networks)
         scores: list[Tensor] = []
@@ -52,7 +52,7 @@ class Validation:
 
     def _synthesizer(self, networks: Networks) -> Synthesizer:
         """A copy of the networks behind the door that users take."""
-        copy = copy_of(networks, plane_mix=self._plane_mix)
+        copy = copy_of(networks)
         config = copy.config
         device = networks.unet.stem.weight.device
         traits = Traits(

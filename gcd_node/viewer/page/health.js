@@ -9,6 +9,10 @@ const WORDS = {
   SRC_LOST: "the camera is gone",
   SRC_STALLED: "the camera is silent",
   SRC_CORRUPT: "many frames arrive damaged",
+  SRC_FAILED: "reading frames broke",
+  PUBLISH_FAILED: "sending views broke",
+  INTERNAL: "the node itself broke",
+  THREAD_DIED: "a part of the node has died: restart it",
   MODEL_FAILED: "the model was given up",
   MODEL_DEGRADED: "the model runs with less than was asked for",
   MODEL_HUNG: "a step of the model takes far too long",
@@ -22,7 +26,8 @@ const WORDS = {
   hfov: "a field of view the model was not trained for",
   view: "the camera is mounted otherwise than in training",
   world: "pictures unlike those the model was trained with",
-  DEPTH_BAD: "the depth network fails, the model uses its own",
+  DEPTH_BAD: "the depth cannot be used, the model uses its own",
+  ODOMETRY_BAD: "the odometry jumps, the model follows the pictures",
 };
 const element = (id) => document.getElementById(id);
 

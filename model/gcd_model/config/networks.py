@@ -1,9 +1,15 @@
 """Shapes of the networks the paper uses, and how they are sampled."""
 
+from typing import Annotated, TypeAlias
+
 import msgspec
-from msgspec import UNSET, UnsetType
+from msgspec import Meta
 
 from gcd_model.errors import OptionError
+
+Width: TypeAlias = Annotated[int, Meta(ge=1, le=1 << 16)]
+Few: TypeAlias = Annotated[int, Meta(ge=1, le=256)]
+"""Limits for configs that files state: a network is built from them before a single weight is compared."""
 
 
 def require_multiple(what: str, width: int, of: str, divisor: int) -> None:
@@ -21,18 +27,18 @@ class UNetConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     vector_width: width of the micro-conditioning vector. camera_width: of the camera vector, 0 for none.
     """
 
-    latent_channels: int = 4
-    condition_channels: int = 4
-    width: int = 320
-    multipliers: tuple[int, ...] = (1, 2, 4, 4)
-    attention: tuple[bool, ...] = (True, True, True, False)
-    blocks_per_level: int = 2
-    embedding_width: int = 1280
-    head_width: int = 64
-    context_width: int | None = 1024
-    vector_width: int = 768
-    camera_width: int = 128
-    norm_groups: int = 32
+    latent_channels: Width = 4
+    condition_channels: Width = 4
+    width: Width = 320
+    multipliers: Annotated[tuple[Few, ...], Meta(min_length=1, max_length=8)] = (1, 2, 4, 4)
+    attention: Annotated[tuple[bool, ...], Meta(max_length=8)] = (True, True, True, False)
+    blocks_per_level: Few = 2
+    embedding_width: Width = 1280
+    head_width: Width = 64
+    context_width: Width | None = 1024
+    vector_width: Width = 768
+    camera_width: Annotated[int, Meta(ge=0, le=1 << 16)] = 128
+    norm_groups: Width = 32
 
     def __post_init__(self) -> None:
         if len(self.attention) != len(self.multipliers):
@@ -67,35 +73,22 @@ class VAEConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     patch: pixels along each side that become channels before the first and after the last layer; 1 as published.
     linear: a linear map from each block of down_factor x down_factor pixels to its latent, and one back, beside the
         convolutions; ours, so that a small autoencoder starts from principal components instead of from nothing.
-    coarse: so many of the finest levels the decoder leaves out: its last layer makes patches that are 2^coarse times as
-        large instead; ours, for models whose time goes into decoding.
     """
 
-    latent_channels: int = 4
-    width: int = 128
-    multipliers: tuple[int, ...] = (1, 2, 4, 4)
-    blocks_per_level: int = 2
-    norm_groups: int = 32
+    latent_channels: Width = 4
+    width: Width = 128
+    multipliers: Annotated[tuple[Few, ...], Meta(min_length=1, max_length=8)] = (1, 2, 4, 4)
+    blocks_per_level: Few = 2
+    norm_groups: Width = 32
     scale: float = 0.18215
     shared: bool = False
-    patch: int = 1
+    patch: Few = 1
     linear: bool = False
-    coarse: int | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         require_multiple("the VAE", self.width, "norm_groups", self.norm_groups)
         if self.patch < 1:
             raise OptionError(f"the VAE's patch must be at least 1 pixel, got {self.patch}")
-        if not 0 <= self.left_out < len(self.multipliers):
-            most = len(self.multipliers) - 1
-            raise OptionError(f"the VAE's decoder can leave out 0 to {most} levels, got coarse = {self.left_out}")
-        if self.coarse == 0:  # so that it is not written, and digests of configs without it stay what they were
-            msgspec.structs.force_setattr(self, "coarse", UNSET)
-
-    @property
-    def left_out(self) -> int:
-        """`coarse`, 0 where nothing is said of it."""
-        return 0 if self.coarse is UNSET else self.coarse
 
     @property
     def widths(self) -> tuple[int, ...]:
@@ -111,13 +104,13 @@ class VAEConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 class ImageEncoderConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Shape of the CLIP image tower; the defaults are ViT-H/14."""
 
-    image_size: int = 224
-    patch: int = 14
-    width: int = 1280
-    layers: int = 32
-    heads: int = 16
-    hidden_width: int = 5120
-    output_width: int = 1024
+    image_size: Width = 224
+    patch: Width = 14
+    width: Width = 1280
+    layers: Few = 32
+    heads: Width = 16
+    hidden_width: Width = 5120
+    output_width: Width = 1024
 
     def __post_init__(self) -> None:
         require_multiple("the image tower", self.width, "heads", self.heads)
@@ -135,7 +128,7 @@ class SamplingConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     augmentation: strength of the noise on the source frames the VAE sees, where the caller names none.
     """
 
-    steps: int = 25
+    steps: Annotated[int, Meta(ge=1, le=1000)] = 25
     sigma_max: float = 700.0
     sigma_min: float = 0.002
     rho: float = 7.0

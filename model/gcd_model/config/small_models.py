@@ -1,10 +1,7 @@
 """Named set-ups: the published model, and the small ones that are trained and run on a CPU."""
 
-from msgspec.structs import replace
-
-from gcd_model.config.model import ModelConfig
+from gcd_model.config.model import ModelConfig, SemanticClass
 from gcd_model.config.networks import ImageEncoderConfig, SamplingConfig, UNetConfig, VAEConfig
-from gcd_model.config.switches import ClassHeadConfig, PlaneMixConfig, PlaneWarpConfig, SemanticClass, warp_channels
 
 SVD_14 = ModelConfig()
 """Stable Video Diffusion, 14 frames, as Generative Camera Dolly finetunes it on Kubric-4D."""
@@ -49,13 +46,13 @@ DRIVING_CLASSES = (
 )
 """Ontology of our procedural driving world, by id."""
 
-DRIVING_SMALL = ModelConfig(
+PLAIN_SMALL = ModelConfig(
     height=128,
     width=192,
     camera="none",
     unet=UNetConfig(
         latent_channels=12,
-        condition_channels=12 + warp_channels(PlaneWarpConfig(), 8),
+        condition_channels=12,
         width=48,
         multipliers=(1, 2, 3),
         attention=(False, False, True),
@@ -80,48 +77,9 @@ DRIVING_SMALL = ModelConfig(
     ),
     image_encoder=None,
     sampling=SamplingConfig(
-        steps=1, sigma_max=80.0, sigma_min=0.6, guidance=(1.0, 1.0), shared_noise=True, augmentation=0.0
+        steps=4, sigma_max=80.0, sigma_min=0.3, guidance=(1.0, 1.0), shared_noise=True, augmentation=0.0
     ),
     prediction="x0",
-    plane_warp=PlaneWarpConfig(),
-    plane_mix=PlaneMixConfig(),
-    class_head=ClassHeadConfig(classes=DRIVING_CLASSES),
 )
-"""A top-down view of the road at widths that are trained on a CPU in hours; with all switches that are ours."""
-
-DRIVING_SEMANTIC_SMALL = replace(
-    DRIVING_SMALL,
-    plane_mix=None,
-    class_head=None,
-    semantic_classes=DRIVING_CLASSES,
-    sampling=SamplingConfig(
-        steps=4, sigma_max=80.0, sigma_min=0.3, guidance=(1.0, 1.0), shared_noise=True, augmentation=0.0
-    ),
-)
-"""The same view painted in class colours, as the paper's semantic models paint it; in several steps, so that edges
-come out sharp. Without the plane mix: the source's own colours have no place in such a picture."""
-
-PLAIN_SMALL = replace(
-    DRIVING_SMALL,
-    unet=replace(DRIVING_SMALL.unet, condition_channels=DRIVING_SMALL.vae.latent_channels),
-    plane_warp=None,
-    plane_mix=None,
-    class_head=None,
-    sampling=SamplingConfig(
-        steps=4, sigma_max=80.0, sigma_min=0.3, guidance=(1.0, 1.0), shared_noise=True, augmentation=0.0
-    ),
-)
-"""The widths of DRIVING_SMALL in the paper's form: the source's latents are all the condition, and several Euler steps
-draw the view; no warps, no plane mix, no class map. For studies of the paper's findings. What is left of ours is
-x0-prediction, one noise for all frames and the autoencoder."""
-
-_STAGE = PlaneWarpConfig(frame="stage", hfov_deg=53.13)
-
-OBJECTS_SMALL = replace(
-    DRIVING_SMALL,
-    camera="spherical",
-    unet=replace(DRIVING_SMALL.unet, condition_channels=12 + warp_channels(_STAGE, 8), camera_width=96),
-    plane_warp=_STAGE,
-    class_head=None,
-)
-"""Orbits about a heap of objects, steered by angles and radius; widths and switches of DRIVING_SMALL, no class map."""
+"""The paper's model at widths that are trained on a CPU in hours: for studies of its findings, and for tests. Ours are
+x0-prediction, one noise for all frames and the autoencoder. It takes no camera command: one path."""

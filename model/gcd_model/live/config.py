@@ -5,8 +5,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from gcd_model.config import CameraControl, SamplingConfig, SemanticClass
-from gcd_model.config.switches import require_ontology
+from gcd_model.config import CameraControl, SamplingConfig, SemanticClass, require_ontology
 from gcd_model.errors import OptionError
 from gcd_model.live.ontology import LIVE_CLASSES
 

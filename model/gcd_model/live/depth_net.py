@@ -49,7 +49,7 @@ class DepthOutput:
 
     def offsets(self, bins: Tensor) -> Tensor:
         """Of the depth from the centres of some bins, int64 [N, M, H, W], in parts of a bin: [N, M, H, W]."""
-        learned = self.raw_offsets.gather(1, bins).tanh() * _OFFSET_REACH
+        learned = self.raw_offsets.gather(1, bins).float().tanh() * _OFFSET_REACH
         plane = self.ground_place - bins
         return learned.lerp(plane.clamp(-_OFFSET_REACH, _OFFSET_REACH), self.ground * (plane.abs() < _OFFSET_REACH))
 
@@ -97,8 +97,9 @@ class DepthNet(nn.Module):
         """
         weight, bins = self.trunk.stem.weight, self.config.bins
         pictures = inputs.to(weight.dtype, memory_format=torch.channels_last)
-        made = self.head(pictures, self.features(pictures, sweep), pixels).float()
-        logits, offsets, classes, moves, gate, trust = made.split([bins, bins - 1, self.classes, 1, 1, 1], dim=1)
+        made = self.head(pictures, self.features(pictures, sweep), pixels)
+        logits, offsets, *others = made.split([bins, bins - 1, self.classes, 1, 1, 1], dim=1)
+        logits, (classes, moves, gate, trust) = logits.float(), (each.float() for each in others)
         if sweep is not None:
             logits = logits - F.softplus(trust + _TRUST_AT_FIRST) * _TRUST * _doubt(sweep, inputs.shape[-1], pixels)
         ground = inputs[:, -2:]
@@ -124,7 +125,8 @@ def _doubt(sweep: Tensor, width: int, pixels: Tensor | None) -> Tensor:
 
     sweep: [N, B + 1, H/2, W/2]. width: W. pixels: [N, M], of these alone.
     """
-    costs = F.avg_pool2d(sweep[:, :-1], _DOUBT_PX, 1, _DOUBT_PX // 2, count_include_pad=False)
+    costs = sweep[:, :-1].contiguous(memory_format=torch.channels_last)  # where pooling is three times as fast
+    costs = F.avg_pool2d(costs, _DOUBT_PX, 1, _DOUBT_PX // 2, count_include_pad=False)
     costs = costs - costs.amin(dim=1, keepdim=True)
     if pixels is None:
         return F.interpolate(costs, scale_factor=SWEEP_SCALE, mode="nearest")

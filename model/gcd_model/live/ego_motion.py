@@ -181,6 +181,20 @@ def _frame(picture: Tensor, lens: Intrinsics, odometry: Tensor | None) -> _Frame
     )
 
 
+def require_motion(before: Tensor | None, after: Tensor) -> Tensor:
+    """The odometry of a frame, float64 [4, 4], once it is known to be a pose that a camera can have after `before`.
+
+    before: of the frame before, from here; None for the first. Raises PoseError.
+    """
+    after = require_rigid(after, "the odometry")
+    if before is not None:
+        try:
+            _require_plausible(inverse(before.numpy()) @ after.numpy(), "the odometry")
+        except _LostError as error:
+            raise PoseError(str(error)) from error
+    return after
+
+
 def _require_plausible(step: Array, what: str) -> None:
     metres = float(np.linalg.norm(step[:3, 3]))
     degrees = math.degrees(math.acos(min(max((float(np.trace(step[:3, :3])) - 1) / 2, -1.0), 1.0)))

@@ -39,8 +39,11 @@ class LiveSynthesizer:
     that stands still is the case of all other models.
     """
 
-    def __init__(self, networks: LiveNetworks, traits: Traits) -> None:
-        self._networks, self._traits = networks.requires_grad_(False), traits
+    def __init__(self, networks: LiveNetworks, traits: Traits, *, carries: bool = False) -> None:
+        """carries: every call of `render` goes on where the one before ended, instead of knowing nothing."""
+        self._networks, self._traits, self._carries = networks.requires_grad_(False), traits, carries
+        self._carried: list[LiveView] = []
+        self._drawn_with: tuple[int, int] | None = None
 
     @property
     def traits(self) -> Traits:
@@ -51,6 +54,14 @@ class LiveSynthesizer:
     def networks(self) -> LiveNetworks:
         """The networks themselves, for measuring."""
         return self._networks
+
+    def streaming(self) -> "LiveSynthesizer":
+        """See FrameSynthesizer. A clip rendered frame by frame is the clip rendered as a whole."""
+        return LiveSynthesizer(self._networks, self._traits.streaming(), carries=True)
+
+    def reset(self) -> None:
+        """See FrameSynthesizer."""
+        self._carried = []
 
     @out_of_memory_is_our_error
     def encode(
@@ -87,7 +98,8 @@ class LiveSynthesizer:
     def render(
         self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
     ) -> list[View]:
-        """See ViewSynthesizer. Nothing is known of frames before the first; `cancel` is asked between two frames.
+        """See ViewSynthesizer. Nothing is known of frames before the first, unless it is `streaming`; `cancel` is asked
+        between two frames.
 
         Several samples differ where several steps draw; one step paints the mean, the same every time. Of the options,
         solver, guidance, motion number and initial noise are for diffusion models and mean nothing here.
@@ -97,9 +109,7 @@ class LiveSynthesizer:
         steps = options.steps or self._traits.config.sampling.steps
         draws = options.samples if steps > 1 else 1
         step_done = _Counter(options, draws * features.frames)
-        drawn = [
-            window.drawn(LiveView(self._networks, steps=steps, seed=s), step_done) for s in _seeds(options.seed, draws)
-        ]
+        drawn = [window.drawn(live, step_done) for live in self._live_views(steps, _seeds(options.seed, draws))]
         drawn += drawn[:1] * (options.samples - draws)
         views = [self._view(drawn, v, path, options) for v, path in enumerate(trajectories)]
         if not all(_is_finite(frame) for draw in drawn for frame in draw):
@@ -107,6 +117,13 @@ class LiveSynthesizer:
                 f"{self._traits.name} produced NaN or Inf; look at the weights with `gcd-node weights inspect`"
             )
         return views
+
+    def _live_views(self, steps: int, seeds: list[int]) -> list[LiveView]:
+        """One for each draw: new ones, or those of the frame before."""
+        if not self._carries or not self._carried or self._drawn_with != (steps, len(seeds)):
+            self._carried = [LiveView(self._networks, steps=steps, seed=seed) for seed in seeds]
+            self._drawn_with = (steps, len(seeds))
+        return self._carried
 
     def _window(self, features: SourceFeatures, trajectories: Sequence[Trajectory]) -> "_Window":
         frames, video, geometry = self._traits.config.frames, features.video, features.geometry

@@ -33,7 +33,7 @@ def window_flops(engine: Engine, config: ModelConfig, work: Work) -> dict[StageN
         "tower": 0 if config.image_encoder is None else _counted(lambda: engine.tokens(frames)),
         "encode": _counted(lambda: engine.condition_mean(frames)),
         "step": step,
-        "decode": _counted(lambda: engine.decode(latents)) + _counted(lambda: _mix(engine, config, work)),
+        "decode": _counted(lambda: engine.decode(latents)),
     }
     sampling = first + (work.steps - 1) * step
     counted["window"] = counted["tower"] + counted["encode"] + sampling + counted["decode"]
@@ -50,21 +50,6 @@ def _sampling(engine: Engine, config: ModelConfig, work: Work) -> tuple[int, int
         engine.sample(start, given, schedule, options)
     first, second = so_far
     return first, second - first
-
-
-def _mix(engine: Engine, config: ModelConfig, work: Work) -> object:
-    """Where the model has none, nothing is counted."""
-    warp, head = config.plane_warp, config.class_head
-    if warp is None or config.plane_mix is None:
-        return None
-    size, latent = (work.height, work.width), _latent_size(config, work)
-    decoded, warped = _empty(config.frames, 3, *size), _empty(config.frames, warp.layers, 3, *size)
-    valid = torch.empty(config.frames, warp.layers, *size, dtype=torch.bool, device=_META)
-    latents = _empty(config.frames, config.vae.latent_channels, *latent)
-    logits = None
-    if head is not None:
-        logits = _empty(config.frames, len(head.classes), *(head.upscale * side for side in latent))
-    return engine.mix(decoded, warped, valid, latents, logits)
 
 
 def _conditioning(config: ModelConfig, work: Work, branches: int) -> Conditioning:

@@ -18,7 +18,6 @@ from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 from gcd_model.clip import RenderOptions
 from gcd_model.conditioning import Conditioning
 from gcd_model.config import ImageEncoderConfig, ModelConfig, UNetConfig, VAEConfig
-from gcd_model.engine import Sampled
 from gcd_model.geometry import Trajectory
 from gcd_model.image_encoder import clip_pixels
 from gcd_model.measuring.published_form import require_published
@@ -222,25 +221,17 @@ class DiffusersEngine:
         """See Engine."""
         return None
 
-    def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Sampled:
+    def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
         """See Engine."""
         denoiser = _Denoiser(self._modules.unet, given, schedule)
-        latents = sample(
-            denoiser, start.to(self.like.device), schedule.steps, progress=options.progress, cancel=options.cancel
-        )
-        return Sampled(latents=latents, class_logits=None)
+        start = start.to(self.like.device)
+        return sample(denoiser, start, schedule.steps, progress=options.progress, cancel=options.cancel)
 
     def decode(self, latents: Tensor) -> Tensor:
         """See Engine."""
         vae, frames = self._modules.vae, len(latents)
         (decoded,) = vae.decode(latents.to(vae.decoder.conv_in.weight), num_frames=frames, return_dict=False)
         return decoded
-
-    def mix(
-        self, decoded: Tensor, warped: Tensor, valid: Tensor, latents: Tensor, logits: Tensor | None
-    ) -> tuple[Tensor, Tensor | None]:
-        """See Engine."""
-        return decoded, logits
 
 
 class _Denoiser:

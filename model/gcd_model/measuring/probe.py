@@ -10,7 +10,7 @@ from torch import Tensor
 from gcd_model.clip import RenderOptions
 from gcd_model.conditioning import Conditioning
 from gcd_model.config import ModelConfig
-from gcd_model.engine import Engine, Sampled
+from gcd_model.engine import Engine
 from gcd_model.geometry import Trajectory
 from gcd_model.measuring.report import StageName
 from gcd_model.measuring.stopwatch import Spent, Stopwatch
@@ -78,10 +78,10 @@ class Probe:
         """See Engine."""
         return self._engine.camera(path)
 
-    def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Sampled:
+    def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
         """See Engine."""
         if "step" not in self._wanted:
-            return Sampled(latents=start / schedule.sigmas[0].item(), class_logits=None)
+            return start / schedule.sigmas[0].item()
         if not self._watched:
             return self._engine.sample(start, given, schedule, options)
         self._watch.lap()
@@ -99,14 +99,6 @@ class Probe:
             return self._timed("decode", lambda: self._engine.decode(latents))
         factor = self._config.vae.down_factor
         return torch.zeros(len(latents), 3, latents.shape[-2] * factor, latents.shape[-1] * factor)
-
-    def mix(
-        self, decoded: Tensor, warped: Tensor, valid: Tensor, latents: Tensor, logits: Tensor | None
-    ) -> tuple[Tensor, Tensor | None]:
-        """See Engine; counts as decoding."""
-        if "decode" in self._wanted:
-            return self._timed("decode", lambda: self._engine.mix(decoded, warped, valid, latents, logits))
-        return decoded, logits
 
     def _timed(self, stage: StageName, work: Callable[[], Made]) -> Made:
         if not self._watched:

@@ -12,7 +12,7 @@ def require_published(config: ModelConfig) -> None:
     unet = config.unet
     lacks = {
         "camera control": config.camera != "none",
-        "switches of ours (warps, plane mix, class head, patches, x0-prediction)": config.is_ours,
+        "switches of ours (patches, x0-prediction)": config.is_ours,
         "a U-Net without image tower": config.image_encoder is None,
         "an embedding that is not four times as wide as the first level": unet.embedding_width != 4 * unet.width,
     }

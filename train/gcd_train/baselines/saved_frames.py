@@ -8,7 +8,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from gcd_model.class_head import nearest_classes
+from gcd_model.colours import nearest_classes
 from gcd_model.config import SemanticClass
 from gcd_train.baselines.predictor import Prediction, SourceClip, to_pictures
 from gcd_train.baselines.saved_layouts import SavedDraw, find_draws

@@ -61,7 +61,7 @@ class VanillaSVD:
         Args: see `gcd_model.load_synthesizer`; a published file is taken to be SVD, whatever it is called.
         Raises:
             CheckpointError: the file is missing, damaged or of another architecture.
-            DataError: it is steered, or warps the source: that is another task.
+            DataError: it is steered: that is another task.
         """
         of_ours = isinstance(weights, str) and weights.startswith(("package:", "random:"))
         family = None if of_ours or inspect_weights(weights).family else "svd"
@@ -69,7 +69,7 @@ class VanillaSVD:
 
     def __post_init__(self) -> None:
         traits = self.synthesizer.traits
-        if traits.config.camera != "none" or traits.plane_warp is not None:
+        if traits.config.camera != "none":
             raise DataError(
                 f"{self.name} wants weights that make a video out of a picture, {traits.name} is told a camera path; "
                 "give svd.safetensors"

@@ -29,8 +29,7 @@ RecipeFile: TypeAlias = Annotated[
     str,
     Argument(
         metavar="RECIPE",
-        help="A TOML file, or package:NAME of distill-driving-small, distill-objects-small, distill-semantic-small, "
-        "distill-coarse-decoder, distill-kubric.",
+        help="A TOML file, or package:distill-kubric.",
     ),
 ]
 Stage: TypeAlias = Annotated[str | None, Option(help=f"Only this one: {', '.join(get_args(DistillStageName))}.")]

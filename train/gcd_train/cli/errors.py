@@ -7,9 +7,10 @@ from contextlib import contextmanager
 import typer
 from rich.console import Console
 
-from gcd_model import ModelError
+from gcd_model import ModelError, printable
 from gcd_train.errors import Interrupted, RunError, TrainError
 
+_LONGEST = 4000  # of a message, in which a file may have put what it likes
 _OPTION = 78  # sysexits: what the model refuses here is an option or a weight file the user named
 
 
@@ -28,6 +29,9 @@ def errors_shown() -> Generator[None]:
         _say("a worker was killed, most likely for want of memory; give fewer --workers, the finished part stays")
         raise typer.Exit(RunError.exit_code) from error
     except RuntimeError as error:
+        if "Symlink loop" in str(error):  # pathlib's, before Python 3.13
+            _say(f"{error}: a link leads to itself; check the path")
+            raise typer.Exit(RunError.exit_code) from error
         if not _out_of_memory(error):
             raise
         _say(
@@ -46,4 +50,5 @@ def _out_of_memory(error: RuntimeError) -> bool:
 
 
 def _say(message: object) -> None:
-    Console(stderr=True, highlight=False).print(f"gcd-train: {message}", markup=False, soft_wrap=True)
+    line = printable(" ".join(str(message).split()), _LONGEST)
+    Console(stderr=True, highlight=False).print(f"gcd-train: {line}", markup=False, soft_wrap=True)

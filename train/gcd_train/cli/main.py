@@ -7,7 +7,7 @@ from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
-from gcd_model import DRIVING_SMALL, FAMILIES, SMALL, SVD_14, Family, ModelConfig
+from gcd_model import FAMILIES, PLAIN_SMALL, SMALL, SVD_14, Family, ModelConfig
 from gcd_train.cli import bench, generate, lerobot, lora
 from gcd_train.cli.cache import cache
 from gcd_train.cli.calibrate import calibrate_command
@@ -72,7 +72,7 @@ def architectures() -> None:
     table = Table(title="Network set-ups")
     for column in ("set-up", "size", "frames", "U-Net widths", "VAE widths", "image tower", "steps"):
         table.add_column(column)
-    for name, config in (("SVD_14", SVD_14), ("DRIVING_SMALL", DRIVING_SMALL), ("SMALL", SMALL)):
+    for name, config in (("SVD_14", SVD_14), ("PLAIN_SMALL", PLAIN_SMALL), ("SMALL", SMALL)):
         table.add_row(name, *_config_row(config))
     Console().print(table)
 

@@ -6,6 +6,7 @@ from typing import Annotated, TypeAlias
 import typer
 from rich.console import Console
 
+from gcd_model import printable
 from gcd_train.cli.errors import errors_shown
 from gcd_train.cli.progress_bar import progress_bar
 from gcd_train.errors import DataError
@@ -57,7 +58,7 @@ def _faults_of(scene: Path) -> list[str]:
 def _tell(count: int, damaged: dict[Path, list[str]]) -> None:
     say = Console(highlight=False)
     for line in (line for lines in damaged.values() for line in lines):
-        say.print(line, markup=False, soft_wrap=True)
+        say.print(printable(line), markup=False, soft_wrap=True)
     whole = f"{count - len(damaged)} of {count} scenes are as they were written"
     advice = "; delete the others and run the line that made them again" if damaged else ""
     say.print(whole + advice, markup=False, soft_wrap=True)

@@ -10,9 +10,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_model.errors import ModelError
+from gcd_model.errors import FileError, ModelError
 from gcd_model.geometry import Intrinsics
-from gcd_train.datasets.picture_files import read
+from gcd_model.small_files import decode_json
+from gcd_train.datasets.picture_files import MOST_TEXT, read
 from gcd_train.datasets.rotations import pose_from_quaternion
 from gcd_train.datasets.skips import FileFault
 from gcd_train.errors import DataError
@@ -74,13 +75,13 @@ def read_calibration(folder: Path, cameras: Sequence[str]) -> dict[str, CameraCa
 
 def _cameras_of(path: Path, wanted: Sequence[str]) -> dict[str, CameraCalibration]:
     try:
-        file = msgspec.json.decode(read(path), type=_File)
+        file = decode_json(read(path, MOST_TEXT), _File)
         if not len(file.names) == len(file.intrinsics) == len(file.extrinsics):
             raise FileFault(path, "is damaged: its lists of names, intrinsics and extrinsics differ in length")
         places = {name: place for place, name in enumerate(file.names) if name in wanted}
         return {name: _camera(path, file.intrinsics[at], file.extrinsics[at]) for name, at in places.items()}
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-        raise FileFault(path, f"is no calibration ({error})") from error
+    except FileError as error:
+        raise FileFault(path, f"is no calibration: it {error}") from error
 
 
 def _camera(path: Path, lens: Mapping[str, Any] | None, pose: Mapping[str, Any] | None) -> CameraCalibration:

@@ -8,8 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gcd_model.class_head import SemanticClass
-from gcd_model.config import CameraControl
+from gcd_model.config import CameraControl, SemanticClass
 from gcd_model.geometry import CameraMount, Trajectory
 from gcd_train.errors import DataError
 

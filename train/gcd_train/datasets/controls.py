@@ -7,9 +7,13 @@ from typing import Annotated
 
 import msgspec
 
-from gcd_model.errors import PoseError
+from gcd_model.errors import FileError, PoseError
 from gcd_model.geometry import Spherical
+from gcd_model.small_files import read_json
 from gcd_train.errors import DataError
+
+MOST_BYTES = 1 << 24
+"""Of a control list."""
 
 
 class _Entry(msgspec.Struct, frozen=True):
@@ -57,11 +61,9 @@ def read_controls(path: Path) -> Controls:
     Raises: DataError if the file cannot be read or is none, naming scene and sample where the fault has one.
     """
     try:
-        listed = msgspec.json.decode(path.read_bytes(), type=dict[str, dict[str, _Entry]])
-    except (OSError, msgspec.MsgspecError, UnicodeDecodeError) as error:
-        raise DataError(
-            f"{path} is no control list ({error}); it wants scenes with samples with frame_start"
-        ) from error
+        listed = read_json(path, dict[str, dict[str, _Entry]], MOST_BYTES)
+    except FileError as error:
+        raise DataError(f"{path} {error}; a control list has scenes with samples with frame_start") from error
     if not listed:
         raise DataError(f"{path} lists no scene")
     return {

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from gcd_model.errors import ModelError
 from gcd_model.geometry import Intrinsics
+from gcd_model.small_files import decode_json
 from gcd_train.datasets.picture_files import (
+    MOST_TEXT,
     one_of,
     read,
     read_colour,
@@ -232,9 +234,9 @@ def _require_one_size(views: list[_View]) -> None:
 
 def _read_view(path: Path) -> _View:
     try:
-        metadata = msgspec.json.decode(read(path), type=_Metadata)
+        metadata = decode_json(read(path, MOST_TEXT), _Metadata)
         lens = _lens(metadata)
-    except (msgspec.MsgspecError, UnicodeDecodeError, ModelError) as error:
+    except ModelError as error:
         raise FileFault(path, f"is damaged or lacks what Kubric-4D tells of a view ({error})") from error
     camera, told = metadata.camera, metadata.scene.num_frames
     frames = min(len(camera.positions), len(camera.quaternions))

@@ -35,9 +35,7 @@ class LatentVideos:
         ]
         order = torch.cat(places).argsort().to(device)
         source, target, motion = (torch.cat(rows)[order] for rows in zip(*made, strict=True))
-        return LatentRows(
-            source=source, target=target, motion=motion, control=None, pictures=None, classes=None, emphasis=None
-        )
+        return LatentRows(source=source, target=target, motion=motion, control=None, emphasis=None)
 
     def names(self, clips: Tensor) -> tuple[str, ...]:
         """What the videos are called in messages: the seed of their pair, and its side."""
@@ -70,10 +68,7 @@ def _joined(metas: Sequence[LatentsMeta]) -> LatentsMeta:
     return msgspec.structs.replace(
         metas[0],
         seeds=tuple(seed for meta in metas for seed in meta.seeds for _ in range(2)),
-        distant=0,
         control=0,
-        class_upscale=0,
         emphasis=False,
-        class_counts=(),
         sensitivity=tuple(sum(row) / len(metas) for row in rows),
     )

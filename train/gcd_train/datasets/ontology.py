@@ -9,8 +9,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_model.class_head import SemanticClass
-from gcd_train.datasets.picture_files import read
+from gcd_model.config import SemanticClass
+from gcd_model.errors import FileError
+from gcd_model.small_files import decode_json
+from gcd_train.datasets.picture_files import MOST_TEXT, read
 from gcd_train.datasets.skips import FileFault
 from gcd_train.errors import DataError
 
@@ -160,7 +162,7 @@ class _File(msgspec.Struct, frozen=True):
 
 def _parsed(path: Path) -> Ontology:
     try:
-        items = msgspec.json.decode(read(path), type=_File).items
+        items = decode_json(read(path, MOST_TEXT), _File).items
         return Ontology(
             tuple(
                 OntologyItem(id=item.id, name=item.name, colour=(item.color.r, item.color.g, item.color.b))
@@ -168,8 +170,8 @@ def _parsed(path: Path) -> Ontology:
                 if 0 <= item.id < _IDS
             )
         )
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-        raise FileFault(path, f"is no ontology ({error})") from error
+    except FileError as error:
+        raise FileFault(path, f"is no ontology: it {error}") from error
     except FileFault:
         raise
     except DataError as error:

@@ -7,8 +7,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_model.class_head import SemanticClass
-from gcd_model.config import CameraControl
+from gcd_model.config import CameraControl, SemanticClass
 from gcd_model.geometry import CameraMount, Trajectory, driving_trajectory
 from gcd_train.datasets.clip_frames import FrameSampling
 from gcd_train.datasets.dataset4d import PairSample

@@ -1,7 +1,6 @@
 """Clips of data folders: what the source camera saw, and what the target camera saw at the same times."""
 
 import hashlib
-import json
 import re
 import zipfile
 from collections.abc import Sequence
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_model.config import CameraControl, SemanticClass
+from gcd_model.errors import FileError
 from gcd_model.geometry import (
     CameraMount,
     Spherical,
@@ -23,12 +23,18 @@ from gcd_model.geometry import (
     driving_trajectory,
     spherical_trajectory,
 )
+from gcd_model.small_files import decode_json
+from gcd_train.array_files import ZIP_FAULTS, read_member
 from gcd_train.errors import DataError
 from gcd_train.scenes.pair_world import DEPTH_UNIT_M, Orbit, World, read_world
 
 Bytes = NDArray[np.uint8]
 _FOLDER_SEEDS = 10**12
 """Clips of the second folder count from here, of the third from twice this: no clip's own number is as large."""
+
+
+class _Scene(msgspec.Struct, frozen=True):
+    orbit: Orbit
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -141,11 +147,9 @@ class PairedClips:
         """How a clip of an orbit world was cut from its scene. Raises DataError for others, or a damaged shard."""
         path, name = self.places[index]
         try:
-            return msgspec.convert(json.loads(self._read(index, "scene.json"))["orbit"], Orbit)
-        except (KeyError, ValueError, msgspec.MsgspecError) as error:
-            raise DataError(
-                f"{path}: {name}/scene.json tells of no orbit ({error}); generate the shard again"
-            ) from error
+            return decode_json(self._read(index, "scene.json"), _Scene).orbit
+        except FileError as error:
+            raise DataError(f"{path}: {name}/scene.json {error}; generate the shard again") from error
 
     @property
     def camera(self) -> CameraControl:
@@ -211,8 +215,8 @@ class PairedClips:
         path, name = self.places[index]
         try:
             with zipfile.ZipFile(path) as archive:
-                return archive.read(f"{name}/{file}")
-        except (OSError, KeyError, zipfile.BadZipFile) as error:
+                return read_member(archive, f"{name}/{file}")
+        except ZIP_FAULTS as error:
             raise DataError(
                 f"{path}: clip {name} cannot be read ({error}); delete the shard and generate again"
             ) from error
@@ -285,7 +289,7 @@ def _clip_names(path: Path) -> list[str]:
     try:
         with zipfile.ZipFile(path) as archive:
             names = {name.split("/")[0] for name in archive.namelist()}
-    except (OSError, zipfile.BadZipFile) as error:
+    except ZIP_FAULTS as error:
         raise DataError(f"{path} is damaged ({error}); delete it and generate again") from error
     if not all(re.fullmatch(r"\d{8,12}", name) for name in names):
         raise DataError(f"{path} holds something else than clips named by their seed; take it out of the folder")

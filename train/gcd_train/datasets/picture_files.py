@@ -11,15 +11,21 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import imagesize
 import numpy as np
 from numpy.typing import NDArray
 
+from gcd_train.array_files import read_npz
 from gcd_train.datasets.skips import FileFault
+from gcd_train.errors import DataError
 from gcd_train.layouts.depth_code import FAR_M, stored_depth
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
 
+MOST_TEXT, MOST_PICTURE = 1 << 24, 1 << 28
+"""Bytes of a data set's JSON, and of a picture's file."""
+_MOST_PIXELS = 1 << 27
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_PALETTE, _PNG_GREY = 3, 0
 
@@ -36,14 +42,19 @@ def bytes_read() -> int:
     return _read.count
 
 
-def read(path: Path) -> bytes:
-    """A whole file. Raises FileFault if it is not there, empty or unreadable."""
+def read(path: Path, most: int = MOST_PICTURE) -> bytes:
+    """A whole file of at most so many bytes. Raises FileFault if it is not there, empty, larger or no regular file."""
     try:
-        content = path.read_bytes()
+        if path.exists() and not path.is_file():
+            raise FileFault(path, "is no regular file")
+        with path.open("rb") as file:
+            content = file.read(most + 1)
     except FileNotFoundError as error:
         raise FileFault(path, "is missing: download or generate the scene again") from error
     except OSError as error:
         raise FileFault(path, f"cannot be read ({error})") from error
+    if len(content) > most:
+        raise FileFault(path, f"is larger than {most} bytes: it is something else")
     if not content:
         raise FileFault(path, "is empty: download or generate the scene again")
     _read.count += len(content)
@@ -65,7 +76,7 @@ def one_of(*paths: Path) -> Path:
 
 def read_colour(path: Path) -> Bytes:
     """RGB picture of a PNG, WebP or JPEG file, u8 [H, W, 3]; alpha is dropped. Raises FileFault."""
-    picture = _decoded(path, read(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    picture = decoded(path, read(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
 
 
@@ -97,7 +108,7 @@ def read_ids(path: Path) -> NDArray[np.int32]:
     """Ids, i32 [H, W], of a PNG that stores them as R + 256 G + 65536 B. Raises FileFault."""
     content = read(path)
     _require_whole_png(path, content)
-    picture = _decoded(path, content, cv2.IMREAD_COLOR)
+    picture = decoded(path, content, cv2.IMREAD_COLOR)
     ids = cv2.extractChannel(picture, 2).astype(np.int32)
     for channel, unit in ((1, 256), (0, 65536)):
         more = cv2.extractChannel(picture, channel)
@@ -119,7 +130,7 @@ def read_palette_indices(path: Path) -> Bytes:
         content = _as_grey(content)
     elif kind != _PNG_GREY:
         raise FileFault(path, "holds colours, not a palette: instance numbers cannot be told from it")
-    picture = _decoded(path, content, cv2.IMREAD_UNCHANGED)
+    picture = decoded(path, content, cv2.IMREAD_UNCHANGED)
     if picture.dtype != np.uint8 or picture.ndim != 2:
         raise FileFault(path, f"should hold 8-bit indices, got {picture.dtype} {list(picture.shape)}")
     step = 255 // (2**depth - 1) if depth < 8 else 1  # fewer bits are spread over 0..255 when they are decoded
@@ -133,7 +144,13 @@ def require_size(path: Path, picture: NDArray[np.generic], height: int, width: i
         raise FileFault(path, f"is {got} where {other} says {width} x {height}: sizes are mixed")
 
 
-def _decoded(path: Path, content: bytes, flags: int) -> NDArray[Any]:
+def decoded(path: Path, content: bytes, flags: int) -> NDArray[Any]:
+    try:
+        width, height = imagesize.get(io.BytesIO(content), exif_rotation=False)
+    except Exception as error:  # of any kind, where a header is damaged
+        raise FileFault(path, f"is damaged: its size cannot be read ({error})") from error
+    if width * height > _MOST_PIXELS:
+        raise FileFault(path, f"states {width} x {height} pixels, more than {_MOST_PIXELS}")
     try:
         picture = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     except cv2.error as error:
@@ -144,7 +161,7 @@ def _decoded(path: Path, content: bytes, flags: int) -> NDArray[Any]:
 
 
 def _float_tiff(path: Path) -> Floats:
-    picture = _decoded(path, read(path), cv2.IMREAD_UNCHANGED)
+    picture = decoded(path, read(path), cv2.IMREAD_UNCHANGED)
     if picture.dtype.kind != "f" or picture.size != picture.shape[0] * picture.shape[1]:
         raise FileFault(path, f"should hold float32 depth, got {picture.dtype} {list(picture.shape)}")
     return picture.reshape(picture.shape[:2]).astype(np.float32, copy=False)
@@ -152,12 +169,14 @@ def _float_tiff(path: Path) -> Floats:
 
 def _npz(path: Path, key: str) -> Floats:
     try:
-        with np.load(io.BytesIO(read(path)), allow_pickle=False) as arrays:
-            array = arrays[key]
+        array = read_npz(one_of(path))[key]
+        count_read(path)
+    except KeyError as error:
+        raise FileFault(path, f"lacks its array `{key}`") from error
     except FileFault:
         raise
-    except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
-        raise FileFault(path, f"is damaged or lacks its array `{key}` ({error})") from error
+    except DataError as error:
+        raise FileFault(path, str(error).removeprefix(f"{path} ")) from error
     if array.dtype.kind != "f" or array.ndim < 2 or array.size == 0 or array.size != array.shape[0] * array.shape[1]:
         raise FileFault(path, f"should hold float depth [H, W], got {array.dtype} {list(array.shape)}")
     return array.reshape(array.shape[:2]).astype(np.float32, copy=False)
@@ -166,7 +185,7 @@ def _npz(path: Path, key: str) -> Floats:
 def _depth_png(path: Path) -> Floats:
     content = read(path)
     _require_whole_png(path, content)
-    picture = _decoded(path, content, cv2.IMREAD_UNCHANGED)
+    picture = decoded(path, content, cv2.IMREAD_UNCHANGED)
     metres = stored_depth(picture)
     if metres is None:
         got = f"{picture.dtype} {list(picture.shape)}"

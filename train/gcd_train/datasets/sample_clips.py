@@ -6,8 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gcd_model.class_head import SemanticClass
-from gcd_model.config import CameraControl
+from gcd_model.config import CameraControl, SemanticClass
 from gcd_model.geometry import CameraMount, Trajectory, pose_trajectory
 from gcd_train.datasets.dataset4d import PairSample
 from gcd_train.sample_loader import Samples
@@ -47,7 +46,7 @@ class SampleClips:
 
     @property
     def mount(self) -> CameraMount | None:
-        """None: models that warp by a mount learn from pairs."""
+        """None: nobody says it."""
         return None
 
     @property

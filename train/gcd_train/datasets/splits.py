@@ -8,6 +8,8 @@ from typing import Literal, get_args
 
 import msgspec
 
+from gcd_model.errors import FileError
+from gcd_model.small_files import read_json, read_small
 from gcd_train.datasets.skips import Skips
 from gcd_train.errors import DataError
 from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
@@ -50,9 +52,9 @@ def read_split(path: Path, part: Part) -> tuple[str, ...]:
     """
     _require_part(part)
     try:
-        split = msgspec.json.decode(path.read_bytes(), type=SplitFile)
-    except (OSError, msgspec.MsgspecError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} is no split file with lists train, val and test ({error})") from error
+        split = read_json(path, SplitFile)
+    except FileError as error:
+        raise DataError(f"{path} is no split file with lists train, val and test: it {error}") from error
     scenes = [Path(name).name for name in (*split.train, *split.val, *split.test)]
     if len(set(scenes)) < len(scenes):
         twice = sorted({name for name in scenes if scenes.count(name) > 1})
@@ -71,9 +73,9 @@ def read_scene_list(path: Path, skips: Skips) -> SceneList:
     Raises: DataError if the file cannot be read or no scene is left.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} is no list of scenes ({error})") from error
+        lines = read_small(path).splitlines()
+    except FileError as error:
+        raise DataError(f"{path} is no list of scenes: it {error}") from error
     scenes: list[str] = []
     left_out = 0
     for number, line in enumerate(lines, 1):

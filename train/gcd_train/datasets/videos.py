@@ -11,8 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gcd_model.class_head import SemanticClass
-from gcd_model.config import CameraControl
+from gcd_model.config import CameraControl, SemanticClass
 from gcd_model.geometry import CameraMount, Trajectory, pose_trajectory
 from gcd_train.datasets.clip_source import ClipSource
 from gcd_train.datasets.dataset4d import PairSample

@@ -11,32 +11,26 @@ import torch
 from torch import Tensor
 
 from gcd_model.adapter import Adapter, base_digest
-from gcd_model.layers import zeroed
-from gcd_model.networks import Networks, weights_digest
+from gcd_model.networks import Networks
 from gcd_model.own_format import Card
 from gcd_train.batches import BatchSource, EncodedBatches, PixelBatches
-from gcd_train.datasets.clip_source import KeptClips, numbers_of
 from gcd_train.datasets.latents import EncodedClips
-from gcd_train.datasets.predictions import Predictions, PredictionsMeta, write_predictions
 from gcd_train.distillation.paired import PairedTask
-from gcd_train.distillation.recipe import DistillRecipe, PairedRecipe, SampleLossRecipe
+from gcd_train.distillation.recipe import DistillRecipe, SampleLossRecipe
 from gcd_train.distillation.sample_losses import SampleLoss
-from gcd_train.distillation.teacher import Teacher, as_training, coarser_config, student_config
-from gcd_train.draws import Draws
-from gcd_train.encodings import Encodings, class_weights
+from gcd_train.distillation.teacher import Teacher, as_training, student_config
+from gcd_train.encodings import Encodings
 from gcd_train.engine.engine import Engine
 from gcd_train.errors import RecipeError
 from gcd_train.loop import Loop, LoopOptions, Task
 from gcd_train.lora import adapter_of, merge_lora
 from gcd_train.model_setup import digest_of, fill, require_exportable
-from gcd_train.objective import Weights
 from gcd_train.precision import Precision
-from gcd_train.recipe import AnyStageName, DecoderRecipe, DistillStageName
+from gcd_train.recipe import DistillStageName
 from gcd_train.run_data import RunData
 from gcd_train.run_folder import RunFolder
-from gcd_train.stages.decoder import DecoderData, DecoderTask, Predictor
 from gcd_train.stages.export import ExportJob, export
-from gcd_train.start import carried_leftovers, fresh_networks, start_networks
+from gcd_train.start import carried_leftovers, start_networks
 from gcd_train.stop import StopSignal
 from gcd_train.trained_part import halve_frozen, let_train, thaw
 from gcd_train.validation import Validation
@@ -64,11 +58,7 @@ class Distiller:
         self._inputs, self._recipe, self._folder = inputs, inputs.recipe, inputs.folder
         self._updates = 0  # of the stage that was filled in last
         self._shared = as_training(inputs.recipe, inputs.teacher)
-        taught = inputs.recipe.paired is not None
-        self._config = student_config(inputs.teacher.config, inputs.recipe.student, taught=taught)
-        coarser_config(self._config, inputs.recipe.student.coarse)
-        if inputs.recipe.decoder is not None and self._config.plane_mix is None:
-            raise RecipeError("[decoder] trains the plane mix, which this teacher has not; leave it out")
+        self._config = student_config(inputs.teacher.config, inputs.recipe.student)
         require_exportable(self._shared, self._config)
         self._precision = Precision.of(inputs.recipe.compute)
         self._encodings = Encodings(
@@ -95,7 +85,6 @@ class Distiller:
         steps = {
             "latents": lambda: self._encodings.encode(self._teacher()),
             "paired": self._train_paired,
-            "decoder": self._train_decoder,
             "export": self._export,
         }
         for stage in (only,) if only else self._recipe.stages:
@@ -124,8 +113,7 @@ class Distiller:
     def _student(self) -> Networks:
         """The same with what [paired] taught it."""
         networks = self._learner()
-        if self._recipe.paired is not None:
-            self._updates = fill(networks, self._folder, "paired", self._identity)
+        self._updates = fill(networks, self._folder, "paired", self._identity)
         return networks
 
     @property
@@ -136,7 +124,6 @@ class Distiller:
 
     def _train_paired(self) -> None:
         recipe, networks = self._recipe.paired, self._learner()
-        assert recipe is not None, "a stage runs only if the recipe has its table"
         batches, weights = self._ready(networks, recipe.loss)
         loss = SampleLoss(networks, recipe.loss, weights, self._precision)
         task = PairedTask(
@@ -149,10 +136,10 @@ class Distiller:
             self._precision,
             self._recipe.seed,
         )
-        self._loop(task, "paired", recipe, self._identity)
+        self._loop(task)
 
-    def _ready(self, networks: Networks, loss: SampleLossRecipe) -> tuple[BatchSource, Weights]:
-        """Batches for networks that are placed to learn, and the constant weights of their loss."""
+    def _ready(self, networks: Networks, loss: SampleLossRecipe) -> tuple[BatchSource, Tensor | None]:
+        """Batches for networks that are placed to learn, and weights of latent channels."""
         shared = self._shared
         if shared.compute.frozen == "bfloat16":
             halve_frozen(networks)
@@ -163,74 +150,22 @@ class Distiller:
         self._precision.placed(networks)
         made = self._inputs.data.batches
         if made is not None:
-            return made(networks, self._precision), Weights()
+            return made(networks, self._precision), None
         family = self._inputs.teacher.family
-        return PixelBatches(self._inputs.data.clips, networks, shared.unet, self._precision, family), Weights()
+        return PixelBatches(self._inputs.data.clips, networks, shared.unet, self._precision, family), None
 
-    def _weights(self, clips: EncodedClips, loss: SampleLossRecipe) -> Weights:
-        device = self._precision.device
-        channels = torch.tensor(clips.meta.sensitivity, device=device) if loss.sensitivity else None
-        return Weights(channels=channels, classes=class_weights(clips, loss.class_power, device))
-
-    def _train_decoder(self) -> None:
-        recipe, networks = self._recipe.decoder, self._merged()
-        assert recipe is not None, "a stage runs only if the recipe has its table"
-        identity, learner = self._decoder_identity(networks), self._coarser(networks)
-        clips = self._encodings.pairs(networks)
-        self._precision.placed(networks)
-        batches = EncodedBatches(clips, self._config, self._shared.unet, self._precision)
-        self._precision.placed(learner)
-        order = Draws(self._recipe.seed, "decoder-clips", 0, torch.device("cpu")).order(clips.meta.clips)
-        meta = PredictionsMeta(identity=self._predictions_identity(networks), clips=tuple(order[: recipe.clips]))
-        folder = self._folder.path / "predictions"
-        predictor = Predictor(networks, clips, batches, self._precision, self._recipe.seed)
-        write_predictions(folder, meta, predictor.predict, self._inputs.stop)
-        data = DecoderData(
-            clips=KeptClips(self._inputs.data.clips, numbers_of(self._inputs.data.clips, clips.meta.seeds)),
-            latents=clips,
-            predictions=Predictions.open(folder),
-            class_weights=class_weights(clips, recipe.class_power, self._precision.device),
-        )
-        task = DecoderTask(learner, data, self._validation(), recipe, self._precision, self._recipe.seed)
-        self._loop(task, "decoder", recipe, identity)
-
-    def _predictions_identity(self, networks: Networks) -> str:
-        made = digest_of(self._recipe.seed, self._config.plane_warp, self._config.plane_mix, self._config.sampling)
-        told = f"-{weights_digest(networks.decoder.state_dict())}" if self._recipe.student.coarse else ""
-        return f"{weights_digest(networks.unet.state_dict())}-{made}{told}"
-
-    def _decoder_identity(self, networks: Networks) -> str:
-        """What the stage's state belongs to. networks: before their decoder is made coarser."""
-        predicted, coarse = self._predictions_identity(networks), self._recipe.student.coarse
-        if not coarse:
-            return predicted
-        mix = {} if networks.plane_mix is None else networks.plane_mix.state_dict()
-        return f"{predicted}-{weights_digest(mix)}-{digest_of(coarser_config(self._config, coarse).vae)}"
-
-    def _coarser(self, networks: Networks) -> Networks:
-        """The same with the decoder that is exported: what is left of it as it was, its last layers at their start."""
-        levels = self._recipe.student.coarse
-        if not levels:
-            return networks
-        config = coarser_config(self._config, levels)
-        made, given = fresh_networks(config, self._recipe.seed), networks.state_dict()
-        fits = {name: given[name] for name, value in made.state_dict().items() if _fits(given.get(name), value)}
-        made.load_state_dict(fits, strict=False)
-        zeroed(made.decoder.conv_out)
-        return made
+    def _weights(self, clips: EncodedClips, loss: SampleLossRecipe) -> Tensor | None:
+        return torch.tensor(clips.meta.sensitivity, device=self._precision.device) if loss.sensitivity else None
 
     def _merged(self) -> Networks:
-        """The student that is exported as plain networks, as far as the decoder stage."""
+        """The student that is exported, as plain networks."""
         networks = self._student()
         merge_lora(networks)
         thaw(networks)
         return networks
 
     def _export(self) -> None:
-        merged, recipe = self._merged(), self._recipe
-        networks = self._coarser(merged)
-        if recipe.decoder is not None:
-            fill(networks, self._folder, "decoder", self._decoder_identity(merged))
+        networks, recipe = self._merged(), self._recipe
         job = ExportJob(
             name=recipe.name,
             family=self._inputs.teacher.family,
@@ -251,23 +186,20 @@ class Distiller:
 
     def _validation(self) -> Validation:
         count = self._recipe.log.valid_clips
-        return Validation(self._inputs.data.valid, self._inputs.teacher.family, count=count, plane_mix=True)
+        return Validation(self._inputs.data.valid, self._inputs.teacher.family, count=count)
 
-    def _loop(self, task: Task, stage: AnyStageName, recipe: PairedRecipe | DecoderRecipe, identity: str) -> None:
+    def _loop(self, task: Task) -> None:
+        recipe = self._recipe.paired
         options = LoopOptions(
-            stage=stage,
-            identity=identity,
+            stage="paired",
+            identity=self._identity,
             budget=recipe.budget,
             optimiser=recipe.optimiser,
             ema=recipe.ema,
             log=self._recipe.log,
             stop=self._inputs.stop,
             frames_per_clip=self._config.frames,
-            parts=1 if isinstance(recipe, DecoderRecipe) else self._recipe.batches.accumulate,
-            engine=Engine() if isinstance(recipe, DecoderRecipe) else Engine(compute=self._recipe.compute),
+            parts=self._recipe.batches.accumulate,
+            engine=Engine(compute=self._recipe.compute),
         )
         Loop(task, self._folder, options).run()
-
-
-def _fits(given: Tensor | None, wanted: Tensor) -> bool:
-    return given is not None and given.shape == wanted.shape

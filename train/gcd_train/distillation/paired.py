@@ -42,7 +42,7 @@ class PairedTask:
 
     @property
     def module(self) -> nn.Module:
-        """U-Net, class head and camera embedder."""
+        """U-Net and camera embedder."""
         return self._denoiser
 
     def parameter_groups(self) -> Sequence[ParameterGroup]:

@@ -13,7 +13,6 @@ from gcd_train.recipe import (
     ComputeRecipe,
     Count,
     DataRecipe,
-    DecoderRecipe,
     EmaRecipe,
     ExportRecipe,
     LatentsRecipe,
@@ -46,8 +45,7 @@ class StudentRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     steps: of the sampler that ships; the teacher's own where its U-Net stays. sigma_max, sigma_min: its first and last
     noise level; left out as the teacher has them. train: all of the U-Net and what steers it, or adapters beside it, as
-    [student.lora] says. coarse: so many more of its finest levels the decoder leaves out, see `VAEConfig`; [decoder]
-    trains what is left, with finetune_vae.
+    [student.lora] says.
     """
 
     steps: Count = 1
@@ -55,12 +53,6 @@ class StudentRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     sigma_min: Positive | None = None
     train: Literal["all", "lora"] = "all"
     lora: LoraRecipe = LoraRecipe()
-    coarse: Annotated[int, Meta(ge=0)] = 0
-
-    @property
-    def sampled_otherwise(self) -> bool:
-        """Whether it names a sampler of its own."""
-        return self.steps != 1 or self.sigma_max is not None or self.sigma_min is not None
 
 
 class BatchRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -84,8 +76,7 @@ class SampleLossRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     say so. class_weights: emphasis by colour there, see `LossRecipe`.
     l1, gradient, ssim, energy: of decoded pictures, see `picture_losses`; `frames` consecutive ones of each clip.
     colours: cross-entropy of the classes that decoded colours stand for, for models that paint classes; softness is the
-    distance of colours (of 0 to 1) at which it becomes unsure. class_map: of the class head's cross-entropy;
-    class_power: its class weights are frequency^-class_power.
+    distance of colours (of 0 to 1) at which it becomes unsure.
     """
 
     latent: NotNegative = 1.0
@@ -97,8 +88,6 @@ class SampleLossRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     energy: NotNegative = 0.0
     colours: NotNegative = 0.0
     softness: Positive = 0.15
-    class_map: NotNegative = 0.0
-    class_power: NotNegative = 0.35
     frames: Count = 4
 
     @property
@@ -123,8 +112,7 @@ class PairedRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 class DistillRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A whole recipe of a distillation; a table that is left out leaves its stage out.
 
-    seed: every random draw follows from it, the stage and the update. decoder: trains the plane mix anew on what the
-    student makes, from the teacher's; with student.coarse a smaller decoder as well.
+    seed: every random draw follows from it, the stage and the update.
     """
 
     name: Annotated[str, Meta(pattern="^[a-z0-9][a-z0-9-]{0,40}$")]
@@ -136,36 +124,17 @@ class DistillRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     log: LogRecipe = LogRecipe()
     latents: LatentsRecipe | None = None
     batches: BatchRecipe = BatchRecipe()
-    paired: PairedRecipe | None = None
-    decoder: DecoderRecipe | None = None
+    paired: PairedRecipe
     export: ExportRecipe = ExportRecipe()
 
     def __post_init__(self) -> None:
-        coarser = self.student.coarse > 0
-        if self.paired is None and not coarser:
-            raise ValueError(
-                "a student learns in [paired], or gets a coarser decoder: give this table, or student.coarse"
-            )
-        if coarser and (self.decoder is None or not self.decoder.finetune_vae):
-            raise ValueError(
-                "student.coarse makes a decoder that has to learn: give [decoder] with finetune_vae = true"
-            )
-        if coarser and self.student.train == "lora":
-            raise ValueError('student.coarse changes what an adapter would lie beside: give student.train = "all"')
-        if self.paired is None and self.student.sampled_otherwise:
-            raise ValueError(
-                "without [paired] nothing teaches other steps or noise levels than the teacher's: leave student.steps, "
-                "sigma_max and sigma_min out"
-            )
         if (self.batches.source == "latents") != (self.latents is not None):
             raise ValueError('batches.source "latents" and a table [latents] go together: give both or neither')
-        if self.decoder is not None and self.latents is None:
-            raise ValueError("[decoder] works on encoded clips and needs a [latents] table")
 
     @property
     def stages(self) -> tuple[DistillStageName, ...]:
         """The steps of a run, in their order."""
-        tables: tuple[DistillStageName, ...] = ("latents", "paired", "decoder", "export")
+        tables: tuple[DistillStageName, ...] = ("latents", "paired", "export")
         return tuple(name for name in tables if getattr(self, name) is not None)
 
 

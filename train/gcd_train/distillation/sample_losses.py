@@ -8,11 +8,10 @@ from torch import Tensor
 
 from gcd_model.networks import Networks
 from gcd_train.distillation.recipe import SampleLossRecipe
-from gcd_train.distillation.student import Sampled
 from gcd_train.draws import Draws
 from gcd_train.errors import RecipeError
 from gcd_train.losses import frame_losses
-from gcd_train.objective import Batch, Weights, class_map_loss
+from gcd_train.objective import Batch
 from gcd_train.picture_losses import energy_l1, gradient_l1, ssim
 from gcd_train.precision import Precision
 
@@ -32,36 +31,32 @@ class SampleLoss:
     the student's, and no pictures have to be read. Raises RecipeError for losses the model has nothing to put in.
     """
 
-    def __init__(self, networks: Networks, recipe: SampleLossRecipe, weights: Weights, precision: Precision) -> None:
+    def __init__(
+        self, networks: Networks, recipe: SampleLossRecipe, channel_weights: Tensor | None, precision: Precision
+    ) -> None:
         if recipe.colours and not networks.config.semantic_classes:
             raise RecipeError("loss.colours is for models that paint classes, which this one does not; leave it out")
-        if recipe.class_map and networks.class_head is None:
-            raise RecipeError("loss.class_map is for models with a class head, which this one has not; leave it out")
-        self._networks, self._recipe, self._weights, self._precision = networks, recipe, weights, precision
+        self._networks, self._recipe, self._weights, self._precision = networks, recipe, channel_weights, precision
         colours = [kind.colour for kind in networks.config.semantic_classes]
         self._colours = torch.tensor(colours, device=precision.device).float() / 255
         if recipe.of_pictures:
             precision.placed(networks.decoder)
 
-    def of(self, made: Sampled, batch: Batch, draws: Draws) -> Compared:
+    def of(self, made: Tensor, batch: Batch, draws: Draws) -> Compared:
         """How far samples are from their pairs, mean over frames."""
         recipe, parts = self._recipe, dict[str, Tensor]()
         if recipe.latent:
             parts["latent"] = self._latent(made, batch)
-        if made.logits is not None and batch.classes is not None and recipe.class_map:
-            counted = torch.ones(len(batch.classes), dtype=torch.bool, device=batch.classes.device)
-            parts["class_map"] = class_map_loss(made.logits, batch.classes, counted, self._weights.classes)
         if recipe.of_pictures:
-            parts |= self._pictures(made.latents, batch, draws)
+            parts |= self._pictures(made, batch, draws)
         if not parts:
             raise RecipeError("a paired loss that weighs nothing teaches nothing: give loss.latent, or another")
         total = torch.stack([getattr(recipe, name) * value for name, value in parts.items()]).sum()
         return Compared(total, {name: value.detach() for name, value in parts.items()})
 
-    def _latent(self, made: Sampled, batch: Batch) -> Tensor:
-        channels = self._weights.channels
-        rows = frame_losses(made.latents, batch.target, fraction=1.0, emphasis=batch.emphasis, channel_weights=channels)
-        return rows.mean()
+    def _latent(self, made: Tensor, batch: Batch) -> Tensor:
+        weights, emphasis = self._weights, batch.emphasis
+        return frame_losses(made, batch.target, fraction=1.0, emphasis=emphasis, channel_weights=weights).mean()
 
     def _pictures(self, latents: Tensor, batch: Batch, draws: Draws) -> dict[str, Tensor]:
         recipe, run = self._recipe, min(self._recipe.frames, batch.frames)

@@ -5,7 +5,6 @@ conditional diffusion model is finetuned end to end, as it will be used, with th
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -16,14 +15,6 @@ from gcd_model.sampler import sample
 from gcd_model.schedule import Schedule
 from gcd_train.draws import Draws
 from gcd_train.objective import Batch, Denoiser, draw_noise
-
-
-@dataclass(frozen=True, slots=True)
-class Sampled:
-    """What the sampler ends with. latents: [N, C, h, w], scaled. logits: of the last step, [N, K, H', W'] or None."""
-
-    latents: Tensor
-    logits: Tensor | None
 
 
 def schedule_of(config: ModelConfig, steps: int) -> Schedule:
@@ -41,21 +32,18 @@ def drawn_steps(numbers: Sequence[int], draws: Draws) -> int:
     return numbers[int(draws.below(len(numbers), 1))]
 
 
-def sampled(denoiser: Denoiser, batch: Batch, noise: Tensor, schedule: Schedule) -> Sampled:
+def sampled(denoiser: Denoiser, batch: Batch, noise: Tensor, schedule: Schedule) -> Tensor:
     """From noise to a sample, as the synthesizer does it; gradients reach the weights through all steps.
 
     Args:
         noise: unit, [N, C, h, w].
+    Returns:
+        Latents [N, C, h, w], scaled.
     """
     levels: list[float] = schedule.sigmas.tolist()
-    logits: list[Tensor | None] = []
 
     def denoise(x: Tensor, step: int) -> Tensor:
         sigma = torch.full(x.shape[:1], levels[step], device=x.device)
-        denoised, classes = denoiser(x, sigma, batch)
-        logits.append(classes)
-        return denoised
+        return denoiser(x, sigma, batch)
 
-    start = schedule.start(noise[None], 1)[0]
-    latents = sample(denoise, start, schedule.steps)
-    return Sampled(latents, logits[-1])
+    return sample(denoise, schedule.start(noise[None], 1)[0], schedule.steps)

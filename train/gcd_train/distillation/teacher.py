@@ -41,30 +41,17 @@ def teacher_of(recipe: DistillRecipe) -> Teacher:
     return teacher
 
 
-def student_config(teacher: ModelConfig, recipe: StudentRecipe, *, taught: bool = True) -> ModelConfig:
+def student_config(teacher: ModelConfig, recipe: StudentRecipe) -> ModelConfig:
     """The teacher's networks, sampled in the student's steps and without guidance.
 
-    taught: the U-Net learns; else it is sampled as the teacher is.
     Raises RecipeError for noise levels that do not fall.
     """
-    if not taught:
-        return teacher
     sampling = teacher.sampling
     high, low = recipe.sigma_max or sampling.sigma_max, recipe.sigma_min or sampling.sigma_min
     if recipe.steps > 1 and low >= high:
         raise RecipeError(f"student.sigma_min must be below sigma_max, got {low:g} and {high:g}; change one of them")
     changed = msgspec.structs.replace(sampling, steps=recipe.steps, sigma_max=high, sigma_min=low, guidance=(1.0, 1.0))
     return msgspec.structs.replace(teacher, sampling=changed)
-
-
-def coarser_config(config: ModelConfig, levels: int) -> ModelConfig:
-    """The same with a decoder that leaves out so many more levels. Raises RecipeError where that leaves none."""
-    try:
-        return msgspec.structs.replace(
-            config, vae=msgspec.structs.replace(config.vae, coarse=config.vae.left_out + levels)
-        )
-    except OptionError as error:
-        raise RecipeError(f"student.coarse cannot be {levels}: {error}") from error
 
 
 def as_training(recipe: DistillRecipe, teacher: Teacher) -> Recipe:
@@ -83,7 +70,7 @@ def as_training(recipe: DistillRecipe, teacher: Teacher) -> Recipe:
         augmentation=teacher.config.sampling.augmentation if told is None else told,
         fps=batches.fps,
         motion_bucket=batches.motion_bucket,
-        loss=LossRecipe(class_weights="none" if recipe.paired is None else recipe.paired.loss.class_weights),
+        loss=LossRecipe(class_weights=recipe.paired.loss.class_weights),
     )
     try:
         return Recipe(
@@ -95,7 +82,6 @@ def as_training(recipe: DistillRecipe, teacher: Teacher) -> Recipe:
             log=recipe.log,
             latents=recipe.latents,
             unet=unet,
-            decoder=recipe.decoder,
             export=recipe.export,
         )
     except (ValueError, OptionError) as error:

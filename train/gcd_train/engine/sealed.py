@@ -40,6 +40,8 @@ def write_sealed(path: Path, write: Callable[[Any], None]) -> None:
 
 def damage(path: Path) -> str | None:
     """What is wrong with a sealed file, or None. One without a digest (of older versions) is checked by its CRCs."""
+    if not path.is_file():
+        return "it is no regular file"
     size = path.stat().st_size
     with path.open("rb") as file:
         file.seek(max(0, size - _END - _COMMENT))

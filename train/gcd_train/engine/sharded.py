@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import pickle
 import shutil
 import warnings
 from pathlib import Path
@@ -12,9 +13,11 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 from torch.distributed.checkpoint.filesystem import FileSystemReader
-from torch.distributed.checkpoint.metadata import TensorStorageMetadata
+from torch.distributed.checkpoint.metadata import Metadata, StorageMeta, TensorStorageMetadata
 from torch.distributed.checkpoint.state_dict_loader import load
 
+from gcd_model.errors import FileError
+from gcd_model.small_files import decode_json, read_small
 from gcd_train.checkpoint import DamagedStateError, StageState
 from gcd_train.engine.optimisers import torchao_optimisers
 from gcd_train.engine.trained import AVERAGE, MODULE
@@ -22,6 +25,19 @@ from gcd_train.errors import RunError
 
 _NOTE = "digest.json"
 _FORMAT = 1
+_DCP = "torch.distributed.checkpoint"
+_MAY_BE_MADE = {
+    "collections": {"OrderedDict"},
+    "pathlib": {"Path", "PosixPath", "WindowsPath"},
+    "torch": {"Size", *(name for name, value in vars(torch).items() if isinstance(value, torch.dtype))},
+    "torch.serialization": {"_get_layout"},
+    f"{_DCP}.filesystem": {"_StorageInfo"},
+    f"{_DCP}.metadata": {
+        "ChunkStorageMetadata", "Metadata", "MetadataIndex", "StorageMeta", "TensorProperties", "TensorStorageMetadata",
+        "_MEM_FORMAT_ENCODING",
+    },
+}  # fmt: skip
+"""What torch's metadata of tensors consists of, by module; a state that somebody else wrote may name anything."""
 
 
 class FolderNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -58,28 +74,58 @@ def checked_note(folder: Path, stage: str) -> FolderNote:
     Raises DamagedStateError; RunError for another stage.
     """
     try:
-        content, _, said = (folder / _NOTE).read_bytes().rpartition(b"\n")
+        content, _, said = read_small(folder / _NOTE).encode().rpartition(b"\n")
         if hashlib.sha256(content).hexdigest().encode() != said:
             raise _damaged(folder, f"{_NOTE} is not as it was written")
-        note = msgspec.json.decode(content, type=FolderNote)
+        note = decode_json(content, FolderNote)
         for name, digest in note.files.items():
-            if not (folder / name).exists():
+            if not (folder / name).is_file():
                 raise _damaged(folder, f"{name} is missing")
             if _digest(folder / name) != digest:
                 raise _damaged(folder, f"the bytes of {name} are not those that were written")
     except FileNotFoundError as error:
         raise _damaged(folder, f"{_NOTE} is missing") from error
-    except (OSError, msgspec.MsgspecError) as error:
-        raise _damaged(folder, f"it cannot be read ({error})") from error
+    except (OSError, FileError) as error:
+        raise _damaged(folder, f"{_NOTE} or a file it names: {error}") from error
     if note.stage != stage:
         raise RunError(f"{folder} is no state of the stage {stage!r}; delete it to start anew")
     return note
 
 
+class _Unpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        if name not in _MAY_BE_MADE.get(module, ()):
+            raise pickle.UnpicklingError(f"it names {module}.{name}, which no state of tensors needs")
+        return super().find_class(module, name)
+
+
+class _TensorReader(FileSystemReader):
+    """Torch's reader, without its plain pickle: metadata of tensors alone, from which nothing else can be made."""
+
+    def read_metadata(self, *args: Any, **kwargs: Any) -> Metadata:
+        """Raises DamagedStateError."""
+        _ = args, kwargs
+        folder = Path(self.path)
+        try:
+            with (folder / ".metadata").open("rb") as file:
+                metadata = _Unpickler(file).load()
+            entries = metadata.state_dict_metadata.values() if isinstance(metadata, Metadata) else [metadata]
+            if not all(isinstance(entry, TensorStorageMetadata) for entry in entries):
+                raise _damaged(folder, "it holds what is no tensor")
+        except FileNotFoundError as error:
+            raise _damaged(folder, ".metadata is missing") from error
+        except DamagedStateError:
+            raise
+        except Exception as error:  # a pickle that was cut or made up fails in any way
+            raise _damaged(folder, f".metadata cannot be read ({error})") from error
+        metadata.storage_meta = metadata.storage_meta or StorageMeta()
+        metadata.storage_meta.load_id = self.load_id
+        return metadata
+
+
 def names_in(folder: Path) -> dict[str, TensorStorageMetadata]:
-    """The tensors a folder holds, by name."""
-    kept = FileSystemReader(folder).read_metadata().state_dict_metadata
-    return {name: value for name, value in kept.items() if isinstance(value, TensorStorageMetadata)}
+    """The tensors a folder holds, by name. Raises DamagedStateError."""
+    return _TensorReader(folder).read_metadata().state_dict_metadata  # pyright: ignore[reportReturnType]
 
 
 def read_weights(folder: Path, stage: str) -> StageState:
@@ -104,7 +150,7 @@ def read_weights(folder: Path, stage: str) -> StageState:
 
 def load_folder(folder: Path, tensors: dict[str, Any], group: dist.ProcessGroup | None) -> None:
     """Read a folder's values into tensors, each process its share; in one process, without a group, all of them."""
-    reader = FileSystemReader(folder)
+    reader = _TensorReader(folder)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="torch.distributed is disabled")  # as it should be
         load(tensors, storage_reader=reader, process_group=group, no_dist=group is None)

@@ -1,6 +1,5 @@
 """Methods against held-out clips: a record of each clip, figures of all, how sure those are, and what is wanted."""
 
-from gcd_train.evaluation.bars import Bar, bars
 from gcd_train.evaluation.clips import EvaluationSet, HeldOutClip, SetKind
 from gcd_train.evaluation.contact_sheet import write_contact_sheet
 from gcd_train.evaluation.figures import Evaluation, Figures, figures, lead, summed_up
@@ -20,7 +19,6 @@ __all__ = [
     "FIRST_MEASURED",
     "MAIN",
     "REGIONS",
-    "Bar",
     "ClipRecord",
     "ClipWork",
     "Conditions",
@@ -41,7 +39,6 @@ __all__ = [
     "Shot",
     "SynthesizedViews",
     "Tallies",
-    "bars",
     "best_of",
     "cameras_of",
     "class_grid",

@@ -23,7 +23,7 @@ def fingerprint(folder: Path) -> bytes:
     try:
         for name, size in sorted(_files(folder)):
             digest.update(f"{name} {size}\n".encode())
-            if name.endswith(_TOLD_BY) and size <= _SMALL_BYTES:
+            if name.endswith(_TOLD_BY) and size <= _SMALL_BYTES and (folder / name).is_file():
                 digest.update(hashlib.sha256((folder / name).read_bytes()).digest())
     except OSError as error:
         raise DataError(f"{folder} cannot be read ({error}); look at the scene, or leave it out with --list") from error

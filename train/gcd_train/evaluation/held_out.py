@@ -64,7 +64,7 @@ def source_side(clips: HeldOutClips, number: int, clip: PairedClip, declared: Ca
 
 
 def class_grid(clips: SizedClips) -> tuple[int, int]:
-    """Height and width at which class maps are compared: half the pictures', the grid of our small class head."""
+    """Height and width at which class maps are compared: half the pictures'."""
     return clips.height // 2, clips.width // 2
 
 

@@ -17,10 +17,13 @@ from pathlib import Path
 
 import msgspec
 
+from gcd_model.errors import FileError
+from gcd_model.small_files import read_json
 from gcd_train.errors import RunError
 from gcd_train.evaluation.record import FRAMES_IN, ClipRecord, RunNote
 
 RUN_FILE = "run.json"
+_MOST_RECORD = 1 << 24
 _SAME = ("data_identity", "kind", "modality", "protocol", "frames", "height", "width", "seed", "classes")
 _PACKAGE = "gcd-node"
 _INFORMS = (FRAMES_IN,)  # the digest says whether frames are the same, wherever they lie
@@ -94,7 +97,7 @@ def read_run(folder: Path | str) -> tuple[RunNote, tuple[ClipRecord, ...]]:
         RunError: there is no run, or a file of it is damaged.
     """
     folder = Path(folder)
-    if not (folder / RUN_FILE).is_file():
+    if not (folder / RUN_FILE).exists():
         raise RunError(f"{folder} holds no {RUN_FILE}; make a run with `gcd-train evaluate --out {folder}`")
     note = _read_note(folder / RUN_FILE)
     places = [folder / "records" / folder_name(method) for method in note.methods]
@@ -114,16 +117,16 @@ def write_whole(path: Path, data: bytes) -> None:
 
 def _read_note(path: Path) -> RunNote:
     try:
-        return msgspec.json.decode(path.read_bytes(), type=RunNote)
-    except (OSError, msgspec.MsgspecError) as error:
-        raise RunError(f"{path} is no note of a run ({error}); delete the run, or choose another folder") from error
+        return read_json(path, RunNote)
+    except FileError as error:
+        raise RunError(f"{path} {error}; delete the run, or choose another folder") from error
 
 
 def _read_record(path: Path) -> ClipRecord:
     try:
-        return msgspec.json.decode(path.read_bytes(), type=ClipRecord)
-    except (OSError, msgspec.MsgspecError) as error:
-        raise RunError(f"{path} is damaged ({error}); delete it and evaluate again, the others are kept") from error
+        return read_json(path, ClipRecord, _MOST_RECORD)
+    except FileError as error:
+        raise RunError(f"{path} {error}; delete it and evaluate again, the others are kept") from error
 
 
 def _joined(folder: Path, found: RunNote, new: RunNote) -> RunNote:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gcd_model.class_head import palette
+from gcd_model.colours import palette
 from gcd_model.config import SemanticClass
 from gcd_train.baselines import Prediction, to_labels
 from gcd_train.datasets.clip_source import Bytes

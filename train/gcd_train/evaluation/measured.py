@@ -127,7 +127,7 @@ class _Painted:
         return torch.stack(each).sum(dim=0)
 
     def halved(self) -> "_Painted":
-        """At half the height and width, where our small class head works; an odd last row or column is left out."""
+        """At half the height and width; an odd last row or column is left out."""
         return _Painted(said=self._coarse(self.said), true=self._coarse(self.true), classes=self.classes)
 
     def _coarse(self, labels: Tensor) -> Tensor:

@@ -9,8 +9,9 @@ from typing import Literal, TypeAlias
 import msgspec
 
 from gcd_model.geometry import CameraMount
+from gcd_model.small_files import read_small
 from gcd_train.datasets.clip_frames import CLIP, DRIVING_FRAMES, KUBRIC_FRAMES, FrameSampling
-from gcd_train.datasets.controls import read_controls
+from gcd_train.datasets.controls import MOST_BYTES, read_controls
 from gcd_train.datasets.kubric4d import Kubric4D
 from gcd_train.datasets.paired import PairedClips
 from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
@@ -242,7 +243,7 @@ def _identity(folder: Path, scenes: Sequence[str], cuts: SceneCuts) -> str:
     """Of the scenes by name and files, and how clips are cut."""
     digest = hashlib.sha256(msgspec.json.encode(replace(cuts, controls=None), order="sorted"))
     if cuts.controls is not None:
-        digest.update(cuts.controls.read_bytes())
+        digest.update(read_small(cuts.controls, MOST_BYTES).encode())
     for scene in scenes:
         digest.update(scene.encode() + fingerprint(folder / scene))
     return digest.hexdigest()[:_DIGITS]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from gcd_model.config import CameraControl, SemanticClass
 from gcd_model.geometry import CameraMount, Intrinsics
+from gcd_train.array_files import ZIP_FAULTS
 from gcd_train.baselines import CameraPair
 from gcd_train.datasets.clip_source import Bytes
 from gcd_train.datasets.paired import PairedClip, PairedClips
@@ -206,6 +207,6 @@ def _checksums(shard: Path) -> dict[str, list[int]]:
         with zipfile.ZipFile(shard) as archive:
             for file in sorted(archive.infolist(), key=lambda each: each.filename):
                 sums.setdefault(file.filename.partition("/")[0], []).append(file.CRC)
-    except (OSError, zipfile.BadZipFile) as error:
+    except ZIP_FAULTS as error:
         raise DataError(f"{shard} is damaged ({error}); delete it and generate again") from error
     return sums

@@ -9,7 +9,6 @@ import msgspec
 
 from gcd_model.config import CameraControl
 from gcd_train.errors import RunError
-from gcd_train.evaluation.bars import Bar, bars
 from gcd_train.evaluation.figures import Evaluation, Figures
 
 
@@ -92,13 +91,6 @@ class Report:
         """All rows, the model's first."""
         return self.model + self.baselines
 
-    @property
-    def bars(self) -> tuple[Bar, ...]:
-        """What weights are meant to reach with the settings that ship; none without weights."""
-        if not self.model:
-            return ()
-        return bars(self.model[0], self.baselines, classes=self.classes, camera=self.conditions.camera)
-
 
 def best_of(evaluations: Sequence[Evaluation], figure: Callable[[Figures], float]) -> Evaluation | None:
     """The one with the highest figure; None where nobody has it."""
@@ -113,7 +105,6 @@ def write_report(report: Report, text: str, folder: Path) -> None:
         "classes": report.classes,
         "model": report.model,
         "baselines": report.baselines,
-        "bars": [{"reached": bar.reached, "margin": bar.margin, **msgspec.to_builtins(bar)} for bar in report.bars],
     }
     write_file(folder / "evaluation.json", msgspec.json.format(msgspec.json.encode(every), indent=1))
     write_file(folder / "evaluation.md", text.encode())

@@ -7,9 +7,8 @@ from typing import Self
 from torch import Tensor
 
 from gcd_model import Clip, RenderOptions, Trajectory, View, ViewSynthesizer
-from gcd_model.class_head import nearest_classes
+from gcd_model.colours import nearest_classes
 from gcd_model.config import SemanticClass
-from gcd_model.geometry import CameraMount
 from gcd_train.baselines import CameraPair, Prediction, SourceClip
 from gcd_train.datasets.clip_source import to_network
 from gcd_train.errors import DataError
@@ -70,8 +69,8 @@ class SynthesizedViews:
         """Draws the clip's view, encoded once, with any options. Raises DataError as `predict`."""
         synthesizer, mount = self.synthesizer, clip.cameras.mount
         live, video = synthesizer.traits.live, to_network(clip.source)
-        declared = None if mount == (synthesizer.traits.mount or CameraMount()) and not live else mount
-        path = self._path(clip.cameras, declared)
+        declared = mount if live else None
+        path = self._path(clip.cameras)
         lens = clip.cameras.source if live else None
         features = synthesizer.encode(Clip(video=video, fps=clip.fps, mount=declared, lens=lens))
         return lambda options: synthesizer.render(features, [path], options)[0]
@@ -87,12 +86,12 @@ class SynthesizedViews:
             return Prediction(classes=nearest_classes(video, self.painted))
         return Prediction(video=None if self.paints_classes else video, classes=classes)
 
-    def _path(self, cameras: CameraPair, declared: CameraMount | None) -> Trajectory:
+    def _path(self, cameras: CameraPair) -> Trajectory:
         traits, asked = self.synthesizer.traits, cameras.trajectory
         if traits.live:
             return asked
         if traits.config.camera == "none":
-            planned = traits.plan_view(mount=declared)
+            planned = traits.plan_view()
             same = planned.at_goal == asked.at_goal
         else:
             planned = traits.plan_view(asked.goal_delta, source=asked.source)  # with the limits of the family

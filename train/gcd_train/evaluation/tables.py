@@ -1,4 +1,4 @@
-"""A report as Markdown: what was measured, the bars, steps against steps, classes, scenes."""
+"""A report as Markdown: what was measured, steps against steps, classes, scenes."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -48,8 +48,6 @@ _COLUMNS = (
 def to_markdown(report: Report) -> str:
     """All tables; what nobody has is left out."""
     parts = [_conditions(report), _predictors(report.evaluations)]
-    if report.bars:
-        parts.append(["Wanted:", "", *(f"- {bar}" for bar in report.bars)])
     if len(report.model) > 1:
         parts.append(_steps(report))
     if any(not math.isnan(each.total.miou) for each in report.evaluations):

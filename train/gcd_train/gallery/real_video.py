@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gcd_model import Traits
 from gcd_model.geometry import center_crop_box
+from gcd_train.datasets.picture_files import decoded, read
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.keeping import folder_name
 
@@ -219,6 +220,8 @@ def _opened(path: Path) -> Generator[cv2.VideoCapture]:
 def _is_container(path: Path) -> bool:
     """By its first bytes: the decoder would also play a text, or follow a play list to other files."""
     try:
+        if not path.is_file():
+            raise DataError(f"{path} is no regular file; give a video")
         with path.open("rb") as file:
             head = file.read(12)
     except OSError as error:
@@ -227,9 +230,7 @@ def _is_container(path: Path) -> bool:
 
 
 def _picture(path: Path) -> Bytes:
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if picture is None:
-        raise DataError(f"{path} is no picture that can be decoded; copy it again, or take it out of the folder")
+    picture = decoded(path, read(path), cv2.IMREAD_COLOR)
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8)
 
 

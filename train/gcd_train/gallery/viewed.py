@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from gcd_model import CameraMount, Clip, RenderOptions, SphericalDelta, Traits, Trajectory, View, ViewSynthesizer
-from gcd_model.class_head import palette
+from gcd_model.colours import palette
 from gcd_train.datasets.clip_source import to_network
 from gcd_train.gallery.real_video import Bytes, Windowed
 from gcd_train.reports.galleries import Strip, write_sheet, write_video
@@ -59,24 +59,22 @@ def paths(traits: Traits, recipe: ViewRecipe, hfov_deg: float | None = None) -> 
 
 
 def mounted(traits: Traits, recipe: ViewRecipe, hfov_deg: float | None) -> CameraMount | None:
-    """How the camera sits on its vehicle, where somebody says more of it than training did; else None."""
-    trained = traits.mount
-    if trained is None and recipe.height_m is None and recipe.tilt_deg is None:
+    """How the camera sits on its vehicle, for the live model where somebody says it; else None."""
+    if not traits.live or (recipe.height_m is None and recipe.tilt_deg is None):
         return None
-    usual = trained or CameraMount()
-    stated = replace(
+    usual = CameraMount()
+    return replace(
         usual,
         height_m=usual.height_m if recipe.height_m is None else recipe.height_m,
         tilt_deg=usual.tilt_deg if recipe.tilt_deg is None else recipe.tilt_deg,
         hfov_deg=usual.hfov_deg if hfov_deg is None else hfov_deg,
     )
-    return None if stated == usual else stated
 
 
 def view_window(synthesizer: ViewSynthesizer, window: Windowed, recipe: ViewRecipe) -> Viewed:
     """Encode a window once and render every goal. Raises: ModelError and its kind."""
     traits = synthesizer.traits
-    mount = None if traits.mount is None else mounted(traits, recipe, window.hfov_deg)
+    mount = mounted(traits, recipe, window.hfov_deg)
     features = synthesizer.encode(Clip(video=to_network(window.pictures), fps=window.fps, mount=mount))
     options = RenderOptions(samples=recipe.samples, steps=recipe.steps, seed=recipe.seed)
     strips = [_strip("input", window.pictures)]

@@ -23,7 +23,7 @@ class CachedBatches:
     """A `BatchSource` of whole clips: noise copy of every frame, posterior sample and dropout drawn anew each time.
 
     The frame rate a clip is told is its own, after the stride; the recipe's `fps` is not used.
-    Raises RecipeError for what a cache does not have: single frames, class maps, a camera to steer, warped pictures,
+    Raises RecipeError for what a cache does not have: single frames, a camera to steer,
     another augmentation, size or path than it was made with, or class emphasis where it was made in colour.
     """
 
@@ -62,7 +62,6 @@ class CachedBatches:
             condition=condition,
             vector=torch.cat([self._vector(clip) for clip in clips]).to(self._precision.device),
             tokens=tokens,
-            classes=None,
             emphasis=self._joined_if([clip.emphasis for clip in clips]) if by_class else None,
             frames=self._config.frames,
             ids=tuple(f"{clip.scene} from {clip.place.start} by {clip.place.stride}" for clip in clips),
@@ -86,10 +85,10 @@ class CachedBatches:
 def require_cached(cache: CachedLatents, config: ModelConfig, recipe: UNetRecipe, path: PathKind) -> None:
     """Raises RecipeError for what model or recipe want and the cache does not have."""
     kept = cache.index.identity
-    if recipe.image_share or recipe.loss.class_map:
-        raise RecipeError("a latent cache has whole clips and no class map; set image_share, class_map to 0")
-    if config.camera != "none" or config.plane_warp is not None:
-        raise RecipeError("a latent cache is of one path without warps; take a model without camera control and warps")
+    if recipe.image_share:
+        raise RecipeError("a latent cache has whole clips only; set image_share to 0")
+    if config.camera != "none":
+        raise RecipeError("a latent cache is of one path; take a model without camera control")
     if recipe.augmentation != kept.augmentation:
         raise RecipeError(
             f"the recipe's unet.augmentation is {recipe.augmentation:g}, {cache.folder} was made with "

@@ -7,10 +7,13 @@ from typing import Literal
 
 import msgspec
 
+from gcd_model.errors import FileError
+from gcd_model.small_files import read_json
 from gcd_train.errors import RunError
 from gcd_train.latent_cache.plan import ClipPlan
 
 INDEX = "index.json"
+_MOST_BYTES = 1 << 26
 Moments = Literal["both", "mean"]
 
 
@@ -75,12 +78,12 @@ class CacheIndex(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 def read_index(folder: Path) -> CacheIndex | None:
     """The index of a folder, None where there is none yet. Raises RunError if it cannot be read."""
     path = folder / INDEX
-    try:
-        index = msgspec.json.decode(path.read_bytes(), type=CacheIndex)
-    except FileNotFoundError:
+    if not path.exists():
         return None
-    except (OSError, msgspec.MsgspecError) as error:
-        raise RunError(f"{path} cannot be read ({error}); delete the folder and run `gcd-train cache` again") from error
+    try:
+        index = read_json(path, CacheIndex, _MOST_BYTES)
+    except FileError as error:
+        raise RunError(f"{path} {error}; delete the folder and run `gcd-train cache` again") from error
     if index.format != 1:
         raise RunError(f"{path} has format {index.format}, this version reads 1; make the cache anew")
     return index
@@ -127,9 +130,10 @@ def fault(folder: Path, entry: ShardEntry) -> str | None:
     """What is wrong with a scene's shard: missing, cut, changed; None if it is as it was written."""
     path = folder / entry.file
     try:
+        size = path.stat().st_size
+        if size != entry.bytes or not path.is_file():
+            return f"{path}: {size} bytes, written were {entry.bytes}"
         content = path.read_bytes()
     except OSError as error:
         return f"{path}: {error.strerror}"
-    if len(content) != entry.bytes:
-        return f"{path}: {len(content)} bytes, written were {entry.bytes}"
     return None if digest(content) == entry.sha256 else f"{path}: its SHA-256 is not the one it was written with"

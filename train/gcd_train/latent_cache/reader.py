@@ -11,6 +11,8 @@ from safetensors.torch import load
 from torch import Tensor
 
 from gcd_model.vae import Posterior
+from gcd_train.datasets.picture_files import read
+from gcd_train.datasets.skips import FileFault
 from gcd_train.draws import Draws
 from gcd_train.errors import DataError
 from gcd_train.latent_cache.index import CacheIndex, digest, read_index
@@ -139,11 +141,11 @@ class CachedLatents:
         entry = self.index.scenes[scene]
         path = self.folder / entry.file
         try:
-            content = path.read_bytes()
+            content = read(path, entry.bytes)
             if digest(content) != entry.sha256:
                 raise DataError(f"{path} is damaged: its SHA-256 is not the one it was written with; {_AGAIN}")
             return load(content)
-        except (OSError, SafetensorError) as error:
+        except (SafetensorError, FileFault) as error:
             raise DataError(f"{path} cannot be read ({error}); {_AGAIN}") from error
 
 

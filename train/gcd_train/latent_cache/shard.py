@@ -6,7 +6,6 @@ source                f16    [N, K, C, h, w]      condition latents of the noise
 tokens                f16    [N, D]               image tokens of the clean source; only with an image tower
 target_mean           f16    [R, C, h, w]         posterior of the target latents, not scaled
 target_log_variance   u8     [R, C, h, w]         of it, -30..20 in 255 steps: the deviation to 5 %; only with moments
-half                  u8     [N, 3, H/2, W/2]     the source at half size; only for models that warp
 emphasis              f16    [R, 1, h, w]         class emphasis of semantic targets; only for semantic targets
 """
 
@@ -14,7 +13,6 @@ from collections import defaultdict
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from gcd_train.datasets.clip_source import to_network
@@ -87,8 +85,6 @@ def encode_moment(encoders: Encoders, identity: CacheIdentity, moment: MomentPic
     tokens = encoders.tokens(source)
     if tokens is not None:
         rows["tokens"] = tokens.half()
-    if encoders.config.plane_warp is not None:
-        rows["half"] = ((F.avg_pool2d(source, 2) + 1) * 127.5).round().to(torch.uint8)
     if identity.emphasis:
         size = (posterior.mean.shape[-2], posterior.mean.shape[-1])
         rows["emphasis"] = class_emphasis(targets, PARALLEL_DOMAIN_WEIGHTS, size).half()

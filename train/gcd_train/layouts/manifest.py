@@ -8,12 +8,15 @@ from typing import Literal
 
 import msgspec
 
+from gcd_model.errors import FileError
+from gcd_model.small_files import read_json
 from gcd_train.errors import DataError
 
 MANIFEST = "gcd-manifest.json"
 GEOMETRY = "geometry.npz"
 """The scene ready to draw (`FrozenScene`), beside the manifest."""
 
+_MOST_BYTES = 1 << 24  # 16 cameras of 1000 frames in five layers
 Matrix = tuple[tuple[float, float, float, float], ...]
 
 
@@ -57,12 +60,12 @@ def package_version() -> str:
 def read_manifest(scene: Path) -> SceneManifest:
     """Of a scene folder. Raises DataError if it has none, or one that cannot be read."""
     path = scene / MANIFEST
+    if not path.exists():
+        raise DataError(f"{scene} has no {MANIFEST}: it was not made by `gcd-train generate`")
     try:
-        return msgspec.json.decode(path.read_bytes(), type=SceneManifest)
-    except FileNotFoundError as error:
-        raise DataError(f"{scene} has no {MANIFEST}: it was not made by `gcd-train generate`") from error
-    except (OSError, msgspec.MsgspecError) as error:
-        raise DataError(f"{path} cannot be read ({error}); delete the scene and generate it again") from error
+        return read_json(path, SceneManifest, _MOST_BYTES)
+    except FileError as error:
+        raise DataError(f"{path} {error}; delete the scene and generate it again") from error
 
 
 def verify(scene: Path) -> SceneManifest:
@@ -80,6 +83,9 @@ def faults(scene: Path, manifest: SceneManifest) -> Iterator[str]:
     """One line for every file of a scene folder that is missing, cannot be read, or is not as it was written."""
     for name, wanted in manifest.files.items():
         try:
+            if (scene / name).exists() and not (scene / name).is_file():
+                yield f"{scene / name} is no regular file"
+                continue
             with (scene / name).open("rb") as file:
                 came = hashlib.file_digest(file, "sha256").hexdigest()
         except OSError as error:

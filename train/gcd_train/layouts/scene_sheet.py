@@ -2,12 +2,14 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from gcd_model.small_files import read_json
+from gcd_train.array_files import read_npz
 from gcd_train.errors import DataError
 from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
 from gcd_train.layouts.depth_code import stored_depth
@@ -89,8 +91,7 @@ def _nearness(path: Path) -> Picture:
 
 def _metres(path: Path) -> NDArray[np.float32]:
     if path.suffix == ".npz":
-        with np.load(path) as kept:
-            return np.asarray(kept[parallel_domain4d_names.DEPTH_KEY], np.float32)
+        return read_npz(path)[parallel_domain4d_names.DEPTH_KEY].astype(np.float32)
     stored = _read(path, cv2.IMREAD_UNCHANGED)
     metres = stored_depth(stored) if path.suffix == ".png" else np.asarray(stored, np.float32)
     if metres is None:
@@ -102,6 +103,6 @@ def _classes(path: Path, scene: Path) -> Picture:
     ids = np.asarray(_read(path, cv2.IMREAD_COLOR_BGR), np.uint8)[..., 2]
     palette = np.zeros((256, 3), np.uint8)
     for ontology in parallel_domain4d_names.ontology_folder(scene).glob("*.json"):
-        for item in msgspec.json.decode(ontology.read_bytes())["items"]:
+        for item in read_json(ontology, dict[str, Any])["items"]:
             palette[item["id"]] = [item["color"][channel] for channel in "bgr"]
     return _small(palette[ids])

@@ -17,8 +17,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gcd_model.errors import ModelError
+from gcd_model.errors import FileError, ModelError
 from gcd_model.geometry import Intrinsics, require_rigid
+from gcd_model.small_files import read_json
 from gcd_train.datasets.skips import FileFault
 from gcd_train.errors import DataError
 
@@ -79,15 +80,15 @@ def read_cameras(folder: Path, calibration: Path | None = None) -> dict[str, Cam
         DataError: there is none; the message shows what to write. FileFault: it is wrong.
     """
     path = calibration or folder / CAMERA_FILE
-    if not path.is_file():
+    if not path.exists():
         raise DataError(
             f"{path} is missing: LeRobot keeps no camera poses, and pairs of cameras need them; write one there, or "
             f"give another with --calibration FILE; for example {_EXAMPLE}"
         )
     try:
-        cameras = msgspec.json.decode(path.read_bytes(), type=CameraFile).cameras
-    except (msgspec.MsgspecError, OSError) as error:
-        raise FileFault(path, f"is no camera calibration ({error}); for example {_EXAMPLE}") from error
+        cameras = read_json(path, CameraFile).cameras
+    except FileError as error:
+        raise FileFault(path, f"is no camera calibration: it {error}; for example {_EXAMPLE}") from error
     for name, camera in cameras.items():
         _check(path, name, camera)
     if len(cameras) < 2:

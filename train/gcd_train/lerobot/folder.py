@@ -3,19 +3,21 @@
 Source: the documented formats v3.0 (several episodes a file, placed by `meta/episodes`) and v2.1 (one file an episode).
 """
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import msgspec
 
+from gcd_model.errors import FileError
+from gcd_model.small_files import decode_json, read_json, read_small
 from gcd_train.datasets.skips import FileFault
 from gcd_train.errors import DataError
 from gcd_train.lerobot.extra import load_arrow
 
 _CHUNK = 1000
+_MOST_BYTES = 1 << 24
 
 
 class Feature(msgspec.Struct, frozen=True, kw_only=True):
@@ -34,6 +36,13 @@ class Info(msgspec.Struct, frozen=True, kw_only=True):
     data_path: str
     video_path: str | None = None
     chunks_size: int = _CHUNK
+
+
+class _Row(msgspec.Struct, frozen=True, kw_only=True):
+    """A line of `meta/episodes.jsonl`, as far as it matters here."""
+
+    episode_index: Annotated[int, msgspec.Meta(ge=0)]
+    length: Annotated[int, msgspec.Meta(ge=0)]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -80,12 +89,12 @@ class LeRobotFolder:
 
 def _read_info(folder: Path) -> Info:
     path = folder / "meta/info.json"
-    if not path.is_file():
+    if not path.exists():
         raise DataError(f"{folder} is no LeRobot data set: {path} is missing; give the folder that holds `meta`")
     try:
-        info = msgspec.json.decode(path.read_bytes(), type=Info)
-    except (msgspec.MsgspecError, OSError) as error:
-        raise FileFault(path, f"cannot be read ({error})") from error
+        info = read_json(path, Info, _MOST_BYTES)
+    except FileError as error:
+        raise FileFault(path, str(error)) from error
     if not info.codebase_version.startswith(("v3.", "v2.")):
         raise DataError(
             f"{path} says version {info.codebase_version}; this reads v3.0 and v2.1: convert it "
@@ -125,11 +134,10 @@ def _episodes_v2(folder: Path, info: Info) -> Iterator[EpisodePlace]:
     videos = [name for name, feature in info.features.items() if feature.dtype == "video"]
     path = folder / "meta/episodes.jsonl"
     try:
-        rows = [json.loads(line) for line in path.read_text("utf-8").splitlines() if line.strip()]
-        pairs = [(int(row["episode_index"]), int(row["length"])) for row in rows]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise FileFault(path, f"cannot be read as the list of episodes ({error!r})") from error
-    for number, length in pairs:
+        rows = [decode_json(line, _Row) for line in read_small(path, _MOST_BYTES).splitlines() if line.strip()]
+    except FileError as error:
+        raise FileFault(path, f"is no list of episodes: it {error}") from error
+    for number, length in ((row.episode_index, row.length) for row in rows):
         numbers = {"episode_index": number, "episode_chunk": number // max(1, info.chunks_size)}
         yield EpisodePlace(
             number=number,
@@ -165,6 +173,8 @@ def read_rows(path: Path, columns: Sequence[str], episode: int | None = None) ->
     arrow, parquet = load_arrow()
     filters = None if episode is None else [("episode_index", "=", episode)]
     try:
+        if path.exists() and not path.is_file():
+            raise FileFault(path, "is no regular file")
         there = set(parquet.read_schema(path).names)
         missing = [name for name in columns if name not in there]
         if missing:

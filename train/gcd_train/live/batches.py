@@ -10,18 +10,22 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.config import SKY_M, DepthConfig, LiveConfig
 from gcd_model.live.depth_net import pixel_rays, plane_depth
 from gcd_model.live.sweep import LONGEST, Reference, References, sweep_costs
+from gcd_model.loading import default_precision
 from gcd_train.live.clips import LiveClip, clip_paths, read_clip
 from gcd_train.live.draws import Poses
 
 Random = np.random.Generator
 Record = TypeVar("Record")
 Batch = TypeVar("Batch")
+SMALL_SHARE = 0.6
+"""So much of the depth and paint stages learns from pictures of half the size, at a quarter of the cost."""
 PART_SEED = 1_000_003
 """Between the seeds of the batches of one update."""
 _MOST_GAP, _REFERENCE_SHARE = 6, 0.85
@@ -194,6 +198,21 @@ def joined(parts: Sequence[Pictures]) -> Pictures:
     )
 
 
+def halved(pictures: Pictures) -> Pictures:
+    """The same at half the size: colours are averages, what cannot be averaged is of one pixel of four."""
+    return replace(
+        pictures,
+        video=avg_pool2d(pictures.video, 2),
+        metres=pictures.metres[:, ::2, ::2],
+        labels=pictures.labels[:, ::2, ::2],
+        moves=pictures.moves[:, ::2, ::2],
+        lenses=tuple(lens.resized(lens.width // 2, lens.height // 2) for lens in pictures.lenses),
+        references=tuple(
+            None if each is None else replace(each, picture=avg_pool2d(each.picture, 2)) for each in pictures.references
+        ),
+    )
+
+
 def augmented(pictures: Pictures, random: Random) -> Pictures:
     """Mirrored or not, and seen by a camera of another exposure, colour, noise and focus."""
     video = pictures.video
@@ -252,7 +271,7 @@ def other_camera(random: Random, n: int) -> Callable[[Tensor, Random], Tensor]:
 
     def look(video: Tensor, random: Random) -> Tensor:
         levels = (((video + 1) / 2).clamp(0, 1) ** gamma * gain + offset).clamp(0, 1)
-        soft = torch.nn.functional.avg_pool2d(levels, 3, 1, 1, count_include_pad=False)
+        soft = avg_pool2d(levels, 3, 1, 1, count_include_pad=False)
         noise = torch.from_numpy(random.standard_normal(levels.shape, np.float32))
         return (torch.lerp(levels, soft, blur) * 2 - 1 + noise * spread).clamp(-1, 1)
 
@@ -272,6 +291,12 @@ def class_weights(paths: Sequence[Path], config: LiveConfig, power: float, sampl
     shares = torch.from_numpy(counts / counts.sum()).float()
     weights = shares.clamp(min=1e-4) ** power
     return weights / (weights * shares).sum()
+
+
+def autocast(device: torch.device) -> torch.autocast:
+    """bfloat16 where the device is fast at it; other processors take seven times as long by it."""
+    fast = default_precision(device, live=True) == "bfloat16"
+    return torch.autocast(device.type, dtype=torch.bfloat16, enabled=fast)
 
 
 def on(device: torch.device, record: Record) -> Record:

@@ -25,6 +25,7 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from gcd_model.live.ontology import LIVE_CLASSES
+from gcd_model.small_files import decode_json
 from gcd_train.errors import DataError, RenderError
 from gcd_train.live.draws import FLOOR_Z_M, METRES_A_UNIT, LiveDraw, LiveWorld, Poses, TargetPath, live_scene
 from gcd_train.map_items import map_items, one_thread_each
@@ -257,8 +258,10 @@ def clip_paths(folder: Path, worlds: tuple[str, ...] | None = None) -> list[Path
 def read_clip(path: Path, frames: slice = slice(None), names: Collection[str] | None = None) -> LiveClip:
     """Some frames of a clip; of some arrays, see the module. Raises DataError for a file that is no live clip."""
     try:
+        if path.exists() and not path.is_file():
+            raise ValueError("it is no regular file")
         with safe_open(path, framework="numpy") as file:
-            facts = json.loads(file.metadata()["facts"])
+            facts = decode_json(file.metadata()["facts"], dict[str, Any])
             wanted = file.keys() if names is None else names
             arrays = {name: file.get_slice(name)[frames] for name in wanted}
     except Exception as error:  # safetensors and json raise kinds of their own

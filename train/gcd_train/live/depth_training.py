@@ -17,7 +17,18 @@ from gcd_model.live.depth_net import (
     first_bin,
     read_depth,
 )
-from gcd_train.live.batches import PART_SEED, Ahead, FrameBatches, Pictures, class_weights, on, with_true_references
+from gcd_train.live.batches import (
+    PART_SEED,
+    SMALL_SHARE,
+    Ahead,
+    FrameBatches,
+    Pictures,
+    autocast,
+    class_weights,
+    halved,
+    on,
+    with_true_references,
+)
 from gcd_train.live.clips import read_clip
 from gcd_train.live.look import depth_sheet
 from gcd_train.loop import Progress, StepLoss
@@ -78,6 +89,8 @@ class DepthTask:
     def step_loss(self, progress: Progress) -> StepLoss:
         """Of one batch of frames."""
         pictures, ground, random = self._batches[progress.part](progress.updates)
+        if progress.share < SMALL_SHARE:
+            pictures, ground = halved(pictures), ground[:, ::2, ::2]
         self._net.train()
         inputs = depth_inputs(pictures.video, pictures.rays, ground).to(self._device)
         pictures = on(self._device, pictures)
@@ -86,7 +99,7 @@ class DepthTask:
         drawn = torch.multinomial(weights.cpu(), int(weights.shape[1] * _PIXEL_SHARE), True, generator=generator)
         pixels = drawn.to(self._device)
         sweeps = pictures.sweeps(self._config.depth)
-        with torch.autocast(self._device.type, dtype=torch.bfloat16):
+        with autocast(self._device):
             output = self._network(inputs, sweeps, pixels)
         parts = self.losses(output, pictures, pixels)
         total = parts["bin"] + _OFFSET * parts["offset"] + _CLASS * parts["class"] + _MOVES * parts["moves"]

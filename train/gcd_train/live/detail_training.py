@@ -19,8 +19,9 @@ from gcd_model.live.config import LiveConfig
 from gcd_model.live.depth_net import DepthNet, depth_inputs
 from gcd_model.live.paint_net import Painted, PaintNet, Seen, filled
 from gcd_model.live.view import movable_classes
-from gcd_train.live.batches import Ahead, on
-from gcd_train.live.paint_training import HeldOutViews, ViewBatches, Views, carry, mirrored
+from gcd_train.live.batches import Ahead, autocast, on
+from gcd_train.live.paint_training import HeldOutViews
+from gcd_train.live.target_views import ViewBatches, Views, carry, mirrored
 from gcd_train.loop import Progress, StepLoss
 from gcd_train.schedule import ParameterGroup
 
@@ -121,7 +122,7 @@ class DetailTask:
         return StepLoss(total=torch.stack(list(parts.values())).sum(), parts=parts, frames=len(now.poses))
 
     def _first_step(self, seen: Seen) -> Painted:
-        with torch.autocast(self._device.type, dtype=torch.bfloat16):
+        with autocast(self._device):
             return self._net.first_step(seen, filled(seen), self._config.sigma_max)
 
     def _losses(self, made: Painted, views: Views) -> dict[str, Tensor]:
@@ -150,7 +151,7 @@ class DetailTask:
         """Distance in features of the depth network, which knows targets too, and of a random network."""
         ground = torch.zeros_like(views.seen.ground_m)
         distance = torch.zeros((), device=self._device)
-        with torch.autocast(self._device.type, dtype=torch.bfloat16):
+        with autocast(self._device):
             made, true = (self._depth.features(depth_inputs(x, views.seen.rays, ground)) for x in (fake, views.target))
             made_random, true_random = self._random(fake), self._random(views.target)
         for a, b in ((made, true), (made_random, true_random)):

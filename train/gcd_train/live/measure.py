@@ -1,7 +1,7 @@
-"""The live view measured beside the models that shipped before it, splats by exact depth and homographies.
+"""The live view measured beside splats by exact depth and homographies.
 
     python -m gcd_train.live.measure --heldout DIR --training DIR --judge FILE --weights FILE --sets paper-first,orbit \
-        --methods old,splat,live --out DIR
+        --methods splat,live --out DIR
 
 Same clips, same run; writes report.md, report.json and a sheet of pictures for each set.
 """
@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -24,25 +23,25 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 from torch import Tensor
 
+from gcd_model import hatched
 from gcd_model.live.config import LiveConfig
 from gcd_model.live.view import LiveNetworks
+from gcd_model.small_files import decode_json
 from gcd_train.errors import DataError
 from gcd_train.live.clips import LiveClip, clip_paths, read_clip
 from gcd_train.live.judge import JudgeNet, load_judge, random_judge
-from gcd_train.live.measure_figures import NEVER, STATES, MethodViews, Tally, fit_spread, scene_interval, truth_of
+from gcd_train.live.measure_figures import STATES, MethodViews, Tally, fit_spread, scene_interval, truth_of
 from gcd_train.live.measure_methods import (
     BestHomography,
     ExactSplat,
     Kept,
     Method,
-    PackagedModel,
     PointSplat,
     live_methods,
 )
 
 _CONFIG_KEY = "gcd.config"
 _SHEET_FRAMES, _SHEET_CLIPS = (5, 9, 13), 4
-_HATCH_EVERY, _HATCH_WIDTH = 8, 2
 _TABLES: dict[str, dict[str, tuple[str, int]]] = {
     "Pictures": {
         "PSNR": ("psnr", 2),
@@ -143,7 +142,9 @@ def _sheet_rows(clip: LiveClip, made: dict[str, MethodViews], truth: Tensor) -> 
         (views for views in made.values() if views.visibility is not None and views.log_variance is not None), None
     )
     if says is not None and says.visibility is not None:
-        columns["painted: hatched"] = hatched(says.video, says.visibility == NEVER)
+        shown = says.visibility.numpy()
+        painted = hatched((says.video.clamp(0, 1) * 255).round().byte().permute(0, 2, 3, 1).numpy(), shown)
+        columns["painted: hatched"] = torch.from_numpy(painted).permute(0, 3, 1, 2) / 255
     columns["truth"] = truth
     rows: list[NDArray[np.uint8]] = []
     for t in _SHEET_FRAMES:
@@ -157,13 +158,6 @@ def _sheet_rows(clip: LiveClip, made: dict[str, MethodViews], truth: Tensor) -> 
             )
         rows.append(np.concatenate(tiles, axis=1).astype(np.uint8))
     return rows
-
-
-def hatched(video: Tensor, mask: Tensor) -> Tensor:
-    """Diagonal lines over the pixels of a mask: [T, 3, H, W] in [0, 1] and bool [T, H, W] -> [T, 3, H, W]."""
-    v, u = torch.meshgrid(*(torch.arange(side) for side in mask.shape[1:]), indexing="ij")
-    lines = mask & ((u + v) % _HATCH_EVERY < _HATCH_WIDTH)
-    return torch.where(lines[:, None], 0.35 * video + 0.65, video)
 
 
 def to_markdown(results: Sequence[SetResult]) -> str:
@@ -267,7 +261,7 @@ def open_networks(weights: str) -> LiveNetworks:
         told = (file.metadata() or {}).get(_CONFIG_KEY)
     if told is None:
         raise DataError(f"{weights} says no {_CONFIG_KEY!r} in its metadata; it is no live model")
-    networks = LiveNetworks(msgspec.json.decode(told, type=LiveConfig))
+    networks = LiveNetworks(decode_json(told, LiveConfig))
     networks.load_state_dict(load_file(weights))
     return networks.eval()
 
@@ -277,7 +271,6 @@ def methods_of(names: Sequence[str], weights: str, training: Path) -> list[Metho
     others: list[Method] = [
         ExactSplat(training=training),
         PointSplat(training=training),
-        PackagedModel(),
         BestHomography(),
     ]
     known: dict[str, Method] = {method.name: method for method in others}
@@ -290,13 +283,13 @@ def methods_of(names: Sequence[str], weights: str, training: Path) -> list[Metho
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """See the module."""
-    parser = argparse.ArgumentParser(description="Measure the live view beside older models, splats and homographies.")
+    parser = argparse.ArgumentParser(description="Measure the live view beside splats and homographies.")
     parser.add_argument("--heldout", type=Path, required=True, help="folder of the sets")
     parser.add_argument("--training", type=Path, required=True, help="clips that fill holes as they are on average")
     parser.add_argument("--judge", type=Path, help="weights of the judge network; else only the random one judges")
     parser.add_argument("--weights", default="init", help="safetensors of the live networks, or init")
     parser.add_argument("--sets", required=True, help="names of sets, with commas")
-    parser.add_argument("--methods", default="old,splat,live", help="names of methods, with commas")
+    parser.add_argument("--methods", default="splat,live", help="names of methods, with commas")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument(
         "--keep", type=Path, help="keep what other methods show there, for the next run; not what is live"

@@ -4,7 +4,7 @@ import json
 import os
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
@@ -18,18 +18,17 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from gcd_model import Clip, Trajectory, ViewRangeError, ViewSynthesizer, load_synthesizer, synthesize
-from gcd_model.geometry import Intrinsics, fitted_trajectory, from_pose, invert_rigid
+from gcd_model.geometry import Intrinsics, invert_rigid
 from gcd_model.live.config import SKY_M, LiveConfig
 from gcd_model.live.depth_net import pixel_rays
 from gcd_model.live.paint_net import filled, seen_of
 from gcd_model.live.splat import splat, unproject
 from gcd_model.live.view import Floor, FrameGeometry, LiveNetworks, LiveView
+from gcd_model.small_files import decode_json
 from gcd_train.baselines.depth_reprojection import splat as splat_points
 from gcd_train.errors import DataError
 from gcd_train.live.batches import Pictures, pictures_of, training_paths
 from gcd_train.live.clips import LiveClip, read_clip
-from gcd_train.live.draws import DRIVING_HFOV_DEG, METRES_A_UNIT, STAGE_HFOV_DEG
 from gcd_train.live.measure_figures import NEVER, NOW, MethodViews
 
 Array = NDArray[Any]
@@ -37,7 +36,6 @@ _COVERED = 0.5
 """From this coverage a pixel counts as seen."""
 _SAMPLE = 60
 """Training clips that the fill of holes is read off."""
-_SAME_PATH, _SAME_LENS_DEG, _STANDS = 1e-3, 0.01, 1e-6
 _FEWEST_PAIRS, _MOST_PAIRS = 8, 3000
 _RANSAC_PX = 1.5
 _ECC_ROUNDS, _ECC_STEP = 40, 1e-5
@@ -96,7 +94,7 @@ class Kept:
             views = self.method.views(clip)
             self._write(path, replace(views, cpu_s=time.process_time() - start))
         with safe_open(path, framework="pt") as file:
-            facts = json.loads(file.metadata()["facts"])
+            facts = decode_json(file.metadata()["facts"], dict[str, Any])
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         return MethodViews(**{**tensors, "video": tensors["video"].float() / 255}, **facts)
 
@@ -177,57 +175,6 @@ class PointSplat:
             video.append(torch.where(covered, shown[:3], fill.colour[:, None, None]))
             classes.append(torch.where(covered, shown[3:].max(dim=0).indices, fill.label))
         return MethodViews(video=torch.stack(video), classes=torch.stack(classes).to(torch.uint8))
-
-
-@dataclass(frozen=True, kw_only=True)
-class PackagedModel:
-    """The models that ship: driving-small on its fixed path, objects-small steered by angles and radius."""
-
-    name: str = "old"
-    _loaded: dict[str, ViewSynthesizer] = field(default_factory=dict[str, ViewSynthesizer], init=False, repr=False)
-
-    def views(self, clip: LiveClip) -> MethodViews:
-        """See Method. Clips beyond the limits of objects-small are tried all the same, and marked."""
-        driving = str(clip.facts["world"]).startswith("driving")
-        self._require_lens(clip, DRIVING_HFOV_DEG if driving else STAGE_HFOV_DEG)
-        synthesizer = self._synthesizer("driving-small" if driving else "objects-small")
-        path, within = _driving_path(synthesizer, clip) if driving else _orbit_path(synthesizer, clip)
-        source = pictures_of(clip, "source")
-        view = synthesize(synthesizer, Clip(video=source.video, fps=float(clip.facts["fps"])), path)
-        classes = None if view.classes is None else view.classes[0]
-        return MethodViews(video=view.video, classes=classes, within=within)
-
-    def _synthesizer(self, name: str) -> ViewSynthesizer:
-        if name not in self._loaded:
-            self._loaded[name] = load_synthesizer(f"package:{name}")
-        return self._loaded[name]
-
-    def _require_lens(self, clip: LiveClip, hfov_deg: float) -> None:
-        if any(abs(clip.hfov_deg(camera) - hfov_deg) > _SAME_LENS_DEG for camera in ("source", "target")):
-            raise DataError(f"{clip.name} has another lens than the {hfov_deg:.1f} degrees of {self.name}")
-
-
-def _driving_path(synthesizer: ViewSynthesizer, clip: LiveClip) -> tuple[Trajectory, bool]:
-    path = synthesizer.traits.plan_view()
-    filmed = invert_rigid(_poses(clip, "source")) @ _poses(clip, "target")
-    if float((path.source_from_target - filmed).abs().max()) > _SAME_PATH:
-        raise DataError(f"{clip.name} does not go the one way that {synthesizer.traits.name} can; use a paper set")
-    return path, True
-
-
-def _orbit_path(synthesizer: ViewSynthesizer, clip: LiveClip) -> tuple[Trajectory, bool]:
-    """The nearest path over the sphere, and whether it is within the model's limits."""
-    source, target = (_poses(clip, camera).clone() for camera in ("source", "target"))
-    if float((source - source[:1]).abs().max()) > _STANDS:
-        raise DataError(f"the source of {clip.name} moves; {synthesizer.traits.name} has a standing one")
-    unit = METRES_A_UNIT[str(clip.facts["world"])]
-    for poses in (source, target):
-        poses[:, :3, 3] /= unit
-    start, asked = from_pose(source[0]), invert_rigid(source) @ target
-    try:
-        return synthesizer.traits.plan_poses(asked, source=start), True
-    except ViewRangeError:
-        return fitted_trajectory(asked, start)[0], False
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

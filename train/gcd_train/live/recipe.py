@@ -1,15 +1,17 @@
 """What a live model is trained from and for how long: `kind = "live"` in a TOML file."""
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 
+from gcd_model.errors import FileError
 from gcd_model.live.config import LiveConfig
+from gcd_model.small_files import decode_toml, read_small
 from gcd_train.errors import RecipeError
 from gcd_train.recipe import Budget, EmaRecipe, LogRecipe, OptimiserRecipe
+from gcd_train.recipe.values import LiveStageName
 
 PACKAGED = Path(__file__).parent.parent / "recipes" / "live"
 """Recipes that ship."""
@@ -32,23 +34,29 @@ class LiveStage(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 class LiveRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A live model's training.
 
-    exact_every: of the clips whose inputs are worked out by exact depth, too: every so many-th. workers: processes that
-    read batches and work out inputs beside the training; 0 for none.
+    weights: a live weight file to begin from, at random without. keep: stages that are left as it has them.
+    exact_every, learned_every: of the clips, every so many-th has its inputs worked out by exact and by learned depth.
+    workers: processes that read batches and work out inputs beside the training; 0 for none.
     """
 
     kind: Literal["live"]
     name: str
     seed: int = 1
     model: LiveConfig = LiveConfig()
+    weights: str | None = None
+    keep: frozenset[LiveStageName] = frozenset()
     device: Literal["auto", "cpu", "cuda"] = "auto"
     workers: Annotated[int, Meta(ge=0)] = 0
     depth: LiveStage
     exact_every: Annotated[int, Meta(ge=1)] = 4
+    learned_every: Annotated[int, Meta(ge=1)] = 1
     paint: LiveStage
     detail: LiveStage
     log: LogRecipe = LogRecipe()
 
     def __post_init__(self) -> None:
+        if self.keep and self.weights is None:
+            raise RecipeError(f"keep = {sorted(self.keep)} needs weights, a live weight file that has them")
         if self.detail.parts != 1:
             raise RecipeError(f"the detail stage takes one batch an update, got detail.parts = {self.detail.parts}")
 
@@ -57,7 +65,7 @@ def is_live(source: str) -> bool:
     """Whether a recipe, by `package:NAME` or path, is a live model's."""
     try:
         return _table(source).get("kind") == "live"
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError):
+    except FileError:
         return False
 
 
@@ -65,7 +73,9 @@ def load_live_recipe(source: str) -> LiveRecipe:
     """A recipe by `package:NAME` or path. Raises RecipeError for one that cannot be read or has unknown keys."""
     try:
         return msgspec.convert(_table(source), LiveRecipe)
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError, msgspec.ValidationError) as error:
+    except FileError as error:
+        raise RecipeError(f"the recipe {source} {error}") from error
+    except msgspec.ValidationError as error:
         raise RecipeError(f"the recipe {source} cannot be used: {error}") from error
 
 
@@ -77,11 +87,11 @@ def live_recipes() -> list[str]:
 def live_toml(source: str) -> str:
     """The recipe's text, once it was found to be sound. Raises RecipeError."""
     load_live_recipe(source)
-    return _path(source).read_text(encoding="utf-8")
+    return read_small(_path(source))
 
 
 def _table(source: str) -> dict[str, object]:
-    return tomllib.loads(_path(source).read_text(encoding="utf-8"))
+    return decode_toml(read_small(_path(source)))
 
 
 def _path(source: str) -> Path:

@@ -15,8 +15,9 @@ import msgspec
 import torch
 
 from gcd_model.live.depth_net import DepthNet
-from gcd_model.live.synthesizer import save_live
+from gcd_model.live.synthesizer import LiveSynthesizer, save_live
 from gcd_model.live.view import LiveNetworks
+from gcd_model.loading import load_synthesizer
 from gcd_train.engine.engine import Engine
 from gcd_train.engine.processes import ALONE, Processes
 from gcd_train.errors import DataError
@@ -26,8 +27,9 @@ from gcd_train.live.clips import clip_paths, read_clip
 from gcd_train.live.depth_training import DepthTask
 from gcd_train.live.detail_training import DetailTask
 from gcd_train.live.inputs import make_inputs
-from gcd_train.live.paint_training import HeldOutViews, PaintTask, ViewBatches
+from gcd_train.live.paint_training import HeldOutViews, PaintTask
 from gcd_train.live.recipe import LiveRecipe, LiveStage
+from gcd_train.live.target_views import ViewBatches
 from gcd_train.loop import Loop, LoopOptions, Task
 from gcd_train.map_items import map_items
 from gcd_train.recipe import ComputeRecipe
@@ -62,7 +64,7 @@ def train_live(recipe: LiveRecipe, places: LivePlaces, stop: StopSignal, process
     _require_shape(recipe, places)
     folder, paths, held_out = RunFolder(places.out), training_paths(places.data), clip_paths(places.valid)
     torch.manual_seed(recipe.seed)
-    networks = LiveNetworks(recipe.model).to(_device(recipe.device), memory_format=torch.channels_last)  # pyright: ignore
+    networks = _networks(recipe).to(_device(recipe.device), memory_format=torch.channels_last)  # pyright: ignore
     measured = held_out[:: max(len(held_out) // _VALID_SHARE, 1)]
     run = partial(_stage, recipe, folder, stop)
     alone = partial(processes.by_the_first, stop=stop)
@@ -75,7 +77,7 @@ def train_live(recipe: LiveRecipe, places: LivePlaces, stop: StopSignal, process
     )
     make = partial(_make_all_inputs, recipe=recipe, stop=stop, workers=max(workers, processes.count))
     alone(lambda: make(exact, paths[:: recipe.exact_every], None))
-    alone(lambda: make(learned, paths, networks.depth))
+    alone(lambda: make(learned, paths[:: recipe.learned_every], networks.depth))
     alone(lambda: make(shown, measured, networks.depth))
     batches = [
         ViewBatches(paths, [exact, learned], model, recipe.paint.batch, seed + part * PART_SEED)
@@ -95,6 +97,20 @@ def train_live(recipe: LiveRecipe, places: LivePlaces, stop: StopSignal, process
 
     alone(finish)
     return path
+
+
+def _networks(recipe: LiveRecipe) -> LiveNetworks:
+    """At random, or as a weight file has them. Raises DataError if that is another model."""
+    networks = LiveNetworks(recipe.model)
+    if recipe.weights is not None:
+        begun = load_synthesizer(recipe.weights, device="cpu", dtype="float32")
+        if not isinstance(begun, LiveSynthesizer):
+            raise DataError(f"a live model's training begins from a live model, {recipe.weights} is another")
+        found, wanted = ((c.depth, c.paint, c.classes) for c in (begun.networks.config, recipe.model))
+        if found != wanted:
+            raise DataError(f"{recipe.weights} has other networks or classes than the recipe: {found}, wanted {wanted}")
+        networks.load_state_dict(begun.networks.state_dict())
+    return networks
 
 
 def _device(name: str) -> torch.device:
@@ -134,7 +150,10 @@ def _stage(
     task: Task,
     processes: Processes,
 ) -> None:
-    """Train a stage to the end of its budget; its module then has the averaged weights."""
+    """Train a stage to the end of its budget; its module then has the averaged weights. One to be kept is kept."""
+    if name in recipe.keep:
+        task.module.eval().requires_grad_(False)
+        return
     told = msgspec.json.encode([recipe.model.depth, recipe.model.paint, recipe.seed, name])
     options = LoopOptions(
         stage=name,

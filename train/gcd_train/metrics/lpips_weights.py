@@ -141,6 +141,8 @@ def _files(folder: Path) -> tuple[LpipsNetwork, Path, Path]:
 def _read(path: Path) -> Mapping[str, object]:
     """What a file of named tensors holds; code in it is never run."""
     try:
+        if not path.is_file():
+            raise ValueError("it is no regular file")
         held: object = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # what a damaged pickle raises depends on which byte is wrong
         cause = str(error).strip().split("\n")[0].split(". ")[0]

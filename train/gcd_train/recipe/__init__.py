@@ -8,7 +8,7 @@ from gcd_train.recipe.merging import PACKAGED, packaged_recipes
 from gcd_train.recipe.model import LoraRecipe, ModelRecipe, TrainedPart, UNetChanges, VAEChanges
 from gcd_train.recipe.optimiser import EmaRecipe, OptimiserRecipe
 from gcd_train.recipe.schema import Recipe
-from gcd_train.recipe.small_stages import DecoderRecipe, LatentsRecipe, VAERecipe
+from gcd_train.recipe.small_stages import LatentsRecipe, VAERecipe
 from gcd_train.recipe.unet import ClassWeightsName, FocalBlendName, LossRecipe, NoiseRecipe, UNetRecipe
 from gcd_train.recipe.values import (
     AnyStageName,
@@ -32,7 +32,6 @@ __all__ = [
     "DataKind",
     "DataRecipe",
     "DataTask",
-    "DecoderRecipe",
     "DistillStageName",
     "EmaRecipe",
     "ExportRecipe",

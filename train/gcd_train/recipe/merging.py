@@ -1,13 +1,14 @@
 """Recipes on bases: a file states only what differs from the one it is based on."""
 
 import difflib
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias, cast
 
-import msgspec
-
+from gcd_model.errors import FileError
+from gcd_model.small_files import decode_toml, read_small
 from gcd_train.errors import RecipeError
 
 PACKAGED = Path(__file__).parents[1] / "recipes"
@@ -54,12 +55,12 @@ def read_merged(source: str | Path) -> MergedTable:
     return _read(recipe_path(source), ())
 
 
-def parsed(text: bytes, name: str) -> Table:
+def parsed(text: str | bytes, name: str) -> Table:
     """A TOML file's content. Raises RecipeError naming it."""
     try:
-        return msgspec.toml.decode(text, type=Table)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise RecipeError(f"{name} is not valid TOML: {error}") from error
+        return decode_toml(text)
+    except FileError as error:
+        raise RecipeError(f"{name} {error}") from error
 
 
 def merged(base: Mapping[str, object], over: Mapping[str, object]) -> Table:
@@ -97,13 +98,14 @@ def require_known(table: Mapping[str, object], known: Sequence[str], name: str) 
 
 
 def _read(path: Path, above: tuple[Path, ...]) -> MergedTable:
-    chain = (*above, path.resolve())
-    if path.resolve() in above or len(chain) > _DEEPEST:
+    here = Path(os.path.realpath(path))
+    chain = (*above, here)
+    if here in above or len(chain) > _DEEPEST:
         raise RecipeError(f"recipes are based on each other in a circle: {_told(chain)}; take out one `base`")
     try:
-        own = parsed(path.read_bytes(), _told(chain))
-    except OSError as error:
-        raise RecipeError(f"cannot read the recipe {_told(chain)}: {error.strerror}; {_instead(path)}") from error
+        own = parsed(read_small(path), _told((*above, path)))
+    except FileError as error:
+        raise RecipeError(f"the recipe {_told((*above, path))} {error}; {_instead(path)}") from error
     base = own.pop(BASE, None)
     own.setdefault("name", path.stem)
     if base is None:

@@ -1,9 +1,8 @@
 """Which networks a run trains."""
 
-from typing import Annotated, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import msgspec
-from msgspec import Meta
 
 from gcd_model.config import CameraControl
 from gcd_train.recipe.values import Count, Positive
@@ -31,7 +30,6 @@ class VAEChanges(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     scale: Positive | None = None
     shared: bool | None = None
     linear: bool | None = None
-    coarse: Annotated[int, Meta(ge=0)] | None = None
 
 
 class LoraRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -60,9 +58,7 @@ class ModelRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     `gcd-train families`. frames, height, width: trained length and size in pixels, left out as the base has them.
     """
 
-    base: Literal["driving-small", "driving-semantic-small", "objects-small", "plain-small", "svd-14", "small"] = (
-        "driving-small"
-    )
+    base: Literal["plain-small", "svd-14", "small"] = "plain-small"
     camera: CameraControl | None = None
     prediction: Literal["v", "x0"] | None = None
     steps: Count | None = None

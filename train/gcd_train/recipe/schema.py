@@ -9,7 +9,7 @@ from gcd_train.recipe.compute import ComputeRecipe, LogRecipe
 from gcd_train.recipe.data import DataRecipe
 from gcd_train.recipe.export import ExportRecipe
 from gcd_train.recipe.model import ModelRecipe
-from gcd_train.recipe.small_stages import DecoderRecipe, LatentsRecipe, VAERecipe
+from gcd_train.recipe.small_stages import LatentsRecipe, VAERecipe
 from gcd_train.recipe.unet import UNetRecipe
 from gcd_train.recipe.values import StageName
 
@@ -29,7 +29,6 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     vae: VAERecipe | None = None
     latents: LatentsRecipe | None = None
     unet: UNetRecipe
-    decoder: DecoderRecipe | None = None
     export: ExportRecipe = ExportRecipe()
 
     def __post_init__(self) -> None:
@@ -39,8 +38,6 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             given, told = self.latents.augmentation, self.unet.augmentation
             if given != told:
                 raise ValueError(f"latents.augmentation is {given:g}, but unet.augmentation tells the network {told:g}")
-        if self.decoder is not None and self.latents is None:
-            raise ValueError("[decoder] works on encoded clips and needs a [latents] table")
         if self.vae is None and self.model.weights is None:
             raise ValueError("a random autoencoder teaches nothing: give a [vae] table, or model.weights to start from")
         if self.vae is not None and self.model.train != "all":
@@ -58,7 +55,6 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             "vae": self.vae is not None,
             "latents": self.latents is not None,
             "unet": True,
-            "decoder": self.decoder is not None,
             "export": True,
         }
         return tuple(name for name, wanted in there.items() if wanted)

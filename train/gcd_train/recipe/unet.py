@@ -25,7 +25,7 @@ class NoiseRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 class LossRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The diffusion loss and, for a model with a class head, its cross-entropy.
+    """The diffusion loss.
 
     weight_limit: upper bound of the noise level's weight (s^2 + 1) / s^2.
     focal: keep the hardest elements of a frame; focal_fraction of them from update focal_steps on.
@@ -33,8 +33,7 @@ class LossRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     "plain" is the mean of the hardest of the class-weighted error, as the paper describes it.
     class_weights: emphasis by colour in semantic pictures, persons 7 times and vehicles 3 times, in the colours of
     ParallelDomain-4D or of our driving world. sensitivity: weigh latent channels by what the decoder
-    makes of them. class_map: weight of the class head's cross-entropy; its class weights are frequency^-class_power.
-    class_from_sigma: the class head learns from noise levels of at least this.
+    makes of them.
     """
 
     weight_limit: Positive | None = None
@@ -44,13 +43,10 @@ class LossRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     focal_blend: FocalBlendName = "released"
     class_weights: ClassWeightsName = "none"
     sensitivity: bool = False
-    class_map: NotNegative = 0.0
-    class_power: NotNegative = 0.35
-    class_from_sigma: NotNegative = 0.0
 
 
 class UNetRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The U-Net and the class head.
+    """The U-Net.
 
     source: "latents" reads what the latents stage wrote, "pixels" encodes every batch anew with fresh noise, "cache"
     reads a latent cache (`gcd-train cache`).

@@ -9,8 +9,8 @@ Positive: TypeAlias = Annotated[float, Meta(gt=0)]
 NotNegative: TypeAlias = Annotated[float, Meta(ge=0)]
 Count: TypeAlias = Annotated[int, Meta(ge=1)]
 Share: TypeAlias = Annotated[float, Meta(ge=0, le=1)]
-StageName: TypeAlias = Literal["vae", "latents", "unet", "decoder", "export"]
-DistillStageName: TypeAlias = Literal["latents", "paired", "decoder", "export"]
+StageName: TypeAlias = Literal["vae", "latents", "unet", "export"]
+DistillStageName: TypeAlias = Literal["latents", "paired", "export"]
 LiveStageName: TypeAlias = Literal["depth", "paint", "detail"]
 AnyStageName: TypeAlias = StageName | DistillStageName | LiveStageName
 

@@ -10,6 +10,8 @@ from typing import Any, BinaryIO, Self
 import msgspec
 import numpy as np
 
+from gcd_model.small_files import decode_json
+from gcd_train.array_files import read_npz
 from gcd_train.errors import DataError
 from gcd_train.scenes.compile import VERTEX, Vertices, vertices_of
 from gcd_train.scenes.description import STREET, Extent, Floats, Light, Scene
@@ -47,9 +49,8 @@ class FrozenScene:
     def load(cls, path: Path) -> Self:
         """Read what `save` wrote. Raises DataError if the file is missing, damaged or of another version."""
         try:
-            with np.load(path, allow_pickle=False) as kept:
-                arrays: dict[str, Any] = dict(kept)
-            facts = msgspec.json.decode(arrays["facts"].tobytes(), type=_Facts)
+            arrays: dict[str, Any] = read_npz(path)
+            facts = decode_json(arrays["facts"].tobytes(), _Facts)
             if facts.format != _FORMAT:
                 raise ValueError(f"its format is {facts.format}, this version reads {_FORMAT}")
             return cls(

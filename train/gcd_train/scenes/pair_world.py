@@ -9,7 +9,9 @@ import msgspec
 from msgspec import Meta
 
 from gcd_model.config import DRIVING_CLASSES, SemanticClass
+from gcd_model.errors import FileError
 from gcd_model.geometry import CameraMount
+from gcd_model.small_files import read_json
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.scenes.driving import FPS as DRIVING_FPS
 from gcd_train.scenes.driving import HFOV_DEG as DRIVING_HFOV_DEG
@@ -168,14 +170,14 @@ def orbit_world(scenes: SceneWorld, form: PairForm, *, stride: int = 2, clips_pe
 def read_world(folder: Path) -> World:
     """What a data folder says about itself. Raises DataError."""
     path = folder / "world.json"
-    if not path.is_file():
+    if not path.exists():
         raise DataError(
             f"{folder} is no data folder: it has no world.json; make one with `gcd-train generate WORLD DIR --pairs`"
         )
     try:
-        return msgspec.json.decode(path.read_bytes(), type=World)
-    except msgspec.MsgspecError as error:
-        raise DataError(f"{path} cannot be read: {error}; make the folder anew with this version") from error
+        return read_json(path, World)
+    except FileError as error:
+        raise DataError(f"{path} {error}; make the folder anew with this version") from error
 
 
 def agree(folder: Path, world: World) -> None:

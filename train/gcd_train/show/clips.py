@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from gcd_model.errors import FileError
 from gcd_model.geometry import (
     DRIVING_GOAL_TARGET,
     LOOK_AT,
@@ -16,9 +17,10 @@ from gcd_model.geometry import (
     from_pose,
     spherical_trajectory,
 )
+from gcd_model.small_files import read_json
 from gcd_train.datasets.dataset4d import Dataset4D
 from gcd_train.datasets.kubric4d import Kubric4D
-from gcd_train.datasets.picture_files import bytes_read
+from gcd_train.datasets.picture_files import MOST_TEXT, bytes_read
 from gcd_train.datasets.pictures_of_draws import trained_picture
 from gcd_train.datasets.trajectories import DRIVING, DRIVING_FRAMES, KUBRIC_FRAMES, MAX90, FrameSampling, generator
 from gcd_train.errors import DataError, RecipeError
@@ -216,7 +218,7 @@ def _asset_names(folder: Path, camera: str) -> dict[int, str]:
     """What instances 1, 2, ... are called in the metadata of a Kubric-4D view; empty where it does not tell."""
     path = kubric4d_names.metadata_path(folder, int(camera.removeprefix("view") or 0))
     try:
-        assets = msgspec.json.decode(path.read_bytes(), type=_Assets).instances
-    except (OSError, msgspec.MsgspecError):
+        assets = read_json(path, _Assets, MOST_TEXT).instances
+    except FileError:
         return {}  # names are decoration; the reader has checked what matters in this file
     return {number: f"{asset.asset_id} ({number})" for number, asset in enumerate(assets, 1) if asset.asset_id}

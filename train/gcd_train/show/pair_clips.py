@@ -1,14 +1,16 @@
 """A clip of pair shards (`gcd-train generate WORLD --pairs`), ready to look at."""
 
-import json
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gcd_model.geometry import DRIVING_GOAL_TARGET, LOOK_AT, Intrinsics
+from gcd_model.small_files import decode_json
+from gcd_train.array_files import ZIP_FAULTS, read_member
 from gcd_train.datasets.paired import PairedClip, PairedClips
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.pointcloud import depth_visibility, splat
@@ -119,10 +121,10 @@ def _told(shard: Path, name: str) -> tuple[dict[str, NDArray[np.float64]], float
     """Poses [T, 4, 4] by camera, and the horizontal field of view, of a clip's `scene.json`."""
     try:
         with zipfile.ZipFile(shard) as archive:
-            told = json.loads(archive.read(f"{name}/scene.json"))
+            told = decode_json(read_member(archive, f"{name}/scene.json"), dict[str, Any])
         poses = {camera: np.array(rows, np.float64) for camera, rows in told["world_from_camera"].items()}
         return {camera: poses[camera] for camera in ("source", "target")}, float(told["facts"]["hfov_deg"])
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+    except (*ZIP_FAULTS, TypeError, AttributeError) as error:
         raise DataError(
             f"{shard}: {name}/scene.json is damaged ({error}); delete the shard, generate it again"
         ) from error

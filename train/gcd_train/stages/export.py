@@ -44,8 +44,7 @@ def export(networks: Networks, folder: RunFolder, job: ExportJob, validation: Va
     """Write `NAME.safetensors` into the run's folder, and measure what a user would load from it.
 
     Beside it `NAME.ckpt` in the published layout where the recipe asks for it, and `NAME-adapter.safetensors` of a run
-    with adapters, which are merged into the others. The card's config leaves out the plane mix if these networks have
-    none. Files of an earlier export are replaced. Raises RunError.
+    with adapters, which are merged into the others. Files of an earlier export are replaced. Raises RunError.
     """
     networks, path = networks.cpu(), folder.path / f"{job.name}.safetensors"
     card = Card(name=job.name, config=networks.config, family=job.family.name, move_time=job.move_time, trained=True)

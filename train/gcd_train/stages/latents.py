@@ -1,13 +1,12 @@
 """Every clip encoded once; resumable clip by clip, finished when meta.json is there."""
 
-import json
 import logging
 import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -15,16 +14,16 @@ import torch
 from torch import Tensor
 
 from gcd_model.config import CAMERA_FEATURES
+from gcd_model.errors import FileError
 from gcd_model.geometry import Trajectory
 from gcd_model.networks import Networks
-from gcd_train.clip_warps import ClipWarps
+from gcd_model.small_files import read_json
 from gcd_train.conditioner import Conditioner, mirrored_path
 from gcd_train.datasets.clip_source import ClipSource, numbers_of, to_network
-from gcd_train.datasets.latents import LatentsMeta, picture_bytes
+from gcd_train.datasets.latents import MOST_META, LatentsMeta
 from gcd_train.draws import Draws
 from gcd_train.errors import DataError, Interrupted, RunError
 from gcd_train.losses import ClassWeight, class_emphasis
-from gcd_train.metrics import majority_classes
 from gcd_train.precision import Precision
 from gcd_train.recipe import LatentsRecipe
 from gcd_train.stop import StopSignal
@@ -67,10 +66,9 @@ def encode_clips(job: LatentsJob) -> None:
     job.precision.placed(job.networks.target_encoder)
     meta, arrays, done = _begin(job)
     places = numbers_of(job.clips, meta.seeds)
-    warps = ClipWarps(job.clips, job.networks.config, job.precision.device)
     logged = started = time.perf_counter()
     for number in range(done, meta.clips):
-        for name, rows in _encoded(job, meta, warps, places[number]).items():
+        for name, rows in _encoded(job, meta, places[number]).items():
             arrays[name][number] = rows
         now = time.perf_counter()
         if now - logged > _LOG_S:
@@ -90,12 +88,29 @@ def encode_clips(job: LatentsJob) -> None:
     _finish(job, meta, arrays)
 
 
+class _Begun(msgspec.Struct, frozen=True, kw_only=True):
+    """Unfinished arrays. done: clips that are in them."""
+
+    meta: LatentsMeta
+    done: int
+
+
+_Kind = TypeVar("_Kind", bound=msgspec.Struct)
+
+
 def _finished(job: LatentsJob) -> bool:
     path = job.folder / "meta.json"
     if not path.exists():
         return False
-    _require_same(job, msgspec.json.decode(path.read_bytes(), type=LatentsMeta))
+    _require_same(job, _read(path, LatentsMeta))
     return True
+
+
+def _read(path: Path, kind: type[_Kind]) -> _Kind:
+    try:
+        return read_json(path, kind, MOST_META)
+    except FileError as error:
+        raise RunError(f"{path} {error}; delete {path.parent} to encode the clips again") from error
 
 
 def _require_same(job: LatentsJob, meta: LatentsMeta) -> None:
@@ -111,14 +126,13 @@ def _begin(job: LatentsJob) -> tuple[LatentsMeta, dict[str, Any], int]:
     progress = job.folder / "clips.json"
     try:
         if progress.exists():
-            kept = json.loads(progress.read_text())
-            meta = msgspec.convert(kept["meta"], LatentsMeta)
-            _require_same(job, meta)
-            return meta, _opened(job.folder, meta, "r+"), int(kept["done"])
+            kept = _read(progress, _Begun)
+            _require_same(job, kept.meta)
+            return kept.meta, _opened(job.folder, kept.meta, "r+"), kept.done
         meta = _description(job)
         job.folder.mkdir(parents=True, exist_ok=True)
         return meta, _opened(job.folder, meta, "w+"), 0
-    except (OSError, ValueError, KeyError, msgspec.ValidationError) as error:
+    except (OSError, ValueError) as error:
         raise RunError(f"cannot go on in {job.folder} ({error}); free some space, or delete the folder") from error
 
 
@@ -153,17 +167,13 @@ def _description(job: LatentsJob) -> LatentsMeta:
         channels=config.vae.latent_channels,
         height=height // down,
         width=width // down,
-        picture_height=height,
-        picture_width=width,
-        distant=0 if config.plane_warp is None else config.plane_warp.distant,
         control=CAMERA_FEATURES[config.camera],
-        class_upscale=0 if config.class_head is None else config.class_head.upscale,
         emphasis=bool(job.class_weights),
     )
 
 
 @torch.no_grad()
-def _encoded(job: LatentsJob, meta: LatentsMeta, warps: ClipWarps, number: int) -> dict[str, np.ndarray[Any, Any]]:
+def _encoded(job: LatentsJob, meta: LatentsMeta, number: int) -> dict[str, np.ndarray[Any, Any]]:
     """One clip's row of every array."""
     source, target = (job.precision.frames(to_network(side)) for side in job.clips.rgb(number))
     draws = Draws(job.seed, "latents", number, job.precision.device)
@@ -173,14 +183,8 @@ def _encoded(job: LatentsJob, meta: LatentsMeta, warps: ClipWarps, number: int) 
         "target": torch.stack([_target(job, target, draws, mirrored) for mirrored in plain_and_mirrored]).half(),
         **_told(job.conditioner, job.clips.trajectory(number), plain_and_mirrored),
     }
-    pictures = warps.pictures(number, source)
-    if pictures is not None:
-        rows |= picture_bytes(pictures)
     if meta.emphasis:
         rows["emphasis"] = class_emphasis(target, job.class_weights, (meta.height, meta.width)).half()
-    if meta.class_upscale:
-        ids = torch.from_numpy(np.ascontiguousarray(job.clips.target_classes(number)))
-        rows["classes"] = majority_classes(ids, *meta.class_grid, len(job.clips.classes))
     return {name: value.cpu().numpy() for name, value in rows.items()}
 
 
@@ -210,18 +214,14 @@ def _target(job: LatentsJob, frames: Tensor, draws: Draws, mirrored: bool) -> Te
 def _keep(job: LatentsJob, meta: LatentsMeta, arrays: Mapping[str, Any], done: int) -> None:
     for array in arrays.values():
         array.flush()
-    _write(job.folder / "clips.json", msgspec.json.encode({"meta": meta, "done": done}))
+    _write(job.folder / "clips.json", msgspec.json.encode(_Begun(meta=meta, done=done)))
 
 
 def _finish(job: LatentsJob, meta: LatentsMeta, arrays: dict[str, Any]) -> None:
     target = torch.from_numpy(arrays["target"][: min(meta.clips, 64)].astype(np.float32))
     values = target.movedim(3, 0).flatten(1)  # [C, everything]
-    counts: tuple[int, ...] = ()
-    if "classes" in arrays:
-        counts = tuple(np.bincount(arrays["classes"].reshape(-1), minlength=len(job.clips.classes)).tolist())
     meta = msgspec.structs.replace(
         meta,
-        class_counts=counts,
         sensitivity=tuple(_sensitivity(job, target[:_SENSITIVITY_CLIPS, 0]).tolist()),
         mean=tuple(values.mean(1).tolist()),
         std=tuple(values.std(1).tolist()),

@@ -1,15 +1,15 @@
-"""The U-Net and the class head: single frames first if the recipe says so, then whole clips."""
+"""The U-Net: single frames first if the recipe says so, then whole clips."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
-from torch import nn
+from torch import Tensor, nn
 
 from gcd_model.networks import Networks
 from gcd_train.batches import BatchSource
 from gcd_train.draws import Draws
 from gcd_train.loop import Progress, StepLoss
-from gcd_train.objective import Weights, denoiser_of, diffusion_loss
+from gcd_train.objective import denoiser_of, diffusion_loss
 from gcd_train.precision import Precision
 from gcd_train.recipe import UNetRecipe
 from gcd_train.schedule import ParameterGroup
@@ -26,19 +26,19 @@ class UNetTask:
         batches: BatchSource,
         validation: Validation,
         recipe: UNetRecipe,
-        weights: Weights,
+        channel_weights: Tensor | None,
         precision: Precision,
         seed: int,
     ) -> None:
         self._networks, self._batches, self._validation = networks, batches, validation
-        self._recipe, self._weights, self._precision, self._seed = recipe, weights, precision, seed
+        self._recipe, self._weights, self._precision, self._seed = recipe, channel_weights, precision, seed
         self._denoiser = precision.placed(denoiser_of(networks))
         self._network: nn.Module = self._denoiser
         keep_trained_alone(self._denoiser)
 
     @property
     def module(self) -> nn.Module:
-        """U-Net, class head and camera embedder."""
+        """U-Net and camera embedder."""
         return self._denoiser
 
     def parameter_groups(self) -> Sequence[ParameterGroup]:
@@ -65,7 +65,7 @@ class UNetTask:
             self._precision,
             noise=recipe.noise_at(progress.share),
             loss=recipe.loss,
-            weights=self._weights,
+            channel_weights=self._weights,
             step=progress.updates,
         )
 
@@ -74,5 +74,5 @@ class UNetTask:
         return False
 
     def measure(self, picture: Path) -> dict[str, float]:
-        """Held-out clips through the shipped synthesizer, without the plane mix."""
+        """Held-out clips through the shipped synthesizer."""
         return self._validation.measure(self._networks, picture)

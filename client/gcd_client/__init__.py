@@ -1,0 +1,29 @@
+"""Client of a gcd node: receive its views (subscriber), command it (control), push frames into it (frames), read and
+write its messages (protocol).
+
+gcd_client.images and .frames need numpy; `view.images`, FramePusher and their like import them when they are used.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from gcd_client.control import ControlClient, ControlError, Reply
+from gcd_client.endpoints import AuthError, ClientKeys, SetupError, read_key_pair, read_public_key
+from gcd_client.protocol import ClientError, MessageError, StatusMessage, ViewHeader, ViewMessage
+from gcd_client.subscriber import ReceivedView, StatusSubscriber, ViewSubscriber
+
+if TYPE_CHECKING:
+    from gcd_client.frames import FramePusher
+
+__all__ = [
+    "AuthError", "ClientError", "ClientKeys", "ControlClient", "ControlError", "FramePusher", "MessageError",
+    "ReceivedView", "Reply", "SetupError", "StatusMessage", "StatusSubscriber", "ViewHeader", "ViewMessage",
+    "ViewSubscriber", "read_key_pair", "read_public_key",
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    if name != "FramePusher":
+        raise AttributeError(f"gcd_client has no {name}")
+    from gcd_client.frames import FramePusher
+
+    return FramePusher

@@ -1,0 +1,342 @@
+"""Who may connect over tcp, and with which role: CURVE keys, an allow-list, and ZeroMQ's authentication protocol (ZAP).
+
+The allow-list is a TOML file:
+
+    [client.desk]
+    key = "40 characters, as `gcd-node keys show` prints"
+    role = "operator"
+
+Encryption alone lets everybody in, so every secured socket also asks the allow-list. ipc sockets ask for no keys: the
+mode of their folder guards them.
+"""
+
+import logging
+import os
+import stat
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, TypeAlias
+
+import msgspec
+import zmq
+from msgspec import Meta
+from zmq.auth.thread import ThreadAuthenticator
+from zmq.utils.monitor import parse_monitor_message
+
+from gcd_client.endpoints import (
+    PUBLIC_FILE,
+    SECRET_FILE,
+    Channel,
+    KeyPair,
+    SetupError,
+    check_key,
+    fingerprint,
+    read_key_pair,
+)
+from gcd_node.binding import check_bindable, free_ipc_path, is_ipv6
+from gcd_node.config import SecurityConfig
+from gcd_node.errors import ConfigError, EndpointError, OutputError
+
+_LOG = logging.getLogger(__name__)
+
+Socket: TypeAlias = "zmq.Socket[bytes]"
+Context: TypeAlias = "zmq.Context[zmq.Socket[bytes]]"
+EventSink: TypeAlias = Callable[[str, dict[str, object]], None]
+"""Takes an event's code and its fields; called from threads of sockets, so it must not wait."""
+
+_CHANNELS: tuple[Channel, ...] = ("data", "status", "control", "frames")
+_MOST_EVENTS = 64  # of one socket at once: a flood of failing clients must not hold up the others
+_FAILED = zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+
+ClientName: TypeAlias = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,32}$(?!\n)")]
+
+
+Role: TypeAlias = Literal["viewer", "operator"]
+"""What a client may do: look, or also command. A viewer's verbs change nothing."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Client:
+    """Whose key it is, and what it may do."""
+
+    name: str
+    role: Role
+
+
+class AllowedClient(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """key: the client's public key. role: "viewer" may look, "operator" may also command."""
+
+    key: str
+    role: Role = "viewer"
+
+
+class AllowFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A whole allow-list, by name; to let nobody in any more, leave an empty [client]."""
+
+    client: dict[ClientName, AllowedClient]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ServerSecurity:
+    """A node's own keys, and its clients. find_client: by public key (Z85), None for a stranger; from any thread."""
+
+    keys: KeyPair
+    find_client: Callable[[str], Client | None]
+
+
+def new_key_pair() -> KeyPair:
+    """Fresh CURVE keys."""
+    public, secret = zmq.curve_keypair()
+    return KeyPair(public=public.decode(), secret=secret.decode())
+
+
+def write_key_pair(folder: Path, pair: KeyPair) -> None:
+    """Write a new key folder, mode 0700, with its secret file of mode 0600.
+
+    Raises:
+        OutputError: there are keys already, which are never overwritten, or the folder cannot be written.
+    """
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for name, text, mode in ((SECRET_FILE, pair.secret, 0o600), (PUBLIC_FILE, pair.public, 0o644)):
+            with os.fdopen(os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "w") as file:
+                file.write(text + "\n")
+    except FileExistsError as error:
+        raise OutputError(f"{folder} holds keys already; choose another folder, or move the old keys away") from error
+    except OSError as error:
+        raise OutputError(f"cannot write keys to {folder}: {error.strerror}; choose another folder") from error
+
+
+def load_server_security(config: SecurityConfig, on_event: EventSink | None = None) -> ServerSecurity | None:
+    """Keys and clients of a launch file; None if it states neither. on_event: see AllowList.
+
+    Raises:
+        ConfigError, SetupError: files missing, readable or writable by others, damaged; a key that two clients share.
+    """
+    if config.keys is None or config.allow is None:
+        return None
+    pair = read_key_pair(Path(config.keys))
+    return ServerSecurity(keys=pair, find_client=AllowList(Path(config.allow), on_event).find)
+
+
+class AllowList:
+    """Clients by public key. The file is read again when it has changed and somebody connects or sends a request.
+
+    on_event gets ALLOW_CHANGED with the names that were `added` and `removed` (a new key or role is both), or
+    ALLOW_REFUSED with a `message`, once for each broken file; then the list stays as it was.
+
+    Raises:
+        ConfigError: as load_server_security(); or nobody is on the list.
+    """
+
+    def __init__(self, path: Path, on_event: EventSink | None = None) -> None:
+        self._path, self._on_event = path, on_event or _ignore
+        self._lock = threading.Lock()
+        self._version = _version(path)
+        self._clients = load_clients(path)
+        if not self._clients:
+            raise ConfigError(f"{path} names no client, so nobody could connect; add one, see docs/control.md")
+
+    def find(self, key: str) -> Client | None:
+        """Whose key this is; None for a stranger. From any thread."""
+        with self._lock:
+            version = _version(self._path)
+            if version != self._version:
+                self._version = version  # before the file is read: what changes meanwhile is read next time
+                self._reload()
+            return self._clients.get(key)
+
+    def _reload(self) -> None:
+        try:
+            clients = load_clients(self._path)
+        except ConfigError as error:
+            _LOG.error("ALLOW_REFUSED: the allow-list stays as it was: %s", error)
+            self._on_event("ALLOW_REFUSED", {"level": 2, "message": str(error)})
+            return
+        was, self._clients = set(self._clients.items()), clients
+        added = sorted(client.name for _, client in clients.items() - was)
+        removed = sorted(client.name for _, client in was - clients.items())
+        if added or removed:
+            _LOG.warning("ALLOW_CHANGED: added %s; removed %s", ", ".join(added) or "-", ", ".join(removed) or "-")
+            self._on_event("ALLOW_CHANGED", {"level": 0, "added": added, "removed": removed})
+
+
+def load_clients(path: Path) -> dict[str, Client]:
+    """Clients by public key; may be none. Raises ConfigError as load_server_security()."""
+    from gcd_model import FileError, decode_toml, read_small  # only now: it brings torch, and clients need none
+
+    try:
+        text, mode = read_small(path), stat.S_IMODE(path.stat().st_mode)
+        if mode & stat.S_IWOTH:
+            raise ConfigError(f"{path} can be written by everybody, mode {mode:04o}; run chmod o-w on it")
+        entries = msgspec.convert(decode_toml(text), AllowFile).client
+    except FileError as error:
+        raise ConfigError(f"cannot read the allow-list {path}: it {error}; see docs/control.md") from error
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{path}: {str(error).replace('`$.', '`')}; see docs/control.md") from error
+    clients: dict[str, Client] = {}
+    for name, entry in entries.items():
+        try:
+            check_key(entry.key, f"{path}: the key of {name}")
+        except SetupError as error:
+            raise ConfigError(str(error)) from error
+        if entry.key in clients:
+            raise ConfigError(f"{path}: {name} and {clients[entry.key].name} have the same key; give each its own")
+        clients[entry.key] = Client(name=name, role=entry.role)
+    return clients
+
+
+class SocketGuard:
+    """Binds the sockets of one context, and answers who may connect to those that are secured.
+
+    on_event gets AUTH_DENIED, limited so that a hostile client cannot flood with it. Close after the sockets.
+    """
+
+    def __init__(self, context: Context, security: ServerSecurity | None, on_event: EventSink | None) -> None:
+        self._security = security
+        self._denials = _Denials(on_event or _ignore)
+        self._monitors: dict[Socket, Channel] = {}
+        self._authenticator: _Authenticator | None = None
+        if security is not None:
+            self._authenticator = _Authenticator(context, security, self._denials)
+            self._authenticator.start()
+
+    def bind(self, socket: Socket, endpoint: str, channel: Channel) -> str:
+        """Bind a socket: tcp with keys if there are any, ipc for this user, and for his group if the umask lets it.
+
+        Returns:
+            The endpoint, with the port that was chosen if 0 was asked for.
+        Raises:
+            ConfigError: others than this machine could reach it without keys. EndpointError: in use, or impossible.
+        """
+        secured = self._security is not None and endpoint.startswith("tcp://")
+        check_bindable(endpoint, secured=secured)
+        if endpoint.startswith("ipc://"):  # ZeroMQ itself would take a live endpoint away without a word
+            free_ipc_path(Path(endpoint.removeprefix("ipc://")))
+        if self._security is not None and secured:
+            socket.set(zmq.CURVE_SERVER, 1)
+            socket.set(zmq.CURVE_SECRETKEY, self._security.keys.secret.encode())
+            socket.set(zmq.ZAP_DOMAIN, _domain(channel).encode())
+            socket.set(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without an authenticator: closed to all, not open to all
+            self._monitors[socket.get_monitor_socket(_FAILED)] = channel
+        socket.set(zmq.IPV6, int(is_ipv6(endpoint)))
+        try:
+            socket.bind(endpoint)
+        except zmq.ZMQError as error:
+            message = f"cannot bind {endpoint}: {error.strerror}; stop who uses it or choose another"
+            raise EndpointError(message) from error
+        bound = socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        if bound.startswith("ipc://"):
+            path = Path(bound.removeprefix("ipc://"))
+            path.chmod(path.stat().st_mode & 0o770)  # whatever folder and umask say: not for everybody
+        return bound
+
+    def report_failures(self) -> None:
+        """Report handshakes that failed before there was a key to judge; call it often, in the sockets' own thread."""
+        for monitor, channel in self._monitors.items():
+            for _ in range(_MOST_EVENTS):
+                if not monitor.poll(0):
+                    break
+                if int(parse_monitor_message(monitor.recv_multipart())["event"]) & _FAILED:
+                    self._denials.add(None, _domain(channel), "")
+
+    @property
+    def monitors(self) -> list[Socket]:
+        """Readable once there is something for report_failures()."""
+        return list(self._monitors)
+
+    @property
+    def alive(self) -> bool:
+        """Whether clients are let in: False once the authenticator's thread has died."""
+        return self._authenticator is None or self._authenticator.is_alive()
+
+    def close(self) -> None:
+        """Stop; a second call does nothing."""
+        for monitor in self._monitors:
+            monitor.close(0)
+        self._monitors.clear()
+        if self._authenticator is not None:
+            self._authenticator.close()
+
+
+def unbind(socket: Socket, endpoint: str, linger_ms: int) -> None:
+    """Close; an ipc file goes first, while it is still ours: ZeroMQ leaves it behind."""
+    if endpoint.startswith("ipc://"):
+        Path(endpoint.removeprefix("ipc://")).unlink(missing_ok=True)
+    socket.close(linger_ms)
+
+
+class _Authenticator(ThreadAuthenticator):
+    """Lets clients of the allow-list in; their messages carry the public key as `User-Id`."""
+
+    def __init__(self, context: Context, security: ServerSecurity, denials: "_Denials") -> None:
+        super().__init__(context)
+        self._find_client, self._denials, self._address = security.find_client, denials, ""
+        for channel in _CHANNELS:  # exactly these: a provider for "*" does not apply to a socket with a domain
+            self.configure_curve_callback(_domain(channel), self)
+
+    def callback(self, domain: str, key: bytes) -> bool:
+        """Whether a key may connect: it is on the allow-list, to push frames as an operator's; called by zmq.auth."""
+        client = self._find_client(key.decode())
+        if client is not None and (client.role == "operator" or domain != _domain("frames")):
+            return True
+        self._denials.add(key.decode(), domain, self._address)
+        return False
+
+    async def handle_zap_message(self, msg: list[bytes]) -> None:
+        self._address = msg[3].decode("ascii", "backslashreplace")[:64] if len(msg) > 3 else ""
+        await super().handle_zap_message(msg)
+
+    def close(self) -> None:
+        """Stop; a second call does nothing."""
+        if self.pipe and not self.is_alive():  # stop() would wait for ever for a thread that has died
+            self.pipe.close(0)
+            self.pipe = None  # pyright: ignore[reportAttributeAccessIssue]  as pyzmq itself does
+        self.stop()
+
+
+class _Denials:
+    """AUTH_DENIED events, limited: one for each key and socket in 10 s, and at most 8 in all in that time."""
+
+    SPAN_S = 10.0
+    MOST = 8
+
+    def __init__(self, on_event: EventSink) -> None:
+        self._on_event, self._lock = on_event, threading.Lock()
+        self._reported_s: dict[tuple[str | None, str], float] = {}
+        self._suppressed = 0
+
+    def add(self, key: str | None, domain: str, address: str) -> None:
+        """Report a refusal, or count it; key: None if the handshake came to none. From any thread."""
+        with self._lock:
+            now_s = time.monotonic()
+            self._reported_s = {each: at for each, at in self._reported_s.items() if now_s - at < self.SPAN_S}
+            if (key, domain) in self._reported_s or len(self._reported_s) >= self.MOST:
+                self._suppressed += 1
+                return
+            self._reported_s[key, domain] = now_s
+            suppressed, self._suppressed = self._suppressed, 0
+        mark = None if key is None else fingerprint(key)
+        _LOG.warning("AUTH_DENIED on %s: %s", domain, "no valid handshake" if mark is None else f"key {mark}")
+        fields: dict[str, object] = {"level": 1, "fingerprint": mark, "domain": domain, "address": address}
+        self._on_event("AUTH_DENIED", fields | {"suppressed": suppressed})
+
+
+def _domain(channel: Channel) -> str:
+    return f"gcd.{channel}"
+
+
+def _version(path: Path) -> tuple[int, int, int] | None:
+    """Differs as soon as anything about the file has changed; None without one."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_ctime_ns, found.st_ino, found.st_size
+
+
+def _ignore(code: str, fields: dict[str, object]) -> None:
+    """Takes the place of an event sink; the log has what it would get."""

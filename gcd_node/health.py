@@ -1,0 +1,399 @@
+"""How the node does: threads report what they see, anybody may ask for a snapshot at any moment.
+
+It only reports: no part of the node decides by what it says.
+"""
+
+import enum
+import math
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias, get_args
+
+SourceState: TypeAlias = Literal["closed", "connecting", "streaming", "stalled", "lost", "ended"]
+ModelState: TypeAlias = Literal["absent", "loading", "warming", "ready", "busy", "degraded", "failed"]
+RecordState: TypeAlias = Literal["off", "recording", "stopping", "failed"]
+Stage: TypeAlias = Literal["capture_gap", "window", "encode", "render", "publish", "age"]
+"""What takes time, in order; docs/reliability.md says from where to where."""
+
+Hop: TypeAlias = Literal["source", "window", "slot", "model", "queue"]
+"""Where frames, windows and messages are given up, in order; docs/reliability.md says why."""
+
+Count: TypeAlias = Hop | Literal["oom_count", "nan_windows", "bad_depths", "sent", "subs", "bytes"]
+"""A hop, a fault of the model, or what the publisher has sent and to how many subscribers."""
+
+THREAD_DIED = "THREAD_DIED"
+"""Reason to raise once a thread that the node needs has ended: it is not ready then, whatever else it does."""
+
+IDLE = "IDLE"
+"""Reason to raise, with Level.OK, while nothing is rendered because nobody subscribes."""
+
+_WORKING = ("ready", "busy", "degraded")
+_CORRUPT_LIMIT = 0.2  # more damaged frames than this, over 5 s, is a warning
+_LEAST_PATIENCE_S = 1.0
+_RATE_FRAMES = 31
+_LONGEST_GAP_NS = 60_000_000_000  # between two stamps; beyond, the source's clock stepped
+_LONGEST_STEP_BACK_NS = 1_000_000_000
+_RECENT_NS = 5_000_000_000
+_LEAST_DURATIONS = 16  # a slow model gives few values a minute
+_LEAST_ARRIVALS = 5  # one damaged picture among the first few says nothing
+
+
+class Level(enum.IntEnum):
+    """How bad it is, with the numbers of a ROS 2 DiagnosticStatus. STALE is for readers: who hears nothing says it."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+    STALE = 3
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RecordHealth:
+    """The recording under way, or the last one.
+
+    state: "failed" is one that ended by itself. file: the one written to now or last, below the folder of recordings.
+    bytes: on the disk, all files together. written: messages. dropped: what found no room in the queue, by topic.
+    """
+
+    state: RecordState = "off"
+    file: str | None = None
+    bytes: int = 0
+    written: int = 0
+    dropped: Mapping[str, int] = field(default_factory=dict[str, int])
+
+    def to_status(self) -> dict[str, object]:
+        """The field `rec` of a status message."""
+        status: dict[str, object] = {"state": self.state}
+        if self.file is not None:
+            status |= {"file": self.file, "bytes": self.bytes, "written": self.written, "dropped": dict(self.dropped)}
+        return status
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class StageSummary:
+    """How long a stage takes. p50_s, p99_s: over the last minute (at most 512 values, at least the last 16 there are),
+    seconds. count, total_s: since the start."""
+
+    p50_s: float
+    p99_s: float
+    count: int
+    total_s: float
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Snapshot:
+    """A node's health at one moment.
+
+    findings: every reason with its level, the worst first (docs/reliability.md explains each).
+    missing: what keeps the node from being ready; empty if it is.
+    status: the fields of a status message (wire protocol, section 4) but its heartbeat; what is unknown is left out.
+    frames: arrived whole since the start.
+    """
+
+    findings: dict[str, Level]
+    missing: tuple[str, ...]
+    status: dict[str, Any]
+    stages: Mapping[str, StageSummary]
+    frames: int
+
+    @property
+    def level(self) -> Level:
+        """The worst of all findings."""
+        return max(self.findings.values(), default=Level.OK)
+
+    @property
+    def ready(self) -> bool:
+        """Whether views come, or would if somebody subscribed."""
+        return not self.missing
+
+
+class Health:
+    """Collects what the node's threads report; every method may be called from any thread and returns at once.
+
+    clock: monotonic nanoseconds, the clock that arrivals are stamped with.
+    """
+
+    def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
+        self._clock, self._lock = clock, threading.Lock()
+        self._state = "unconfigured"
+        self._source: SourceState = "closed"
+        self._model: ModelState = "absent"
+        self._lost = False
+        self._counts: Counter[str] = Counter()
+        self._stages: dict[Stage, StageTimes] = {name: StageTimes() for name in get_args(Stage)}
+        self._stamps: deque[int] = deque(maxlen=_RATE_FRAMES)
+        self._arrival_ns: int | None = None
+        self._arrivals: deque[tuple[int, bool]] = deque(maxlen=1024)  # when, and whether whole
+        self._faults: dict[str, int] = {}
+        self._measures: dict[str, float | None] = {}
+        self._rec = RecordHealth()
+        self._raised: dict[str, Level] = {}
+        self._views: dict[str, int | None] = {}
+        self._window_s: float | None = None
+        self._due_from_ns = 0
+        self._heartbeat = 0
+        self._reported: tuple[object, ...] | None = None
+
+    def state(self, name: str) -> None:
+        """The lifecycle's state, lower case (lifecycle.State.label)."""
+        with self._lock:
+            if name != self._state:
+                self._due_from_ns = self._clock()
+            self._state = name
+
+    def source(self, state: SourceState) -> None:
+        """The source's state. "lost" is remembered until it streams again; streaming after that is a reconnect."""
+        with self._lock:
+            if state != self._source and state != "stalled":
+                self._stamps.clear()  # no rate across a break
+            if state == "streaming" and self._source != "streaming":
+                self._due_from_ns = self._clock()
+                self._counts["reconnects"] += self._lost
+            self._lost = state == "lost" or (self._lost and state not in ("streaming", "closed", "ended"))
+            self._source = state
+
+    def model(self, state: ModelState) -> None:
+        """The model's state."""
+        with self._lock:
+            if state in _WORKING and self._model not in _WORKING:
+                self._due_from_ns = self._clock()
+            self._model = state
+
+    def frame(self, stamp_ns: int, arrival_ns: int) -> None:
+        """A frame arrived whole. stamp_ns: on the source's clock; arrival_ns: on this object's clock."""
+        with self._lock:
+            self._counts["frames"] += 1
+            self._arrival_ns = arrival_ns
+            self._arrivals.append((arrival_ns, True))
+            gap_ns = stamp_ns - self._stamps[-1] if self._stamps else 0
+            if not -_LONGEST_STEP_BACK_NS <= gap_ns <= _LONGEST_GAP_NS:
+                self._stamps.clear()  # its clock stepped: no rate and no gap across that
+                gap_ns = 0
+            if not self._stamps or gap_ns > 0:
+                self._stamps.append(stamp_ns)
+            if gap_ns > 0:
+                self._stages["capture_gap"].add(arrival_ns, gap_ns / 1e9)
+
+    def corrupt(self, count: int = 1) -> None:
+        """So many more frames arrived damaged."""
+        with self._lock:
+            self._counts["corrupt"] += count
+            self._arrivals.extend(min(count, 1024) * [(self._clock(), False)])
+
+    def stage(self, name: Stage, seconds: float) -> None:
+        """How long a stage took once."""
+        with self._lock:
+            self._stages[name].add(self._clock(), seconds)
+
+    def count(self, name: Count) -> None:
+        """One more."""
+        with self._lock:
+            self._counts[name] += 1
+
+    def totals(self, **totals: int) -> None:
+        """So many in total, by the names of Count, from whoever counts for himself."""
+        with self._lock:
+            for name, total in totals.items():
+                self._counts[name] = total
+
+    def windows(self, built: int, faults: Mapping[str, int]) -> None:
+        """What the window builder counts: windows built, and what spoilt how many; sets the hop "window"."""
+        with self._lock:
+            self._counts["built"], self._faults = built, dict(faults)
+            self._counts["window"] = sum(faults.values())
+
+    def expect(self, views: Iterable[str], window_s: float | None) -> None:
+        """Which views are rendered, and how often a window begins, seconds; None if nobody waits for the clock
+        (lockstep), so that no view is ever overdue. When each view was published last is kept."""
+        with self._lock:
+            self._views = {view_id: self._views.get(view_id) for view_id in views}
+            self._window_s, self._due_from_ns = window_s, self._clock()
+
+    def published(self, view_id: str, age_s: float) -> None:
+        """A window of this view was published now; age_s: of its newest input frame, the stage "age"."""
+        with self._lock:
+            now_ns = self._clock()
+            self._stages["age"].add(now_ns, age_s)
+            if view_id in self._views:
+                self._views[view_id] = now_ns
+
+    def recording(self, now: RecordHealth) -> None:
+        """How the recording does."""
+        with self._lock:
+            self._rec = now
+
+    def measure(self, name: Literal["ood_score", "gpu_mem_mb"], value: float | None) -> None:
+        """How unlike the training the last window looked to the model; the device's memory in use. None: unknown."""
+        with self._lock:
+            self._measures[name] = value
+
+    def raise_reason(self, code: str, level: Level) -> None:
+        """Something lasting that the rules do not know, such as "fps" out of the trained set or MODEL_HUNG."""
+        with self._lock:
+            self._raised[code] = level
+
+    def clear_reason(self, code: str) -> None:
+        """It is over; nothing happens if it never was."""
+        with self._lock:
+            if self._raised.pop(code, None) is not None and code == IDLE:
+                self._due_from_ns = self._clock()
+
+    def snapshot(self) -> Snapshot:
+        """Everything as it stands now."""
+        with self._lock:
+            return self._snapshot(self._clock())
+
+    def report(self) -> dict[str, object]:
+        """The fields of a status message; `heartbeat_seq` rises with each call, so only who publishes it calls it."""
+        with self._lock:
+            now_ns = self._clock()
+            self._heartbeat += 1
+            self._reported = self._essence(now_ns)
+            return {**self._snapshot(now_ns).status, "heartbeat_seq": self._heartbeat}
+
+    def changed(self) -> bool:
+        """Whether level, reasons, readiness or a state differ from the last `report`; ready and busy are the same."""
+        with self._lock:
+            return self._essence(self._clock()) != self._reported
+
+    # What follows is called with the lock held.
+
+    def _snapshot(self, now_ns: int) -> Snapshot:
+        stages = {name: summary for name, times in self._stages.items() if (summary := times.summary(now_ns))}
+        findings, missing = self._findings(now_ns), self._missing(now_ns)
+        counts = self._counts
+        status: dict[str, Any] = {
+            "state": self._state,
+            "level": int(max(findings.values(), default=Level.OK)),
+            "reasons": list(findings),
+            "ready": not missing,
+            "not_ready": list(missing),
+            "source": self._source_status(now_ns),
+            "window": {
+                "built": counts["built"],
+                "rejected": counts["window"],
+                "reason_counts": dict(self._faults),
+                "skipped": counts["slot"],
+            },
+            "model": self._model_status(stages.get("render")),
+            "publish": {name: counts[name] for name in ("sent", "subs", "bytes")} | {"dropped": counts["queue"]},
+            "drops": {hop: counts[hop] for hop in get_args(Hop)},
+            "stages": {
+                name: {"p50_ms": _ms(stage.p50_s), "p99_ms": _ms(stage.p99_s), "count": stage.count}
+                for name, stage in stages.items()
+            },
+            "views": {
+                view_id: {} if at is None else {"last_ms": round((now_ns - at) / 1e6)}
+                for view_id, at in self._views.items()
+            },
+            "rec": self._rec.to_status(),
+        }
+        return Snapshot(findings=findings, missing=missing, status=status, stages=stages, frames=counts["frames"])
+
+    def _essence(self, now_ns: int) -> tuple[object, ...]:
+        """What is worth a status message at once."""
+        model = "ready" if self._model == "busy" else self._model
+        states = self._state, self._source, model, self._rec.state
+        return states, tuple(self._findings(now_ns).items()), self._missing(now_ns)
+
+    def _source_status(self, now_ns: int) -> dict[str, object]:
+        status: dict[str, object] = {"state": self._source, "dropped": self._counts["source"]}
+        status |= {name: self._counts[name] for name in ("reconnects", "corrupt")}
+        if self._source in ("stalled", "lost"):
+            status["fps"] = 0.0
+        elif len(self._stamps) > 1:
+            status["fps"] = round((len(self._stamps) - 1) * 1e9 / (self._stamps[-1] - self._stamps[0]), 2)
+        if self._arrival_ns is not None:
+            status["last_frame_age_ms"] = round(max(0, now_ns - self._arrival_ns) / 1e6, 1)
+        return status
+
+    def _model_status(self, render: StageSummary | None) -> dict[str, object]:
+        counts = self._counts
+        status: dict[str, object] = {name: counts[name] for name in ("oom_count", "nan_windows")}
+        status |= {"state": self._model, "backoff_s": 0.0}  # of protocol 1.0: no model is tried again later
+        if render is not None:
+            status |= {"ms_p50": _ms(render.p50_s), "ms_p99": _ms(render.p99_s)}
+        if counts["bad_depths"]:
+            status["bad_depths"] = counts["bad_depths"]
+        for name, digits in (("gpu_mem_mb", 1), ("ood_score", 3)):
+            if (value := self._measures.get(name)) is not None:
+                status[name] = round(value, digits)
+        return status
+
+    def _findings(self, now_ns: int) -> dict[str, Level]:
+        rules = (
+            (self._state == "errorprocessing", "NODE_ERROR", Level.ERROR),
+            (self._lost, "SRC_LOST", Level.ERROR),
+            (self._source == "stalled" and not self._lost, "SRC_STALLED", Level.WARN),
+            (self._is_corrupt(now_ns), "SRC_CORRUPT", Level.WARN),
+            (self._model == "failed", "MODEL_FAILED", Level.ERROR),
+            (self._model == "degraded", "MODEL_DEGRADED", Level.WARN),
+            (self._overdue(now_ns), "VIEWS_OVERDUE", Level.WARN),
+            (self._rec.state == "failed", "REC_FAILED", Level.WARN),
+        )
+        found = self._raised | {code: level for holds, code, level in rules if holds}
+        return dict(sorted(found.items(), key=lambda each: (-each[1], each[0])))
+
+    def _is_corrupt(self, now_ns: int) -> bool:
+        recent = [whole for at_ns, whole in self._arrivals if now_ns - at_ns <= _RECENT_NS]
+        return len(recent) >= _LEAST_ARRIVALS and recent.count(False) > _CORRUPT_LIMIT * len(recent)
+
+    def _missing(self, now_ns: int) -> tuple[str, ...]:
+        oldest_ns = -math.inf if self._window_s is None else now_ns - self._patience_ns(now_ns)
+        fresh = bool(self._views) and all(at is not None and at >= oldest_ns for at in self._views.values())
+        rules = (
+            (self._state == "active", "NOT_ACTIVE"),
+            (self._source == "streaming", "SRC_NOT_STREAMING"),
+            (self._model in _WORKING, "MODEL_NOT_READY"),
+            (fresh or IDLE in self._raised, "VIEWS_NOT_FRESH"),
+            (THREAD_DIED not in self._raised, THREAD_DIED),
+        )
+        return tuple(code for holds, code in rules if not holds)
+
+    def _overdue(self, now_ns: int) -> bool:
+        """Whether views should have come by now: frames do, the model works, and one window more than patience passed
+        since the last view, or since whatever had to happen first."""
+        works = self._state == "active" and self._source == "streaming" and self._model in _WORKING
+        if self._window_s is None or not works or not self._views or IDLE in self._raised:
+            return False
+        allowed_ns = self._patience_ns(now_ns) + self._window_s * 1e9
+        return any(now_ns - max(at or 0, self._due_from_ns) > allowed_ns for at in self._views.values())
+
+    def _patience_ns(self, now_ns: int) -> float:
+        """How old the last view may be: two windows, or two renderings if those take longer, and at least a second."""
+        render = self._stages["render"].summary(now_ns)
+        slowest_s = max(self._window_s or 0.0, 0.0 if render is None else render.p99_s)
+        return 1e9 * max(_LEAST_PATIENCE_S, 2 * slowest_s)
+
+
+class StageTimes:
+    """Durations of one stage. Times are monotonic nanoseconds, given by the caller. Not thread-safe."""
+
+    def __init__(self) -> None:
+        self._recent: deque[tuple[int, float]] = deque(maxlen=512)
+        self._count, self._total_s = 0, 0.0
+
+    def add(self, now_ns: int, seconds: float) -> None:
+        """Take note of one duration; a negative one counts as 0 (two clocks disagree), one that is no number not."""
+        if math.isfinite(seconds):
+            self._recent.append((now_ns, max(0.0, seconds)))
+            self._count += 1
+            self._total_s += max(0.0, seconds)
+
+    def summary(self, now_ns: int) -> StageSummary | None:
+        """The figures now; None before the first value. Quantiles by nearest rank."""
+        if not self._recent:
+            return None
+        recent = [seconds for at_ns, seconds in self._recent if now_ns - at_ns <= 60_000_000_000]
+        if len(recent) < _LEAST_DURATIONS:
+            recent = [seconds for _, seconds in list(self._recent)[-_LEAST_DURATIONS:]]
+        recent.sort()
+        p50_s, p99_s = (recent[math.ceil(part * len(recent)) - 1] for part in (0.5, 0.99))
+        return StageSummary(p50_s=p50_s, p99_s=p99_s, count=self._count, total_s=self._total_s)
+
+
+def _ms(seconds: float) -> float:
+    return round(1000 * seconds, 2)

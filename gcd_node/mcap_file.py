@@ -1,0 +1,160 @@
+"""The MCAP files of recordings: how one is written, where it goes, and how much room all of them may take.
+
+Chunks of 64 KiB, and one at least once a second: what a reader can lose of a file that was never finished is the last.
+"""
+
+import contextlib
+import itertools
+import logging
+import os
+import platform
+import time
+from collections.abc import Iterable, Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from mcap.data_stream import RecordBuilder
+from mcap.records import DataEnd, Footer
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+
+from gcd_client.protocol import PROTO
+from gcd_node.config import NodeConfig, RecordConfig
+from gcd_node.ros_messages import IMAGE_TOPIC, RosMessage, definition
+
+_LOG = logging.getLogger(__name__)
+_CHUNK_BYTES = 64 * 1024
+_LARGEST_SEQUENCE = 2**32
+_MB = 10**6
+_PACKAGES = ("gcd-node", "torch", "numpy", "opencv-contrib-python-headless", "mcap")
+
+
+class RoomError(Exception):
+    """Recordings must not take more room. code: stable, of the event."""
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+def check_room(config: RecordConfig, root: Path) -> float:
+    """Whether recordings in `root` may take more room, by max_total_mb and keep_free_mb.
+
+    Returns:
+        MB that are free on its disk.
+    Raises:
+        RoomError, OSError.
+    """
+    taken_mb = sum(each.stat().st_size for each in root.rglob("*.mcap")) / _MB if config.max_total_mb else 0.0
+    if taken_mb > config.max_total_mb:
+        limit = f"max_total_mb is {config.max_total_mb:g}: move some away"
+        raise RoomError("TOTAL_LIMIT", f"recordings in {root} take {taken_mb:.0f} MB, {limit}")
+    disk = os.statvfs(root)
+    free_mb = disk.f_bavail * disk.f_frsize / _MB
+    if free_mb < config.keep_free_mb:
+        limit = f"keep_free_mb is {config.keep_free_mb:g}: make room on it"
+        raise RoomError("DISK_LOW", f"the disk of {root} has {free_mb:.0f} MB left, {limit}")
+    return free_mb
+
+
+def new_folder(root: Path, node_id: str, boot_id: str) -> Path:
+    """A folder for one recording, such as `20261121T184000Z_gcd_1a2b3c4d`: names sort by time, none is taken twice.
+    Raises OSError."""
+    name = f"{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}_{node_id}_{boot_id[:8]}"
+    names = itertools.chain((name,), (f"{name}_{count}" for count in itertools.count(2)))
+    folder = next(path for each in names if not (path := root / each).exists())
+    folder.mkdir()
+    return folder
+
+
+def node_facts(recording: str, part: int, config: NodeConfig, boot_id: str) -> dict[str, str]:
+    """Who recorded what, with which settings and versions. input_topic: left out if inputs are not recorded."""
+    record = config.record
+    facts = {"format": "1", "recording": recording, "part": str(part), "node_id": config.node_id, "boot_id": boot_id}
+    facts |= {"proto": PROTO, "what": ",".join(record.what), "python": platform.python_version()}
+    if "inputs" in record.what:
+        facts |= {"input_topic": IMAGE_TOPIC, "input_encoding": record.input_encoding}
+    for package in _PACKAGES:
+        with contextlib.suppress(PackageNotFoundError):
+            facts[f"version/{package}"] = version(package)
+    return facts
+
+
+class McapFile:
+    """A file being written. size, messages: so far. begun_ns: UTC."""
+
+    def __init__(self, path: Path) -> None:
+        """Create `path`. Raises OSError: it is there already, or cannot be."""
+        self._path, self.begun_ns = path, time.time_ns()
+        self._file = path.open("xb")
+        self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer.start(profile="ros2", library=f"gcd-node; mcap-python/{version('mcap')}")
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self.size = self.messages = 0
+        self._flushed = (0, 0)  # size and messages that are on the disk for certain
+
+    def describe(self, name: str, facts: Mapping[str, str]) -> None:
+        """Add metadata."""
+        self._writer.add_metadata(name, dict(facts))
+
+    def attach(self, name: str, media_type: str, data: bytes) -> None:
+        """Add a file."""
+        self._writer.add_attachment(self.begun_ns, self.begun_ns, name, media_type, data)
+
+    def write(self, messages: Iterable[RosMessage]) -> None:
+        """Add messages that belong together: all of them, or none if one cannot be made. Raises OSError."""
+        for each in tuple(messages):
+            if each.kind not in self._schemas:
+                text = definition(each.kind).encode()
+                self._schemas[each.kind] = self._writer.register_schema(each.kind, "ros2msg", text)
+            if each.topic not in self._channels:
+                self._channels[each.topic] = self._writer.register_channel(each.topic, "cdr", self._schemas[each.kind])
+            self._writer.add_message(
+                channel_id=self._channels[each.topic],
+                log_time=each.log_ns,
+                data=each.data,  # pyright: ignore[reportArgumentType]  it is copied
+                publish_time=each.sent_ns,
+                sequence=each.sequence % _LARGEST_SEQUENCE,
+            )
+            self.messages += 1
+        self.size = self._file.tell()
+
+    def flush(self, *, sync: bool = False) -> None:
+        """Close the chunk in work, so that a reader gets it whatever happens next. sync: even without power. Raises
+        OSError: the disk is full or broken."""
+        self._writer.flush()
+        if sync:
+            os.fdatasync(self._file.fileno())
+        self.size = self._file.tell()
+        self._flushed = self.size, self.messages
+
+    def finish(self) -> bool:
+        """Write index and end, and close; see cut_back() for where that fails. Returns whether the file has an end."""
+        try:
+            self._writer.finish()
+            self.flush(sync=True)
+            self._file.close()
+        except Exception as error:
+            _LOG.warning("%s: %s", self._path, error)
+            return self.cut_back()
+        return True
+
+    def cut_back(self) -> bool:
+        """After an error: end the file behind what was flushed, without an index. Returns whether it has an end."""
+        try:
+            self.size, self.messages = self._flushed
+            if self.size == 0:
+                self._path.unlink()
+                return False
+            builder = RecordBuilder()
+            DataEnd(data_section_crc=0).write(builder)
+            Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(builder)
+            end = builder.end() + MCAP0_MAGIC
+            os.ftruncate(self._file.fileno(), self.size)
+            self.size += os.pwrite(self._file.fileno(), end, self.size)
+            return self.size == self._flushed[0] + len(end)
+        except OSError:
+            return False
+        finally:
+            with contextlib.suppress(OSError):
+                self._file.raw.close()  # not the buffer: what is in it has no place any more

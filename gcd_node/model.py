@@ -1,0 +1,176 @@
+"""The model a node has loaded. It may be exchanged for a lighter one while the node lives."""
+
+import threading
+import time
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from msgspec.structs import replace
+from torch import nn
+from torch.nn.modules.module import register_module_forward_pre_hook
+
+from gcd_model import (
+    CameraMount,
+    Cancelled,
+    Clip,
+    FrameSynthesizer,
+    ModelError,
+    OptionError,
+    RenderOptions,
+    Sampler,
+    Traits,
+    Trajectory,
+    ViewSynthesizer,
+    sampler_of,
+)
+from gcd_node.config import ModelSection
+from gcd_node.errors import ModelFailedError, NodeError
+
+
+@contextmanager
+def model_errors() -> Generator[None]:
+    """Around a call of the model: what nobody foresaw becomes ModelFailedError, so that nothing else is blamed."""
+    try:
+        yield
+    except (ModelError, NodeError):
+        raise
+    except Exception as error:
+        raise ModelFailedError(f"the model broke: {type(error).__name__}: {error}") from error
+
+
+LoadModel = Callable[[ModelSection], ViewSynthesizer]
+"""Loads the model of a launch file; see session.load_model()."""
+
+
+def load_streaming(load: LoadModel, section: ModelSection) -> ViewSynthesizer:
+    """The model as a node uses it: frame by frame if it can, else window by window. Raises as `load`."""
+    loaded = load(section)
+    return loaded.streaming() if isinstance(loaded, FrameSynthesizer) else loaded
+
+
+class ModelSlot:
+    """Holds the model; the only reference to it, so that an exchange gives the memory back first."""
+
+    def __init__(self, section: ModelSection, load: LoadModel) -> None:
+        """Load it, see load_streaming(). Raises as `load`."""
+        self._section, self._load = section, load
+        self._synthesizer: ViewSynthesizer | None = load_streaming(load, section)
+        self._traits = self._synthesizer.traits
+
+    @property
+    def synthesizer(self) -> ViewSynthesizer:
+        """The model in use; loaded anew if the last exchange did not succeed."""
+        if self._synthesizer is None:
+            self._synthesizer = load_streaming(self._load, self._section)
+            self._traits = self._synthesizer.traits
+        return self._synthesizer
+
+    @property
+    def traits(self) -> Traits:
+        """The model's."""
+        return self._traits
+
+    def forget_frames(self) -> None:
+        """What a model that works frame by frame remembers of the frames before; others remember nothing."""
+        if isinstance(self._synthesizer, FrameSynthesizer):
+            self._synthesizer.reset()
+
+    @property
+    def streams(self) -> bool:
+        """Whether it works frame by frame, and one frame goes on where the one before ended."""
+        return isinstance(self._synthesizer, FrameSynthesizer)
+
+    @property
+    def can_halve(self) -> bool:
+        """Whether bfloat16 weights would be smaller, and the device is one that gains by them."""
+        return self._traits.device.startswith("cuda") and self._traits.precision == "float32"
+
+    def halve(self) -> None:
+        """Let the model go and load it in bfloat16. Raises as `load`."""
+        self._synthesizer = None
+        self._section = replace(self._section, dtype="bfloat16")
+        self._synthesizer = load_streaming(self._load, self._section)
+        self._traits = self._synthesizer.traits
+
+
+def drawing_options(section: ModelSection) -> RenderOptions:
+    """What [model] says of drawing; without a seed, which is the window's."""
+    return RenderOptions(
+        quality=section.quality,
+        steps=section.steps,
+        solver=section.solver,
+        guidance=section.guidance,
+        guidance_interval=section.guidance_interval,
+        samples=section.samples,
+        motion_bucket=section.motion_bucket,
+    )
+
+
+def sampler_in_use(section: ModelSection, traits: Traits) -> Sampler:
+    """The same in full: what [model] leaves out as quality and checkpoint have it."""
+    return sampler_of(traits.config.sampling, drawing_options(section))
+
+
+def render_grey(
+    synthesizer: ViewSynthesizer, paths: Sequence[Trajectory], mount: CameraMount | None, options: RenderOptions
+) -> None:
+    """Render a grey clip along paths, encoded a frame at a time as windows are.
+
+    Args:
+        mount: of the source camera.
+    Raises:
+        NonFiniteError, DeviceMemoryError, Cancelled: see ViewSynthesizer.render.
+    """
+    traits = synthesizer.traits
+    grey = Clip(video=torch.zeros(1, 3, *_size(traits)), fps=traits.fps, mount=mount)
+    encoded = synthesizer.encode(grey)
+    synthesizer.render(encoded.followed_by(*[encoded] * (traits.config.frames - 1)), paths, options)
+
+
+def _size(traits: Traits) -> tuple[int, int]:
+    """Height and width of the clip to warm up with: half of each on a CPU, where a whole rendering takes longer than
+    all that happens only once, and puts off the first view."""
+    height, width = traits.config.height, traits.config.width
+    if traits.device != "cpu":
+        return height, width
+    try:
+        traits.check_size(height // 2, width // 2)
+    except OptionError:
+        return height, width
+    return height // 2, width // 2
+
+
+@contextmanager
+def interruptible(cancel: threading.Event) -> Generator[None]:
+    """Within the block, once `cancel` is set, the next layer of any network that this thread calls raises Cancelled:
+    in an encoder, a denoising step or a decoder alike. Changes no result; costs a microsecond a layer."""
+    thread = threading.get_ident()
+
+    def look(module: nn.Module, _: Any) -> None:
+        if cancel.is_set() and threading.get_ident() == thread:
+            raise Cancelled(f"told to stop, before a layer ({type(module).__name__})")
+
+    hook = register_module_forward_pre_hook(look)
+    try:
+        yield
+    finally:
+        hook.remove()
+
+
+class IdleTimer:
+    """Says whether nobody watches. It has to be asked often: who came and went in between was not seen."""
+
+    def __init__(self, idle_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+        """Begin as if somebody had just left. idle_s: patience, seconds; 0 for never. clock: monotonic seconds."""
+        self._idle_s, self._clock = idle_s, clock
+        self._watched_s = clock()
+
+    def is_idle(self, subscribers: int) -> bool:
+        """Whether nobody has watched for `idle_s`. subscribers: of views, now; who
+        looks at the input alone keeps nobody busy."""
+        now_s = self._clock()
+        if subscribers > 0:
+            self._watched_s = now_s
+        return 0 < self._idle_s < now_s - self._watched_s

@@ -1,0 +1,355 @@
+"""From a camera's picture to the network's: crop, resize, and what that does to the camera's intrinsics."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gcd_model import (
+    ASSUMED_SOURCE,
+    FAMILIES,
+    CameraMount,
+    Intrinsics,
+    OptionError,
+    ShapeError,
+    Spherical,
+    Traits,
+    center_crop_box,
+)
+from gcd_node.calibration import HALF_PIXEL, LensModel
+from gcd_node.errors import ConfigError
+from gcd_node.frame import Image
+from gcd_node.source_config import SourcePose
+
+Resize: TypeAlias = Literal["released", "area"]
+"""released: bilinear, as in training; it aliases when it shrinks a lot. area: averages, and does not."""
+
+ResizePath: TypeAlias = Literal[Resize, "remap2x_area"]
+"""What is published as `src.resize`; remap2x_area: undistorted at twice the size, then averaged."""
+
+_LEVELS = np.arange(256, dtype=np.float32) / np.float32(127.5) - np.float32(1.0)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Fit:
+    """How pictures of any size become `width` x `height`: the largest centred crop of that shape, resized.
+
+    resize: the name published as `src.resize`.
+    share: how much of the picture's width may be used; less than 1 narrows the field of view.
+    allow_upscale: enlarge pictures that are too small instead of refusing them.
+    Source: Generative Camera Dolly, loading of custom videos, as released; wire protocol, section 7, F7.
+    """
+
+    width: int
+    height: int
+    resize: Resize = "released"
+    share: float = 1.0
+    allow_upscale: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 < self.share <= 1:
+            raise ConfigError(f"the share of a picture that is used must lie above 0 and up to 1, got {self.share:g}")
+        if self.width < 1 or self.height < 1:
+            raise ConfigError(f"frames must be fitted to at least 1 x 1 pixels, got {self.width} x {self.height}")
+
+    def crop_box(self, width: int, height: int) -> tuple[int, int, int, int]:
+        """The part of a `width` x `height` picture that is used: left, top, width, height, pixels.
+
+        Raises:
+            ConfigError: it would have to be enlarged, and `allow_upscale` is not set.
+        """
+        beside = round(width * (1 - self.share) / 2)
+        try:
+            left, top, wide, high = center_crop_box(max(1, width - 2 * beside), height, self.width / self.height)
+        except ShapeError as error:
+            raise ConfigError(str(error)) from error
+        if not self.allow_upscale and (wide < self.width or high < self.height):
+            raise ConfigError(
+                f"a {width} x {height} picture (cropped to {wide} x {high}) is smaller than the {self.width} x "
+                f"{self.height} the model takes; use a larger one or set allow_upscale"
+            )
+        return left + beside, top, wide, high
+
+    def image(self, image: Image) -> Image:
+        """Crop and resize one picture: u8 [H, W, 3] to [height, width, 3]. Raises ConfigError as `crop_box`."""
+        left, top, wide, high = self.crop_box(image.shape[1], image.shape[0])
+        part = image[top : top + high, left : left + wide]
+        if (wide, high) == (self.width, self.height):
+            return np.ascontiguousarray(part)
+        shrinks = self.width < wide or self.height < high
+        how = cv2.INTER_AREA if self.resize == "area" and shrinks else cv2.INTER_LINEAR
+        return np.asarray(cv2.resize(part, (self.width, self.height), interpolation=how), np.uint8)
+
+    def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The same of a depth picture, [H, W]; no depth between two surfaces is made up. Raises as `crop_box`."""
+        left, top, wide, high = self.crop_box(depth.shape[1], depth.shape[0])
+        part = np.ascontiguousarray(depth[top : top + high, left : left + wide])
+        size = (self.width, self.height)
+        return np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
+
+    def intrinsics(self, source: Intrinsics) -> Intrinsics:
+        """The camera of the fitted picture, from the camera of the whole. Raises ConfigError as `crop_box`."""
+        return source.cropped(*self.crop_box(source.width, source.height)).resized(self.width, self.height)
+
+
+def to_clip_tensor(images: Image) -> NDArray[np.float32]:
+    """u8 [T, H, W, 3] in 0..255 -> float32 [T, 3, H, W] in [-1, 1], contiguous.
+
+    Raises:
+        ConfigError: another type or shape.
+    """
+    if images.dtype != np.uint8 or images.ndim != 4 or images.shape[3] != 3:
+        raise ConfigError(f"images must be u8 [T, H, W, 3], got {images.dtype} {list(images.shape)}")
+    count, height, width, _ = images.shape
+    clip = np.empty((count, 3, height, width), np.float32)
+    for image, planes in zip(images, clip, strict=True):
+        write_planes(image, planes)
+    return clip
+
+
+def to_image(planes: NDArray[np.float32]) -> Image:
+    """Inverse of write_planes(): float32 [3, H, W] in [-1, 1] -> u8 [H, W, 3], at the nearest level."""
+    return np.rint((planes.transpose(1, 2, 0) + 1.0) * 127.5).clip(0, 255).astype(np.uint8)
+
+
+def write_planes(image: Image, planes: NDArray[np.float32]) -> None:
+    """One picture, u8 [H, W, 3] in 0..255, into float32 [3, H, W] in [-1, 1], contiguous."""
+    for levels, plane in zip(cv2.split(image), planes, strict=True):
+        cv2.LUT(levels, _LEVELS, plane)
+
+
+_WIDEST_DEG = 120.0
+_NARROWEST_DEG = 1.0
+_SLACK_PX = 1.0
+_ENLARGED = 1.01
+_SUPERSAMPLED = 2
+_MOST_SHRINK = 4.0
+_SIDE_POINTS, _RING_POINTS = 17, 65
+
+
+class Rectifier:
+    """Undistorts, cuts to a field of view and resizes, in one step per picture.
+
+    The picture is sampled at twice the wanted size and then averaged: within 37 dB of undistorting at full resolution
+    and averaging, at a third of the time. Sampling straight at the wanted size would alias (24 dB).
+    Pictures more than four times as fine as wanted are halved first, for the same reason.
+    """
+
+    def __init__(
+        self, lens: LensModel, *, width: int, height: int, hfov_deg: float | None, allow_upscale: bool = False
+    ) -> None:
+        """Work out which camera the fitted pictures are of.
+
+        Args:
+            lens: of the source's pictures.
+            width, height: of the fitted picture.
+            hfov_deg: wanted horizontal field of view, None for as much as the lens sees (at most 120 degrees).
+            allow_upscale: enlarge pictures that are too coarse instead of refusing them.
+        Raises:
+            ConfigError: the lens sees next to nothing around its axis, or its picture would have to be enlarged.
+        """
+        self._lens = lens
+        self._camera = widest_camera(lens, width, height, _WIDEST_DEG if hfov_deg is None else hfov_deg)
+        self._allow_upscale = allow_upscale
+        self._sampling = self._sampling_of(lens.width, lens.height)
+
+    @property
+    def resize(self) -> Literal["remap2x_area"]:
+        """Published as `src.resize`."""
+        return "remap2x_area"
+
+    @property
+    def camera(self) -> Intrinsics:
+        """Of the fitted picture: looks along the lens's axis, square pixels, no distortion. Its field of view is the
+        wanted one, or the largest of that shape which the lens sees all of."""
+        return self._camera
+
+    def image(self, image: Image) -> Image:
+        """One picture, u8 [H, W, 3] to [height, width, 3].
+
+        Raises:
+            ConfigError: of another shape than the lens was calibrated for, or too coarse.
+        """
+        high, wide = image.shape[:2]
+        if (wide, high) != (self._sampling.lens.width, self._sampling.lens.height):
+            self._sampling = self._sampling_of(wide, high)
+        return self._sampling.image(image)
+
+    def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The same of a depth picture, [H, W]; no depth between two surfaces is made up. Raises as `image`."""
+        high, wide = depth.shape
+        if (wide, high) != (self._sampling.lens.width, self._sampling.lens.height):
+            self._sampling = self._sampling_of(wide, high)
+        return self._sampling.depth(depth)
+
+    def _sampling_of(self, width: int, height: int) -> "_Sampling":
+        lens = self._lens.resized(width, height)
+        enlarged = max(self._camera.fx / lens.fx, self._camera.fy / lens.fy)
+        if enlarged > _ENLARGED and not self._allow_upscale:
+            raise ConfigError(
+                f"a {width} x {height} picture would have to be enlarged {enlarged:.2f} times to fill the "
+                f"{self._camera.width} x {self._camera.height} the model takes at {self._camera.hfov_deg:.0f} degrees; "
+                "use a larger one or set allow_upscale"
+            )
+        return _Sampling(lens, self._camera)
+
+
+def widest_camera(lens: LensModel, width: int, height: int, hfov_deg: float) -> Intrinsics:
+    """The camera of `width` x `height` along the lens's axis with a field of view of up to `hfov_deg` across, of which
+    the lens sees every pixel.
+
+    Raises:
+        ConfigError: not even one degree of it.
+    """
+    wanted = Intrinsics.from_hfov(hfov_deg, width, height)
+    if _sees(lens, wanted):
+        return wanted
+    least, most = _NARROWEST_DEG, hfov_deg
+    if not _sees(lens, Intrinsics.from_hfov(least, width, height)):
+        raise ConfigError(
+            f"the calibration ({lens}) leaves less than {_NARROWEST_DEG:g} degree of view around the axis; "
+            "calibrate the camera again"
+        )
+    while most - least > 1e-3:
+        middle = (least + most) / 2
+        least, most = (middle, most) if _sees(lens, Intrinsics.from_hfov(middle, width, height)) else (least, middle)
+    return Intrinsics.from_hfov(least, width, height)
+
+
+def _sees(lens: LensModel, camera: Intrinsics) -> bool:
+    """Whether every pixel of the camera is in the lens's picture. A polynomial fitted to the picture may turn back
+    beyond its edge: from the axis outwards, pixels must go outwards too."""
+    rings = np.linspace(1 / _RING_POINTS, 1, _RING_POINTS)[:, None, None] * _border_rays(camera)
+    pixels = project(lens, rings.reshape(-1, 2)).reshape(rings.shape)
+    outwards = (pixels - (lens.cx, lens.cy)) / (lens.fx, lens.fy)
+    rising = np.diff(np.hypot(outwards[..., 0], outwards[..., 1]), axis=0) > 0
+    low, high = -HALF_PIXEL - _SLACK_PX, np.array([lens.width, lens.height]) - HALF_PIXEL + _SLACK_PX
+    edge = pixels[-1]
+    return bool(rising.all() and np.isfinite(edge).all() and (edge >= low).all() and (edge <= high).all())
+
+
+def _border_rays(camera: Intrinsics) -> NDArray[np.float64]:
+    """x / z and y / z along the four edges of the picture, [N, 2]."""
+    u, v = np.linspace(0, camera.width, _SIDE_POINTS), np.linspace(0, camera.height, _SIDE_POINTS)
+    edges = [(u, 0 * u), (u, 0 * u + camera.height), (0 * v, v), (0 * v + camera.width, v)]
+    pixels = np.concatenate([np.stack(edge, axis=1) for edge in edges])
+    return (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+
+
+def project(lens: LensModel, rays: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Where rays meet the lens's picture: [N, 2] of x / z and y / z to [N, 2] pixels, from the first pixel's centre."""
+    coefficients = np.array(lens.coefficients)
+    if lens.distortion == "equidistant":
+        pixels = cv2.fisheye.distortPoints(rays[:, None], lens.matrix, coefficients)
+    else:
+        ahead = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
+        pixels, _ = cv2.projectPoints(ahead, np.zeros(3), np.zeros(3), lens.matrix, coefficients)
+    return np.asarray(pixels, np.float64).reshape(-1, 2)
+
+
+class _Sampling:
+    """Where each pixel of the camera's picture, at twice its size, lies in pictures of one size."""
+
+    def __init__(self, lens: LensModel, camera: Intrinsics) -> None:
+        self.lens = lens
+        self._size = (camera.width, camera.height)
+        self._shrunk = _shrunk_size(lens, camera)
+        small, fine = lens.resized(*self._shrunk), camera.resized(*(_SUPERSAMPLED * side for side in self._size))
+        target = np.array([[fine.fx, 0.0, fine.cx - HALF_PIXEL], [0.0, fine.fy, fine.cy - HALF_PIXEL], [0.0, 0.0, 1.0]])
+        arguments = (small.matrix, np.array(small.coefficients), np.eye(3), target, (fine.width, fine.height))
+        if lens.distortion == "equidistant":
+            self._maps = cv2.fisheye.initUndistortRectifyMap(*arguments, cv2.CV_16SC2)
+        else:
+            self._maps = cv2.initUndistortRectifyMap(*arguments, cv2.CV_16SC2)
+
+    def image(self, image: Image) -> Image:
+        if self._shrunk != (self.lens.width, self.lens.height):
+            image = np.asarray(cv2.resize(image, self._shrunk, interpolation=cv2.INTER_AREA), np.uint8)
+        fine = cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(cv2.resize(fine, self._size, interpolation=cv2.INTER_AREA), np.uint8)
+
+    def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        small = cv2.resize(depth, self._shrunk, interpolation=cv2.INTER_NEAREST_EXACT)
+        fine = cv2.remap(small, *self._maps, cv2.INTER_NEAREST)  # 0, a hole, beyond the picture
+        return np.ascontiguousarray(fine[::_SUPERSAMPLED, ::_SUPERSAMPLED], np.float32)
+
+
+def _shrunk_size(lens: LensModel, camera: Intrinsics) -> tuple[int, int]:
+    """The picture's size, halved until it is at most four times as fine as the camera's."""
+    finer = min(lens.fx / camera.fx, lens.fy / camera.fy)
+    halvings = max(0, math.ceil(math.log2(finer / _MOST_SHRINK)))
+    return max(1, lens.width >> halvings), max(1, lens.height >> halvings)
+
+
+def require_usable(pose: SourcePose | None, traits: Traits) -> None:
+    """Refuse a pose in words the model does not know.
+
+    Raises:
+        OptionError: angles for a model that is not steered by them, a mount for another model than the live one.
+    """
+    steered = traits.config.camera != "none"
+    if pose is None or traits.live:  # that one has a use for either
+        return
+    if pose.on_vehicle:
+        reason = "is steered by angles" if steered else "sees nothing but the pictures"
+        remedy = "; state elevation and radius instead" if steered else "; leave it out"
+        raise OptionError(f"{traits.name} {reason} and has no use for a mount (height, forward, left, tilt){remedy}")
+    if pose.on_sphere and not steered:
+        raise OptionError(
+            f"{traits.name} is not steered by angles and has no use for elevation and radius; leave them out"
+        )
+
+
+def stated_sphere(pose: SourcePose | None) -> Spherical | None:
+    """The camera on the sphere, None if nobody stated it. Raises PoseError."""
+    if pose is None or pose.on_vehicle:
+        return None
+    return Spherical(
+        azimuth_deg=0.0,
+        elevation_deg=ASSUMED_SOURCE.elevation_deg if pose.elevation_deg is None else pose.elevation_deg,
+        radius_m=ASSUMED_SOURCE.radius_m if pose.radius is None else pose.radius,
+    )
+
+
+def stated_mount(pose: SourcePose | None, hfov_deg: float | None, traits: Traits) -> CameraMount | None:
+    """The camera on its vehicle, for the live model where a mount was stated: it knows where the ground is then.
+
+    hfov_deg: horizontal field of view of the picture the model is given, None if nobody knows.
+    Raises:
+        OptionError: numbers that no camera has.
+    """
+    if not traits.live or pose is None or not pose.on_vehicle:
+        return None
+    usual = CameraMount(hfov_deg=assumed_hfov_deg(pose))
+    return CameraMount(
+        height_m=usual.height_m if pose.height_m is None else pose.height_m,
+        forward_m=usual.forward_m if pose.forward_m is None else pose.forward_m,
+        left_m=usual.left_m if pose.left_m is None else pose.left_m,
+        tilt_deg=usual.tilt_deg if pose.tilt_deg is None else pose.tilt_deg,
+        hfov_deg=usual.hfov_deg if hfov_deg is None else hfov_deg,
+    )
+
+
+def assumed_hfov_deg(pose: SourcePose | None) -> float:
+    """Field of view that the live model takes a camera to have where nobody states one: of the orbits' training for a
+    camera on a sphere, else of the vehicle's."""
+    orbits = FAMILIES["kubric90"].hfov_deg
+    return orbits if pose is not None and pose.on_sphere and orbits is not None else CameraMount().hfov_deg
+
+
+def in_words(mount: CameraMount | None, pose: SourcePose | None, traits: Traits) -> str:
+    """Where the live model is told that the source camera stands; empty where nothing is stated, and for other models.
+
+    mount: as `stated_mount` gives it.
+    """
+    if not traits.live or pose is None:
+        return ""
+    if mount is not None:
+        where = f"{mount.height_m:g} m above the ground, {mount.forward_m:g} m ahead, tilted {mount.tilt_deg:g} degrees"
+    else:
+        source = stated_sphere(pose) or ASSUMED_SOURCE
+        where = f"at an elevation of {source.elevation_deg:g} degrees and a radius of {source.radius_m:g} m"
+    return f"the source camera stands {where}"

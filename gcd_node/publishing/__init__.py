@@ -1,1 +1,0 @@
-"""From rendered views to the publisher: order, rhythm, and what a publisher is told."""

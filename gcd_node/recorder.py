@@ -1,0 +1,399 @@
+"""Recordings: what a node saw, drew, said and was asked, in MCAP files that ROS 2 tools and Foxglove open.
+
+A recording has a thread of its own. Between it and the node is a queue, so that a slow or full disk costs recorded data
+and never frames, views or memory.
+"""
+
+import errno
+import logging
+import math
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from gcd_client.protocol import EndMessage, OriginHeader, StatusTopic, ViewMessage
+from gcd_node.auth import Client
+from gcd_node.calibration import LensModel
+from gcd_node.config import NodeConfig
+from gcd_node.config_text import to_toml
+from gcd_node.errors import NodeError
+from gcd_node.frame import Frame, SourceInfo
+from gcd_node.health import Level, RecordHealth
+from gcd_node.mcap_file import McapFile, RoomError, check_room, new_folder, node_facts
+from gcd_node.publisher import MessageSink, PublisherStats
+from gcd_node.ros_messages import (
+    COMMAND_TOPIC,
+    IMAGE_TOPIC,
+    Source,
+    command_messages,
+    input_messages,
+    is_recorded,
+    note_messages,
+    view_messages,
+    view_topic,
+)
+
+_LOG = logging.getLogger(__name__)
+_MB = 10**6
+_QUEUED_BYTES, _QUEUED_ITEMS = 64 * 2**20, 4096
+_LOCKSTEP_S, _PATIENCE_S = 5.0, 10.0
+_FLUSH_S, _SYNC_EVERY, _SHARP_NS, _DRIFT_NS = 1.0, 5, 100_000, 1_000_000  # sync every so many flushes
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+Tell: TypeAlias = Callable[[str, Level, Mapping[str, object]], None]  # publishes an event: code, level, fields
+
+
+class Recorder:
+    """Of one life of a node. Every method may be called from any thread; none waits for the disk, but in lockstep."""
+
+    def __init__(self, config: NodeConfig, boot_id: str, live: Callable[[], NodeConfig], tell: Tell) -> None:
+        """live: the configuration in force. tell: publishes an event; called from the recorder's thread."""
+        self.config, self.boot_id, self.live, self.tell = config, boot_id, live, tell
+        self._order = threading.Lock()
+        self._recording: _Recording | None = None
+        self._head: dict[str, _Item] = {}
+        self._source: Source | None = None
+        self._utc_offset_ns: int | None = None
+
+    @property
+    def available(self) -> bool:
+        """Whether there is a folder for recordings."""
+        return self.config.record.folder is not None
+
+    @property
+    def busy(self) -> bool:
+        """Whether a recording is under way, or still being finished."""
+        return self._recording is not None and self._recording.thread.is_alive()
+
+    def start(self) -> bool:
+        """Begin; an event tells how that went. False if there is no folder, or a recording is under way."""
+        with self._order:
+            if not self.available or self.busy:
+                return False
+            self._recording = _Recording(self, self._head)
+            return True
+
+    def stop(self) -> bool:
+        """End soon; an event tells. False if no recording is under way."""
+        if self._recording is None or not self.busy:
+            return False
+        self._recording.stop("ASKED", _PATIENCE_S)
+        return True
+
+    def hurry(self) -> None:
+        """Make nobody wait for the disk any more, in lockstep either."""
+        if self._recording is not None:
+            self._recording.queue.hurry()
+
+    def close(self, patience_s: float) -> None:
+        """End for good: what waits is written for at most so long, and the last file is finished."""
+        if self._recording is not None:
+            self._recording.stop("SHUTDOWN", patience_s / 2)
+            self._recording.thread.join(patience_s)
+
+    def report(self) -> RecordHealth:
+        """How the recording does, or did."""
+        return RecordHealth() if self._recording is None else self._recording.report()
+
+    # What the node tells.
+
+    def source(self, info: SourceInfo, lens: LensModel | None) -> None:
+        """Frames are of this source from here on. lens: the calibration in use for its pictures."""
+        hfov_deg = self.config.source.hfov_deg or info.hfov_deg
+        self._source = source = Source(info=info, lens=lens, hfov_deg=hfov_deg)
+        if "inputs" in self.config.record.what:
+            facts = source.facts()
+            self._put("/src/camera_info", 0, lambda file: file.describe("gcd-node/source", facts), is_head=True)
+
+    def frame(self, frame: Frame) -> None:
+        """A frame has arrived."""
+        if self._recording is None or self._source is None or "inputs" not in self.config.record.what:
+            return
+        source, record = self._source, self.config.record
+        is_live = source.info.clock == "realtime"
+        stamp_ns = frame.stamp_ns + self._to_utc_ns() if is_live else frame.stamp_ns
+        at_ns = stamp_ns if is_live else time.time_ns()
+        size = frame.image.nbytes
+        self._put(IMAGE_TOPIC, size, lambda file: file.write(input_messages(frame, source, stamp_ns, at_ns, record)))
+
+    def view(self, message: ViewMessage) -> None:
+        """A view has left."""
+        if self._recording is not None and "views" in self.config.record.what and is_recorded(message):
+            size = len(message.payload)
+            self._put(view_topic(message), size, lambda file: file.write(view_messages(message, self.config)))
+
+    def note(self, kind: StatusTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
+        """A status, an event or the metadata was said."""
+
+        def write(file: McapFile) -> None:
+            log_ns = header.t_publish_ns
+            if kind == "meta" and isinstance(weights := fields.get("weights"), Mapping):
+                facts = {key: str(value) for key, value in weights.items()}
+                file.describe("gcd-node/weights", facts | {"cfg_digest": str(fields.get("cfg_digest"))})
+                log_ns = max(log_ns, file.begun_ns)  # it is said again at the head of each file
+            file.write(note_messages(kind, header, fields, log_ns))
+
+        self._put(f"/gcd/{kind}", 0, write, is_head=kind == "meta")
+
+    def command(self, request: bytes, reply: bytes, client: Client) -> None:
+        """A request was answered."""
+        at_ns = time.time_ns()
+        self._put(COMMAND_TOPIC, 0, lambda file: file.write(command_messages(request, reply, client, at_ns)))
+
+    def _put(self, topic: str, size: int, write: Callable[[McapFile], None], *, is_head: bool = False) -> None:
+        item = _Item(topic=topic, size=size, write=write, is_head=is_head)
+        if is_head:
+            self._head[topic] = item
+        if self._recording is not None:
+            self._recording.queue.put(item)
+
+    def _to_utc_ns(self) -> int:
+        """UTC minus the monotonic clock, held still while it moves by less than a millisecond: so steps between stamps
+        stay those of the camera. A look that was interrupted between the two clocks is used only if there is none."""
+        before_ns, utc_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        offset_ns, held_ns = utc_ns - (before_ns + after_ns) // 2, self._utc_offset_ns
+        if held_ns is None or (after_ns - before_ns < _SHARP_NS and abs(offset_ns - held_ns) > _DRIFT_NS):
+            self._utc_offset_ns = held_ns = offset_ns
+        return held_ns
+
+
+class RecordingSink:
+    """Implements MessageSink over another one, and shows the recorder what leaves. What is published goes first."""
+
+    def __init__(self, sink: MessageSink, recorder: Recorder) -> None:
+        self._sink, self._recorder = sink, recorder
+
+    def send(self, message: ViewMessage) -> object:
+        sent = self._sink.send(message)
+        self._recorder.view(message)
+        return sent
+
+    def preview(self, made: Callable[[], ViewMessage]) -> None:
+        """See MessageSink. The recorder has the frames themselves."""
+        self._sink.preview(made)
+
+    def end(self, message: EndMessage, *, delay_ms: int | None = None) -> None:
+        self._sink.end(message, delay_ms=delay_ms)
+
+    def note(self, topic: StatusTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
+        self._sink.note(topic, header, fields)
+        self._recorder.note(topic, header, fields)
+
+    def stop_waiting(self) -> None:
+        self._sink.stop_waiting()
+        self._recorder.hurry()
+
+    @property
+    def stats(self) -> PublisherStats:
+        return self._sink.stats
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class _Item:
+    """Something on its way to the disk. topic: where its loss is counted. size: bytes of a picture, 0 of what is small.
+    write: makes messages of it, in the recorder's thread. is_head: every file begins with it."""
+
+    topic: str
+    size: int
+    write: Callable[[McapFile], None]
+    is_head: bool
+
+
+class _Queue:
+    """What waits for the disk; when there is no room, the oldest pictures go. waits: in lockstep whoever has a picture
+    waits for room instead, for 5 s at most."""
+
+    def __init__(self, *, waits: bool) -> None:
+        self._waits, self._end_s = waits, math.inf
+        self._changed = threading.Condition()
+        self._items: deque[_Item] = deque()
+        self._bytes = 0
+        self.dropped: Counter[str] = Counter()
+        """What found no room or could not be written, by topic: frames, windows, notes."""
+
+    @property
+    def over(self) -> bool:
+        """Whether it was closed, and is empty or has no time left."""
+        return self._end_s < math.inf and (not self._items or time.monotonic() > self._end_s)
+
+    def put(self, item: _Item) -> None:
+        """Hand an item over; from any thread."""
+        with self._changed:
+            if item.size:
+                self._changed.wait_for(lambda: not self._waits or self._has_room(item), _LOCKSTEP_S)
+            if self._end_s < math.inf:
+                return
+            if not item.size and len(self._items) >= _QUEUED_ITEMS:
+                self.drop(item)
+                return
+            while not self._has_room(item):
+                oldest = next(each for each in self._items if each.size)
+                self._items.remove(oldest)
+                self._bytes -= oldest.size
+                self.drop(oldest)
+            self._items.append(item)
+            self._bytes += item.size
+            self._changed.notify_all()
+
+    def take(self, timeout_s: float) -> _Item | None:
+        """The next item; None if none comes in time, or it is over."""
+        with self._changed:
+            self._changed.wait_for(lambda: bool(self._items) or self._end_s < math.inf, max(0.0, timeout_s))
+            if self.over or not self._items:
+                return None
+            item = self._items.popleft()
+            self._bytes -= item.size
+            self._changed.notify_all()
+            return item
+
+    def hurry(self) -> None:
+        """Make nobody wait any more."""
+        with self._changed:
+            self._waits = False
+            self._changed.notify_all()
+
+    def close(self, patience_s: float) -> None:
+        """Take nothing more in; what is in there may be taken for so long, then it counts as dropped."""
+        self._end_s = min(self._end_s, time.monotonic() + patience_s)
+        self.hurry()
+
+    def drop(self, *items: _Item) -> None:
+        """Count what is lost."""
+        with self._changed:
+            self.dropped.update(item.topic for item in items)
+
+    def clear(self) -> None:
+        """Give up what is left."""
+        with self._changed:
+            self.drop(*self._items)
+            self._items.clear()
+
+    def _has_room(self, item: _Item) -> bool:
+        return self._bytes == 0 or self._bytes + item.size <= _QUEUED_BYTES  # one always finds room
+
+
+class _Recording:
+    """From `record_start` to `record_stop`, or to a full disk: its queue, its thread and its files."""
+
+    def __init__(self, recorder: Recorder, head: Mapping[str, _Item]) -> None:
+        """head: what was said before and still holds."""
+        self._recorder, self._config, self._head = recorder, recorder.config.record, dict(head)
+        self.queue = _Queue(waits=recorder.config.source.pace == "lockstep")
+        self._file: McapFile | None = None
+        self._name: str | None = None  # of the file, below the folder of recordings
+        self._parts = self._bytes = self._written = 0  # of all files that are closed
+        self._whole = True
+        self._stop: str | None = None
+        self._failure: tuple[str, str] | None = None  # code and message
+        self._is_broken = False  # the file, since a write failed
+        self.thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+        self.thread.start()
+
+    def stop(self, reason: str, patience_s: float) -> None:
+        """End soon: what waits is written for so long, then given up. Does not wait."""
+        self._stop = self._stop or reason
+        self.queue.close(patience_s)
+
+    def report(self) -> RecordHealth:
+        """How it does."""
+        file, under_way = self._file, "recording" if self._stop is None else "stopping"
+        return RecordHealth(
+            state="failed" if self._failure else under_way if self.thread.is_alive() else "off",
+            file=self._name,
+            bytes=self._bytes + (0 if file is None else file.size),
+            written=self._written + (0 if file is None else file.messages),
+            dropped=dict(self.queue.dropped),
+        )
+
+    # What follows runs in the recorder thread alone.
+
+    def _run(self) -> None:
+        try:
+            root = Path(self._config.folder or "").expanduser()
+            root.mkdir(parents=True, exist_ok=True)
+            check_room(self._config, root)
+            folder = new_folder(root, self._recorder.config.node_id, self._recorder.boot_id)
+            file = self._open(folder)
+            self._tell("REC_STARTED", Level.OK, {"file": self._name})
+            self._work(root, folder, file)
+        except RoomError as limit:
+            self._failure = limit.code, str(limit)
+        except OSError as error:
+            self._is_broken = True
+            remedy = "look at the disk" if self._parts else "check folder in [record], its permissions and its disk"
+            self._failure = "DISK_FULL" if error.errno in _FULL else "DISK_ERROR", f"{error}; {remedy}"
+        except Exception as error:
+            self._is_broken = True
+            _LOG.exception("the recording broke")
+            self._failure = "INTERNAL", f"{type(error).__name__}; see the log"
+        self._end()
+
+    def _work(self, root: Path, folder: Path, file: McapFile) -> None:
+        config, flush_s, flushes = self._config, time.monotonic() + _FLUSH_S, 0
+        while not self.queue.over:
+            item = self.queue.take(flush_s - time.monotonic())
+            if item is not None:
+                self._write(file, item)
+            if time.monotonic() >= flush_s:
+                flush_s, flushes = time.monotonic() + _FLUSH_S, flushes + 1
+                file.flush(sync=flushes % _SYNC_EVERY == 0)
+                check_room(config, root)
+            age_s = (time.time_ns() - file.begun_ns) / 1e9
+            if 0 < config.rotate_mb <= file.size / _MB or 0 < config.rotate_s <= age_s:
+                before = self._name
+                self._close(file)
+                file = self._open(folder)
+                self._tell("REC_ROTATED", Level.OK, {"file": self._name, "before": before})
+
+    def _write(self, file: McapFile, item: _Item) -> None:
+        if item.is_head:
+            self._head[item.topic] = item
+        try:
+            item.write(file)
+        except OSError:
+            raise
+        except Exception as error:  # of one item: a recording does not end for it
+            _LOG.warning("something on %s is not recorded: %s", item.topic, error)
+            self.queue.drop(item)
+
+    def _open(self, folder: Path) -> McapFile:
+        """Every file begins with all it takes to read it alone."""
+        path = folder / f"{folder.name}_{self._parts:04d}.mcap"
+        file = self._file = McapFile(path)
+        self._name = f"{folder.name}/{path.name}"
+        config = self._recorder.live()
+        file.describe("gcd-node", node_facts(folder.name, self._parts, config, self._recorder.boot_id))
+        file.attach("config.toml", "application/toml", to_toml(config).encode())
+        self._parts += 1
+        for item in tuple(self._head.values()):
+            self._write(file, item)
+        file.flush()
+        return file
+
+    def _close(self, file: McapFile) -> None:
+        self._whole &= file.cut_back() if self._is_broken else file.finish()
+        self._file = None
+        self._bytes, self._written = self._bytes + file.size, self._written + file.messages
+
+    def _end(self) -> None:
+        self.queue.close(0.0)
+        self.queue.clear()
+        if self._file is not None:
+            self._close(self._file)
+        reason, message = self._failure or (self._stop or "INTERNAL", "")
+        done = self.report()
+        fields: dict[str, object] = {"reason": reason, "file": done.file, "bytes": done.bytes, "written": done.written}
+        fields |= {"dropped": dict(done.dropped), "finished": self._whole and self._parts > 0}
+        level = Level.WARN if self._failure else Level.OK
+        self._tell("REC_STOPPED", level, fields | ({"message": message} if message else {}))
+
+    def _tell(self, code: str, level: Level, fields: Mapping[str, object]) -> None:
+        try:
+            self._recorder.tell(code, level, fields)
+        except NodeError as error:  # the publisher is closed, or failed: no reason to stop
+            at = logging.INFO if level is Level.OK else logging.WARNING  # the event would have been logged
+            _LOG.log(at, "nobody hears %s: %s %s", code, fields.get("message", ""), error)

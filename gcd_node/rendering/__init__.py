@@ -1,1 +1,0 @@
-"""The model at work: windows in, views out, and what is given up when it cannot."""

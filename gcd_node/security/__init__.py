@@ -1,1 +1,0 @@
-"""Who may connect, and with which role: keys, allow-list, and the gate in front of the sockets."""

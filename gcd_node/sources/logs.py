@@ -1,0 +1,362 @@
+"""Robot logs as a source: pictures with their stamps, and the lens, depth and odometry that belong to them."""
+
+import contextlib
+import logging
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gcd_node.errors import SourceError
+from gcd_node.frame import Frame, SourceInfo
+from gcd_node.sources.depth import clean_depth
+from gcd_node.sources.log_fields import Cameras, ImageDecoder, are_filled_in, depth_of, head_of, pose_of, rate_of
+from gcd_node.sources.log_reader import IMAGES, ODOMETRY, Deadline, LogLimitError, LogMessage, LogReader, line_of
+from gcd_node.sources.pace import Pace, Pacer
+
+_LOG = logging.getLogger(__name__)
+_SEARCH_S = 15.0  # of reading, for what is needed to begin, and from one picture to the next
+_SURVEYED_NS = 5_000_000_000
+_MOST_STAMPS, _MOST_TOPICS = 500, 1000
+_LISTED, _SHOWN = 8, 100
+_LONGEST_STEP_NS = 10_000_000_000
+_LATEST_NS = 2**63  # in the year 2262
+_HEADER_UNCERTAINTY_US = 10_000  # drivers stamp anything from the begin of the exposure to the picture's arrival
+_WAIT_NS, _MOST_WAITING = 500_000_000, 30  # of the log's time, for what was recorded after the picture it belongs to
+_OWN, _OWN_SOURCE = "gcd-node", "gcd-node/source"  # metadata of this node's recordings
+
+
+class LogSource:
+    """One topic of a log as a FrameSource: ROS or Foxglove pictures, compressed, raw or video.
+
+    Stamps are those of the pictures' headers, on the clock of the robot; where nobody filled these in, when they were
+    sent. They may repeat or step back if the robot's did.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        topic: str | None = None,
+        depth_topic: str | None = None,
+        odometry_topic: str | None = None,
+        pace: Pace = "lockstep",
+        loop: bool = False,
+    ) -> None:
+        """Find the pictures and decode the first.
+
+        Args:
+            path: an MCAP file, a ROS bag, or the folder of a ROS 2 bag or of a recording of this node. A file that was
+                never finished plays up to its last whole chunk.
+            topic: where the pictures are; may be left out if just one topic has some, or in this node's recordings,
+                whose input it is.
+            depth_topic, odometry_topic: what frames carry along, each with the stamp nearest to the picture's, within
+                half a frame period.
+            pace: "realtime" yields every frame at its time (holes over 10 s are skipped), "lockstep" as soon as it is
+                asked for.
+            loop: begin again at the end; stamps and sequence numbers keep rising.
+        Raises:
+            SourceError: no log; no such topic; no pictures, or on several topics; none of them can be decoded, or none
+                was found in 15 s of reading. TooShortError: one picture.
+        """
+        self._path, self._loop, self._pacer = path.absolute(), loop, Pacer(pace)
+        self._found = _Survey(self._path, topic, depth_topic, odometry_topic)
+        self._matcher: _Matcher | None = None  # of the pass under way
+        self._corrupt = 0  # of the passes before
+
+    @property
+    def info(self) -> SourceInfo:
+        """Size of the first picture, rate by the first seconds' stamps, lens if the log states one."""
+        return self._found.info
+
+    @property
+    def topic(self) -> str:
+        """Where the pictures are."""
+        return self._found.topic
+
+    @property
+    def corrupt(self) -> int:
+        """Pictures, and damaged parts of the log, left out so far."""
+        return self._corrupt + (0 if self._matcher is None else self._matcher.corrupt + self._matcher.reader.damaged)
+
+    def frames(self) -> Iterator[Frame]:
+        """Every picture that can be decoded. See FrameSource.frames.
+
+        Raises:
+            SourceError: none can any more; or the next one does not come in 15 s of reading.
+        """
+        offset_ns, newest_ns = 0, None
+        for frame in self._played():
+            step_ns = None if newest_ns is None else frame.stamp_ns - newest_ns
+            if step_ns is None or not 0 <= step_ns <= _LONGEST_STEP_NS:
+                offset_ns = self._pacer.start(frame.stamp_ns)
+            newest_ns = frame.stamp_ns
+            if not self._pacer.wait(frame.stamp_ns, offset_ns):
+                return
+            yield frame
+
+    def close(self) -> None:
+        """End `frames` soon, from any thread."""
+        self._pacer.stop()
+
+    def _played(self) -> Iterator[Frame]:
+        """One pass, or pass after pass, each going on where the last one ended."""
+        begin_ns, begin_seq, period_ns = 0, 0, round(1e9 / self.info.fps_nominal)
+        while not self._pacer.stopped:
+            first = newest = None
+            for frame in self._one_pass():
+                first = frame if first is None else first
+                newest = replace(frame, stamp_ns=frame.stamp_ns + begin_ns, seq=frame.seq + begin_seq)
+                yield newest
+            if self._pacer.stopped or (newest is not None and not self._loop):
+                return
+            if first is None or newest is None:
+                raise SourceError(f"{self._path} gives no pictures any more; was it replaced while it was playing?")
+            begin_ns = newest.stamp_ns + period_ns - first.stamp_ns
+            begin_seq = newest.seq + 1 - first.seq
+
+    def _one_pass(self) -> Iterator[Frame]:
+        deadline = Deadline(_SEARCH_S, stopped=lambda: self._pacer.stopped)
+        matcher, count = _Matcher(self._found, LogReader(self._path, deadline)), 0
+        self._corrupt, self._matcher = self.corrupt, matcher
+        try:
+            for message in matcher.reader.messages():
+                for frame in matcher.take(message):
+                    count += 1
+                    yield frame
+                    deadline.renew()  # what was done with it took its own time
+            yield from matcher.rest()
+        except LogLimitError as error:
+            if not self._pacer.stopped:
+                raise SourceError(
+                    f"{self._path}: {error} after {count} pictures on {self.topic}, and the log goes on; cut it to the "
+                    f"pictures: mcap filter LOG -y {self.topic} -o NEW"
+                ) from None
+
+
+class _Matcher:
+    """Puts the frames of one pass together: a picture waits until its depth and odometry have come."""
+
+    def __init__(self, found: "_Survey", reader: LogReader) -> None:
+        self._found, self.reader, self._decoder = found, reader, ImageDecoder()
+        self._waiting: deque[tuple[int, Frame]] = deque()  # and when each was recorded
+        self._depth = _Nearest(found.depth_topic, found.info.fps_nominal, 32)
+        self._odometry = _Nearest(found.odometry_topic, found.info.fps_nominal, 2048)
+        self._seq = -1
+        self.corrupt = 0
+
+    def take(self, message: LogMessage) -> Iterator[Frame]:
+        """Frames that are complete with this message."""
+        companion = next((each for each in (self._depth, self._odometry) if message.topic == each.topic), None)
+        try:
+            if companion is not None:
+                fields = message.decode()
+                companion.add(self._stamp_ns(message, fields), message.kind, fields)
+            elif message.topic == self._found.topic and message.kind in IMAGES:
+                self._add_picture(message)
+        except Exception as error:  # of a library, or SourceError: the message is damaged
+            self.corrupt += companion is None
+            _LOG.debug("a message on %s is left out: %s", message.topic, line_of(error))
+        while self._waiting and self._is_complete(message.log_ns):
+            yield self._complete()
+
+    def rest(self) -> Iterator[Frame]:
+        """Those that waited for more."""
+        while self._waiting:
+            yield self._complete()
+
+    def _add_picture(self, message: LogMessage) -> None:
+        fields = message.decode()
+        decoded, stamp_ns = self._decoder.decode(message.kind, fields), self._stamp_ns(message, fields)
+        if decoded is not None:
+            # numbers rise: as they were recorded, or counted on, as many recorders leave them 0
+            self._seq = max(message.sequence, self._seq + 1)
+            self._waiting.append((message.log_ns, Frame(image=decoded[0], stamp_ns=stamp_ns, seq=self._seq)))
+
+    def _stamp_ns(self, message: LogMessage, fields: Any) -> int:
+        stamp_ns = head_of(fields)[0] if self._found.header_stamps else message.sent_ns
+        if stamp_ns >= _LATEST_NS:
+            raise SourceError(f"a message states {stamp_ns} ns since 1970 as its time: it is damaged")
+        return stamp_ns
+
+    def _is_complete(self, now_ns: int) -> bool:
+        recorded_ns, frame = self._waiting[0]
+        has_come = all(each.topic is None or each.newest_ns >= frame.stamp_ns for each in (self._depth, self._odometry))
+        return has_come or len(self._waiting) > _MOST_WAITING or now_ns - recorded_ns > _WAIT_NS
+
+    def _complete(self) -> Frame:
+        _, frame = self._waiting.popleft()
+        depth, odometry = self._depth.take(frame.stamp_ns), self._odometry.take(frame.stamp_ns)
+        try:
+            if depth is not None:
+                frame = replace(frame, depth=clean_depth(depth_of(*depth), frame.image.shape[:2]))
+            if odometry is not None:
+                pose = odometry[1].pose.pose
+                world_from_body = pose_of(pose.position, pose.orientation)
+                frame = replace(frame, odometry=world_from_body @ self._found.body_from_camera)
+        except Exception as error:  # as above
+            _LOG.warning("frame %d goes without depth or odometry: %s", frame.seq, line_of(error))
+        return frame
+
+
+class _Nearest:
+    """The latest messages of a topic, to find the one that was stamped nearest to a picture."""
+
+    def __init__(self, topic: str | None, fps: float, most: int) -> None:
+        self.topic, self.newest_ns = topic, -1
+        self._half_ns = 0.5e9 / fps
+        self._kept: deque[tuple[int, str, Any]] = deque(maxlen=most)
+
+    def add(self, stamp_ns: int, kind: str, fields: Any) -> None:
+        """Keep one."""
+        self.newest_ns = stamp_ns
+        self._kept.append((stamp_ns, kind, fields))
+
+    def take(self, stamp_ns: int) -> tuple[str, Any] | None:
+        """Type and fields of the nearest, None if it is farther than half a frame period."""
+        while self._kept and self._kept[0][0] < stamp_ns - self._half_ns:
+            self._kept.popleft()
+        nearest = min(self._kept, key=lambda each: abs(each[0] - stamp_ns), default=None)
+        return None if nearest is None or abs(nearest[0] - stamp_ns) > self._half_ns else nearest[1:]
+
+
+@dataclass(slots=True)
+class _Topic:
+    """What was seen of one picture topic. Stamps in nanoseconds; reason: why a picture cannot be read."""
+
+    name: str
+    decoder: ImageDecoder = field(default_factory=ImageDecoder)
+    header_ns: list[int] = field(default_factory=list[int])
+    sent_ns: list[int] = field(default_factory=list[int])
+    frame_id: str = ""
+    size: tuple[int, int] = (0, 0)
+    codec: str = ""
+    reason: str = "none is whole"
+
+    def add(self, message: LogMessage) -> None:
+        """Count a message; pictures are decoded until one could be. Damaged ones do not count."""
+        if len(self.sent_ns) >= _MOST_STAMPS:
+            return
+        try:
+            fields = message.decode()
+            stamp_ns, self.frame_id = head_of(fields)
+            if not self.codec and (decoded := self.decoder.decode(message.kind, fields)) is not None:
+                self.size, self.codec = decoded[0].shape[1::-1], decoded[1]
+        except Exception as error:  # of a library, or SourceError: the message is damaged
+            self.reason = line_of(error)
+            return
+        self.header_ns.append(stamp_ns)
+        self.sent_ns.append(message.sent_ns)
+
+
+class _Survey:
+    """The first seconds of a log, or as much of it as it takes to find the pictures and what goes along with them.
+
+    topic: where the pictures are. header_stamps: their own stamps hold, else when they were sent. body_from_camera:
+    where the camera stands on what odometry speaks of.
+    """
+
+    def __init__(self, path: Path, topic: str | None, depth_topic: str | None, odometry_topic: str | None) -> None:
+        """See LogSource."""
+        self._path, self._wanted, self.depth_topic, self.odometry_topic = path, topic, depth_topic, odometry_topic
+        self._reader = LogReader(path, Deadline(_SEARCH_S))
+        self._topics: dict[str, _Topic] = {}
+        self._cameras, self._body, self._limit = Cameras(), "", ""
+        first_ns = None
+        try:
+            for message in self._reader.messages():
+                self._add(message)
+                first_ns = message.log_ns if first_ns is None else first_ns
+                if message.log_ns - first_ns > _SURVEYED_NS and self._is_enough():
+                    break
+        except LogLimitError as error:
+            self._limit = f"; {error}: cut it to the pictures: mcap filter LOG -y TOPIC -o NEW"
+        for name in (depth_topic, odometry_topic):
+            if name is not None and name not in self._reader.topics:
+                raise SourceError(f"{path} has no topic {name!r}; it has {_shown(self._reader.topics)}{self._limit}")
+        chosen = self._chosen()
+        self.topic = chosen.name
+        is_own = self._own("recording") is not None  # whose stamps may begin at 0
+        self.header_stamps = is_own or are_filled_in(chosen.header_ns)
+        self.info = self._describe(chosen)
+        self.body_from_camera = np.eye(4)
+        if odometry_topic is not None:
+            self.body_from_camera = self._cameras.body_from_camera(self._body, chosen.frame_id)
+
+    def _add(self, message: LogMessage) -> None:
+        try:
+            if message.kind in IMAGES and message.topic != self.depth_topic:
+                if message.topic in self._topics or len(self._topics) < _MOST_TOPICS:
+                    self._topics.setdefault(message.topic, _Topic(message.topic)).add(message)
+            elif message.kind == ODOMETRY and message.topic == self.odometry_topic:
+                self._body = self._body or message.decode().child_frame_id
+            else:
+                self._cameras.add(message)
+        except Exception as error:  # of a library, or SourceError: the message is damaged
+            _LOG.warning("a message on %s is left out: %s", message.topic, line_of(error))
+
+    def _own(self, key: str, name: str = _OWN) -> str | None:
+        """What a recording of this node says of itself."""
+        return self._reader.metadata.get(name, {}).get(key)
+
+    def _usable(self) -> list[_Topic]:
+        wanted = self._wanted or self._own("input_topic")
+        return [topic for name, topic in self._topics.items() if topic.codec and wanted in (None, name)]
+
+    def _is_enough(self) -> bool:
+        companions = all(each in (None, *self._reader.topics) for each in (self.depth_topic, self.odometry_topic))
+        return companions and any(len(topic.sent_ns) > 1 for topic in self._usable())
+
+    def _describe(self, chosen: _Topic) -> SourceInfo:
+        fps = rate_of(chosen.header_ns if self.header_stamps else chosen.sent_ns, f"{chosen.name} of {self._path}")
+        info = SourceInfo(
+            kind="mcap",
+            id=self._path.name,
+            width=chosen.size[0],
+            height=chosen.size[1],
+            fps_nominal=fps,
+            clock="replay",
+            codec=chosen.codec,
+            lens=self._cameras.lens(chosen.name, chosen.frame_id, chosen.size),
+            stamp_uncertainty_us=_HEADER_UNCERTAINTY_US if self.header_stamps else round(1e6 / fps),
+        )
+        return self._as_recorded(info) if chosen.name == self._own("input_topic") else info
+
+    def _as_recorded(self, info: SourceInfo) -> SourceInfo:
+        """With what was known of the source when it was recorded. A field of view is not made a lens of: that would be
+        another way to the model's picture."""
+        with contextlib.suppress(TypeError, ValueError):  # none was written, or by somebody else
+            info = replace(info, stamp_uncertainty_us=int(self._own("stamp_uncertainty_us", _OWN_SOURCE) or ""))
+        if self._own("calibrated", _OWN_SOURCE) == "yes":
+            return info
+        with contextlib.suppress(TypeError, ValueError):
+            hfov_deg = float(self._own("hfov_deg", _OWN_SOURCE) or "")
+            return replace(info, lens=None, hfov_deg=hfov_deg if 0 < hfov_deg < 180 else None)
+        return replace(info, lens=None)
+
+    def _chosen(self) -> _Topic:
+        usable, wanted = self._usable(), self._wanted or self._own("input_topic")
+        if len(usable) == 1:
+            return usable[0]
+        if usable:
+            names = _shown(topic.name for topic in usable)
+            raise SourceError(
+                f"{self._path} has pictures on {len(usable)} topics, {names}: say which with topic in [source]"
+            )
+        for topic in self._topics.values():
+            if wanted in (None, topic.name):
+                raise SourceError(
+                    f"{self._path}: no picture on {topic.name} can be decoded: {topic.reason}{self._limit}"
+                )
+        kinds = [f"{name} ({kind})" for name, kind in self._reader.topics.items()]
+        has = f"it has pictures on {_shown(self._topics)}" if self._topics else f"its topics are {_shown(kinds)}"
+        where = "" if wanted is None else f" on the topic {wanted!r}"
+        raise SourceError(f"{self._path} has no pictures{where}; {has}{self._limit}")
+
+
+def _shown(names: Iterable[str]) -> str:
+    """A few names, as a terminal can show them."""
+    return ", ".join(ascii(name[:_SHOWN])[1:-1] for name in sorted(names)[:_LISTED]) or "none"

@@ -1,0 +1,133 @@
+"""Frames that somebody else pushes: a camera that a ROS driver, LeRobot or a program of the user's own holds open.
+
+The node binds, whoever has frames connects (gcd_client.FramePusher; docs/cameras.md). Nothing that arrives is trusted.
+"""
+
+import logging
+import time
+
+import zmq
+
+from gcd_client.frames import PushedFrame, decode_frame
+from gcd_client.protocol import MAX_HEADER, MAX_PAYLOAD, PREFIX, ClientError, MessageError
+from gcd_node.auth import Context, EventSink, ServerSecurity, SocketGuard, unbind
+from gcd_node.binding import own_endpoint
+from gcd_node.errors import DepthError, SourceError, SourceLostError
+from gcd_node.frame import Frame, SourceInfo
+from gcd_node.sources.depth import DepthPicture, clean_depth
+from gcd_node.sources.live_camera import LiveCamera, SparingLog
+
+_LOG = logging.getLogger(__name__)
+_WAIT_MS = 100
+_QUEUED = 2
+_FARTHEST_NS = 10_000_000_000  # a stamp that is farther from now is of another clock
+_UNCERTAINTY_US = 10_000
+_SILENT_S = 0.5  # a pusher that is silent for so long has made way for another one
+_HINT = "start who pushes them, or correct endpoint in [source]; state fps there if they come slowly"
+
+
+def open_push(
+    endpoint: str,
+    *,
+    fps: float | None,
+    open_timeout_s: float,
+    security: ServerSecurity | None = None,
+    on_event: EventSink | None = None,
+) -> LiveCamera:
+    """The first who pushes frames, as a camera.
+
+    Args:
+        endpoint: to bind, "ipc" for the runtime folder. fps: None to measure it.
+        security: keys and clients of a tcp endpoint; only operators may push. on_event: gets AUTH_DENIED.
+    Raises:
+        SourceAbsentError: nobody pushed a frame in time. EndpointError, ConfigError: see SocketGuard.bind().
+        SetupError: no endpoint.
+    """
+    return LiveCamera(
+        f"the push source at {endpoint}",
+        lambda: _PushDriver(endpoint, fps, security, on_event),
+        open_timeout_s=open_timeout_s,
+        hint=_HINT,
+    )
+
+
+class _PushDriver:
+    """A bound socket as a Driver. Stamps arrive in UTC; the node's are of its monotonic clock."""
+
+    def __init__(
+        self, endpoint: str, fps: float | None, security: ServerSecurity | None, on_event: EventSink | None
+    ) -> None:
+        """Raises EndpointError, ConfigError, SetupError: see SocketGuard.bind()."""
+        self.fps, self.corrupt = fps, 0
+        self._pusher, self._heard_s = "", 0.0
+        self._refusals, self._depths = SparingLog(_LOG), SparingLog(_LOG)
+        context: Context = zmq.Context()
+        self._context, self._guard = context, SocketGuard(context, security, on_event)
+        try:
+            self._socket = context.socket(zmq.PULL)
+            self._socket.set(zmq.RCVHWM, _QUEUED)
+            self._socket.set(zmq.MAXMSGSIZE, PREFIX.size + MAX_HEADER + MAX_PAYLOAD)
+            self._endpoint = self._guard.bind(self._socket, own_endpoint(endpoint, "frames"), "frames")
+        except BaseException:
+            self._guard.close()
+            context.destroy(linger=0)
+            raise
+
+    def read(self) -> Frame | None:
+        """See Driver."""
+        self._guard.report_failures()
+        if not self._socket.poll(_WAIT_MS):
+            return None
+        parts = self._socket.recv_multipart(copy=False)
+        try:
+            if len(parts) != 1:
+                raise MessageError(f"a pushed frame is one part, got {len(parts)}")
+            return self._frame(decode_frame(parts[0].buffer))
+        except SourceLostError:
+            raise
+        except (ClientError, SourceError) as error:
+            self.corrupt += 1
+            self._refusals.warn(f"a pushed frame is refused: {error}")
+            return None
+
+    def describe(self, first: Frame, fps: float) -> SourceInfo:
+        """See Driver."""
+        return SourceInfo(
+            kind="push",
+            id=self._endpoint.rpartition("/")[2],
+            width=first.size[0],
+            height=first.size[1],
+            fps_nominal=fps,
+            clock="realtime",
+            stamp_uncertainty_us=_UNCERTAINTY_US,
+        )
+
+    def close(self) -> None:
+        """See Driver."""
+        unbind(self._socket, self._endpoint, 0)
+        self._guard.close()
+        self._context.destroy(linger=0)
+
+    def _frame(self, pushed: PushedFrame) -> Frame:
+        """Raises SourceError, MessageError: it is refused; SourceLostError: another camera takes over."""
+        late_ns = time.time_ns() - pushed.stamp_ns
+        if abs(late_ns) > _FARTHEST_NS:
+            raise MessageError(
+                f"its stamp is {late_ns / 1e9:.1f} s before now: stamps are UTC, as time.time_ns() gives them"
+            )
+        now_s = time.monotonic()
+        if pushed.pusher != self._pusher:
+            if self._pusher and now_s - self._heard_s < _SILENT_S:
+                raise MessageError("somebody else pushes frames here already: give each camera a node of its own")
+            if self._pusher:
+                raise SourceLostError("somebody else pushes frames from now on")
+            self._pusher = pushed.pusher
+        self._heard_s = now_s
+        depth: DepthPicture | None = None
+        try:
+            if pushed.depth is not None:
+                depth = clean_depth(pushed.depth, pushed.image.shape[:2])
+        except DepthError as error:
+            self._depths.warn(f"frame {pushed.seq} goes without its depth: {error}")
+        stamp_ns = time.monotonic_ns() - late_ns
+        return Frame(image=pushed.image, stamp_ns=stamp_ns, seq=pushed.seq, depth=depth, odometry=pushed.odometry)

@@ -1,0 +1,251 @@
+"""The views a node gives: what is asked for now, the path of each one's camera, and the end of its topics."""
+
+import threading
+from collections.abc import Callable, Mapping, Sequence, Set
+from dataclasses import dataclass, replace
+from typing import get_args
+
+import msgspec
+import torch
+
+from gcd_client.protocol import ViewKind, ViewMessage, view_topic
+from gcd_model import CameraMount, OptionError, Orbit, SphericalDelta, Traits, Trajectory
+from gcd_node.config import ModelSection, NodeConfig, PublishConfig, ViewConfig, pose_matrix
+from gcd_node.messages import Run, end_messages, published_kinds
+from gcd_node.preprocess import stated_sphere
+from gcd_node.publisher import MessageSink
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Settings:
+    """The configuration at one moment. revisions: of every view in it; each change of a view raises its own."""
+
+    config: NodeConfig
+    revisions: Mapping[str, int]
+
+
+class LiveConfig:
+    """Holds the configuration between the control thread that changes it and the model thread that follows it.
+
+    Nothing is checked here. A view that was removed may come back, and its revision goes on from where it was:
+    receivers drop older ones.
+    """
+
+    def __init__(self, config: NodeConfig) -> None:
+        self._lock = threading.Lock()
+        self._config = config
+        self._revisions = dict.fromkeys(config.view, 1)
+        self._removed: list[tuple[str, int]] = []
+
+    @property
+    def config(self) -> NodeConfig:
+        """In force now."""
+        with self._lock:
+            return self._config
+
+    @property
+    def known_views(self) -> tuple[str, ...]:
+        """Every view there is or has been."""
+        with self._lock:
+            return tuple(self._revisions)
+
+    def settings(self) -> Settings:
+        """In force now, with the revisions of its views."""
+        with self._lock:
+            return Settings(
+                config=self._config, revisions={view_id: self._revisions[view_id] for view_id in self._config.view}
+            )
+
+    def revision(self, view_id: str) -> int:
+        """Of a view there is or has been; 0 for others."""
+        with self._lock:
+            return self._revisions.get(view_id, 0)
+
+    def set_view(self, view_id: str, view: ViewConfig) -> int:
+        """Replace or add a view; gives its new revision."""
+        with self._lock:
+            self._revisions[view_id] = self._revisions.get(view_id, 0) + 1
+            self._config = msgspec.structs.replace(self._config, view={**self._config.view, view_id: view})
+            self._removed = [each for each in self._removed if each[0] != view_id]
+            return self._revisions[view_id]
+
+    def remove_view(self, view_id: str) -> None:
+        """Take a view out. Raises KeyError if it is not in."""
+        with self._lock:
+            left = dict(self._config.view)
+            del left[view_id]
+            self._config = msgspec.structs.replace(self._config, view=left)
+            self._removed.append((view_id, self._revisions[view_id]))
+
+    def change(self, model: ModelSection, publish: PublishConfig) -> None:
+        """Replace how views are drawn and how they are sent."""
+        with self._lock:
+            self._config = msgspec.structs.replace(self._config, model=model, publish=publish)
+
+    def take_removed(self) -> list[tuple[str, int]]:
+        """Views removed since the last call, with their last revision: their end is yet to be announced."""
+        with self._lock:
+            removed, self._removed = self._removed, []
+            return removed
+
+
+NANOSECONDS = 1_000_000_000
+
+
+class VirtualView:
+    """One configured virtual camera; an orbit remembers where it stands.
+
+    rev: counts changes of the view; receivers drop older ones.
+    """
+
+    def __init__(
+        self, view_id: str, config: NodeConfig, traits: Traits, mount: CameraMount | None = None, rev: int = 1
+    ) -> None:
+        """Check that the checkpoint can give it. mount: of the source camera, None for the trained one.
+
+        Raises:
+            ViewRangeError, ViewFixedError: it cannot. PoseError: no camera has that pose. OptionError: an impossible
+            orbit, or the motion number cannot be worked out and was not given; or places on a vehicle for a camera that
+            is declared on a sphere.
+        """
+        self.view_id, self.rev = view_id, rev
+        self._traits, self._mount, self._source = traits, mount, stated_sphere(config.source.pose)
+        self._move_time = traits.move_time if config.model.move_time is None else config.model.move_time
+        wanted = self._wanted = config.view[view_id]
+        self._goal = SphericalDelta(
+            azimuth_deg=wanted.azimuth_deg, elevation_deg=wanted.elevation_deg, radius_m=wanted.radius
+        )
+        self._orbit = _orbit(wanted)
+        self._newest: tuple[int, int] | None = None  # epoch and stamp of the last window
+        self._planned: tuple[SphericalDelta, Trajectory] | None = None  # most views stand still
+        self._check_reach()
+        if config.model.motion_bucket is None:
+            traits.motion_bucket(self.planned())
+
+    def trajectory(self, stamp_ns: int, epoch: int) -> Trajectory:
+        """The camera path for a window whose newest frame was captured at `stamp_ns`.
+
+        An orbit's destination goes on from the last window's by the time between them, and turns at its limit. Stamps
+        of different epochs cannot be compared: there it waits for one window. The same window may be asked for again.
+        """
+        if self._orbit is not None and self._newest is not None and self._newest[0] == epoch:
+            self._orbit = self._orbit.advanced((stamp_ns - self._newest[1]) / NANOSECONDS)
+        self._newest = (epoch, stamp_ns)
+        return self.planned()
+
+    def planned(self) -> Trajectory:
+        """The path to where the view is now; an orbit does not move on."""
+        goal = self._destination(self._orbit)
+        if self._planned is None or self._planned[0] != goal:
+            self._planned = (goal, self._plan(goal))
+        return self._planned[1]
+
+    def _destination(self, orbit: Orbit | None) -> SphericalDelta:
+        return self._goal if orbit is None else replace(self._goal, azimuth_deg=orbit.azimuth_deg)
+
+    def _plan(self, goal: SphericalDelta) -> Trajectory:
+        wanted, traits = self._wanted, self._traits
+        if wanted.position_m is not None and wanted.look_at_m is not None:
+            if self._source is not None:
+                raise OptionError(
+                    f"[view.{self.view_id}] position_m is counted from what the camera is mounted on: in [source.pose] "
+                    "state height_m and tilt_deg instead of elevation_deg and radius"
+                )
+            return traits.plan_placed(wanted.position_m, wanted.look_at_m, mount=self._mount)
+        if wanted.pose is not None:
+            pose = torch.tensor(pose_matrix(wanted.pose), dtype=torch.float64).view(4, 4)
+            return traits.plan_poses(pose.repeat(traits.config.frames, 1, 1), source=self._source)
+        own = traits.live and self._orbit is None and wanted.at_source
+        return traits.plan_view(
+            None if own else goal, source=self._source, move_time=self._move_time, mount=self._mount
+        )
+
+    def _check_reach(self) -> None:
+        """Raises ViewRangeError or ViewFixedError before the first window rather than in the middle of a run."""
+        self._plan(self._goal)
+        if self._orbit is not None:
+            for azimuth_deg in (-self._orbit.amplitude_deg, self._orbit.amplitude_deg):
+                self._plan(replace(self._goal, azimuth_deg=azimuth_deg))
+
+
+def _orbit(config: ViewConfig) -> Orbit | None:
+    if config.kind == "fixed" or config.rate_deg_s is None or config.amplitude_deg is None:
+        return None
+    return Orbit(rate_deg_s=config.rate_deg_s, amplitude_deg=config.amplitude_deg, azimuth_deg=config.azimuth_deg)
+
+
+class VirtualViews:
+    """The views a configuration names, made anew where a command has changed one. Belongs to one thread."""
+
+    def __init__(self, traits: Traits) -> None:
+        self._traits = traits
+        self._made: dict[str, tuple[CameraMount | None, VirtualView]] = {}
+
+    def following(self, settings: Settings, mount: CameraMount | None = None) -> list[VirtualView]:
+        """The views now; an orbit whose view has not changed goes on from where it was.
+
+        Raises: as VirtualView.
+        """
+        for view_id, rev in settings.revisions.items():
+            made = self._made.get(view_id)
+            if made is None or (made[0], made[1].rev) != (mount, rev):
+                self._made[view_id] = (mount, VirtualView(view_id, settings.config, self._traits, mount, rev))
+        return [self._made[view_id][1] for view_id in settings.revisions]
+
+
+_KINDS: tuple[ViewKind, ...] = get_args(ViewKind)
+
+
+class EndOfStream:
+    """Sends views, and ends every topic once: what is made of a view now, and what was made of it before a command
+    changed that."""
+
+    def __init__(self, live: LiveConfig, sink: MessageSink, run: Callable[[], Run]) -> None:
+        """run: what is known of the source now."""
+        self._live, self._sink, self._run = live, sink, run
+        self._open: set[str] = set()  # topics on which something was sent, and no end since
+        self._newest_goal: dict[str, tuple[int, int]] = {}
+        self.carried: Set[ViewKind] = frozenset()
+        """What the last window's views held of themselves."""
+
+    def send(self, messages: Sequence[ViewMessage]) -> None:
+        """What one view of one window came to. Left out: frames that an overlapping window has sent before."""
+        for message in messages:
+            if message.topic.endswith("/frm"):
+                moment = (message.header.src.epoch, message.header.src.seq[0])
+                if moment <= self._newest_goal.get(message.topic, (-1, -1)):
+                    continue
+                self._newest_goal[message.topic] = moment
+            self._sink.send(message)
+            self._open.add(message.topic)
+
+    def announce_due(self, last_window_id: int) -> None:
+        """End views that were taken out, and what is made of a view no more, such as deviations of a single sample."""
+        settings = self._live.settings()
+        for view_id, rev in self._live.take_removed():
+            self._end(view_id, rev, self._known(view_id, settings), last_window_id, delay_ms=0)
+        made = self._made(settings)
+        for view_id, rev in settings.revisions.items():
+            if gone := self._known(view_id, settings) - made:
+                self._end(view_id, rev, gone, last_window_id, delay_ms=0)
+
+    def announce_all(self, last_window_id: int, *, delay_ms: int | None) -> None:
+        """End everything. delay_ms: see MessageSink."""
+        self.announce_due(last_window_id)
+        settings = self._live.settings()
+        for view_id, rev in settings.revisions.items():
+            self._end(view_id, rev, self._made(settings), last_window_id, delay_ms=delay_ms)
+
+    def _made(self, settings: Settings) -> Set[ViewKind]:
+        return {*published_kinds(replace(self._run(), config=settings.config)), *self.carried}
+
+    def _known(self, view_id: str, settings: Settings) -> Set[ViewKind]:
+        """What is made of a view now, or was and has not ended."""
+        made = self._made(settings)
+        return {kind for kind in _KINDS if kind in made or view_topic(view_id, kind) in self._open}
+
+    def _end(self, view_id: str, rev: int, kinds: Set[ViewKind], last: int, *, delay_ms: int | None) -> None:
+        ordered = sorted(kinds, key=_KINDS.index)
+        for message in end_messages(self._run(), view_id, rev, last, ordered):
+            self._open.discard(message.topic)
+            self._sink.end(message, delay_ms=delay_ms)

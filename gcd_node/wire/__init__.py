@@ -1,1 +1,0 @@
-"""What a message says and how: headers, endpoints, JPEG tables. Nothing here opens a socket."""

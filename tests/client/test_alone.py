@@ -1,0 +1,61 @@
+"""The client installed alone, in a fresh environment, against a node's publisher and control socket."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from wire_messages import end, window
+
+from gcd_node.control.message import Command, Outcome
+from gcd_node.control.server import ControlOptions, ControlServer
+from gcd_node.publisher import Publisher
+from gcd_node.sockets import PublisherOptions
+
+CLIENT = Path(__file__).parents[2] / "client"
+LIGHTEST_IMPORT_S = 0.15
+PROGRAM = """
+import importlib.util, sys
+from gcd_client import ControlClient, ViewSubscriber
+data, control = sys.argv[1:]
+assert not any(importlib.util.find_spec(name) for name in ("torch", "cv2", "gcd_node", "gcd_model"))
+with ViewSubscriber(data, "top", conflate=False) as views:
+    print([(view.header.window_id, view.images.shape, int(view.images.sum())) for view in views])
+with ControlClient(control) as node:
+    print(node.call("views"))
+"""
+
+
+class Views:
+    """A node that knows one answer."""
+
+    def handle(self, command: Command, role: str) -> Outcome:
+        return Outcome(result={"verb": command.verb})
+
+
+@pytest.mark.slow
+def test_the_client_alone_reads_views_and_commands(tmp_path: Path) -> None:
+    python, clean = tmp_path / "venv" / "bin" / "python", {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    subprocess.run([sys.executable, "-m", "venv", tmp_path / "venv"], check=True, timeout=100)
+    subprocess.run([python, "-m", "pip", "install", "-q", CLIENT], check=True, timeout=300, env=clean)
+    options = PublisherOptions(data=f"ipc://{tmp_path}/d", status=None, lockstep=True, min_subscribers=1)
+    control = ControlOptions(endpoint=f"ipc://{tmp_path}/c")
+    with ControlServer(control, Views(), lambda: "active", print) as server, Publisher(options) as publisher:
+        command = [python, "-c", PROGRAM, publisher.endpoint, server.endpoint]
+        reader = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=clean, cwd=tmp_path)
+        message = window(4)
+        publisher.send(message)
+        publisher.end(end(window_id=4))
+        out, _ = reader.communicate(timeout=60)
+    assert out.splitlines() == [f"[(4, (2, 4, 6, 3), {sum(bytes(message.payload))})]", "{'verb': 'views'}"]
+    assert min(import_s(python, clean) for _ in range(7)) <= LIGHTEST_IMPORT_S
+
+
+def import_s(python: Path, environment: dict[str, str]) -> float:
+    """How long `import gcd_client` takes in a new process."""
+    command = [python, "-X", "importtime", "-c", "import gcd_client"]
+    told = subprocess.run(
+        command, capture_output=True, text=True, check=True, timeout=60, env=environment, cwd="/"
+    ).stderr
+    return int(told.splitlines()[-1].split("|")[1]) / 1e6

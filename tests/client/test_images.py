@@ -1,0 +1,111 @@
+"""Pixels of messages: raw, JPEG, class maps, visibility, inverse depth."""
+
+import math
+import random
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from wire_messages import CLASSES, class_map, depth, numbers, pixels, view_header, visibility, window
+
+from gcd_client.images import colours, decode_jpegs, depth_m, encode_jpegs, images, inverse_depth, payload_of
+from gcd_client.protocol import MessageError, ViewMessage, decode, encode
+
+
+def test_raw_images_are_the_received_bytes_and_read_only() -> None:
+    part = encode(window(images=pixels(5)))
+    shown = images(decode(part))
+    assert np.array_equal(shown, pixels(5))
+    assert np.shares_memory(shown, np.frombuffer(part, np.uint8))
+    with pytest.raises(ValueError, match="read-only"):
+        shown[0, 0, 0, 0] = 1
+
+
+def test_class_maps_and_visibility_are_numbers() -> None:
+    assert np.array_equal(images(class_map(5)), numbers(5)[..., None])
+    assert images(visibility(5)).tobytes() == bytes(visibility(5).payload)
+
+
+def test_inverse_depth_and_metres_agree() -> None:
+    message = depth(5)
+    inverse, metres = inverse_depth(message), depth_m(message)
+    assert np.array_equal(inverse, np.frombuffer(message.payload, "<f2").reshape(2, 4, 6))
+    assert np.array_equal(np.isnan(metres), inverse == 0)
+    assert np.allclose((metres * inverse)[inverse > 0], 1)
+    with pytest.raises(MessageError):
+        images(message)
+    with pytest.raises(MessageError):
+        inverse_depth(window())
+
+
+@pytest.mark.parametrize("value", [-1.0, math.nan, math.inf])
+def test_a_depth_that_is_none_is_refused(value: float) -> None:
+    with pytest.raises(MessageError, match="finite and not negative"):
+        inverse_depth(depth(inverse=np.array([[[0.5, value]]], "<f2")))
+
+
+def test_nearer_is_brighter_and_no_depth_is_black() -> None:
+    shown = colours(depth(inverse=np.array([[[0, 0.005, 0.1, 1, 65504]]], "<f2")))[0, 0, :, 0]
+    assert (np.diff(shown.astype(int)) > 0).all()
+    assert shown[0] == 0
+
+
+def test_a_class_map_is_shown_in_the_colours_of_its_ontology() -> None:
+    drawn = np.array([[[0, 1, 7], [7, 7, 0]]], np.uint8)
+    shown = colours(class_map(drawn=drawn))
+    of = {each.id: each.colour for each in CLASSES}
+    assert [[tuple(pixel) for pixel in row] for row in shown[0].tolist()] == [[of[n] for n in row] for row in drawn[0]]
+    with pytest.raises(MessageError, match="got 2"):
+        colours(class_map(drawn=np.array([[[0, 1, 2]]], np.uint8)))
+
+
+def test_pictures_are_shown_as_they_are_and_grey_levels_as_grey() -> None:
+    assert np.array_equal(colours(window(images=pixels(2))), pixels(2))
+    grey = pixels(3, channels=1)
+    message = ViewMessage(topic="view/top/win", header=view_header(shape=grey.shape), payload=payload_of(grey))
+    assert np.array_equal(colours(message), np.repeat(grey, 3, axis=-1))
+
+
+# JPEG
+
+
+def smooth() -> np.ndarray:
+    rows, columns = np.mgrid[0:48, 0:64]
+    frame = np.stack([rows * 5, columns * 3, 255 - rows * 2], axis=-1).clip(0, 255).astype(np.uint8)
+    return np.stack([frame, frame[::-1]])
+
+
+def jpeg_message(width: int = 64) -> ViewMessage:
+    payload, offsets = encode_jpegs(smooth(), 90)
+    header = replace(view_header(shape=(2, 48, width, 3)), encoding="jpeg", offsets=offsets)
+    return ViewMessage(topic="view/top/win", header=header, payload=payload)
+
+
+def test_jpeg_frames_keep_their_colours_and_order() -> None:
+    shown = images(decode(encode(jpeg_message())))
+    assert np.abs(shown.astype(int) - smooth()).mean() < 2
+    assert not shown.flags.writeable
+
+
+def test_a_jpeg_of_another_size_is_refused_before_it_is_decoded() -> None:
+    with pytest.raises(MessageError, match=r"\(48, 60\), got \(48, 64\)"):
+        images(jpeg_message(width=60))
+
+
+@pytest.mark.parametrize("coded", [b"", b"\xff\xd8", b"\xff\xd8\xff\xe0\x00\x00" * 9, b"\x89PNG" + bytes(99)])
+def test_what_is_no_jpeg_is_refused(coded: bytes) -> None:
+    with pytest.raises(MessageError):
+        decode_jpegs(coded, (0, len(coded)), (1, 48, 64, 3))
+
+
+def test_damaged_jpegs_raise_nothing_but_message_errors() -> None:
+    message, chance = jpeg_message(), random.Random(3)
+    for _ in range(60):
+        payload = bytearray(message.payload)
+        for _ in range(20):
+            payload[chance.randrange(700)] = chance.randrange(256)
+        try:
+            shown = images(replace(message, payload=bytes(payload)))
+        except MessageError:
+            continue
+        assert shown.shape == (2, 48, 64, 3)

@@ -1,0 +1,376 @@
+"""Messages as bytes: round trips, the layout, and what a hostile sender can do (nothing but MessageError)."""
+
+import json
+import random
+import struct
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from wire_messages import class_map, depth, end, origin, pixels, view_header, visibility, window
+
+from gcd_client.images import payload_of
+from gcd_client.protocol import (
+    MAGIC,
+    PREFIX,
+    EndMessage,
+    Message,
+    MessageError,
+    StatusMessage,
+    ViewMessage,
+    decode,
+    encode,
+    topic_key,
+    view_topic,
+)
+
+PAGE = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text()
+
+
+def spread() -> ViewMessage:
+    grey = pixels(channels=1)
+    header = replace(view_header(shape=grey.shape), scale=0.125)
+    return ViewMessage(topic="view/top/std", header=header, payload=payload_of(grey))
+
+
+def jpeg(offsets: tuple[int, ...] = (0, 40, 100)) -> ViewMessage:
+    header = replace(view_header(), encoding="jpeg", offsets=offsets)
+    return ViewMessage(topic="view/top/win", header=header, payload=bytes(100))
+
+
+def status(fields: Mapping[str, Any]) -> StatusMessage:
+    return StatusMessage(topic="status", header=origin(), fields=fields)
+
+
+def unknown_camera() -> ViewMessage:
+    header = replace(view_header(), pose=None, source_from_view=None, src_pose=None, intrinsics=None)
+    return ViewMessage(topic="view/top/win", header=header, payload=payload_of(pixels()))
+
+
+MESSAGES: dict[str, Message] = {
+    "win": replace(window(3), sequence=2**63 + 5),
+    "frm": window(3, kind="frm"),
+    "std": spread(),
+    "cls": class_map(5),
+    "vis": visibility(5),
+    "depth": depth(5),
+    "jpeg": jpeg(),
+    "no camera": unknown_camera(),
+    "end": end(window_id=9),
+    "status": status({"state": "active", "reasons": ["SRC_LOST"], "level": 2, "t_infer_start": "any field is allowed"}),
+}
+
+
+def split(part: bytes) -> tuple[dict[str, Any], bytes]:
+    """Header and payload of a message."""
+    start = 64 + 16 * struct.unpack_from("<H", part, 36)[0]
+    return json.loads(part[64:start]), part[start:]
+
+
+def raw(header: bytes, payload: bytes = b"", *, topic: bytes = b"view/top/win", flags: int = 5) -> bytes:
+    """A message of any content, with a right checksum."""
+    header = header.ljust(-(-len(header) // 16) * 16)
+    crc = zlib.crc32(header + payload)
+    return PREFIX.pack(topic, MAGIC, len(header) // 16, flags, len(payload), 0, crc, 0) + header + payload
+
+
+def changed(message: ViewMessage, changes: Mapping[str, Any], *, removed: str = "") -> bytes:
+    """The message with other header values."""
+    header, payload = split(encode(message))
+    header = {key: value for key, value in (header | changes).items() if key != removed}
+    return raw(json.dumps(header).encode(), payload, topic=message.topic.encode())
+
+
+def is_refused(part: bytes) -> bool:
+    try:
+        decode(part)
+    except MessageError:
+        return True
+    return False
+
+
+# Laws
+
+
+@pytest.mark.parametrize("name", MESSAGES)
+def test_a_message_survives_the_round_trip(name: str) -> None:
+    assert decode(encode(MESSAGES[name])) == MESSAGES[name]
+
+
+@pytest.mark.parametrize("message", [window(), class_map(), visibility(), depth()], ids=lambda message: message.topic)
+@pytest.mark.parametrize("kind", ["win", "frm", "cls", "vis", "depth"])
+def test_pixels_of_one_kind_are_never_taken_for_another(message: ViewMessage, kind: str) -> None:
+    alike = [{"win", "frm"}, {"cls", "vis"}, {"depth"}]  # by encoding
+    fits = any({message.topic.rpartition("/")[2], kind} <= kinds for kinds in alike)
+    part = encode(message)
+    assert fits != is_refused(f"view/top/{kind}".encode().ljust(32, b"\0") + part[32:])
+
+
+@pytest.mark.parametrize("checked", [True, False])
+def test_damage_anywhere_raises_nothing_but_message_errors(checked: bool) -> None:
+    chance, whole, refused = random.Random(20), encode(window()), 0
+    for _ in range(1500):
+        part = bytearray(whole)
+        for _ in range(chance.choice((1, 1, 2, 8))):
+            part[chance.randrange(len(part))] ^= 1 << chance.randrange(8)
+        if not checked:
+            part[56:60] = bytes(4)  # no checksum: the header's own checks must hold
+        refused += is_refused(bytes(part))
+    assert refused > (1200 if checked else 300)
+
+
+def test_truncation_anywhere_is_refused() -> None:
+    whole = encode(window())
+    assert all(is_refused(whole[:length]) for length in range(len(whole)))
+    assert is_refused(whole + b"\0")
+
+
+@pytest.mark.parametrize("message", [window(), class_map(), jpeg()], ids=lambda message: message.header.encoding)
+def test_foreign_values_in_any_header_field_raise_nothing_but_message_errors(message: ViewMessage) -> None:
+    foreign = [None, True, -1, 0, 2**70, 10**400, 1e308, "", "\ud800", [], {}, [[]], [None], [[1, 2]], [1] * 14]
+    for key in split(encode(message))[0]:
+        for value in foreign:
+            is_refused(changed(message, {key: value}))  # any other exception fails the test
+
+
+# The layout, byte by byte
+
+
+def test_the_prefix_lies_where_the_protocol_says() -> None:
+    part = encode(replace(window(), sequence=258))
+    length = 16 * int.from_bytes(part[36:38], "little")
+    assert part[:32] == b"view/top/win".ljust(32, b"\0")
+    assert part[32:36] == b"GCD1"
+    assert int.from_bytes(part[38:40], "little") == 0b101
+    assert int.from_bytes(part[40:48], "little") == 2 * 4 * 6 * 3
+    assert int.from_bytes(part[48:56], "little") == 258
+    assert int.from_bytes(part[56:60], "little") == zlib.crc32(part[64:])
+    assert part[60:64] == bytes(4)
+    assert part[64 + length :] == pixels().tobytes()
+
+
+def test_the_header_names_every_field_of_the_protocol() -> None:
+    names = (
+        "proto node_id boot_id view_id view_rev window_id t_capture t_capture_unc_us clock t_infer_start t_infer_end "
+        "t_publish age_ms valid_for_ms src frame_id src_frame_id pose T_src_dst pose_units src_pose frame_role K "
+        "distortion shape layout dtype encoding range synthetic quality model cfg_digest"
+    )
+    header, _ = split(encode(window()))
+    assert set(names.split()) == set(header)
+    assert header["t_capture"][1] == [1_700_000_000, 100_000_001]
+    assert header["pose"][1] == {"az_deg": 3.0, "el_deg": 1.5, "r": 0.0}
+
+
+def test_checksum_reserved_bytes_and_unknown_flags_may_be_anything_a_later_minor_makes_of_them() -> None:
+    message = window()
+    part = bytearray(encode(message))
+    part[56:64] = bytes(4) + b"abcd"
+    part[39] |= 0x80
+    assert decode(bytes(part)) == message
+
+
+def test_unknown_header_keys_and_a_newer_minor_are_ignored() -> None:
+    message = window()
+    decoded = decode(changed(message, {"proto": "gcd/1.7", "novelty": {"deep": [1]}}))
+    assert decoded.header == replace(message.header, proto="gcd/1.7")
+
+
+def test_no_topic_key_is_a_prefix_of_another() -> None:
+    keys = {topic_key(name) for name in ("view/top/win", "view/topdown/win", "view/top2/win", "view/top/frm", "meta")}
+    assert [len(key) for key in keys] == [32] * 5
+
+
+# What is refused
+
+CLASS = {"id": 1, "name": "a", "colour": [0, 0, 0]}
+BAD_HEADERS: list[tuple[ViewMessage, dict[str, Any]]] = [
+    *(
+        (window(), changes)
+        for changes in (
+            {"proto": "gcd/2.0"},
+            {"proto": 1},
+            {"boot_id": "xyz"},
+            {"boot_id": "A" * 32},
+            {"shape": [3, 4, 6, 3]},
+            {"shape": [2, 4, 7, 3]},
+            {"shape": [2, 4, 6]},
+            {"shape": [2, -4, -6, 3]},
+            {"shape": [2, 4, 6, 1]},
+            {"shape": [2.0, 4, 6, 3]},
+            {"encoding": "png"},
+            {"encoding": "jpeg"},
+            {"encoding": "class8"},
+            {"encoding": "invdepth16"},
+            {"offsets": [0, 1, 2]},
+            {"dtype": "f32"},
+            {"dtype": "f16"},
+            {"view_id": "side"},
+            {"view_rev": 1.5},
+            {"view_rev": 1.0},
+            {"view_rev": True},
+            {"view_rev": "1"},
+            {"window_id": 2**53},
+            {"window_id": -(2**53)},
+            {"age_ms": 2**53},
+            {"age_ms": True},
+            {"age_ms": "1.0"},
+            {"t_publish": [1, 10**9]},
+            {"t_publish": [1, -1]},
+            {"t_publish": [2**53, 0]},
+            {"t_publish": [1.0, 0]},
+            {"t_publish": [1, 0, 0]},
+            {"t_publish": 1_700_000_000},
+            {"t_capture": [[1, 2, 3], [4, 5]]},
+            {"t_capture": [[1, 2]] * 3},
+            {"src": []},
+            {"src": {"kind": "file"}},
+            {"clock": "sundial"},
+            {"frame_role": ["at_goal"]},
+            {"frame_role": ["at_goal", "lost"]},
+            {"K": [1.0]},
+            {"K": [1.0] * 8 + [None]},
+            {"T_src_dst": [[1.0] * 16, [1.0]]},
+            {"T_src_dst": [[1.0] * 16]},
+            {"pose": []},
+            {"range": [0]},
+            {"synthetic": 1},
+            {"distortion": None},
+            {"node_id": "a\nb"},
+            {"node_id": "\ud800"},
+            {"frame_id": "\u2028"},
+            {"quality": {"nan_frames": 0, "ood": ["f\0s"], "steps": 1, "seed": 1}},
+            {"classes": [CLASS]},
+        )
+    ),
+    *(
+        (class_map(), {"classes": classes})
+        for classes in (
+            None,
+            [],
+            {},
+            [CLASS, CLASS],
+            [CLASS | {"id": 256}],
+            [CLASS | {"id": -1}],
+            [CLASS | {"colour": [0, 0, 256]}],
+            [CLASS | {"colour": [0, 0]}],
+            [CLASS | {"name": "\x7f"}],
+            [{"id": 1, "name": "a"}],
+        )
+    ),
+    (spread(), {"scale": None}),
+    *(
+        (jpeg(), {"offsets": offsets})
+        for offsets in ([0, 5], [1, 5, 100], [0, 100, 100], [0, 101, 100], [-5, 0, 100], [], [0, 5, 10**9], None)
+    ),
+]
+
+
+@pytest.mark.parametrize(("message", "changes"), BAD_HEADERS, ids=[str(changes)[:50] for _, changes in BAD_HEADERS])
+def test_a_wrong_header_value_is_refused(message: ViewMessage, changes: dict[str, Any]) -> None:
+    with pytest.raises(MessageError):
+        decode(changed(message, changes))
+
+
+@pytest.mark.parametrize("key", ["proto", "window_id", "t_publish", "t_capture", "src", "shape", "cfg_digest"])
+def test_a_missing_header_key_is_refused(key: str) -> None:
+    with pytest.raises(MessageError):
+        decode(changed(window(), {}, removed=key))
+
+
+HEADER_TEXTS = [
+    *(b"", b"[]", b"1", b"null", b"{", b"\xff\xfe", b'{"a": "\xff"}', b"[" * 60_000, b'{"a":' * 12_000),
+    *(b'{"age_ms": NaN}', b'{"zzz": Infinity}', b'{"age_ms": 1e999}', b'{"age_ms": ' + b"9" * 5000 + b"}"),
+    b'{"zzz": ' + b"9" * 5000 + b"}",
+]
+
+
+@pytest.mark.parametrize("text", HEADER_TEXTS, ids=lambda text: text[:20])
+@pytest.mark.parametrize("topic", [b"view/top/win", b"status"])
+def test_a_header_that_is_no_json_object_is_refused(text: bytes, topic: bytes) -> None:
+    header = json.dumps(split(encode(window()))[0]).encode()
+    whole = text if not text.startswith(b'{"') else header[:-1] + b", " + text[1:]
+    with pytest.raises(MessageError):
+        decode(raw(whole, topic=topic, flags=0 if topic == b"status" else 5))
+
+
+def test_an_error_says_what_came_in_one_short_printable_line() -> None:
+    with pytest.raises(MessageError) as caught:
+        decode(changed(window(), {"clock": "\x1b[31m" + "x" * 50_000}))
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 400
+
+
+def test_another_magic_and_a_damaged_payload_are_refused() -> None:
+    for at in (35, -1):
+        part = bytearray(encode(window()))
+        part[at] ^= 1
+        assert is_refused(bytes(part))
+
+
+def test_sizes_are_bounded_before_anything_is_read() -> None:
+    assert is_refused(PREFIX.pack(b"view/top/win", MAGIC, 65535, 5, 0, 0, 0, 0))
+    assert is_refused(PREFIX.pack(b"view/top/win", MAGIC, 0, 5, 2**64 - 1, 0, 0, 0))
+    with pytest.raises(MessageError, match="max_payload"):
+        decode(encode(window()), max_payload=100)
+
+
+@pytest.mark.parametrize(
+    "topic",
+    [
+        *(b"", b"view/top", b"view/Top/win", b"view/top/win/", b"view//win", b"view/abcdefghijklmnopq/win"),
+        *(b"src/win", b"view/src/frm", b"view/top/win\0x", b"\xffiew/top/win", b"control"),
+    ],
+)
+def test_a_topic_outside_the_protocol_is_refused(topic: bytes) -> None:
+    header, payload = split(encode(window()))
+    assert is_refused(raw(json.dumps(header).encode(), payload, topic=topic))
+
+
+@pytest.mark.parametrize("flags", [0, 1, 2, 4, 3, 6, 7])
+def test_flags_that_contradict_the_content_are_refused(flags: int) -> None:
+    header, payload = split(encode(window()))
+    assert is_refused(raw(json.dumps(header).encode(), payload, flags=flags))
+
+
+@pytest.mark.parametrize("view_id", ["", "Top", "a" * 17, "a-b", "a/b", "é", "src", "a\n"])
+def test_a_view_id_outside_the_alphabet_is_refused(view_id: str) -> None:
+    with pytest.raises(MessageError, match="view id"):
+        view_topic(view_id, "win")
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        ViewMessage(topic="view/top/win", header=replace(view_header(), age_ms=float("nan")), payload=bytes(144)),
+        ViewMessage(topic="view/top/win", header=replace(view_header(), age_ms=np.float32(1)), payload=bytes(144)),
+        status({"fps": float("inf")}),
+        status({"fps": object()}),
+        status({"text": "x" * 70_000}),
+    ],
+    ids=["NaN", "foreign number", "infinite", "object", "too long"],
+)
+def test_what_a_header_cannot_hold_is_refused_when_encoding(message: Message) -> None:
+    with pytest.raises(MessageError):
+        encode(message)
+
+
+# The page other languages are written from
+
+
+def test_the_protocol_page_names_every_header_key() -> None:
+    header = split(encode(jpeg()))[0]
+    nested = [*header["src"], *header["quality"], *header["model"], *header["pose"][0], *header["src_pose"]]
+    classes = split(encode(class_map()))[0]["classes"]
+    assert [key for key in (*header, *nested, "scale", "classes", *classes[0]) if f"`{key}`" not in PAGE] == []
+
+
+def test_the_example_on_the_protocol_page_is_a_message() -> None:
+    part = bytes.fromhex(PAGE.split("```hex")[1].split("```")[0])
+    message = decode(part)
+    assert isinstance(message, EndMessage)
+    assert (message.topic, message.sequence, message.header.window_id) == ("view/top/win", 3, 2)
+    assert encode(message) == part

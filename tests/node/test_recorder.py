@@ -1,0 +1,398 @@
+"""How recordings begin, end, rotate and play again; what they survive, and what they never touch: the stream."""
+
+import errno
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cameras import FPS, Bench, Camera, until
+from fakes import HEIGHT, WIDTH, Box, FakeSource, painting_traits
+from recordings import (
+    LENS,
+    SECOND_NS,
+    Calibrated,
+    attachments,
+    files,
+    metadata,
+    of,
+    recorded,
+    recorder_config,
+    replayed,
+    said,
+    salvaged,
+    summary,
+)
+from rig import Rig
+from wire_messages import origin
+
+import gcd_node
+from gcd_client.control import Code
+from gcd_node import recorder as recorder_module
+from gcd_node.config import parse_config
+from gcd_node.errors import ConfigError
+from gcd_node.frame import Frame, SourceInfo
+from gcd_node.health import Level
+from gcd_node.mcap_file import McapFile
+from gcd_node.recorder import Recorder
+from gcd_node.ros_messages import note_messages
+from gcd_node.sources.logs import LogSource
+
+pytestmark = pytest.mark.timeout(180)
+
+LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
+RAW = 'input_encoding = "raw"'
+START_S = 120.0  # what a busy machine may take to start a process
+
+
+class Steady(FakeSource):
+    """Noise at its rhythm until it is closed."""
+
+    def __init__(self) -> None:
+        super().__init__(10_000_000)
+        self.period_s = 0.005
+
+    def frames(self) -> Iterator[Frame]:
+        draw = np.random.default_rng(0)
+        for frame in super().frames():
+            image = draw.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+            yield Frame(image=image, stamp_ns=frame.stamp_ns, seq=frame.seq)
+
+
+def hashes(box: Box, kind: str = "win") -> list[str]:
+    return [hashlib.sha256(each.payload).hexdigest() for each in box.of(kind)]
+
+
+def section(folder: Path, more: str = "") -> str:
+    return f'record = {{folder = "{folder}", keep_free_mb = 0{more}}}'
+
+
+def ended(box: Box) -> dict[str, object]:
+    """The event that says how a recording ended."""
+    (fields,) = [dict(fields) for topic, fields in box.notes if topic == "event" and fields["code"] == "REC_STOPPED"]
+    return fields
+
+
+# --- a node that lives -------------------------------------------------------------------------------------------
+
+
+def test_a_live_node_records_from_start_to_stop_and_says_so(tmp_path: Path) -> None:
+    camera, folder = Camera(), tmp_path / "recordings"
+    with Rig(tmp_path, Bench(camera), more=section(folder)) as rig:
+        rig.await_state("active")
+        camera.run(3)  # before anybody records
+        assert rig.ask("record_stop").code is Code.WRONG_STATE
+        assert rig.try_out("record_start").code is Code.OK
+        assert not folder.exists()
+        assert rig.ask("record_start").code is Code.ACCEPTED
+        begun = rig.await_event("REC_STARTED")
+        assert rig.ask("record_start").code is Code.WRONG_STATE
+        camera.run(28)
+        rig.await_views(2)
+        status = rig.await_status(lambda status: status["rec"].get("written", 0) >= 2 * 28)
+        rig.ask("set_view", {"view": "main", "azimuth_deg": 20.0})
+        rig.ask("set_view", {"view": "main", "azimuth_deg": 900.0})
+        rig.ask("state")
+        assert rig.ask("record_stop").code is Code.ACCEPTED
+        stopped = rig.await_event("REC_STOPPED")
+        assert rig.ask("record_start").code is Code.ACCEPTED
+        rig.await_event("REC_STARTED", 2)
+    first, second = files(folder)
+    assert begun["file"] == f"{first.parent.name}/{first.name}"
+    assert (status["rec"]["state"], status["rec"]["file"]) == ("recording", begun["file"])
+    assert status["rec"]["dropped"] == {}
+    assert (stopped["reason"], stopped["finished"], stopped["level"]) == ("ASKED", True, 0)
+    heard = said(first)
+    assert (stopped["bytes"], stopped["written"]) == (first.stat().st_size, len(heard))
+    assert [each.sequence for each in of(heard, "/src/image")][-28:] == list(range(3, 31))
+    told = [(each.told["verb"], each.told["role"], each.told["code"]) for each in of(heard, "/gcd/command")]
+    assert told == [  # no questions
+        ("record_start", "operator", "ACCEPTED"),
+        ("record_start", "operator", "WRONG_STATE"),
+        ("set_view", "operator", "OK"),
+        ("set_view", "operator", "OUT_OF_RANGE"),
+    ]
+    assert of(heard, "/gcd/command")[-1].told["args"] == {"view": "main", "azimuth_deg": 900.0}
+    assert "VIEW_SET" in [each.told["code"] for each in of(heard, "/gcd/event")]
+    assert rig.events("REC_STOPPED")[1]["reason"] == "SHUTDOWN"
+    assert said(second)
+
+
+def test_live_frames_are_stamped_with_the_time_of_their_capture(tmp_path: Path) -> None:
+    camera, folder = Camera(), tmp_path / "recordings"
+    before_ns = time.time_ns()
+    with Rig(tmp_path, Bench(camera), more=section(folder, ", autostart = true")) as rig:
+        rig.await_state("active")
+        camera.run(15)
+        rig.await_views(1)
+        captured_ns = rig.of()[0].header.t_capture_ns
+    after_ns = time.time_ns()
+    heard = said(files(folder)[0])
+    inputs, views = of(heard, "/src/image"), of(heard, "/view/main/image")
+    assert all(before_ns <= each.stamp_ns == each.log_ns <= after_ns for each in inputs)
+    steps = {later.stamp_ns - earlier.stamp_ns for earlier, later in pairwise(inputs)}
+    assert all(abs(step - SECOND_NS / FPS) <= 1_000_000 for step in steps)
+    assert [each.stamp_ns for each in views] == list(captured_ns)
+    by_number = {each.sequence: each.stamp_ns for each in inputs}
+    assert all(abs(each.stamp_ns - by_number[each.sequence]) <= 2_000_000 for each in views)  # two looks at the clock
+
+
+def test_settings_that_cannot_be_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="state the folder"):
+        parse_config(b'[source]\nkind="synthetic"\n[model]\nweights="fake"\n[view.a]\n[record]\nautostart=true', "t")
+    with pytest.raises(ConfigError, match=r"at least 0\.1 MB"):
+        recorder_config(tmp_path, record="rotate_mb = 0.01")
+    with pytest.raises(ConfigError, match=r"no record\.notes any more: .*std_msgs/String"):
+        recorder_config(tmp_path, record='notes = "json"')
+
+
+# --- files -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def rotated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Box]:
+    folder = tmp_path_factory.mktemp("rotated")
+    _, box = recorded(recorder_config(folder, record=f"{RAW}\nrotate_mb = 0.6"), Calibrated(45))
+    return folder, box
+
+
+def test_every_file_of_a_recording_that_rotated_can_be_read_alone(rotated: tuple[Path, Box]) -> None:
+    folder, box = rotated
+    found = files(folder)
+    assert len(found) >= 3
+    numbers: list[int] = []
+    for part, path in enumerate(found):
+        heard = said(path)
+        assert metadata(path)["gcd-node"]["part"] == str(part)
+        assert metadata(path)["gcd-node/source"]["calibrated"] == "yes"
+        assert "config.toml" in attachments(path)
+        assert path.stat().st_size < 1_500_000
+        if part > 0:
+            assert metadata(path)["gcd-node/weights"]["name"] == "fake"
+            assert of(heard, "/gcd/meta")[0].told["weights"]["name"] == "fake"
+        images = [each.sequence for each in of(heard, "/src/image")]
+        assert images == [each.sequence for each in of(heard, "/src/camera_info")]
+        numbers += images
+        assert len(of(heard, "/view/main/image")) == 14 * len(of(heard, "/view/main/header"))  # windows whole
+    assert numbers == list(range(45))
+    told = [fields for topic, fields in box.notes if topic == "event" and fields["code"] == "REC_ROTATED"]
+    assert [fields["file"] for fields in told] == [f"{path.parent.name}/{path.name}" for path in found[1:]]
+
+
+# --- playing again -----------------------------------------------------------------------------------------------
+
+
+def test_a_folder_plays_all_parts_of_its_recording_as_the_source_gave_them(rotated: tuple[Path, Box]) -> None:
+    folder, box = rotated
+    recording = files(folder)[0].parent
+    source, again = replayed(recording)
+    assert hashes(again) == hashes(box)
+    assert len(hashes(again)) == 3
+    captured = [[message.header.t_capture_ns for message in each.of("win")] for each in (again, box)]
+    assert captured[0] == captured[1]
+    assert (source.info.id, source.info.lens) == (recording.name, LENS)
+
+
+def test_a_raw_recording_gives_the_same_payloads_every_time(tmp_path: Path) -> None:
+    _, box = recorded(recorder_config(tmp_path, record=RAW), FakeSource(30, fps=10.0), painting_traits())
+    (path,) = files(tmp_path)
+    runs = [replayed(path, painting_traits())[1] for _ in range(2)]
+    for kind in ("win", "cls"):
+        assert hashes(runs[0], kind) == hashes(runs[1], kind) == hashes(box, kind) != []
+
+
+def test_the_input_is_played_though_there_are_views_and_a_view_where_it_is_named(tmp_path: Path) -> None:
+    recorded(recorder_config(tmp_path / "a"), Calibrated(14))
+    assert replayed(files(tmp_path)[0])[0].info.width == 192
+    view, _ = replayed(files(tmp_path)[0], source='topic = "/view/main/image"')
+    assert (view.info.width, view.info.lens is None) == (96, False)  # through its own camera
+    recorded(recorder_config(tmp_path / "b", record='what = ["views"]'), FakeSource(14))
+    assert replayed(files(tmp_path / "b")[0])[0].info.width == 96  # the only pictures there are
+
+
+# --- kill -9, full disks -----------------------------------------------------------------------------------------
+
+
+def test_after_kill_9_everything_written_is_readable_and_plays(tmp_path: Path) -> None:
+    tests = str(Path(__file__).parent)
+    paths = f"{Path(gcd_node.__file__).parent.parent}:{tests}:{os.environ.get('PYTHONPATH', '')}"
+    command = [sys.executable, f"{tests}/recording_process.py", str(tmp_path), "40"]
+    recorder = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": paths})
+    try:
+        assert recorder.stdout is not None
+        assert recorder.stdout.readline() == "written\n"
+    finally:
+        recorder.send_signal(signal.SIGKILL)
+        recorder.communicate(timeout=START_S)
+    (path,) = files(tmp_path)
+    found = salvaged(path, "/src/image")
+    assert len(found) >= 40
+    assert found == list(range(len(found)))  # nothing is missing before the end
+    for place in (path, path.parent):
+        assert [frame.seq for frame in LogSource(place).frames()][: len(found)] == found
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 4 MB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", str(place)]
+    if subprocess.run(command, capture_output=True, check=False).returncode != 0:
+        pytest.skip("mounting a small disk needs root (CAP_SYS_ADMIN)")
+    yield place
+    subprocess.run(["umount", "-l", str(place)], check=True)
+
+
+def test_f22_a_full_disk_ends_the_recording_with_a_readable_file_and_the_stream_goes_on(
+    tmp_path: Path, small_disk: Path
+) -> None:
+    more = f'record = {{folder = "{small_disk}/here", keep_free_mb = 0, autostart = true, input_encoding = "raw"}}'
+    with Rig(tmp_path, lambda _: Steady(), config=LOCKSTEP, more=more, keep=False) as rig:
+        stopped = rig.await_event("REC_STOPPED")
+        status = rig.await_status(lambda status: "REC_FAILED" in status["reasons"])
+        rig.await_views(len(rig.of()) + 2)
+        assert rig.node.state.label == "active"
+        (path,) = files(small_disk)
+        heard = said(path)
+        for each in files(small_disk):
+            each.unlink()
+        assert rig.ask("record_start").code is Code.ACCEPTED  # there is room again
+        rig.await_event("REC_STARTED", 2)
+        rig.await_status(lambda later: later["heartbeat_seq"] > status["heartbeat_seq"] and later["level"] == 0)
+    assert (stopped["reason"], stopped["finished"], stopped["level"]) == ("DISK_FULL", True, Level.WARN)
+    assert "No space left" in stopped["message"]
+    assert stopped["written"] == len(heard)
+    assert stopped["bytes"] > 0  # what was flushed, once a second
+    assert (status["level"], status["rec"]["state"]) == (1, "failed")
+    numbers = [each.sequence for each in of(heard, "/src/image")]
+    assert numbers == list(range(len(numbers)))
+
+
+def test_a_file_on_a_broken_disk_is_whole_up_to_its_last_flush(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    file = McapFile(tmp_path / "a.mcap")
+    for number in range(100):
+        file.write(note_messages("event", origin(), {"code": "E" * 3000, "number": number}, number))
+    file.flush()
+    file.write(note_messages("event", origin(), {"code": "lost"}, 100))
+    for name in ("fdatasync", "pwrite"):
+        monkeypatch.setattr(os, name, broken)
+    assert not file.finish()
+    assert len(salvaged(tmp_path / "a.mcap", "/gcd/event")) == file.messages == 100
+
+
+def test_a_recording_stops_before_the_room_is_gone_that_it_must_leave(tmp_path: Path) -> None:
+    for code, keep_free_mb, most_mb in (("DISK_LOW", 1e12, 0.0), ("TOTAL_LIMIT", 0.0, 0.5)):
+        folder = tmp_path / code
+        folder.mkdir()
+        (folder / "older.mcap").write_bytes(bytes(600_000))
+        config = recorder_config(folder, record=f"max_total_mb = {most_mb}", keep_free_mb=keep_free_mb)
+        _, box = recorded(config, FakeSource(14))
+        done = ended(box)
+        assert (done["reason"], done["file"], done["level"]) == (code, None, 1)
+        assert (done["finished"], done["written"]) == (False, 0)  # it never began
+        assert [each.name for each in folder.iterdir()] == ["older.mcap"]
+        assert box.of("win")
+
+
+def test_a_folder_that_cannot_be_made_is_blamed_on_the_setting_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "file").touch()
+    _, box = recorded(recorder_config(tmp_path / "file" / "recordings"), FakeSource(14))
+    done = ended(box)
+    assert (done["reason"], done["file"], done["finished"]) == ("DISK_ERROR", None, False)
+    assert "check folder in [record]" in str(done["message"])
+    assert caplog.text.count("check folder in [record]") == 1
+    assert box.of("win")
+
+
+# --- slow disks --------------------------------------------------------------------------------------------------
+
+
+class Hanging:
+    """A recorder whose disk hangs until it is released."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, source: str) -> None:
+        self.released, write = threading.Event(), McapFile.write
+        monkeypatch.setattr(McapFile, "write", lambda file, each: (self.released.wait(100.0), write(file, each))[1])
+        config = recorder_config(folder, source=source, record=RAW)
+        self.told: list[str] = []
+        self.recorder = Recorder(config, "0" * 32, lambda: config, lambda code, *_: self.told.append(code))
+        info = SourceInfo(kind="v4l2", id="t", width=100, height=100, fps_nominal=10.0, clock="realtime")
+        self.recorder.source(info, None)
+        self.recorder.start()
+        until(lambda: "REC_STARTED" in self.told)
+
+    def frame(self, seq: int, side: int = 1000) -> None:
+        self.recorder.frame(Frame(image=np.zeros((side, side, 3), np.uint8), stamp_ns=seq, seq=seq))
+
+
+def test_a_disk_that_hangs_holds_up_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    disk = Hanging(tmp_path, monkeypatch, 'kind = "v4l2"')
+    for seq in range(60):  # 3 MB each; nobody waits, or this would never end
+        disk.frame(seq)
+        disk.recorder.note("event", origin(), {"code": f"E{seq}"})
+    lost = disk.recorder.report().dropped
+    assert 30 <= lost["/src/image"] < 60
+    assert set(lost) == {"/src/image"}  # notes have room of their own
+    disk.recorder.close(0.2)
+    assert disk.recorder.busy
+    disk.released.set()
+    until(lambda: not disk.recorder.busy)
+    assert disk.told == ["REC_STARTED", "REC_STOPPED"]
+
+
+def test_when_there_is_no_room_the_newest_pictures_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorder_module, "_QUEUED_BYTES", 3 * 100 * 100 * 4)
+    disk = Hanging(tmp_path, monkeypatch, 'kind = "v4l2"')
+    for seq in range(10):
+        disk.frame(seq, 100)
+    disk.released.set()
+    disk.recorder.close(60.0)
+    written = [each.sequence for each in of(said(files(tmp_path)[0]), "/src/image")]
+    assert written[-4:] == [6, 7, 8, 9]
+    assert disk.recorder.report().dropped == {"/src/image": 10 - len(written)}
+
+
+def test_in_lockstep_the_source_waits_for_the_disk_instead(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorder_module, "_QUEUED_BYTES", 40_000)
+    disk = Hanging(tmp_path, monkeypatch, LOCKSTEP)
+    threading.Timer(0.5, disk.released.set).start()
+    for seq in range(10):
+        disk.frame(seq, 100)
+    disk.recorder.close(60.0)
+    assert disk.recorder.report().dropped == {}
+    assert [each.sequence for each in of(said(files(tmp_path)[0]), "/src/image")] == list(range(10))
+
+
+def test_what_cannot_be_written_is_counted_and_the_rest_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    from gcd_node import ros_messages
+
+    code = ros_messages.encode_jpegs
+
+    def sometimes(frames: np.ndarray, quality: int) -> tuple[bytes, tuple[int, ...]]:
+        if frames[0, 0, 0, 0] == 25:
+            raise ValueError("no such picture")
+        return code(frames, quality)
+
+    monkeypatch.setattr(ros_messages, "encode_jpegs", sometimes)
+    node, _ = recorded(recorder_config(tmp_path), FakeSource(14))
+    heard = said(files(tmp_path)[0])
+    assert [each.sequence for each in of(heard, "/src/image")] == [0, 1, 2, 3, 4, *range(6, 14)]
+    assert node.recorder.report().dropped == {"/src/image": 1}
+    assert "no such picture" in caplog.text
+    assert summary(files(tmp_path)[0]).statistics.message_count == len(heard)

@@ -1,0 +1,729 @@
+"""Files made to break, stop or fill whatever opens them, given to the real commands: each ends in one line, in time.
+
+Every kind of hostile file goes to every door that takes such files, in a process of its own. Logs have their own tests,
+`node/test_hostile_logs.py`.
+"""
+
+import json
+import os
+import shutil
+import struct
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+import torch
+from safetensors.torch import save_file
+from warm_commands import LIMIT_MB, LIMIT_S, WarmCommands
+
+from gcd_model.config import PLAIN_SMALL
+from gcd_model.own_format import Card
+from gcd_node.auth import new_key_pair, write_key_pair
+from gcd_train.evaluation.record import RunNote
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+CODES = range(64, 79)
+"""What may end a command here: sysexits, as docs/node.md lists them."""
+
+Plant = Callable[[str], str]
+"""Puts the hostile file at a place in the folder of the case, and names the place."""
+
+
+# --- text ------------------------------------------------------------------------------------------------------------
+
+
+def fifo(path: Path, _: str) -> None:
+    os.mkfifo(path)
+
+
+def zeros(path: Path, _: str) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def loop(path: Path, _: str) -> None:
+    path.symlink_to(path)
+
+
+def folder(path: Path, _: str) -> None:
+    path.mkdir()
+
+
+def sparse(path: Path, _: str) -> None:
+    with path.open("wb") as file:
+        file.truncate(4 << 30)
+
+
+def latin(path: Path, syntax: str) -> None:
+    path.write_bytes({"json": b'{"\xff\xfe": "\xe9"}', "toml": b'name = "\xff\xe9"'}.get(syntax, b"caf\xe9: \xff\n"))
+
+
+def nul(path: Path, syntax: str) -> None:
+    texts = {"json": '{"file": "a\\u0000b"}', "toml": 'name = "a\\u0000b"', "yaml": 'name: "a\0b"'}
+    path.write_text(texts.get(syntax, "a\0b\n"))
+
+
+def deep(path: Path, syntax: str) -> None:
+    start = {"toml": "name = ", "yaml": "image_width: "}.get(syntax, "")
+    path.write_text(start + ("[" * 5000 if syntax == "yaml" else "[" * 100_000))
+
+
+def deep_unknown(path: Path, syntax: str) -> None:
+    start = {"toml": "name = ", "yaml": "more: "}.get(syntax, "")
+    count = 5000 if syntax == "yaml" else 100_000
+    nested = "[" * count + "]" * count
+    path.write_text('{"more": ' + nested + "}" if syntax == "json" else start + nested)
+
+
+def digits(path: Path, syntax: str) -> None:
+    start, end = {"json": ('{"format": ', "}"), "toml": ("seed = ", ""), "yaml": ("image_width: ", "")}.get(
+        syntax, ("", "")
+    )
+    path.write_text(f"{start}{'9' * 5000}{end}\n")
+
+
+def many(path: Path, syntax: str) -> None:
+    """A million entries."""
+    lines = {"json": '"k{0}": {0},', "toml": "k{0} = {0}\n", "yaml": "k{0}: {0}\n"}.get(syntax, "entry {0}\n")
+    text = "".join(lines.format(number) for number in range(1_000_000))
+    path.write_text('{"weight_map": {' + text + '"end": 0}}' if syntax == "json" else text)
+
+
+def dots(path: Path, syntax: str) -> None:
+    name = ".".join(["a"] * 100_000)
+    path.write_text(f"{name} = 1\n" if syntax == "toml" else f'{{"{name}": 1}}')
+
+
+def escapes(path: Path, syntax: str) -> None:
+    """What a terminal would obey, in a name."""
+    name, plain = "\\u001b]0;owned\\u0007\\u001b[2J[/red]", "\x1b]0;owned\x07\x1b[2J[/red]\n"
+    path.write_text({"json": f'{{"{name}": 1}}', "toml": f'"{name}" = 1'}.get(syntax, plain))
+
+
+TEXTS = (fifo, zeros, loop, folder, sparse, latin, nul, deep, deep_unknown, digits, many, dots, escapes)
+Door = Callable[[Path, Plant], list[str]]
+TEXT_DOORS: dict[str, tuple[str, Door]] = {}
+
+
+def text_door(syntax: str) -> Callable[[Door], Door]:
+    def keep(door: Door) -> Door:
+        TEXT_DOORS[door.__name__] = syntax, door
+        return door
+
+    return keep
+
+
+def launch_file(here: Path, more: str = "", *, source: str = 'kind = "synthetic"', weights: str = "random:live") -> str:
+    text = f'[source]\n{source}\n[model]\nweights = "{weights}"\n[view.top]\n{more}\n'
+    (here / "launch.toml").write_text(text)
+    return "launch.toml"
+
+
+@text_door("toml")
+def launch_of_check(here: Path, plant: Plant) -> list[str]:
+    return ["gcd-node", "check", plant("launch.toml")]
+
+
+@text_door("toml")
+def launch_of_run(here: Path, plant: Plant) -> list[str]:
+    return ["gcd-node", "run", plant("launch.toml")]
+
+
+@text_door("toml")
+def launch_of_replay(here: Path, plant: Plant) -> list[str]:
+    return ["gcd-node", "replay", plant("launch.toml"), "--out", "run"]
+
+
+@text_door("toml")
+def allow_list(here: Path, plant: Plant) -> list[str]:
+    write_key_pair(here / "keys", new_key_pair())
+    more = f'[security]\nkeys = "keys"\nallow = "{plant("allow.toml")}"'
+    return ["gcd-node", "check", launch_file(here, more)]
+
+
+@text_door("key")
+def client_key(here: Path, plant: Plant) -> list[str]:
+    write_key_pair(here / "keys", new_key_pair())
+    (here / "keys" / "public.key").unlink()
+    plant("keys/public.key")
+    return ["gcd-node", "keys", "show", "keys"]
+
+
+@text_door("key")
+def node_key(here: Path, plant: Plant) -> list[str]:
+    write_key_pair(here / "keys", new_key_pair())
+    return ["gcd-node", "status", "--once", "--keys", "keys", "--node-key", plant("node.key")]
+
+
+@text_door("yaml")
+def camera_info(here: Path, plant: Plant) -> list[str]:
+    source = f'kind = "file"\npath = "package:drive.mp4"\ncalibration = "{plant("camera.yaml")}"'
+    return ["gcd-node", "check", launch_file(here, source=source)]
+
+
+@text_door("json")
+def manifest_of_run(here: Path, plant: Plant) -> list[str]:
+    (here / "a").mkdir()
+    plant("a/manifest.json")
+    return ["gcd-node", "diff", "a", "a"]
+
+
+@text_door("json")
+def stereo_calibration(here: Path, plant: Plant) -> list[str]:
+    film = str(Path(__file__).parents[1] / "gcd_node" / "assets" / "drive.mp4")
+    pair = ["--depth", film, "--calibration", plant("board.json")]
+    return ["gcd-node", "synthesize", film, "--weights", "random:live", "--out", "out", *pair]
+
+
+@text_door("json")
+def export_manifest(here: Path, plant: Plant) -> list[str]:
+    (here / "export").mkdir()
+    plant("export/manifest.json")
+    return ["gcd-node", "check", launch_file(here, weights="export")]
+
+
+def diffusers(here: Path) -> None:
+    for part in ("unet", "vae", "image_encoder"):
+        (here / "model" / part).mkdir(parents=True)
+        save_file({"x": torch.zeros(1)}, here / "model" / part / "model.safetensors")
+
+
+@text_door("json")
+def diffusers_config(here: Path, plant: Plant) -> list[str]:
+    diffusers(here)
+    plant("model/unet/config.json")
+    return ["gcd-node", "weights", "inspect", "model"]
+
+
+@text_door("json")
+def diffusers_index(here: Path, plant: Plant) -> list[str]:
+    diffusers(here)
+    (here / "model/unet/model.safetensors").unlink()
+    plant("model/unet/diffusion_pytorch_model.safetensors.index.json")
+    return ["gcd-node", "weights", "inspect", "model"]
+
+
+@text_door("toml")
+def recipe(here: Path, plant: Plant) -> list[str]:
+    return ["gcd-train", "recipes", plant("recipe.toml")]
+
+
+@text_door("toml")
+def recipe_of_training(here: Path, plant: Plant) -> list[str]:
+    return ["gcd-train", "train", plant("recipe.toml"), "--data", "data", "--valid", "valid", "--out", "out"]
+
+
+@text_door("toml")
+def base_of_recipe(here: Path, plant: Plant) -> list[str]:
+    (here / "recipe.toml").write_text(f'base = "{plant("base.toml")}"\n')
+    return ["gcd-train", "recipes", "recipe.toml"]
+
+
+@text_door("toml")
+def distillation(here: Path, plant: Plant) -> list[str]:
+    return ["gcd-train", "distill", plant("student.toml"), "--data", "data", "--valid", "valid", "--out", "out"]
+
+
+@text_door("json")
+def pair_world(here: Path, plant: Plant) -> list[str]:
+    (here / "pairs").mkdir()
+    plant("pairs/world.json")
+    return ["gcd-train", "train", "package:paper-driving", "--data", "pairs", "--valid", "pairs", "--out", "out"]
+
+
+@text_door("json")
+def scene_manifest(here: Path, plant: Plant) -> list[str]:
+    (here / "scn00000").mkdir()
+    plant("scn00000/gcd-manifest.json")
+    return ["gcd-train", "verify", "scn00000"]
+
+
+@text_door("json")
+def kubric_metadata(here: Path, plant: Plant) -> list[str]:
+    (here / "scn00000").mkdir()
+    plant("scn00000/scn00000_p0_v4.json")
+    return ["gcd-train", "show", "scn00000"]
+
+
+def driving_scene(here: Path) -> None:
+    for name in ("rgb/yaw-0", "rgb/camera0", "calibration", "ontology", "semantic_segmentation_2d"):
+        (here / "scene_000000" / name).mkdir(parents=True)
+
+
+@text_door("json")
+def driving_ontology(here: Path, plant: Plant) -> list[str]:
+    driving_scene(here)
+    plant("scene_000000/ontology/ontology.json")
+    return ["gcd-train", "show", "scene_000000"]
+
+
+@text_door("json")
+def driving_calibration(here: Path, plant: Plant) -> list[str]:
+    driving_scene(here)
+    (here / "scene_000000/semantic_segmentation_2d").rmdir()
+    plant("scene_000000/calibration/calibration.json")
+    return ["gcd-train", "show", "scene_000000"]
+
+
+NOTE = RunNote(
+    command="x", made="x", versions={}, data=(), data_identity="x", kind="orbit", modality="rgb", protocol="pairs",
+    frames=4, height=8, width=8, fps=10.0, seed=0, methods={"copy": {}},
+)  # fmt: skip
+
+
+@text_door("json")
+def run_note(here: Path, plant: Plant) -> list[str]:
+    (here / "run").mkdir()
+    plant("run/run.json")
+    return ["gcd-train", "report", "run", "--out", "report"]
+
+
+@text_door("json")
+def run_record(here: Path, plant: Plant) -> list[str]:
+    (here / "run/records/copy").mkdir(parents=True)
+    (here / "run/run.json").write_bytes(msgspec.json.encode(NOTE))
+    plant("run/records/copy/clip.json")
+    return ["gcd-train", "report", "run", "--out", "report"]
+
+
+def scenes(here: Path) -> list[str]:
+    (here / "scenes/scn00000").mkdir(parents=True)
+    return ["gcd-train", "evaluate", "--data", "scenes", "--out", "out"]
+
+
+@text_door("json")
+def controls(here: Path, plant: Plant) -> list[str]:
+    return [*scenes(here), "--controls", plant("controls.json")]
+
+
+@text_door("json")
+def split(here: Path, plant: Plant) -> list[str]:
+    (here / "scenes/scene_000000").mkdir(parents=True)
+    return ["gcd-train", "evaluate", "--data", "scenes", "--out", "out", "--split", plant("split.json")]
+
+
+@text_door("list")
+def scene_list(here: Path, plant: Plant) -> list[str]:
+    return [*scenes(here), "--list", plant("list.txt")]
+
+
+CAMERAS = {"a": {"dtype": "video"}, "b": {"dtype": "video"}}
+INFO = {"codebase_version": "v2.1", "fps": 30, "features": CAMERAS, "data_path": "x", "video_path": "y"}
+
+
+@text_door("json")
+def lerobot_info(here: Path, plant: Plant) -> list[str]:
+    (here / "set/meta").mkdir(parents=True)
+    plant("set/meta/info.json")
+    return ["gcd-train", "lerobot", "set"]
+
+
+@text_door("json")
+def lerobot_episodes(here: Path, plant: Plant) -> list[str]:
+    (here / "set/meta").mkdir(parents=True)
+    (here / "set/meta/info.json").write_text(json.dumps(INFO))
+    plant("set/meta/episodes.jsonl")
+    return ["gcd-train", "lerobot", "set"]
+
+
+@text_door("json")
+def lerobot_cameras(here: Path, plant: Plant) -> list[str]:
+    (here / "set/meta").mkdir(parents=True)
+    (here / "set/meta/info.json").write_text(json.dumps(INFO))
+    (here / "set/meta/episodes.jsonl").write_text('{"episode_index": 0, "length": 30}\n')
+    return ["gcd-train", "lerobot", "set", "--calibration", plant("cameras.json")]
+
+
+@text_door("json")
+def cache_index(here: Path, plant: Plant) -> list[str]:
+    (here / "cache").mkdir()
+    plant("cache/index.json")
+    start = [
+        "gcd-train",
+        "train",
+        "package:pardom-gradual-rgb",
+        "--small",
+        "--set",
+        "data.kind=cache",
+        "--set",
+        "unet.source=cache",
+    ]
+    return [*start, "--data", "cache", "--valid", "scenes", "--out", "out"]
+
+
+# --- the rest --------------------------------------------------------------------------------------------------------
+
+CASES: dict[str, Callable[[Path], tuple[list[str], str]]] = {}
+"""By name: what prepares a folder, and gives the command line and the name that its error must tell."""
+
+
+def case(function: Callable[[Path], tuple[list[str], str]]) -> Callable[[Path], tuple[list[str], str]]:
+    CASES[function.__name__] = function
+    return function
+
+
+def add(name: str, function: Callable[[Path], tuple[list[str], str]]) -> None:
+    CASES[name] = function
+
+
+def setting(more: str = "", **options: str) -> Callable[[Path], tuple[list[str], str]]:
+    return lambda here: (["gcd-node", "check", launch_file(here, more, **options)], "")
+
+
+add("5,000 views", setting("".join(f"[view.v{number}]\n" for number in range(5000))))
+add("a path with NUL", setting(source='path = "a\\u0000b.mp4"'))
+add("a source of 5,000 characters", setting(source=f'path = "{"a" * 5000}.mp4"'))
+add("a folder of 5,000 characters", setting(source=f'kind = "folder"\nfps = 10\npath = "{"a" * 5000}"'))
+add("a log of 5,000 characters", setting(source=f'kind = "mcap"\npath = "{"a" * 5000}"'))
+add("weights of 5,000 characters", setting(weights="a" * 5000))
+add("weights with NUL", setting(weights="a\\u0000b"))
+add("packaged weights of 5,000 characters", setting(weights="package:" + "a" * 5000))
+add("markup as weights", setting(weights="[/red]"))
+add("a calibration of 5,000 characters", setting(source=f'kind = "synthetic"\ncalibration = "{"a" * 5000}"'))
+add("keys of 5,000 characters", setting(f'[security]\nkeys = "{"a" * 5000}"\nallow = "b"'))
+add("an abstract socket", setting('[publish]\ndata = "ipc://@abstract"'))
+add("an endpoint with NUL", setting('[publish]\ndata = "ipc:///tmp/a\\u0000b"'))
+add("an endpoint of 5,000 characters", setting(f'[publish]\ndata = "ipc:///tmp/{"a" * 5000}"'))
+add("a port of 5,000 digits", setting(f'[publish]\ndata = "tcp://127.0.0.1:{"9" * 5000}"'))
+add("infinite rate", setting("[window]\nfps = inf"))
+add("NaN as a rate", setting("[window]\nfps = nan"))
+
+
+def steps_without_end(here: Path) -> tuple[list[str], str]:
+    return ["gcd-node", "check", launch_file(here, weights="random:kubric90"), "--set", "model.steps=1000000000"], ""
+
+
+CASES["steps without end"] = steps_without_end
+for given in ("9" * 5000, "[" * 100_000, '"\\u0000"'):
+    add(
+        f"--set to {given[:9]}",
+        lambda here, given=given: (["gcd-node", "check", launch_file(here), "--set", f"window.fps={given}"], ""),
+    )
+    add(
+        f"gcd-train --set to {given[:9]}",
+        lambda here, given=given: (
+            ["gcd-train", "recipes", "package:tabletop", "--set", f"unet.batch={given}"],
+            "",
+        ),
+    )
+
+
+CARD = Card(name="w", config=PLAIN_SMALL, family=None, move_time=0)
+
+
+def safetensors(path: Path, header: bytes, size: int = 0) -> None:
+    with path.open("wb") as file:
+        file.write(len(header).to_bytes(8, "little") + header)
+        file.truncate(max(size, 8 + len(header)))
+
+
+def metadata(path: Path, **changed: str) -> None:
+    save_file({"x": torch.zeros(1)}, path, CARD.to_metadata() | changed)
+
+
+def adapter(path: Path, facts: str) -> None:
+    metadata(path, **{"gcd.adapter": facts})
+
+
+def pickle_bomb(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("archive/data.pkl", b"\x80\x02" + b"(" * 10_000_000 + b".")
+
+
+def squares(path: Path) -> None:
+    """Beside it, what regular expressions take the square of a length for."""
+    torch.save({"state_dict": {"x": torch.zeros(1)}}, path)
+    parts = ("pardom\n", "azimuth" * 12_000, "\nazimuth:" + "\n" * 80_000, "x\nmodality:" + "\n" * 80_000 + "x")
+    path.with_suffix(".yaml").write_text("".join(parts))
+
+
+def tensor(size: int, **more: object) -> bytes:
+    return json.dumps({"x": {"dtype": "F32", "shape": [size // 4], "data_offsets": [0, size]}, **more}).encode()
+
+
+def tensors(count: int) -> bytes:
+    return json.dumps({f"t{n}": {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]} for n in range(count)}).encode()
+
+
+def config_with(**changed: object) -> str:
+    return json.dumps({**msgspec.to_builtins(PLAIN_SMALL), **changed})
+
+
+def unet_with(**changed: object) -> str:
+    return config_with(unet={**msgspec.to_builtins(PLAIN_SMALL.unet), **changed})
+
+
+WEIGHTS: dict[str, Callable[[Path], None]] = {
+    "a pipe": os.mkfifo,
+    "endless zeros": lambda path: path.symlink_to("/dev/zero"),
+    "a link to itself": lambda path: path.symlink_to(path),
+    "a sparse file": lambda path: sparse(path, ""),
+    "a header of 99 MB": lambda path: safetensors(path, tensor(4).ljust(99_000_000)),
+    "a header nested deep": lambda path: safetensors(path, b'{"x":' + b"[" * 1_000_000),
+    "a header that is not UTF-8": lambda path: safetensors(path, b'{"\xff": 1}'),
+    "a header of many tensors": lambda path: safetensors(path, tensors(100_000)),
+    "2 TB": lambda path: safetensors(path, tensor(2 << 40), (2 << 40) + 200),
+    "2 TB of ours": lambda path: safetensors(path, tensor(2 << 40, __metadata__=CARD.to_metadata()), (2 << 40) + 9000),
+    "a config nested deep": lambda path: metadata(path, **{"gcd.config": '{"kind": ' + "[" * 100_000}),
+    "a config of digits": lambda path: metadata(path, **{"gcd.config": '{"frames": ' + "9" * 5000 + "}"}),
+    "a config of NaN": lambda path: metadata(path, **{"gcd.config": '{"frames": NaN}'}),
+    "a move time of digits": lambda path: metadata(path, **{"gcd.move_time": "9" * 5000}),
+    "a scale of NaN": lambda path: metadata(path, **{"gcd.uncertainty_scale": "nan"}),
+    "blocks without end": lambda path: metadata(path, **{"gcd.config": unet_with(blocks_per_level=10**9)}),
+    "levels without end": lambda path: metadata(
+        path, **{"gcd.config": unet_with(multipliers=[1] * 100_000, attention=[True] * 100_000)}
+    ),
+    "frames without end": lambda path: metadata(path, **{"gcd.config": config_with(frames=10**15)}),
+    "width without end": lambda path: metadata(path, **{"gcd.config": unet_with(width=2**60)}),
+    "heads of none": lambda path: metadata(path, **{"gcd.config": unet_with(head_width=0, norm_groups=0)}),
+    "a pickle of marks": pickle_bomb,
+    "squares in its yaml": squares,
+}  # fmt: skip
+for about, write_weights in WEIGHTS.items():
+
+    def inspected(here: Path, write: Callable[[Path], None] = write_weights) -> tuple[list[str], str]:
+        write(here / "weights.ckpt")
+        return ["gcd-node", "weights", "inspect", "weights.ckpt"], "weights.ckpt"
+
+    def converted(here: Path, write: Callable[[Path], None] = write_weights) -> tuple[list[str], str]:
+        write(here / "weights.ckpt")
+        return ["gcd-node", "weights", "convert", "weights.ckpt", "out.safetensors"], "weights.ckpt"
+
+    add(f"weights: {about}", inspected)
+    add(f"weights to convert: {about}", converted)
+
+ADAPTERS = {
+    "rank 0": '{"rank": 0, "alpha": 1.0, "base": "x"}',
+    "a negative rank": '{"rank": -1, "alpha": 1.0, "base": "x"}',
+    "alpha 1e308": '{"rank": 1, "alpha": 1e308, "base": "x"}',
+    "depth": '{"rank": ' + "[" * 100_000,
+    "digits": '{"rank": ' + "9" * 5000 + "}",
+}
+for about, facts in ADAPTERS.items():
+
+    def joined(here: Path, facts: str = facts) -> tuple[list[str], str]:
+        adapter(here / "adapter.safetensors", facts)
+        packaged = Path(__file__).parents[1] / "model/gcd_model/weights/driving-small.safetensors"
+        return ["gcd-train", "lora", "merge", str(packaged), "adapter.safetensors", "out.safetensors"], "adapter"
+
+    add(f"an adapter of {about}", joined)
+
+
+def npy(shape: str) -> bytes:
+    header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header
+
+
+def npz_bomb(path: Path, name: str = "initial", count: int = 3 << 27) -> None:
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open(f"{name}.npy", "w", force_zip64=True) as member,
+    ):
+        member.write(npy(f"({count},)"))
+        for _ in range(count >> 20):
+            member.write(bytes(4 << 20))
+
+
+def sparse_npy(path: Path) -> None:
+    path.write_bytes(npy("(1073741824,)"))
+    os.truncate(path, (4 << 30) + 200)
+
+
+ARRAYS: dict[str, Callable[[Path], None]] = {
+    "a pipe": os.mkfifo,
+    "endless zeros": lambda path: path.symlink_to("/dev/zero"),
+    "a link to itself": lambda path: path.symlink_to(path),
+    "a header nested deep": lambda path: path.write_bytes(npy("(" * 5000)) and None,
+    "a header nested deep, closed": lambda path: path.write_bytes(npy("(" * 150 + ")" * 150)) and None,
+    "a shape without end": lambda path: path.write_bytes(npy(f"({10**18},)")) and None,
+    "a shape of digits": lambda path: path.write_bytes(npy(f"({'9' * 5000},)")) and None,
+    "a negative shape": lambda path: path.write_bytes(npy("(-1, 4, 4)")) and None,
+    "4 GB, sparse": sparse_npy,
+    "a bomb": npz_bomb,
+    "not UTF-8": lambda path: path.write_bytes(b"PK\x03\x04" + bytes(range(256))) and None,
+}
+FILM = str(Path(__file__).parents[1] / "gcd_node" / "assets" / "drive.mp4")
+for about, write_array in ARRAYS.items():
+
+    def posed(here: Path, write: Callable[[Path], object] = write_array) -> tuple[list[str], str]:
+        write(here / "poses.npy")
+        more = ["--weights", "random:kubric90", "--out", "out", "--poses", "poses.npy"]
+        return ["gcd-node", "synthesize", FILM, *more], "poses.npy"
+
+    def noisy(here: Path, write: Callable[[Path], object] = write_array) -> tuple[list[str], str]:
+        write(here / "noise.npz")
+        more = ["--weights", "random:kubric90", "--out", "out", "--azimuth-deg", "5", "--noise", "noise.npz"]
+        return ["gcd-node", "synthesize", FILM, *more], "noise.npz"
+
+    add(f"poses: {about}", posed)
+    add(f"noise: {about}", noisy)
+
+
+def png(width: int, height: int, rows: int = 0) -> bytes:
+    def part(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    body = zlib.compress(bytes((1 + 3 * width) * rows))
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + part(b"IHDR", head) + part(b"IDAT", body) + part(b"IEND", b"")
+
+
+PICTURES: dict[str, Callable[[Path], object]] = {
+    "a pipe": os.mkfifo,
+    "endless zeros": lambda path: path.symlink_to("/dev/zero"),
+    "a link to itself": lambda path: path.symlink_to(path),
+    "a folder": Path.mkdir,
+    "nothing": Path.touch,
+    "a sparse file": lambda path: sparse(path, ""),
+    "a head alone": lambda path: path.write_bytes(png(64, 64)[:20]),
+    "a billion pixels": lambda path: path.write_bytes(png(32_000, 32_000, 20)),
+    "a side without end": lambda path: path.write_bytes(png(2**31 - 1, 2**31 - 1)),
+    "TIFF of loops": lambda path: path.write_bytes(b"II*\0" + struct.pack("<IH", 8, 65535) + bytes(12 * 100)),
+    "JPEG of marks": lambda path: path.write_bytes(b"\xff\xd8" + b"\xff\xe0\x00\x02" * 500_000),
+    "GIF of nothing": lambda path: path.write_bytes(b"GIF89a"),
+    "JPEG 2000 of nothing": lambda path: path.write_bytes(b"\x00\x00\x00\x0cjP  \r\n\x87\n" + b"\x00" * 40),
+    "SVG": lambda path: path.write_bytes(b"<?xml version='1.0'?><svg width='9" + b"9" * 5000 + b"' height='1'/>"),
+    "WebP of nothing": lambda path: path.write_bytes(b"RIFF\xff\xff\xff\xffWEBPVP8X" + bytes(4)),
+}
+for about, write_picture in PICTURES.items():
+
+    def in_folder(here: Path, write: Callable[[Path], object] = write_picture) -> tuple[list[str], str]:
+        (here / "pictures").mkdir()
+        write(here / "pictures" / "0001.png")
+        source = 'kind = "folder"\nfps = 10\npath = "pictures"'
+        return ["gcd-node", "check", launch_file(here, source=source)], "0001.png"
+
+    def still(here: Path, write: Callable[[Path], object] = write_picture) -> tuple[list[str], str]:
+        write(here / "still.png")
+        return ["gcd-node", "synthesize", "still.png", "--weights", "random:live", "--out", "out"], "still.png"
+
+    def in_gallery(here: Path, write: Callable[[Path], object] = write_picture) -> tuple[list[str], str]:
+        (here / "pictures").mkdir()
+        for number in range(16):
+            write(here / "pictures" / f"im_{number}.png")
+        more = ["--weights", "random:kubric90", "--rate", "12", "--out", "out"]
+        return ["gcd-train", "gallery", "pictures", *more], "pictures"
+
+    add(f"a folder of pictures: {about}", in_folder)
+    add(f"a still: {about}", still)
+    add(f"a gallery of pictures: {about}", in_gallery)
+
+PLACES = ("a pipe", "endless zeros", "a link to itself", "a folder", "nothing", "a sparse file")
+VIDEOS = {name: PICTURES[name] for name in PLACES}
+for about, write_video in VIDEOS.items():
+
+    def of_node(here: Path, write: Callable[[Path], object] = write_video) -> tuple[list[str], str]:
+        write(here / "film.mp4")
+        return ["gcd-node", "check", launch_file(here, source='path = "film.mp4"')], "film.mp4"
+
+    def of_gallery(here: Path, write: Callable[[Path], object] = write_video) -> tuple[list[str], str]:
+        write(here / "film.mp4")
+        return ["gcd-train", "gallery", "film.mp4", "--weights", "random:kubric90", "--out", "out"], "film.mp4"
+
+    def as_log(here: Path, write: Callable[[Path], object] = write_video) -> tuple[list[str], str]:
+        write(here / "log.mcap")
+        return ["gcd-node", "check", launch_file(here, source='kind = "mcap"\npath = "log.mcap"')], "log.mcap"
+
+    add(f"a video: {about}", of_node)
+    add(f"a video for the gallery: {about}", of_gallery)
+    add(f"a log: {about}", as_log)
+
+
+def bag(write: Callable[[Path], object]) -> Callable[[Path], tuple[list[str], str]]:
+    def prepared(here: Path) -> tuple[list[str], str]:
+        (here / "bag").mkdir()
+        write(here / "bag" / "metadata.yaml")
+        (here / "bag" / "log_0.db3").write_bytes(b"SQLite format 3\0" + bytes(4000))
+        return ["gcd-node", "check", launch_file(here, source='kind = "mcap"\npath = "bag"')], "bag"
+
+    return prepared
+
+
+def laughs(path: Path) -> None:
+    lines = ["a: &a [x,x,x,x,x,x,x,x,x]"]
+    lines += [f"{new}: &{new} [{','.join([f'*{old}'] * 9)}]" for old, new in zip("abcdefgh", "bcdefghi", strict=True)]
+    path.write_text("\n".join(lines))
+
+
+add("a bag's metadata: a pipe", bag(os.mkfifo))
+add("a bag's metadata: a sparse file", bag(lambda path: sparse(path, "")))
+add("a bag's metadata: depth", bag(lambda path: path.write_text("a: " + "[" * 100_000)))
+add("a bag's metadata: laughs", bag(laughs))
+
+
+def shard(write: Callable[[Path], object]) -> Callable[[Path], tuple[list[str], str]]:
+    def prepared(here: Path) -> tuple[list[str], str]:
+        (here / "pairs").mkdir()
+        world = {"name": "driving", "width": 96, "height": 64, "frames": 14, "fps": 10}
+        (here / "pairs/world.json").write_text(json.dumps(world))
+        write(here / "pairs/shard-00000000.zip")
+        return ["gcd-train", "show", "pairs"], "pairs"
+
+    return prepared
+
+
+def scene_bomb(path: Path) -> None:
+    name = "00000001/source.rgb.png"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open(name, "w") as member:
+        for _ in range(1000):
+            member.write(bytes(1 << 20))
+
+
+for about in PLACES:
+    add(f"a shard: {about}", shard(PICTURES[about]))
+add("a shard: a bomb", shard(scene_bomb))
+
+
+@pytest.fixture(scope="module")
+def commands() -> Iterator[WarmCommands]:
+    with WarmCommands() as started:
+        yield started
+
+
+@pytest.fixture
+def here() -> Iterator[Path]:
+    """A folder of a short name: a socket's must fit 107 characters."""
+    path = Path(tempfile.mkdtemp(prefix="h", dir="/tmp"))
+    yield path
+    shutil.rmtree(path)
+
+
+@pytest.mark.parametrize("door", TEXT_DOORS)
+@pytest.mark.parametrize("kind", TEXTS, ids=lambda kind: kind.__name__)
+def test_a_hostile_text_ends_in_one_line_that_names_it(
+    commands: WarmCommands, here: Path, door: str, kind: Callable[[Path, str], None]
+) -> None:
+    syntax, prepare = TEXT_DOORS[door]
+    planted: list[str] = []
+
+    def plant(name: str) -> str:
+        planted.append(name)
+        kind(here / name, syntax)
+        return name
+
+    argv = prepare(here, plant)
+    require_one_line(commands, argv, here, Path(planted[0]).name)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_hostile_file_ends_in_one_line_that_names_it(commands: WarmCommands, here: Path, name: str) -> None:
+    argv, told = CASES[name](here)
+    require_one_line(commands, argv, here, told)
+
+
+def require_one_line(commands: WarmCommands, argv: list[str], here: Path, name: str) -> None:
+    ended = commands.run(argv, here)
+    shown = (
+        f"{ended.code} after {ended.cpu_s:.1f} s of processor time and {ended.peak_mb:.0f} MB: {ended.output[-3000:]}"
+    )
+    assert "Traceback" not in ended.output, shown
+    assert ended.code in CODES, shown
+    assert ended.cpu_s < LIMIT_S, shown
+    assert ended.peak_mb < LIMIT_MB, shown
+    last = ended.output.strip().splitlines()[-1]
+    assert last.startswith(("error: ", "gcd-train: ")) or argv[1] == "verify", shown
+    assert name in ended.output, shown
+    assert "\x1b" not in ended.output.replace("\x1b[", ""), shown

@@ -1,0 +1,229 @@
+"""What the paint network learns from: target views of clips with what is seen of them, in batches by number."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from gcd_model.geometry import Intrinsics
+from gcd_model.live.config import LiveConfig
+from gcd_model.live.depth_net import plane_depth
+from gcd_model.live.paint_net import Painted, Seen, camera_features
+from gcd_model.live.splat import splat, unproject
+from gcd_train.live.batches import Random, lens_rays, to_video
+from gcd_train.live.clips import LiveClip, read_clip
+from gcd_train.live.inputs import read_inputs
+
+VIEW_ARRAYS = ("source.pose", *(f"target.{name}" for name in ("pose", "rgb", "depth", "labels", "visibility")))
+"""What is read of a clip."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Views:
+    """N target views: what is seen of them and the truth.
+
+    target: [N, 3, H, W] in [-1, 1]. labels: int64, log_depth: float32, visibility: int64, [N, H, W]. poses: N of
+    world_from_target [4, 4]. lenses: N.
+    """
+
+    seen: Seen
+    target: Tensor
+    labels: Tensor
+    log_depth: Tensor
+    visibility: Tensor
+    poses: tuple[Tensor, ...]
+    lenses: tuple[Intrinsics, ...]
+
+
+def views_of(clip: LiveClip, inputs: dict[str, Tensor], *, ground: bool) -> Views:
+    """The frames that were read of a clip, with what is seen of them."""
+    labels = torch.from_numpy(clip.arrays["target.labels"].astype(np.int64))
+    n, height, width = labels.shape
+    lens = Intrinsics.from_hfov(clip.hfov_deg("target"), width, height)
+    poses = clip.arrays["target.pose"]
+    floor = float(clip.facts["floor_z_m"])
+    grounds = [
+        plane_depth(lens, torch.from_numpy(pose[2, :3].copy()).float(), max(float(pose[2, 3]) - floor, 0.05))
+        if ground
+        else torch.zeros(height, width)
+        for pose in poses
+    ]
+    empty = torch.zeros(n, height, width)
+    seen = Seen(
+        **inputs,
+        painted=torch.zeros(n, 3, height, width),
+        painted_coverage=empty,
+        rays=lens_rays(lens).expand(n, -1, -1, -1),
+        ground_m=torch.stack(grounds),
+        camera=camera_features(torch.from_numpy(np.linalg.inv(clip.arrays["source.pose"]) @ poses)),
+    )
+    return Views(
+        seen=seen,
+        target=to_video(clip.arrays["target.rgb"]),
+        labels=labels,
+        log_depth=torch.from_numpy(clip.depth("target")).log(),
+        visibility=torch.from_numpy(clip.arrays["target.visibility"].astype(np.int64)),
+        poses=tuple(torch.from_numpy(pose) for pose in poses),
+        lenses=(lens,) * n,
+    )
+
+
+def together(parts: Sequence[Views]) -> Views:
+    """Views of several clips as one batch."""
+    names = Seen.__dataclass_fields__
+    seen = Seen(**{name: torch.cat([getattr(part.seen, name) for part in parts]) for name in names})
+    return Views(
+        seen=seen,
+        target=torch.cat([part.target for part in parts]),
+        labels=torch.cat([part.labels for part in parts]),
+        log_depth=torch.cat([part.log_depth for part in parts]),
+        visibility=torch.cat([part.visibility for part in parts]),
+        poses=sum((part.poses for part in parts), ()),
+        lenses=sum((part.lenses for part in parts), ()),
+    )
+
+
+def frame_of(views: Views, index: Tensor) -> Views:
+    """Some of the views."""
+    names = Seen.__dataclass_fields__
+    numbers = index.tolist()
+    return Views(
+        seen=Seen(**{name: getattr(views.seen, name)[index] for name in names}),
+        target=views.target[index],
+        labels=views.labels[index],
+        log_depth=views.log_depth[index],
+        visibility=views.visibility[index],
+        poses=tuple(views.poses[i] for i in numbers),
+        lenses=tuple(views.lenses[i] for i in numbers),
+    )
+
+
+def halved(views: Views) -> Views:
+    """The same at half the size: what can be averaged is; the rest is of one pixel of four."""
+    seen = views.seen
+    covered = avg_pool2d(seen.coverage[:, None], 2)
+    names = ("coverage", "now_share", "age", "painted_coverage")
+    made = {name: avg_pool2d(getattr(seen, name)[:, None], 2)[:, 0] for name in names}
+    return replace(
+        views,
+        seen=replace(
+            seen,
+            **made,
+            colour=avg_pool2d(seen.colour * seen.coverage[:, None], 2) / covered.clamp(min=1e-6),
+            log_depth=seen.log_depth[:, ::2, ::2],
+            votes=seen.votes[..., ::2, ::2],
+            painted=avg_pool2d(seen.painted, 2),
+            rays=avg_pool2d(seen.rays, 2),
+            ground_m=seen.ground_m[:, ::2, ::2],
+        ),
+        target=avg_pool2d(views.target, 2),
+        labels=views.labels[:, ::2, ::2],
+        log_depth=views.log_depth[:, ::2, ::2],
+        visibility=views.visibility[:, ::2, ::2],
+        lenses=tuple(lens.resized(lens.width // 2, lens.height // 2) for lens in views.lenses),
+    )
+
+
+class ViewBatches:
+    """Batches of target views; the number of the update decides which.
+
+    inputs: folders of `make_inputs`; of those that have a clip one is drawn. carried: share of the views that see what
+    was painted a frame before.
+    """
+
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        inputs: Sequence[Path],
+        config: LiveConfig,
+        size: int,
+        seed: int,
+        carried: float = 0.35,
+    ) -> None:
+        self._config, self._size, self._seed, self._carried = config, size, seed, carried
+        places = [
+            (path, [p for folder in inputs if (p := folder / path.parent.name / path.name).exists()]) for path in paths
+        ]
+        self._clips = [(path, there) for path, there in places if there]
+
+    def __len__(self) -> int:
+        return len(self._clips)
+
+    def batch(self, update: int) -> tuple[Views | None, Views, Random]:
+        """N views; before them the frames before of the first of them, which see what was painted there.
+
+        And the generator for what else is drawn.
+        """
+        random = np.random.default_rng([self._seed, update])
+        carried = int(random.binomial(self._size, self._carried))
+        made = [self._views(random, 2 if i < carried else 1) for i in range(self._size)]
+        before = [frame_of(views, torch.tensor([0])) for views in made[:carried]]
+        now = [*(frame_of(views, torch.tensor([1])) for views in made[:carried]), *made[carried:]]
+        return together(before) if before else None, together(now), random
+
+    def _views(self, random: Random, count: int) -> Views:
+        """Frames in a row of some clip."""
+        path, there = self._clips[int(random.integers(len(self._clips)))]
+        first = int(random.integers(self._config.frames + 1 - count))
+        cut = slice(first, first + count)
+        inputs = read_inputs(there[int(random.integers(len(there)))], cut, len(self._config.classes))
+        views = views_of(read_clip(path, cut, VIEW_ARRAYS), inputs, ground=random.random() < 0.6)
+        return _other_look(views, random)
+
+
+def _other_look(views: Views, random: Random) -> Views:
+    """Exposure, gamma and white balance, the same for what is seen and for the truth."""
+    gamma, gain = (
+        np.exp(random.normal() * 0.2),
+        np.exp(random.normal() * 0.12 + random.normal(size=(1, 3, 1, 1)) * 0.05),
+    )
+    scale = torch.from_numpy(np.asarray(gain, np.float32))
+
+    def look(x: Tensor) -> Tensor:
+        return ((((x + 1) / 2).clamp(0, 1) ** float(gamma)) * scale).clamp(0, 1) * 2 - 1
+
+    colour = look(views.seen.colour) * (views.seen.coverage > 0)[:, None]
+    return replace(views, seen=replace(views.seen, colour=colour), target=look(views.target))
+
+
+def mirrored(views: Views) -> Views:
+    """All of it seen in a mirror. Poses are not: carry what was painted before."""
+    seen = views.seen
+    fixed = ("rays", "camera")
+    turned = {name: getattr(seen, name).flip(-1) for name in Seen.__dataclass_fields__ if name not in fixed}
+    # x becomes -x in both cameras: rotation entries that mix x with another axis change sign, and so does the move in x
+    signs = torch.tensor([1.0, -1, -1, -1, 1, 1, -1, 1, 1, -1, 1, 1], device=seen.camera.device)
+    return replace(
+        views,
+        seen=Seen(**turned, rays=seen.rays, camera=seen.camera * signs),
+        target=views.target.flip(-1),
+        labels=views.labels.flip(-1),
+        log_depth=views.log_depth.flip(-1),
+        visibility=views.visibility.flip(-1),
+    )
+
+
+@torch.no_grad()
+def carry(painted: Painted, before: Views, now: Views, movable: Tensor) -> Views:
+    """`now` with what was painted in the frames before of the first of its views, moved into their cameras."""
+    colours, coverages = now.seen.painted.clone(), now.seen.painted_coverage.clone()
+    labels = painted.classes.argmax(1)
+    for i, (pose, lens) in enumerate(zip(before.poses, before.lenses, strict=True)):
+        keep = (before.seen.coverage[i] < 0.5) & ~movable[labels[i]]
+        surfels = unproject(
+            painted.log_depth[i].exp(),
+            painted.picture[i].clamp(-1, 1),
+            labels[i].to(torch.uint8),
+            lens,
+            pose,
+            0.0,
+            painted=True,
+            keep=keep,
+        )
+        moved = splat(surfels, now.poses[i], now.lenses[i], painted.classes.shape[1], 0.0)
+        colours[i], coverages[i] = moved.colour, moved.coverage
+    return replace(now, seen=replace(now.seen, painted=colours, painted_coverage=coverages))
