@@ -24,8 +24,6 @@ from gcd_train.live.draws import Poses
 Random = np.random.Generator
 Record = TypeVar("Record")
 Batch = TypeVar("Batch")
-SMALL_SHARE = 0.6
-"""So much of the depth and paint stages learns from pictures of half the size, at a quarter of the cost."""
 PART_SEED = 1_000_003
 """Between the seeds of the batches of one update."""
 _MOST_GAP, _REFERENCE_SHARE = 6, 0.85

@@ -19,7 +19,6 @@ from gcd_model.live.depth_net import (
 )
 from gcd_train.live.batches import (
     PART_SEED,
-    SMALL_SHARE,
     Ahead,
     FrameBatches,
     Pictures,
@@ -56,8 +55,10 @@ class DepthTask:
         seed: int,
         parts: int = 1,
         workers: int = 0,
+        small_share: float = 0.0,
     ) -> None:
-        """size: frames a batch. parts: batches an update. workers: processes that read them."""
+        """size: frames a batch. parts: batches an update. workers: processes that read them. small_share: LiveStage's."""
+        self._small_share = small_share
         self._net, self._config, self._held_out = net, config, list(held_out)
         self._network: nn.Module = net
         self._device = next(net.parameters()).device
@@ -89,7 +90,7 @@ class DepthTask:
     def step_loss(self, progress: Progress) -> StepLoss:
         """Of one batch of frames."""
         pictures, ground, random = self._batches[progress.part](progress.updates)
-        if progress.share < SMALL_SHARE:
+        if progress.share < self._small_share:
             pictures, ground = halved(pictures), ground[:, ::2, ::2]
         self._net.train()
         inputs = depth_inputs(pictures.video, pictures.rays, ground).to(self._device)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from gcd_model.live.config import LiveConfig
 from gcd_model.live.paint_net import SIGMA_DATA, Painted, PaintNet, Seen, filled
 from gcd_model.live.view import movable_classes
-from gcd_train.live.batches import SMALL_SHARE, Ahead, Random, autocast, class_weights, on
+from gcd_train.live.batches import Ahead, Random, autocast, class_weights, on
 from gcd_train.live.clips import read_clip
 from gcd_train.live.inputs import read_inputs
 from gcd_train.live.look import picture, write_rows
@@ -45,8 +45,10 @@ class PaintTask:
         paths: Sequence[Path],
         held_out: "HeldOutViews",
         workers: int = 0,
+        small_share: float = 0.0,
     ) -> None:
-        """batches: of the parts of an update. workers: processes that read them."""
+        """batches: of the parts of an update. workers: processes that read them. small_share: LiveStage's."""
+        self._small_share = small_share
         self._net, self._config, self._held_out = net, config, held_out
         self._network: nn.Module = net
         self._device, self._batches = next(net.parameters()).device, [Ahead(each.batch, workers) for each in batches]
@@ -70,7 +72,7 @@ class PaintTask:
     def step_loss(self, progress: Progress) -> StepLoss:
         """Of one batch of views."""
         before, now, random = on(self._device, self._batches[progress.part](progress.updates))
-        if progress.share < SMALL_SHARE:
+        if progress.share < self._small_share:
             before, now = None if before is None else halved(before), halved(now)
         later = progress.share >= _MEAN_ALONE
         if before is not None and later:

@@ -21,12 +21,14 @@ class LiveStage(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     """How long a stage trains and how.
 
     batch: frames (depth) or views (paint, detail) of a batch. parts: batches an update, which the processes that
-    `torchrun` starts share; of the detail, one.
+    `torchrun` starts share; of the detail, one. small_share: so much of its time depth and paint learn from pictures
+    of half the size, at a quarter of the cost.
     """
 
     budget: Budget
     batch: Annotated[int, Meta(ge=1)] = 8
     parts: Annotated[int, Meta(ge=1)] = 1
+    small_share: Annotated[float, Meta(ge=0, le=1)] = 0.6
     optimiser: OptimiserRecipe
     ema: EmaRecipe = EmaRecipe(limit=0.998, horizon=0.15)
 

@@ -69,7 +69,10 @@ def train_live(recipe: LiveRecipe, places: LivePlaces, stop: StopSignal, process
     run = partial(_stage, recipe, folder, stop)
     alone = partial(processes.by_the_first, stop=stop)
     model, (seed, workers) = recipe.model, (recipe.seed, recipe.workers)
-    depth = DepthTask(networks.depth, model, paths, measured, recipe.depth.batch, seed, recipe.depth.parts, workers)
+    stage = recipe.depth
+    depth = DepthTask(
+        networks.depth, model, paths, measured, stage.batch, seed, stage.parts, workers, stage.small_share
+    )
     run("depth", recipe.depth, depth, processes)
     exact, learned, shown = (
         places.out / "inputs" / name / _digest(net, recipe)
@@ -84,7 +87,7 @@ def train_live(recipe: LiveRecipe, places: LivePlaces, stop: StopSignal, process
         for part in range(recipe.paint.parts)
     ]
     views = HeldOutViews(measured, shown, model)
-    paint = PaintTask(networks.paint, model, batches, paths, views, workers)
+    paint = PaintTask(networks.paint, model, batches, paths, views, workers, recipe.paint.small_share)
     run("paint", recipe.paint, paint, processes)
     seen = ViewBatches(paths, [learned], model, recipe.detail.batch, seed + 1, carried=0.6)
     path = places.out / f"{recipe.name}.safetensors"
