@@ -57,7 +57,10 @@ class DepthTask:
         workers: int = 0,
         small_share: float = 0.0,
     ) -> None:
-        """size: frames a batch. parts: batches an update. workers: processes that read them. small_share: LiveStage's."""
+        """size: frames a batch. parts: batches an update. workers: processes that read them.
+
+        small_share: see LiveStage.
+        """
         self._small_share = small_share
         self._net, self._config, self._held_out = net, config, list(held_out)
         self._network: nn.Module = net

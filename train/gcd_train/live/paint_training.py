@@ -47,7 +47,10 @@ class PaintTask:
         workers: int = 0,
         small_share: float = 0.0,
     ) -> None:
-        """batches: of the parts of an update. workers: processes that read them. small_share: LiveStage's."""
+        """batches: of the parts of an update. workers: processes that read them.
+
+        small_share: see LiveStage.
+        """
         self._small_share = small_share
         self._net, self._config, self._held_out = net, config, held_out
         self._network: nn.Module = net
