@@ -2,7 +2,8 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from functools import cached_property
+from typing import Any, Literal, TypeAlias
 
 import cv2
 import numpy as np
@@ -257,13 +258,24 @@ class _Sampling:
         self.lens = lens
         self._size = (camera.width, camera.height)
         self._shrunk = _shrunk_size(lens, camera)
-        small, fine = lens.resized(*self._shrunk), camera.resized(*(_SUPERSAMPLED * side for side in self._size))
-        target = np.array([[fine.fx, 0.0, fine.cx - HALF_PIXEL], [0.0, fine.fy, fine.cy - HALF_PIXEL], [0.0, 0.0, 1.0]])
-        arguments = (small.matrix, np.array(small.coefficients), np.eye(3), target, (fine.width, fine.height))
-        if lens.distortion == "equidistant":
-            self._maps = cv2.fisheye.initUndistortRectifyMap(*arguments, cv2.CV_16SC2)
-        else:
-            self._maps = cv2.initUndistortRectifyMap(*arguments, cv2.CV_16SC2)
+        self._camera = camera
+        fine = camera.resized(*(_SUPERSAMPLED * side for side in self._size))
+        self._maps = self._maps_to(fine, cv2.CV_16SC2)
+
+    def _maps_to(self, camera: Intrinsics, kind: int) -> tuple[NDArray[Any], NDArray[Any]]:
+        """For `cv2.remap`, from the shrunk picture."""
+        small = self.lens.resized(*self._shrunk)
+        centre = (camera.cx - HALF_PIXEL, camera.cy - HALF_PIXEL)
+        target = np.array([[camera.fx, 0.0, centre[0]], [0.0, camera.fy, centre[1]], [0.0, 0.0, 1.0]])
+        equidistant = self.lens.distortion == "equidistant"
+        undistort = cv2.fisheye.initUndistortRectifyMap if equidistant else cv2.initUndistortRectifyMap
+        coefficients = np.array(self.lens.coefficients)
+        return undistort(small.matrix, coefficients, np.eye(3), target, (camera.width, camera.height), kind)
+
+    @cached_property
+    def _depth_maps(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Straight to the camera's pixels: nearest neighbours of fixed-point maps would be those to the upper left."""
+        return self._maps_to(self._camera, cv2.CV_32FC1)
 
     def image(self, image: Image) -> Image:
         if self._shrunk != (self.lens.width, self.lens.height):
@@ -273,8 +285,7 @@ class _Sampling:
 
     def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
         small = cv2.resize(depth, self._shrunk, interpolation=cv2.INTER_NEAREST_EXACT)
-        fine = cv2.remap(small, *self._maps, cv2.INTER_NEAREST)  # 0, a hole, beyond the picture
-        return np.ascontiguousarray(fine[::_SUPERSAMPLED, ::_SUPERSAMPLED], np.float32)
+        return np.asarray(cv2.remap(small, *self._depth_maps, cv2.INTER_NEAREST), np.float32)  # 0, a hole, beyond it
 
 
 def _shrunk_size(lens: LensModel, camera: Intrinsics) -> tuple[int, int]:

@@ -149,7 +149,7 @@ def examine(file: WeightsFile, options: Options) -> Examined:
     family = checked_family(told, config)
     if isinstance(config, ModelConfig) and card is None:
         config = at_trained_size(config, family)
-    networks = _empty(config, len(file.tensors))
+    networks = _empty(config)
     expected = {name: tuple(tensor.shape) for name, tensor in networks.state_dict().items()}
     levels = Levels.of(config) if isinstance(config, ModelConfig) else _NO_LEVELS
     match = match_weights(expected, file.shapes, _NAMINGS[file.layout], levels)
@@ -195,14 +195,8 @@ def _with_options(config: ModelConfig | LiveConfig, options: Options) -> ModelCo
     return config if options.frames is None else msgspec.structs.replace(config, frames=options.frames)
 
 
-def _empty(config: ModelConfig | LiveConfig, tensors: int) -> Networks | LiveNetworks:
-    """Networks without storage. A config that is out of proportion to its file is refused before it is built."""
-    if isinstance(config, ModelConfig):
-        tower = 0 if config.image_encoder is None else config.image_encoder.layers
-        blocks = config.unet.blocks_per_level * len(config.unet.multipliers)
-        blocks += config.vae.blocks_per_level * len(config.vae.multipliers)
-        if tower + blocks > tensors:
-            raise CheckpointError(f"describes {tower + blocks} blocks and holds {tensors} tensors; it is damaged")
+def _empty(config: ModelConfig | LiveConfig) -> Networks | LiveNetworks:
+    """Networks without storage."""
     try:
         return empty_networks(config)
     except (ArithmeticError, RuntimeError, TypeError, ValueError) as error:

@@ -181,10 +181,10 @@ def test_damaged_metadata_is_refused(tmp_path: Path, metadata: dict[str, str], s
     assert said in refused(own_file(tmp_path, **metadata))
 
 
-def test_a_config_out_of_proportion_is_refused_before_it_is_built(tmp_path: Path) -> None:
-    tower = msgspec.to_builtins(SMALL_GCD.image_encoder) | {"layers": 10**9}
-    path = own_file(tmp_path, **{"gcd.config": tampered(image_encoder=tower)})
-    assert "describes 1000000004 blocks" in refused(path)
+def test_a_config_out_of_proportion_is_refused(tmp_path: Path) -> None:
+    for blocks, said in ((10**9, "`int` <= 256"), (256, "weights are missing")):
+        unet = msgspec.to_builtins(SMALL_GCD.unet) | {"blocks_per_level": blocks}
+        assert said in refused(own_file(tmp_path, **{"gcd.config": tampered(unet=unet)}))
 
 
 def test_our_files_state_their_heads(tmp_path: Path) -> None:

@@ -92,7 +92,7 @@ def test_missing_and_huge_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "huge.yaml").write_bytes(FILE + b"#" * 70_000)
     with pytest.raises(ConfigError, match="larger than 16384 bytes"):
         load_lens(tmp_path / "huge.yaml")
-    with pytest.raises(ConfigError, match="Is a directory"):
+    with pytest.raises(ConfigError, match="is no regular file"):
         load_lens(tmp_path)
 
 

@@ -22,7 +22,6 @@ from gcd_node.errors import SourceLostError
 from gcd_node.frame import FrameSource
 from gcd_node.publisher import Publisher
 from gcd_node.sockets import PublisherOptions
-from gcd_node.source_config import SourceConfig
 
 SLACK_S = 10.0  # what a machine that does other things may add
 LIVE = 'kind = "v4l2"\ndevice = "/dev/video-none"'
@@ -67,12 +66,12 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
     return ran
 
 
-def _giving(source: FrameSource) -> Callable[[SourceConfig], FrameSource]:
+def _giving(source: FrameSource) -> Callable[..., FrameSource]:
     """Opens this source once; the next time it is gone."""
     bench = Bench()
     left = [source]
 
-    def opened(_: SourceConfig) -> FrameSource:
+    def opened(*_: object) -> FrameSource:
         return left.pop() if left else bench.open()
 
     return opened

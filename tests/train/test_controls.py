@@ -102,9 +102,9 @@ def test_kubric_controls_say_cameras_and_driving_ones_do_not(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("sample", "match"),
     [
-        ({"frame_start": -1, "frame_skip": 1}, "is no control list"),
-        ({"frame_start": 0, "frame_skip": 0}, "is no control list"),
-        ({"frame_start": 0}, "is no control list"),
+        ({"frame_start": -1, "frame_skip": 1}, "a control list has scenes with samples with frame_start"),
+        ({"frame_start": 0, "frame_skip": 0}, "a control list has scenes with samples with frame_start"),
+        ({"frame_start": 0}, "a control list has scenes with samples with frame_start"),
         ({"frame_start": 0, "frame_skip": 1, "spherical_start": [0, 0, 1]}, "a, s has only one of"),
         (
             {"frame_start": 0, "frame_skip": 1, "spherical_start": [0, 0, 0], "spherical_end": [0, 0, 1]},

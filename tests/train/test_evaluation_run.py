@@ -164,7 +164,7 @@ def test_a_damaged_record_is_named_and_no_run_is_refused(tmp_path: Path) -> None
     keeper.begin(note(methods={"a": {}}))
     keeper.keep(record("a", "k"))
     (tmp_path / "records" / "a" / "k.json").write_bytes(b'{"method": "a"')
-    with pytest.raises(RunError, match=r"k\.json is damaged"):
+    with pytest.raises(RunError, match=r"k\.json cannot be used"):
         read_run(tmp_path)
 
 

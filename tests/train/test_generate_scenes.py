@@ -178,7 +178,7 @@ class TestWriteScene:
         with pytest.raises(DataError, match=r"depth_00000.tiff cannot be read"):
             verify(folder)
         (folder / MANIFEST).write_text("{")
-        with pytest.raises(DataError, match=r"gcd-manifest.json cannot be read"):
+        with pytest.raises(DataError, match=r"gcd-manifest.json cannot be used"):
             verify(folder)
 
     def test_a_full_disk_leaves_what_was_finished(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

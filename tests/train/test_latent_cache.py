@@ -382,5 +382,5 @@ def test_a_folder_without_a_cache_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="holds no cached scene"):
         CachedLatents.open(tmp_path)
     (tmp_path / "index.json").write_text("{}")
-    with pytest.raises(RunError, match=r"index\.json cannot be read"):
+    with pytest.raises(RunError, match=r"index\.json cannot be used"):
         CachedLatents.open(tmp_path)

@@ -33,7 +33,7 @@ ADAPTED = ModelRecipe(base="small", family="kubric90", weights="given.safetensor
 
 def output(networks: Networks) -> Tensor:
     batch = random_batch(networks.config)
-    denoiser = Denoiser(networks.unet, None, "v", networks.camera)
+    denoiser = Denoiser(networks.unet, "v", networks.camera)
     with torch.no_grad():
         return denoiser(batch.target, torch.full((batch.frames,), 2.0), batch)[0]
 

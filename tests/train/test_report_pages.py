@@ -483,5 +483,5 @@ def test_an_empty_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="holds no record yet"):
         Run.read(tmp_path)
     (tmp_path / "run.json").write_text(json.dumps({"command": 1}))
-    with pytest.raises(RunError, match="no note of a run"):
+    with pytest.raises(RunError, match=r"run\.json cannot be used"):
         Run.read(tmp_path)

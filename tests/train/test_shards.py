@@ -94,7 +94,7 @@ def test_folders_without_data_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no finished shard"):
         PairedClips.open(tmp_path)
     (tmp_path / "world.json").write_text('{"name": 3}')
-    with pytest.raises(DataError, match="cannot be read"):
+    with pytest.raises(DataError, match=r"world\.json cannot be used"):
         PairedClips.open(tmp_path)
 
 

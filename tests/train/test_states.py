@@ -244,7 +244,7 @@ def replace_files(note: FolderNote) -> FolderNote:
         ("__0_0.distcp", Path.unlink, "is missing"),
         ("__1_0.distcp", truncate, "not those that were written"),
         ("__1_0.distcp", flip, "not those that were written"),
-        ("digest.json", Path.unlink, "digest.json is missing"),
+        ("digest.json", Path.unlink, "digest.json cannot be read: No such file"),
         ("digest.json", flip, "not as it was written"),
     ],
 )

@@ -27,6 +27,8 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
         _require_regular(path)
         with path.open("rb") as file:
             content = io.BytesIO(file.read(_MOST_ARRAYS))
+        if not content.getbuffer().nbytes:
+            raise ValueError("it is empty")
         with zipfile.ZipFile(content) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > _MOST_ARRAYS:
                 raise ValueError(f"it unfolds to more than {_MOST_ARRAYS} bytes")

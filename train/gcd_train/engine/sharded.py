@@ -83,10 +83,10 @@ def checked_note(folder: Path, stage: str) -> FolderNote:
                 raise _damaged(folder, f"{name} is missing")
             if _digest(folder / name) != digest:
                 raise _damaged(folder, f"the bytes of {name} are not those that were written")
-    except FileNotFoundError as error:
-        raise _damaged(folder, f"{_NOTE} is missing") from error
-    except (OSError, FileError) as error:
-        raise _damaged(folder, f"{_NOTE} or a file it names: {error}") from error
+    except FileError as error:
+        raise _damaged(folder, f"{_NOTE} {error}") from error
+    except OSError as error:
+        raise _damaged(folder, f"a file that {_NOTE} names cannot be read: {error}") from error
     if note.stage != stage:
         raise RunError(f"{folder} is no state of the stage {stage!r}; delete it to start anew")
     return note
