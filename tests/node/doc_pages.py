@@ -24,6 +24,17 @@ SHELL = ("", "sh", "bash", "console")
 GAP = "\0"  # stands for what a message fills in
 WHOLE = ("source.kind=synthetic", "model.weights=random:driving", "view.topdown.kind=fixed")
 """What a launch file cannot do without, as changes."""
+SOURCES_AND_KEYS = {
+    "synthetic": (),
+    "mcap": ("path=x",),
+    "file": ("path=x",),
+    "folder": ("path=x", "fps=5"),
+    "v4l2": (),
+    "oak": (),
+    "push": (),
+    "rtsp": ("url=x",),
+}
+"""Every kind of source, with the keys that it cannot do without."""
 
 
 class Block(NamedTuple):
@@ -126,9 +137,10 @@ def _option(command: Any, word: str) -> Any:
 
 def _wrong_change(values: list[str]) -> list[str]:
     """A change of a key that no launch file has."""
-    for source in ("kind=synthetic", "path=x", "kind=v4l2", "kind=oak", "kind=push", "url=x"):
+    for kind, needed in SOURCES_AND_KEYS.items():
+        source = [f"source.{each}" for each in (f"kind={kind}", *needed)]
         try:
-            parse_config(b"", "here", [f"source.{source}", *WHOLE[1:], *values])
+            parse_config(b"", "here", [*source, *WHOLE[1:], *values])
         except ConfigError as error:
             if "unknown key" in str(error):
                 continue

@@ -137,7 +137,7 @@ def test_the_replay_of_a_hostile_log_fails_with_its_reason(
 def test_what_a_strange_run_states_takes_neither_time_nor_memory(tmp_path: Path) -> None:
     golden = made_run(tmp_path / "golden")
     lies: dict[str, tuple[str, object, str]] = {
-        "a name of a million parts": ("config", "a" + ".a" * 20_000 + "=1", "names of more than 200 parts"),
+        "a name of a million parts": ("config", "a" + ".a" * 20_000 + "=1", "more than 200 dots"),
         "a window of terabytes": ("size", {"frames": 14, "height": 10**6, "width": 10**6}, "takes more than"),
     }
     for key, value, reason in lies.values():
@@ -148,7 +148,7 @@ def test_what_a_strange_run_states_takes_neither_time_nor_memory(tmp_path: Path)
             compare(golden, open_run(run))
     with (tmp_path / "config" / MANIFEST).open("r+b") as file:
         file.truncate(2**30)  # a sparse file
-    with pytest.raises(DamagedRunError, match="more than 67108864"):
+    with pytest.raises(DamagedRunError, match="larger than 67108864"):
         open_run(tmp_path / "config")
 
 

@@ -207,7 +207,9 @@ def test_a_process_ends_although_a_read_never_returns(server: RtspServer) -> Non
         server.stall()
         time.sleep(0.3)
         out, errors = process.communicate("go\n", timeout=60)
-    assert (process.returncode, out, errors) == (0, "closed\n", "")
+    assert (process.returncode, out) == (0, "closed\n")
+    assert errors.endswith("does not let go; its thread is left behind\n")
+    assert errors.count("\n") == 1
 
 
 def test_a_server_that_never_answers_is_absent_in_time() -> None:
