@@ -217,6 +217,7 @@ def test_true_logits_are_read_as_the_true_depth() -> None:
         moves=metres,
         ground=nowhere,
         ground_place=nowhere,
+        summary=nowhere,
     )
     assert torch.allclose(read_depth(output, config).metres, metres, rtol=1e-3)
 
@@ -365,7 +366,7 @@ def test_calibration_makes_the_interval_hold_and_takes_back_what_rare_classes_we
     weights = torch.ones(len(TINY.classes))
     weights[10] = torch.tensor(40.0).exp()
     assert not bool((labels == 10).any())
-    calibrate(networks, paths, views, weights, torch.ones_like(weights))
+    calibrate(networks, paths, paths, views, weights, torch.ones_like(weights))
     assert float(biases[rare]) <= 10.0
     inside = SpreadHistogram()
     clip = read_clip(paths[0])

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.blocks import FineHead, Trunk
 from gcd_model.live.config import SKY_M, DepthConfig
+from gcd_model.live.familiarity import summary_of
 from gcd_model.live.sweep import SWEEP_SCALE, sweep_channels
 
 INPUTS = 7
@@ -37,7 +38,7 @@ class DepthOutput:
 
     logits: [N, B, H, W], the last bin is the sky. raw_offsets: [N, B - 1, H, W], see `offsets`. classes: [N, K, H, W],
     logits. moves: [N, H, W], logit of a thing in motion. ground: [N, 1, H, W], probability that the declared ground is
-    seen. ground_place: [N, 1, H, W], where it is, in bins.
+    seen. ground_place: [N, 1, H, W], where it is, in bins. summary: [N, 2 C], see `summary_of`.
     """
 
     logits: Tensor
@@ -46,6 +47,7 @@ class DepthOutput:
     moves: Tensor
     ground: Tensor
     ground_place: Tensor
+    summary: Tensor
 
     def offsets(self, bins: Tensor) -> Tensor:
         """Of the depth from the centres of some bins, int64 [N, M, H, W], in parts of a bin: [N, M, H, W]."""
@@ -58,8 +60,7 @@ class DepthOutput:
 class DepthReading:
     """What is read off it. metres: [N, H, W], SKY_M for the sky. confidence: [N, H, W], probability of the peak.
 
-    entropy: [N], mean over pixels of the classes' entropy, in parts of its largest: high where the network has never
-    been. (It tells real pictures from rendered ones better than the bins' entropy does.)
+    entropy: [N], mean over pixels of the classes' entropy, in parts of its largest.
     """
 
     metres: Tensor
@@ -97,7 +98,8 @@ class DepthNet(nn.Module):
         """
         weight, bins = self.trunk.stem.weight, self.config.bins
         pictures = inputs.to(weight.dtype, memory_format=torch.channels_last)
-        made = self.head(pictures, self.features(pictures, sweep), pixels)
+        features = self.features(pictures, sweep)
+        made = self.head(pictures, features, pixels)
         logits, offsets, *others = made.split([bins, bins - 1, self.classes, 1, 1, 1], dim=1)
         logits, (classes, moves, gate, trust) = logits.float(), (each.float() for each in others)
         if sweep is not None:
@@ -117,6 +119,7 @@ class DepthNet(nn.Module):
             moves=moves[:, 0],
             ground=opened,
             ground_place=place,
+            summary=summary_of(features.detach()),
         )
 
 

@@ -153,7 +153,7 @@ class LiveSynthesizer:
             visibility=torch.stack([each.visibility for each in first]).cpu(),
             inverse_depth=torch.stack([each.inverse_depth for each in first]).float().cpu(),
             log_variance=torch.stack([each.log_variance for each in first]).float().cpu(),
-            ood=sum(frame.geometry.entropy for frame in drawn[0]) / len(drawn[0]),
+            ood=sum(frame.geometry.ood for frame in drawn[0]) / len(drawn[0]),
             lost=tuple(frame.lost for frame in drawn[0] if frame.lost is not None),
         )
 
@@ -243,7 +243,7 @@ def _seeds(seed: int, draws: int) -> list[int]:
 
 def _is_finite(frame: LiveFrame) -> bool:
     pictures = [each for view in frame.views for each in (view.picture, view.inverse_depth, view.log_variance)]
-    return math.isfinite(frame.geometry.entropy) and all(bool(each.isfinite().all()) for each in pictures)
+    return math.isfinite(frame.geometry.ood) and all(bool(each.isfinite().all()) for each in pictures)
 
 
 def save_live(

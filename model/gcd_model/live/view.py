@@ -14,6 +14,7 @@ from gcd_model.geometry import Intrinsics, invert_rigid, require_rigid
 from gcd_model.live.config import SIZE_FACTOR, SKY_M, LiveConfig
 from gcd_model.live.depth_net import DepthNet, depth_inputs, pixel_rays, plane_depth, read_depth
 from gcd_model.live.ego_motion import EgoMotion
+from gcd_model.live.familiarity import Familiarity
 from gcd_model.live.paint_net import Painted, PaintNet, Seen, camera_features, filled, seen_of
 from gcd_model.live.seen_world import SeenWorld
 from gcd_model.live.splat import Splat, Surfels, splat, unproject
@@ -39,6 +40,7 @@ class LiveNetworks(nn.Module):
         self.config = config
         self.depth = DepthNet(config.depth, len(config.classes))
         self.paint = PaintNet(config.paint, len(config.classes))
+        self.familiarity = Familiarity(config.depth.widths[0])
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -55,13 +57,13 @@ class Floor:
 class FrameGeometry:
     """What a source frame shows: metres [H, W] (0: hole, SKY_M: sky), labels uint8 [H, W], static bool [H, W].
 
-    entropy: how unsure the depth network was, 0 to 1; see `DepthReading`.
+    ood: how unlike its training it looks to the depth network, 0 to 1; see `Familiarity`.
     """
 
     metres: Tensor
     labels: Tensor
     static: Tensor
-    entropy: float
+    ood: float
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -148,7 +150,8 @@ class LiveView:
         labels = _likeliest(output.classes[0])
         metres = reading.metres[0] if depth is None else _taken(depth, reading.metres[0], lens)
         static = output.moves[0] < 0
-        return FrameGeometry(metres=metres, labels=labels, static=static, entropy=float(reading.entropy[0]))
+        ood = float(self._networks.familiarity.score(output.summary, reading.entropy)[0])
+        return FrameGeometry(metres=metres, labels=labels, static=static, ood=ood)
 
     @torch.inference_mode()
     def step(

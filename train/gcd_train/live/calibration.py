@@ -8,10 +8,11 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gcd_model.live.depth_net import depth_inputs, read_depth
+from gcd_model.live.depth_net import DepthOutput, depth_inputs, read_depth
 from gcd_model.live.paint_net import filled
 from gcd_model.live.view import LiveNetworks
 from gcd_train.live.batches import to_video, with_true_references
@@ -23,23 +24,32 @@ from gcd_train.metrics.classes import class_iou, confusion_matrix
 
 _SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 _FRAMES = slice(1, 14, 4)
+_FAMILIAR = 400
+"""So many clips of the training say what is familiar."""
 _DOUBT = 1.1
 """A source counts as another world's from so many times the highest score of a held-out clip."""
 
 
 @torch.no_grad()
 def calibrate(
-    networks: LiveNetworks, paths: Sequence[Path], views: HeldOutViews, depth_weights: Tensor, paint_weights: Tensor
+    networks: LiveNetworks,
+    learned: Sequence[Path],
+    paths: Sequence[Path],
+    views: HeldOutViews,
+    depth_weights: Tensor,
+    paint_weights: Tensor,
 ) -> None:
-    """Changes the class biases of both networks, and the config's spread and threshold.
+    """Changes the class biases of both networks, what is familiar, and the config's spread and threshold.
 
-    paths, views: of held-out clips. depth_weights, paint_weights: [K], how much the losses made of each class.
+    learned: clips of the training. paths, views: of held-out clips. depth_weights, paint_weights: [K], how much the
+    losses made of each class.
     """
     networks.eval()
     config = networks.config
     depth_head, paint_head = networks.depth.head.out, networks.paint.head.out
     _take_back(depth_head, 2 * config.depth.bins - 1, depth_weights, lambda: _source_classes(networks, paths))
     _take_back(paint_head, 3, paint_weights, lambda: _view_classes(networks, views))
+    _learn_familiar(networks, learned, np.random.default_rng(0))
     networks.config = msgspec.structs.replace(
         config, spread_shift=_spread_shift(networks, paths), ood_threshold=_threshold(networks, paths)
     )
@@ -95,12 +105,29 @@ def _spread_shift(networks: LiveNetworks, paths: Sequence[Path]) -> tuple[float,
 
 
 def _threshold(networks: LiveNetworks, paths: Sequence[Path]) -> float:
-    scores: list[float] = []
+    def score(output: DepthOutput) -> float:
+        return float(networks.familiarity.score(output.summary, read_depth(output, networks.config.depth).entropy))
+
+    frames = range(14)[_FRAMES]
+    means = [
+        np.mean([[score(output) for output in _outputs(networks, path, t)] for t in frames], axis=0).max()
+        for path in paths
+    ]
+    return min(_DOUBT * float(max(means)), 1.0)
+
+
+def _learn_familiar(networks: LiveNetworks, paths: Sequence[Path], random: np.random.Generator) -> None:
+    """From a frame of each of some clips that were learned from."""
+    some = [paths[i] for i in random.permutation(len(paths))[:_FAMILIAR]]
+    outputs = (each for path in some for each in _outputs(networks, path, int(random.integers(14))))
+    networks.familiarity.fit(torch.cat([each.summary for each in outputs]).cpu())
+
+
+def _outputs(networks: LiveNetworks, path: Path, t: int) -> Iterator[DepthOutput]:
+    """Of a frame of a clip's source: with its mount and an earlier frame, and without."""
     device = next(networks.parameters()).device
-    for path in paths:
-        source = with_true_references(read_clip(path), "source")
-        output = networks.depth(
-            depth_inputs(source.video, source.rays, source.ground()).to(device), source.sweeps(networks.config.depth)
-        )
-        scores.append(float(read_depth(output, networks.config.depth).entropy.mean()))
-    return min(_DOUBT * max(scores), 1.0)
+    frame = with_true_references(read_clip(path, slice(t + 1)), "source").last()
+    ground = frame.ground()
+    told = depth_inputs(frame.video, frame.rays, ground).to(device)
+    yield networks.depth(told, frame.sweeps(networks.config.depth).to(device))
+    yield networks.depth(depth_inputs(frame.video, frame.rays, torch.zeros_like(ground)).to(device))

@@ -316,7 +316,7 @@ class _Misjudging(LiveView):
 
 def _exact(source: Pictures, t: int) -> FrameGeometry:
     return FrameGeometry(
-        metres=source.metres[t], labels=source.labels[t].to(torch.uint8), static=source.moves[t] < 0.5, entropy=0.0
+        metres=source.metres[t], labels=source.labels[t].to(torch.uint8), static=source.moves[t] < 0.5, ood=0.0
     )
 
 

@@ -94,7 +94,7 @@ def train_live(recipe: LiveRecipe, places: LivePlaces, stop: StopSignal, process
 
     def finish() -> None:
         run("detail", recipe.detail, DetailTask(networks.paint, networks.depth, model, seen, views, workers), ALONE)
-        calibrate(networks.cpu(), held_out, views, depth.class_weights, paint.class_weights)
+        calibrate(networks.cpu(), paths, held_out, views, depth.class_weights, paint.class_weights)
         save_live(path, networks, recipe.name, overwrite=True)
         _log.info("wrote %s", path)
 

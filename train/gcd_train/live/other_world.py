@@ -1,0 +1,95 @@
+"""Does a live model know that a camera shows another world? Its score on held-out clips beside that on real videos.
+
+python -m gcd_train.live.other_world --heldout DIR --videos DIR [FILE ...] --weights FILE --out OUT
+"""
+
+import argparse
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from gcd_model import load_synthesizer
+from gcd_model.geometry import Intrinsics
+from gcd_model.live.synthesizer import LiveSynthesizer
+from gcd_model.live.view import LiveView
+from gcd_train.errors import DataError
+from gcd_train.gallery.real_video import WindowChoice, find_videos, read_windows
+from gcd_train.live.batches import to_video
+from gcd_train.live.clips import clip_paths, read_clip
+
+_ASSUMED_HFOV_DEG = 70.0
+"""Of a video whose lens nobody knows."""
+
+
+def score(synthesizer: LiveSynthesizer, video: Tensor, lens: Intrinsics) -> float:
+    """Mean `FrameGeometry.ood` of a window [T, 3, H, W] in [-1, 1], motion by its pictures, no mount declared."""
+    view = LiveView(synthesizer.networks)
+    return float(np.mean([view.step(frame, [], lens=lens).geometry.ood for frame in video]))
+
+
+def auc(known: Sequence[float], other: Sequence[float]) -> float:
+    """How often a score of another world is above one of the known world; ties count half."""
+    wins = np.subtract.outer(np.asarray(other), np.asarray(known))
+    return float(((wins > 0) + 0.5 * (wins == 0)).mean())
+
+
+def known_scores(synthesizer: LiveSynthesizer, folder: Path, clips: int) -> Iterator[tuple[str, float]]:
+    """Of at most so many clips, evenly chosen, each world."""
+    for world in sorted(path for path in folder.iterdir() if path.is_dir()):
+        paths = sorted(world.glob("*.safetensors"))
+        for path in paths[:: max(len(paths) // clips, 1)][:clips]:
+            clip = read_clip(path, names=["source.rgb"])
+            video = to_video(clip.arrays["source.rgb"])
+            lens = Intrinsics.from_hfov(clip.hfov_deg("source"), video.shape[-1], video.shape[-2])
+            yield f"{world.name}/{path.stem}", score(synthesizer, video, lens)
+
+
+def other_scores(synthesizer: LiveSynthesizer, paths: Sequence[Path], windows: int) -> Iterator[tuple[str, float]]:
+    """Of at most so many windows a video, evenly chosen."""
+    traits = synthesizer.traits
+    lens = Intrinsics.from_hfov(_ASSUMED_HFOV_DEG, traits.config.width, traits.config.height)
+    for video in find_videos(paths):
+        for window in read_windows(video, traits, WindowChoice(count=windows)):
+            yield f"{window.name} at {window.start_s:.1f} s", score(synthesizer, to_video(window.pictures), lens)
+
+
+def live_model(weights: str) -> LiveSynthesizer:
+    """Raises DataError for weights of another model."""
+    loaded = load_synthesizer(weights)
+    if not isinstance(loaded, LiveSynthesizer):
+        raise DataError(f"{weights} is no live model; only live models have a score")
+    return loaded
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """See the module."""
+    parser = argparse.ArgumentParser(description="How well a live model tells other worlds from its own.")
+    parser.add_argument("--heldout", type=Path, required=True, help="clips of the known worlds that it never learned")
+    parser.add_argument("--videos", type=Path, nargs="+", required=True, help="videos of other worlds, or folders")
+    parser.add_argument("--weights", default="package:live-small", help="a live model's")
+    parser.add_argument("--clips", type=int, default=10, help="of each known world")
+    parser.add_argument("--windows", type=int, default=6, help="of each video")
+    parser.add_argument("--out", type=Path, required=True, help="JSON file")
+    options = parser.parse_args(arguments)
+    clip_paths(options.heldout)
+    model = live_model(options.weights)
+    known = dict(known_scores(model, options.heldout, options.clips))
+    other = dict(other_scores(model, options.videos, options.windows))
+    threshold = model.networks.config.ood_threshold
+    told = {
+        "auc": auc(list(known.values()), list(other.values())),
+        "threshold": threshold,
+        "known_above": float(np.mean(np.asarray(list(known.values())) > threshold)),
+        "other_above": float(np.mean(np.asarray(list(other.values())) > threshold)),
+        "known": known,
+        "other": other,
+    }
+    options.out.write_text(json.dumps(told, indent=1))
+    print(json.dumps({name: value for name, value in told.items() if isinstance(value, float)}))
+
+
+if __name__ == "__main__":
+    main()
