@@ -13,6 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import cycle
 from types import TracebackType
 from typing import Any, Protocol
 
@@ -25,7 +26,7 @@ from gcd_node.errors import EndpointError, NodeError, PublisherError
 from gcd_node.sockets import NO_READERS, DataSocket, Parcel, PublisherOptions, Readers, StatusSocket
 
 _LOG = logging.getLogger(__name__)
-_RETRY_MS = 3
+_RETRY_MS, _REPEAT_MS = 3, 10
 _LEAST_LINGER_MS = 100
 
 
@@ -315,11 +316,14 @@ class Publisher:
 
     def _see_off(self) -> None:
         """Wait until readers have left. ZeroMQ's linger ends when its last batch of bytes is on its way, and loses it
-        to a reader too slow to take it at once; who leaves has the end-of-stream message."""
-        until = time.monotonic() + self._left_s(time.monotonic())
-        while self._data.ended and self._data.subscriptions.now.total > 0 and time.monotonic() < until:
+        to a reader too slow to take it at once; who leaves has the end-of-stream message. The ends are sent again
+        meanwhile: ZeroMQ skips them where a reader has no room."""
+        until, ends = time.monotonic(), cycle(self._data.ends)
+        until += self._left_s(until)
+        while self._data.ends and self._data.subscriptions.now.total > 0 and time.monotonic() < until:
             self._serve_sockets()
-            self._wait(_RETRY_MS)
+            self._wait(_REPEAT_MS)
+            self._data.try_send(next(ends))
             if self._abandoned.is_set():
                 return
 

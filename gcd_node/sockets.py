@@ -105,7 +105,7 @@ class Subscriptions:
 
 
 class DataSocket:
-    """The data socket; in lockstep it refuses rather than skips."""
+    """The data socket; in lockstep it refuses rather than skips. ends: the end messages since the last view."""
 
     def __init__(self, context: Context, guard: SocketGuard, options: PublisherOptions) -> None:
         self._options = options
@@ -114,7 +114,8 @@ class DataSocket:
         self.local = self.endpoint.startswith("ipc://")
         self.sent = self.bytes = 0
         self.subscriptions = Subscriptions()
-        self._begun = self.ended = False
+        self._begun = False
+        self.ends: list[bytes] = []
         self._last_sent = time.monotonic()
 
     def serve(self) -> None:
@@ -134,9 +135,12 @@ class DataSocket:
             return False
         if not self.try_send(parcel.part):
             return False
-        self._begun, self.ended = True, parcel.follow_s is not None
-        if not self.ended:
-            self._last_sent = time.monotonic()
+        self._begun = True
+        if parcel.follow_s is not None:
+            self.ends.append(parcel.part)
+            return True
+        self.ends.clear()
+        self._last_sent = time.monotonic()
         return True
 
     def try_send(self, part: bytes) -> bool:

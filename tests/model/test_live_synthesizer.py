@@ -325,8 +325,8 @@ def test_weights_survive_their_file(tmp_path: Path) -> None:
         assert torch.equal(loaded.networks.state_dict()[name], tensor.half().float())
     report = inspect_weights(tmp_path / "mine.safetensors")
     assert (report.family, report.config, report.trained) == ("live", LIVE_TINY, True)
-    assert [each.name for each in report.networks] == ["depth", "paint"]
-    assert report.parameters == sum(each.numel() for each in networks.parameters())
+    assert [each.name for each in report.networks] == ["depth", "paint", "familiarity"]
+    assert report.parameters == sum(each.numel() for each in networks.state_dict().values())
     converted = convert_weights(tmp_path / "mine.safetensors", tmp_path / "wide.safetensors", dtype="float32")
     assert converted.networks[0].dtypes == ("float32",)
 

@@ -14,7 +14,7 @@ import zmq
 from wire_messages import OTHER_BOOT, end, lines_of, origin, pixels, start_reader, window
 
 from gcd_client.endpoints import SetupError
-from gcd_client.protocol import MessageError, StatusMessage, decode, topic_key
+from gcd_client.protocol import EndMessage, MessageError, StatusMessage, decode, topic_key
 from gcd_client.subscriber import StatusSubscriber, ViewSubscriber
 from gcd_node.errors import ConfigError, EndpointError, NodeError
 from gcd_node.publisher import Publisher
@@ -274,6 +274,27 @@ def test_a_full_queue_loses_no_end_of_a_node_that_was_told_to_stop(tmp_path, mon
     ready.set()
     publisher.close()
     assert [parcel.follow_s is not None for parcel in left] == [False, True, True, True]
+
+
+def test_a_reader_that_was_busy_at_the_end_is_told_of_every_end(tmp_path, context) -> None:
+    views = [f"view{i}" for i in range(12)]
+    with Publisher(options(tmp_path)) as publisher:
+        reader = plain_reader(context, publisher.endpoint, b"view/")
+        reader.set(zmq.RCVHWM, 1)
+        wait_for_subscribers(publisher, 1)
+        for i in range(300):  # more than the buffers on the way hold
+            publisher.send(window(i))
+        for view_id in views:
+            publisher.end(end(view_id=view_id), delay_ms=0)
+        closing = threading.Thread(target=publisher.close)
+        closing.start()
+        time.sleep(0.2)
+        parts = []
+        while reader.poll(500):
+            parts.append(reader.recv())
+        closing.join()
+    ends = [message for part in parts if isinstance(message := decode(part), EndMessage)]
+    assert {message.header.view_id for message in ends} == set(views)
 
 
 def test_what_stops_the_thread_reaches_the_caller(tmp_path, monkeypatch) -> None:

@@ -376,10 +376,10 @@ def test_a_template_may_not_lead_out_of_the_set(copied: Path) -> None:
         LeRobotPairs(copied)
 
 
-@pytest.mark.parametrize(("told", "said"), [("{", "cannot be read"), ("{}", "missing required field")])
-def test_a_damaged_description_is_an_error_that_names_it(copied: Path, told: str, said: str) -> None:
-    (copied / "meta/info.json").write_text(told)
-    with pytest.raises(FileFault, match=said):
+@pytest.mark.parametrize("text", ["{", "{}"])
+def test_a_damaged_description_is_an_error_that_names_it(copied: Path, text: str) -> None:
+    (copied / "meta/info.json").write_text(text)
+    with pytest.raises(FileFault, match=r"info\.json"):
         LeRobotPairs(copied)
 
 

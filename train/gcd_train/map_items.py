@@ -25,7 +25,7 @@ Value = TypeVar("Value")
 
 _LOG = logging.getLogger(__name__)
 _ONE_THREAD = ("LP_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
-_STOP_S = 10.0
+_STOP_S = 30.0
 _KINDS: dict[str, type[TrainError]] = {kind.__name__: kind for kind in (DataError, RecipeError, RenderError, RunError)}
 
 
