@@ -506,7 +506,7 @@ for about, facts in ADAPTERS.items():
 
     def joined(here: Path, facts: str = facts) -> tuple[list[str], str]:
         adapter(here / "adapter.safetensors", facts)
-        packaged = Path(__file__).parents[1] / "model/gcd_model/weights/driving-small.safetensors"
+        packaged = Path(__file__).parents[1] / "model/gcd_model/weights/live-small.safetensors"
         return ["gcd-train", "lora", "merge", str(packaged), "adapter.safetensors", "out.safetensors"], "adapter"
 
     add(f"an adapter of {about}", joined)

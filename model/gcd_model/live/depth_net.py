@@ -60,11 +60,13 @@ class DepthOutput:
 class DepthReading:
     """What is read off it. metres: [N, H, W], SKY_M for the sky. confidence: [N, H, W], probability of the peak.
 
+    spread: [N, H, W], standard deviation of log-depth within the peak; errors are one to three times as large.
     entropy: [N], mean over pixels of the classes' entropy, in parts of its largest.
     """
 
     metres: Tensor
     confidence: Tensor
+    spread: Tensor
     entropy: Tensor
 
 
@@ -193,13 +195,16 @@ def read_depth(output: DepthOutput, config: DepthConfig) -> DepthReading:
     around = around.clamp(0, config.bins - 2)
     weight = solid.gather(1, around) * inside
     places = first_bin(config) + (around + output.offsets(around)) * bin_width(config)
-    place = (places * weight).sum(dim=1) / weight.sum(dim=1).clamp(min=1e-8)
+    weight = weight / weight.sum(dim=1, keepdim=True).clamp(min=1e-8)
+    place = (places * weight).sum(dim=1)
+    spread = ((places - place[:, None]).square() * weight).sum(dim=1).sqrt()
     sky = probability[:, -1] > best
     confidence = torch.maximum(best, probability[:, -1])
     metres = torch.where(sky, SKY_M, place.exp())
     return DepthReading(
         metres=torch.where(sky, SKY_M, _smoothed(metres, confidence)),
         confidence=confidence,
+        spread=spread,
         entropy=_entropy(output.classes),
     )
 

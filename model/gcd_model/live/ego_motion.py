@@ -46,8 +46,10 @@ _FEWEST, _SMALLEST_SHARE = 10, 0.5
 """Of the tracks: fewer that agree are a coincidence. A wrong pose does more harm than a lost one."""
 _STANDS_PX, _STANDS_SHARE = 0.15, 0.9
 """A camera stands if its motion would shift this share of the tracks by less than what optical flow gets wrong."""
+_DEPTH_SHARE, _SPREADS, _SUREST = 0.04, 2.0, 0.01
+"""Standard error of a depth from elsewhere, in parts of it; of the depth network's in its spreads, and at least."""
 _SIGHTINGS = 8
-"""A place is the mean of this many sightings; from then on newer ones count more."""
+"""A place is never surer than the mean of this many sightings: newer ones count, too."""
 _OTHER_SURFACE = 0.15
 """Relative step of depth from which on a track's pixel shows something else than its point."""
 
@@ -69,21 +71,24 @@ class Motion:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Frame:
-    """grey: u8 [H, W]. depth: [H, W] metres. usable: u8 [H, W], 1 where something static has a depth."""
+    """grey: u8 [H, W]. depth: [H, W] metres. share: [H, W], its standard error in parts of it. usable: u8 [H, W], 1
+    where something static has a depth."""
 
     grey: Array
     depth: Array
+    share: Array
     usable: Array
     lens: Intrinsics
     odometry: Tensor | None
 
-    def with_depth(self, depth: Tensor, static: Tensor) -> "_Frame":
+    def with_depth(self, depth: Tensor, static: Tensor, spread: Tensor | None) -> "_Frame":
         depth, static = depth.cpu(), static.cpu()
         usable = (static & depth.isfinite() & (depth > 0)).to(torch.uint8)
         inner = torch.zeros_like(usable)
         inside = (slice(_BORDER_PX, -_BORDER_PX),) * 2
         inner[inside] = usable[inside]
-        return replace(self, depth=depth.double().numpy(), usable=inner.numpy())
+        share = torch.full_like(depth, _DEPTH_SHARE) if spread is None else (spread.cpu() * _SPREADS).clamp(min=_SUREST)
+        return replace(self, depth=depth.double().numpy(), share=share.double().numpy(), usable=inner.numpy())
 
 
 class _LostError(Exception):
@@ -140,15 +145,16 @@ class EgoMotion:
             return Motion(world_from_camera=torch.eye(4, dtype=torch.float64), lost=True, reason=str(error))
         return Motion(world_from_camera=torch.from_numpy(self._pose.copy()), inliers=inliers)
 
-    def settle(self, depth: Tensor, static: Tensor) -> None:
+    def settle(self, depth: Tensor, static: Tensor, spread: Tensor | None = None) -> None:
         """What the frame shows that was just followed: the next one's motion hangs on it.
 
         Args:
             depth: [H, W] metres, 1000 for the sky; 0 or not finite: a hole. static: bool [H, W], what does not move.
+            spread: [H, W], standard deviation of log-depth; None for depth from elsewhere.
         """
         if self._new is None:
             return
-        self._last = frame = self._new.with_depth(depth, static)
+        self._last = frame = self._new.with_depth(depth, static, spread)
         if len(self._tracks):
             column, row = np.rint(self._tracks.place).astype(int).T
             here = self._pose
@@ -175,6 +181,7 @@ def _frame(picture: Tensor, lens: Intrinsics, odometry: Tensor | None) -> _Frame
     return _Frame(
         grey=grey.round().clamp(0, 255).to(torch.uint8).numpy(),
         depth=nothing.astype(np.float64),
+        share=nothing.astype(np.float64),
         usable=nothing,
         lens=lens,
         odometry=odometry,
@@ -256,7 +263,7 @@ def _with_new_corners(tracks: Tracks, frame: _Frame, grey: Array, pose: Array) -
         place=np.concatenate([tracks.place, place]),
         point=np.concatenate([tracks.point, point]),
         eye=np.concatenate([tracks.eye, np.broadcast_to(pose[:3, 3], point.shape)]),
-        sightings=np.concatenate([tracks.sightings, np.ones(len(place), np.int64)]),
+        share=np.concatenate([tracks.share, frame.share[row, column]]),
     )
 
 
@@ -292,10 +299,12 @@ def _placed_better(tracks: Tracks, frame: _Frame, pose: Array) -> Tracks:
     expected = (tracks.point - pose[:3, 3]) @ pose[:3, 2]
     same = (depth > 0) & (depth < _FARTHEST_M) & (np.abs(depth - expected) < _OTHER_SURFACE * expected)
     sighting = unprojected(tracks.place, np.where(same, depth, 1.0), frame.lens, pose)
-    share = np.where(same, 1 / (tracks.sightings + 1), 0.0)[:, None]
+    old, new = tracks.share**2, frame.share[row, column] ** 2
+    gain = np.where(same, old / (old + new), 0.0)
+    joined = np.where(same, np.maximum(old * new / (old + new), np.minimum(old, new / _SIGHTINGS)), old)
     return replace(
         tracks,
-        point=tracks.point + share * (sighting - tracks.point),
-        eye=tracks.eye + share * (pose[:3, 3] - tracks.eye),
-        sightings=np.minimum(tracks.sightings + same, _SIGHTINGS - 1),
+        point=tracks.point + gain[:, None] * (sighting - tracks.point),
+        eye=tracks.eye + gain[:, None] * (pose[:3, 3] - tracks.eye),
+        share=np.sqrt(joined),
     )

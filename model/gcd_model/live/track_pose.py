@@ -16,8 +16,8 @@ Array = NDArray[Any]
 _MOST = 0.75
 """Share of the tracks that agree with a pose from which on no other is tried."""
 _RANSAC_PX, _RANSAC_ROUNDS = 2.0, 150
-_FLOW_PX, _DEPTH_SHARE = 0.25, 0.04
-"""Standard errors of a followed place, and of one sighting's depth."""
+_FLOW_PX = 0.25
+"""Standard error of a followed place."""
 _DOUBTED, OUTLIER, _HOPELESS = 1.5, 4.0, 12.0
 """In standard errors: from here on a track counts less, not at all, and not even while the pose is still rough."""
 _ROUGH_STEPS, _FINE_STEPS, _SETTLED = 4, 4, 1e-5
@@ -30,13 +30,13 @@ class Tracks:
     """N points of the world that are followed.
 
     place: float32 [N, 2], where the last frame shows them, pixels as OpenCV counts them. point: [N, 3].
-    eye: [N, 3], from where they were seen, on average. sightings: [N], that the point is the mean of.
+    eye: [N, 3], from where they were seen, on average. share: [N], standard error of its depth, in parts of it.
     """
 
     place: Array
     point: Array
     eye: Array
-    sightings: Array
+    share: Array
 
     def __len__(self) -> int:
         return len(self.place)
@@ -113,7 +113,7 @@ def _reprojection(tracks: Tracks, lens: Intrinsics, pose: Array) -> tuple[Array,
     x, y, z = x[:, None], y[:, None], z[:, None]
     slope[:, :, 3], slope[:, :, 4], slope[:, :, 5] = y * ahead - z * down, z * right - x * ahead, x * down - y * right
     ray = (tracks.point - tracks.eye) @ pose[:3, :3]
-    blur = (slope[:, :, :3] @ ray[:, :, None])[:, :, 0] * (_DEPTH_SHARE / np.sqrt(tracks.sightings))[:, None]
+    blur = (slope[:, :, :3] @ ray[:, :, None])[:, :, 0] * tracks.share[:, None]
     size = np.linalg.norm(blur, axis=1)[:, None]
     along = blur / np.maximum(size, 1e-9)
     excess = (1 - _FLOW_PX / np.hypot(_FLOW_PX, size)) * along
@@ -129,7 +129,7 @@ def no_tracks() -> Tracks:
         place=np.zeros((0, 2), np.float32),
         point=np.zeros((0, 3)),
         eye=np.zeros((0, 3)),
-        sightings=np.zeros(0, np.int64),
+        share=np.zeros(0),
     )
 
 

@@ -57,13 +57,15 @@ class Floor:
 class FrameGeometry:
     """What a source frame shows: metres [H, W] (0: hole, SKY_M: sky), labels uint8 [H, W], static bool [H, W].
 
-    ood: how unlike its training it looks to the depth network, 0 to 1; see `Familiarity`.
+    ood: how unlike its training it looks to the depth network, 0 to 1; see `Familiarity`. spread: [H, W], see
+    `DepthReading`; None for depth from elsewhere.
     """
 
     metres: Tensor
     labels: Tensor
     static: Tensor
     ood: float
+    spread: Tensor | None = None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -151,7 +153,8 @@ class LiveView:
         metres = reading.metres[0] if depth is None else _taken(depth, reading.metres[0], lens)
         static = output.moves[0] < 0
         ood = float(self._networks.familiarity.score(output.summary, reading.entropy)[0])
-        return FrameGeometry(metres=metres, labels=labels, static=static, ood=ood)
+        spread = reading.spread[0] if depth is None else None
+        return FrameGeometry(metres=metres, labels=labels, static=static, ood=ood, spread=spread)
 
     @torch.inference_mode()
     def step(
@@ -192,7 +195,7 @@ class LiveView:
         pose = motion.world_from_camera
         if geometry is None:
             geometry = self.look(frame, lens, depth=depth, floor=floor, reference=self._references.chosen(pose))
-        self._ego.settle(geometry.metres, geometry.static)
+        self._ego.settle(geometry.metres, geometry.static, geometry.spread)
         self._references.add(picture, pose, geometry.metres)
         self._world.look(picture, geometry.metres, geometry.labels, geometry.static, lens, pose)
         out_lens = lens if target_lens is None else target_lens
