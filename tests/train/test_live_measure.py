@@ -10,6 +10,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from gcd_model.errors import CheckpointError
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.config import LiveConfig
 from gcd_train.errors import DataError
@@ -235,5 +236,5 @@ def test_unknown_methods_and_other_weights_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError):
         methods_of(["telepathy"], "init", tmp_path)
     save_file({"x": torch.zeros(1)}, tmp_path / "other.safetensors")
-    with pytest.raises(DataError):
+    with pytest.raises(CheckpointError):
         open_networks(str(tmp_path / "other.safetensors"))

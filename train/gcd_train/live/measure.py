@@ -19,14 +19,13 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import safe_open
-from safetensors.torch import load_file
 from torch import Tensor
 
 from gcd_model import hatched
 from gcd_model.live.config import LiveConfig
+from gcd_model.live.synthesizer import LiveSynthesizer
 from gcd_model.live.view import LiveNetworks
-from gcd_model.small_files import decode_json
+from gcd_model.loading import load_synthesizer
 from gcd_train.errors import DataError
 from gcd_train.live.clips import LiveClip, clip_paths, read_clip
 from gcd_train.live.judge import JudgeNet, load_judge, random_judge
@@ -40,7 +39,6 @@ from gcd_train.live.measure_methods import (
     live_methods,
 )
 
-_CONFIG_KEY = "gcd.config"
 _SHEET_FRAMES, _SHEET_CLIPS = (5, 9, 13), 4
 _TABLES: dict[str, dict[str, tuple[str, int]]] = {
     "Pictures": {
@@ -253,17 +251,14 @@ def to_json(results: Sequence[SetResult]) -> dict[str, Any]:
 
 
 def open_networks(weights: str) -> LiveNetworks:
-    """From a safetensors file of a state dict with its LiveConfig in the metadata; "init": fresh ones, seed 0."""
+    """Of a live weight file, in the precision that a node takes here; "init": fresh ones, seed 0. Raises DataError."""
     if weights == "init":
         torch.manual_seed(0)
         return LiveNetworks(LiveConfig()).eval()
-    with safe_open(weights, framework="pt") as file:
-        told = (file.metadata() or {}).get(_CONFIG_KEY)
-    if told is None:
-        raise DataError(f"{weights} says no {_CONFIG_KEY!r} in its metadata; it is no live model")
-    networks = LiveNetworks(decode_json(told, LiveConfig))
-    networks.load_state_dict(load_file(weights))
-    return networks.eval()
+    loaded = load_synthesizer(weights, device="cpu")
+    if not isinstance(loaded, LiveSynthesizer):
+        raise DataError(f"{weights} is no live model")
+    return loaded.networks
 
 
 def methods_of(names: Sequence[str], weights: str, training: Path) -> list[Method]:

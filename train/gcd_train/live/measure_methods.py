@@ -4,6 +4,7 @@ import json
 import os
 import time
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -19,6 +20,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from gcd_model.geometry import Intrinsics, invert_rigid
+from gcd_model.layers import zeroed
 from gcd_model.live.config import SKY_M, LiveConfig
 from gcd_model.live.depth_net import pixel_rays
 from gcd_model.live.paint_net import filled, seen_of
@@ -321,8 +323,10 @@ def _exact(source: Pictures, t: int) -> FrameGeometry:
 
 
 def live_methods(networks: LiveNetworks) -> dict[str, LiveModel]:
-    """The live model as it ships, told its motion, with exact depth, and with what may be wrong, by name."""
-    plain = LiveModel(networks=networks)
+    """The live model as it ships, told its motion, with exact depth, with what may be wrong, and painting otherwise (in
+    several steps, or the mean alone), by name."""
+    plain, mean = LiveModel(networks=networks), deepcopy(networks)
+    zeroed(mean.paint.detail.out)
     made = [
         plain,
         replace(plain, name="live-odometry", odometry=True),
@@ -331,5 +335,8 @@ def live_methods(networks: LiveNetworks) -> dict[str, LiveModel]:
         replace(plain, name="live-depth-1.1", depth_scale=1.1),
         replace(plain, name="live-floor-20cm", floor_higher_m=0.2),
         replace(plain, name="live-floor-2deg", floor_tilt_deg=2.0),
+        replace(plain, name="live-2-steps", steps=2),
+        replace(plain, name="live-4-steps", steps=4),
+        replace(plain, name="live-mean", networks=mean),
     ]
     return {each.name: each for each in made}
