@@ -22,7 +22,7 @@ from gcd_model.live.config import SKY_M, LiveConfig
 from gcd_model.live.depth_net import DepthNet, depth_inputs, read_depth
 from gcd_model.live.seen_world import SeenWorld
 from gcd_model.live.splat import Splat
-from gcd_train.live.batches import Pictures, Random, pictures_of, with_true_references
+from gcd_train.live.batches import Pictures, Random, autocast, pictures_of, with_true_references
 from gcd_train.live.clips import LiveClip, decode_depth, encode_depth, read_clip
 
 Array = NDArray[Any]
@@ -45,7 +45,8 @@ def learned_geometry(net: DepthNet, config: LiveConfig, source: Pictures, ground
     sweeps = source.sweeps(config.depth)
     for t in range(len(source.lenses)):
         inputs = depth_inputs(source.video[t : t + 1], source.rays[t : t + 1], ground[t : t + 1])
-        output = net(inputs, sweeps[t : t + 1])
+        with autocast(inputs.device):
+            output = net(inputs, sweeps[t : t + 1])
         metres.append(read_depth(output, config.depth).metres)
         labels.append(output.classes.argmax(1).to(torch.uint8))
         static.append(output.moves < 0)
