@@ -5,7 +5,6 @@ import signal
 import sys
 import threading
 import webbrowser
-from types import FrameType
 from typing import Annotated, TypeAlias
 
 import typer
@@ -31,30 +30,19 @@ def viewer(
     show: Open = False,
     ends_with_stdin: EndsWithStdin = False,
 ) -> None:
-    """Serve the page for a running node, which it reads as any client does; ends with Ctrl-C."""
-    from gcd_node.viewer.node_link import NodeEndpoints  # OpenCV and the server: the other quick commands need neither
+    """Serve the page for a running node; ends with Ctrl-C."""
+    from gcd_node.viewer.feed import NodeEndpoints  # OpenCV and the server: the other quick commands need neither
     from gcd_node.viewer.server import ViewerServer
 
     ended = threading.Event()
-
-    def end(_number: int, _frame: FrameType | None) -> None:
-        ended.set()
-
-    def end_with_stdin() -> None:
-        sys.stdin.buffer.read()
-        ended.set()
-
     if ends_with_stdin:
-        threading.Thread(target=end_with_stdin, daemon=True).start()
+        threading.Thread(target=lambda: (sys.stdin.buffer.read(), ended.set()), daemon=True).start()
     keys = client_keys(key_folder, node_key)
     node = NodeEndpoints(data=data, status=status, control=None if control == "none" else control, keys=keys)
-    previous = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        with ViewerServer(http, node) as server:
-            typer.echo(f"page {server.operator_url}", err=True)  # nowhere else is the token shown
-            if show and any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")):
-                webbrowser.open(server.operator_url)
-            ended.wait()
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda _number, _frame: ended.set())
+    with ViewerServer(http, node) as server:
+        typer.echo(f"page {server.operator_url}", err=True)  # nowhere else is the token shown
+        if show and any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")):
+            webbrowser.open(server.operator_url)
+        ended.wait()

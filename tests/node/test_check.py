@@ -5,7 +5,7 @@ import pytest
 from media import write_video
 from tiny_weights import write_tiny
 
-from gcd_node.check import Resources, check
+from gcd_node.check import check_launch
 from gcd_node.cli.main import run_app
 from gcd_node.config import NodeConfig, load_config, parse_config
 from gcd_node.config_text import to_toml
@@ -39,8 +39,7 @@ def launch(tmp_path: Path) -> Path:
 
 
 def found(launch: Path, *changes: str, memory: int | None = None) -> dict[str, tuple[str, str]]:
-    resources = None if memory is None else Resources(device="cpu", memory=memory)
-    return {each.topic: (each.verdict, each.detail) for each in check(load_config(launch, changes), resources)}
+    return {each.topic: (each.verdict, each.detail) for each in check_launch(load_config(launch, changes), memory)}
 
 
 def test_a_good_launch_file_is_looked_at_from_end_to_end(launch: Path) -> None:

@@ -17,7 +17,6 @@ import pytest
 
 from gcd_node.errors import ConfigError
 from gcd_node.health import Health, Level
-from gcd_node.service import loopback_address
 
 prometheus = pytest.importorskip("prometheus_client", reason="needs the extra `metrics`")
 from prometheus_client.parser import text_string_to_metric_families  # noqa: E402
@@ -157,9 +156,9 @@ def test_callers_that_say_nothing_neither_grow_the_node_nor_lock_probes_out_for_
     server: MetricsServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gcd_node.metrics._Handler.timeout", 0.5)
-    host, port = loopback_address(server.url.removeprefix("http://"), "")
+    host, _, port = server.url.removeprefix("http://").rpartition(":")
     before = threading.active_count()
-    silent = [socket.create_connection((host, port), timeout=20) for _ in range(30)]
+    silent = [socket.create_connection((host, int(port)), timeout=20) for _ in range(30)]
     try:
         for caller in silent[8:]:
             assert caller.recv(1) == b""  # turned away
@@ -174,8 +173,8 @@ def test_callers_that_say_nothing_neither_grow_the_node_nor_lock_probes_out_for_
 
 @pytest.mark.parametrize("sent", [b"\x00\xff" * 40, b"GET " + b"/" * 70_000, b"GET /metrics HTTP/9.9\r\n\r\n", b"\r\n"])
 def test_junk_is_refused_and_the_next_caller_served(server: MetricsServer, sent: bytes) -> None:
-    host, port = loopback_address(server.url.removeprefix("http://"), "")
-    with socket.create_connection((host, port), timeout=20) as caller:
+    host, _, port = server.url.removeprefix("http://").rpartition(":")
+    with socket.create_connection((host, int(port)), timeout=20) as caller:
         caller.sendall(sent)
         caller.shutdown(socket.SHUT_WR)
         with contextlib.suppress(ConnectionResetError):
