@@ -21,7 +21,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("run:run", "Run the node on a launch file, until its recording ends or it is told to."),
     "check": ("run:check", "Look at all that a launch file needs, before anything is started; loads no weights."),
     "view": ("watch:view", "Watch the views of a node: a live table, and with --save pictures on disk."),
-    "viewer": ("viewer:viewer", "Serve the page for a running node; ends with Ctrl-C."),
+    "viewer": ("watch:viewer", "Serve the page for a running node; ends with Ctrl-C."),
     "replay": (
         "replay:replay_launch",
         "Replay a launch file's recording in lockstep, as fast as the model goes, into a run that can be compared.",

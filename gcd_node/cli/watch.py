@@ -1,8 +1,14 @@
-"""`gcd-node view` and `gcd-node status`: live tables of a running node's views, and of how it does. Needs no torch."""
+"""`gcd-node view`, `status` and `viewer`: live tables of a running node's views and of how it does, and the page for
+both. Needs no torch."""
 
 import json
 import math
+import os
+import signal
+import sys
+import threading
 import time
+import webbrowser
 from collections import deque
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -63,6 +69,12 @@ AsJson: TypeAlias = Annotated[bool, Option("--json", help="One JSON object a lin
 StaleAfter: TypeAlias = Annotated[
     float, Option("--timeout", min=0.1, help="A node silent for so many seconds is stale.")
 ]
+Http: TypeAlias = Annotated[str, Option(help="Where to serve the page: 127.0.0.1:PORT.")]
+Data: TypeAlias = Annotated[str, Option(help="The node's data endpoint: ipc, ipc://PATH or tcp://HOST:PORT.")]
+Status: TypeAlias = Annotated[str, Option("--status", help="Its status endpoint.")]
+Control: TypeAlias = Annotated[str, Option(help="Its control endpoint; none to look only.")]
+Open: TypeAlias = Annotated[bool, Option("--open", help="Open the page in a browser, where there is a screen.")]
+EndsWithStdin: TypeAlias = Annotated[bool, Option("--ends-with-stdin", hidden=True)]
 
 
 def view(
@@ -89,11 +101,12 @@ def view(
             saver = stack.enter_context(ViewSaver(save, hatch=hatch))
         views = stack.enter_context(ViewSubscriber(endpoint, name, kinds, conflate=False, keys=keys))
         live = stack.enter_context(Live(console=console, auto_refresh=False))
-        until_s = time.monotonic() + (timeout or math.inf)
+        patience_s = math.inf if timeout is None else timeout
+        until_s = time.monotonic() + patience_s
         while not (views.ended or views.received >= (limit or math.inf) or time.monotonic() >= until_s):
             received = views.receive(_REFRESH_MS)
             if received is not None:
-                until_s = time.monotonic() + (timeout or math.inf)
+                until_s = time.monotonic() + patience_s
                 table.add(received, time.monotonic())
                 try:
                     if saver is not None:
@@ -147,6 +160,34 @@ def status(
                 console.print(board.render(now_s, where))
             if once and not board.stale(now_s):
                 return
+
+
+def viewer(
+    http: Http = "127.0.0.1:8470",
+    data: Data = "ipc",
+    status_endpoint: Status = "ipc",
+    control: Control = "ipc",
+    key_folder: KeyFolder = None,
+    node_key: NodeKey = None,
+    show: Open = False,
+    ends_with_stdin: EndsWithStdin = False,
+) -> None:
+    """Serve the page for a running node; ends with Ctrl-C."""
+    from gcd_node.viewer.feed import NodeEndpoints  # the server's libraries: the tables need none
+    from gcd_node.viewer.server import ViewerServer
+
+    ended, keys = threading.Event(), client_keys(key_folder, node_key)
+    if ends_with_stdin:
+        threading.Thread(target=lambda: (sys.stdin.buffer.read(), ended.set()), daemon=True).start()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda _number, _frame: ended.set())
+    control_endpoint = None if control == "none" else control
+    node = NodeEndpoints(data=data, status=status_endpoint, control=control_endpoint, keys=keys)
+    with ViewerServer(http, node) as server:
+        typer.echo(f"page {server.operator_url}", err=True)  # nowhere else is the token shown
+        if show and any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")):
+            webbrowser.open(server.operator_url)
+        ended.wait()
 
 
 class ViewTable:

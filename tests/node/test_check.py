@@ -177,6 +177,7 @@ def test_changes_are_read_as_toml_and_else_as_text() -> None:
         ("model.stepz=4", "did you mean `steps`"),
         ("model.steps=zero", "int"),
         ("model.steps=0", ">= 1"),
+        ("view.a.kind=orbital", "`view.*kind` must be fixed, orbit or pose, got 'orbital'"),
     ],
 )
 def test_a_change_that_cannot_be_made_is_explained(change: str, reason: str) -> None:

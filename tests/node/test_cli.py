@@ -284,18 +284,6 @@ def test_the_demo_ends_with_pictures_of_what_arrived_in_the_other_process(tmp_pa
         assert (tmp_path / "gcd-demo" / name).stat().st_size > 10_000
 
 
-def test_view_saves_what_a_running_node_publishes(video: Path, tmp_path: Path) -> None:
-    settings = launch_file(tmp_path, video, publish="min_subscribers = 1")
-    node = subprocess.Popen([sys.executable, "-m", "gcd_node", "run", str(settings)], stderr=subprocess.DEVNULL)
-    try:
-        assert run_app(["view", f"ipc://{tmp_path}/data", "--save", str(tmp_path / "s"), "--timeout", "60"]) == 0
-        assert node.wait(30) == 0
-    finally:
-        node.kill()
-    assert len(list((tmp_path / "s" / "main").glob("*.png"))) == 14
-    assert (tmp_path / "s" / "main.mkv").exists()
-
-
 def test_a_still_is_seen_as_a_clip(tmp_path: Path) -> None:
     write_png(tmp_path / "still.png", np.full((*SIZE, 3), 90, np.uint8))
     assert run_app([str(a) for a in synthesize(tmp_path / "still.png", tmp_path / "out", *DRIVING)]) == 0
