@@ -3,6 +3,7 @@
 import contextlib
 import logging
 import os
+import re
 import signal
 import sys
 import threading
@@ -11,7 +12,6 @@ from importlib import import_module, metadata
 from typing import Annotated, cast
 
 import typer
-from rich.markup import escape
 
 from gcd_client.protocol import ClientError
 from gcd_node.errors import NodeError, SourceError
@@ -100,7 +100,8 @@ def new_app(loaded: Collection[str]) -> typer.Typer:
         if isinstance(command, typer.Typer):
             app.add_typer(command, name=name)
         else:
-            app.command(name, help=escape(command.__doc__ or ""))(command)  # [model] is no markup
+            text = re.sub(r"(\[[a-z])", r"\\\1", command.__doc__ or "")  # [model] is no markup
+            app.command(name, help=text)(command)
     return app
 
 

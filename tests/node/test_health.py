@@ -2,7 +2,7 @@
 
 import json
 import statistics
-import threading
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -145,17 +145,21 @@ def test_over_a_fifth_of_damaged_frames_warns_and_passes(
     assert status(health)["source"]["corrupt"] == corrupt
 
 
-@pytest.mark.parametrize(
-    ("model", "expected"),
-    [("failed", Level.ERROR), ("degraded", Level.WARN), ("busy", Level.OK), ("loading", Level.OK)],
-)
-def test_the_model_sets_the_level(health: Health, model: ModelState, expected: Level) -> None:
-    health.model(model)
-    assert level(health) is expected
+def test_the_model_sets_the_level(health: Health) -> None:
+    expected: dict[ModelState, Level] = {
+        "failed": Level.ERROR,
+        "degraded": Level.WARN,
+        "busy": Level.OK,
+        "loading": Level.OK,
+    }
+    for model, worst in expected.items():
+        health.model(model)
+        assert level(health) is worst
 
 
 def test_reasons_are_listed_worst_first_and_the_worst_is_the_level(health: Health, clock: Clock) -> None:
     work(health, clock)
+    assert (level(health), missing(health), health.snapshot().findings) == (Level.OK, (), {})
     health.raise_reason("fps", Level.WARN)
     health.raise_reason(IDLE, Level.OK)
     health.source("stalled")
@@ -258,12 +262,8 @@ def test_a_status_holds_every_key_of_the_protocol_that_is_known(health: Health, 
         "corrupt": 1,
         "dropped": 7,
     }
-    assert told["window"] == {
-        "built": 5,
-        "rejected": 3,
-        "reason_counts": {"WIN_GAP": 2, "CLOCK_STEP": 1},
-        "skipped": 4,
-    }
+    faults = {"WIN_GAP": 2, "CLOCK_STEP": 1}
+    assert told["window"] == {"built": 5, "rejected": 3, "reason_counts": faults, "skipped": 4}
     assert told["model"] == {
         "state": "ready",
         "ms_p50": 250.0,
@@ -296,29 +296,20 @@ def test_a_change_is_noticed_once_and_rendering_is_none(health: Health, clock: C
 
 def test_many_threads_tell_at_once_and_nothing_is_lost() -> None:
     health, rounds = Health(), 300
-    errors: list[Exception] = []
 
     def tell(start: int) -> None:
-        try:
-            for i in range(rounds):
-                health.frame(start + i, start + i)
-                health.stage("render", 0.01)
-                health.count("slot")
-                health.count("oom_count")
-                health.raise_reason("fps", Level.WARN)
-                if i % 50 == 0:
-                    health.report()
-                health.clear_reason("fps")
-        except Exception as error:
-            errors.append(error)
+        for i in range(rounds):
+            health.frame(start + i, start + i)
+            health.stage("render", 0.01)
+            health.count("slot")
+            health.raise_reason("fps", Level.WARN)
+            if i % 50 == 0:
+                health.report()
+            health.clear_reason("fps")
 
-    threads = [threading.Thread(target=tell, args=(i * S,)) for i in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(60)
+    with ThreadPoolExecutor(4) as threads:
+        list(threads.map(tell, (i * S for i in range(4))))
     report = health.snapshot()
-    assert errors == []
-    assert (report.frames, report.status["drops"]["slot"], report.status["model"]["oom_count"]) == (1200, 1200, 1200)
+    assert (report.frames, report.status["drops"]["slot"]) == (1200, 1200)
     assert report.stages["render"].count == 1200
     assert health.report()["heartbeat_seq"] == 4 * len(range(0, rounds, 50)) + 1
