@@ -8,6 +8,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Literal, TypeAlias
 
+import psutil
 import torch
 
 from gcd_client.endpoints import resolve_endpoint
@@ -54,14 +55,6 @@ class Finding:
     error: Exception | None = None
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Resources:
-    """What this machine has left for the model. memory: bytes free on `device`."""
-
-    device: str
-    memory: int
-
-
 @dataclass(slots=True)
 class _Known:
     """What has been found out so far. weight_bytes: the weights in the precision they will be used in."""
@@ -71,31 +64,32 @@ class _Known:
     weight_bytes: int = 0
 
 
-def check(config: NodeConfig, resources: Resources | None = None) -> Iterator[Finding]:
-    """Look at endpoints, source, weights, memory, views and time, in this order, and where recordings go, if anywhere;
-    each as soon as it is known.
-
-    resources: measured if left out. What follows from something that failed is left out.
-    """
-    known = _Known()
-    yield _tried("endpoints", lambda: _endpoints(config))
-    if config.record.folder is not None:
-        yield _tried("record", lambda: _record(Path(config.record.folder or ""), config.record))
-    yield _tried("source", lambda: _source(config, known))
-    yield _tried("weights", lambda: _weights(config.model, known))
-    info, traits = known.info, None if known.traits is None else known.traits.streaming()
-    if traits is not None:
-        yield _tried("memory", lambda: _memory(traits, known.weight_bytes, resources or measured(traits.device)))
-    if traits is not None and info is not None:
-        yield _tried("views", lambda: _views(config, traits, info))
-        yield _tried("time", lambda: _time(config, traits, info))
-
-
 class _DoubtfulError(Exception):
     """A start would go on, with a warning."""
 
 
-def _tried(topic: str, look: Callable[[], str]) -> Finding:
+def check_launch(config: NodeConfig, free_memory: int | None = None) -> Iterator[Finding]:
+    """Look at endpoints, source, weights, memory, views and time, in this order, and where recordings go, if anywhere;
+    each as soon as it is known.
+
+    free_memory: bytes, on the model's device; measured if left out. What follows from something that failed is left
+        out.
+    """
+    known = _Known()
+    yield _finding("endpoints", lambda: _endpoints(config))
+    if config.record.folder is not None:
+        yield _finding("record", lambda: _record(Path(config.record.folder or ""), config.record))
+    yield _finding("source", lambda: _source(config, known))
+    yield _finding("weights", lambda: _weights(config.model, known))
+    info, traits = known.info, None if known.traits is None else known.traits.streaming()
+    if traits is not None:
+        yield _finding("memory", lambda: _memory(traits, known.weight_bytes, free_memory))
+    if traits is not None and info is not None:
+        yield _finding("views", lambda: _views(config, traits, info))
+        yield _finding("time", lambda: _time(config, traits, info))
+
+
+def _finding(topic: str, look: Callable[[], str]) -> Finding:
     try:
         return Finding(topic=topic, verdict="ok", detail=look())
     except _DoubtfulError as doubt:
@@ -106,8 +100,8 @@ def _tried(topic: str, look: Callable[[], str]) -> Finding:
 
 def _endpoints(config: NodeConfig) -> str:
     with open_session(config) as (_, publisher):
-        wanted = config.control.endpoint
-        control = "no control" if wanted is None else f"control {resolve_endpoint(wanted, 'control')}"
+        endpoint = config.control.endpoint
+        control = "no control" if endpoint is None else f"control {resolve_endpoint(endpoint, 'control')}"
         return f"free: data {publisher.endpoint}, status {publisher.status_endpoint}, {control}"
 
 
@@ -130,10 +124,10 @@ def _source(config: NodeConfig, known: _Known) -> str:
     source = open_source(config.source, load_server_security(config.security))
     try:
         first = _first_frame(source)
-        told = known.info = source.info
-        rate = f"{told.width} x {told.height} at {told.fps_nominal:g} FPS"
-        lens = "" if told.lens is None else ", calibrated"
-        return f"{told.kind} {told.id}: {rate}{lens}; its first frame is number {first.seq}"
+        info = known.info = source.info
+        rate = f"{info.width} x {info.height} at {info.fps_nominal:g} FPS"
+        lens = "" if info.lens is None else ", calibrated"
+        return f"{info.kind} {info.id}: {rate}{lens}; its first frame is number {first.seq}"
     finally:
         source.close()
 
@@ -159,52 +153,40 @@ def _first_frame(source: FrameSource) -> Frame:
 
 
 def _weights(section: ModelSection, known: _Known) -> str:
-    kind, _, name = section.weights.partition(":")
-    if kind == "random":
+    if section.weights.startswith("random:"):
         known.traits = load_synthesizer(section.weights, device="cpu").traits
         raise _DoubtfulError(f"{section.weights}: these weights are random, so every picture is noise")
-    path = _packaged(name) if kind == "package" else Path(section.weights)
-    if is_export(path):
-        return _exported(path, section, known)
+    path = weights_path(section.weights)
+    if is_export(path):  # only loading says whether onnxruntime takes it here
+        known.traits = load_model(section).traits
+        known.weight_bytes = sum(file.stat().st_size for file in path.iterdir() if file.is_file())
+        return f"{known.traits.name}, {known.traits.precision}, an export of {known.weight_bytes / 1e6:.1f} MB"
     report = inspect_weights(
         path, family=section.family, head_width=section.head_width, image_heads=section.image_heads
     )
-    known.traits = _traits(report, section) if section.adapter is None else _adapted(section)
-    known.weight_bytes = report.parameters * _BYTES.get(known.traits.precision, 4)
-    family = "unknown" if known.traits.family is None else known.traits.family.name
-    return f"{known.traits.name}, family {family}, {report.parameters / 1e6:.1f} M parameters"
+    # Only loading says whether weights and adapter belong together.
+    traits = known.traits = _traits(report, section) if section.adapter is None else load_model(section).traits
+    known.weight_bytes = report.parameters * _BYTES.get(traits.precision, 4)
+    family = "unknown" if traits.family is None else traits.family.name
+    return f"{traits.name}, family {family}, {report.parameters / 1e6:.1f} M parameters"
 
 
-def _exported(folder: Path, section: ModelSection, known: _Known) -> str:
-    """Of an export: it is loaded, as nothing less says whether onnxruntime takes it here."""
-    known.traits = load_model(section).traits
-    known.weight_bytes = sum(file.stat().st_size for file in folder.iterdir() if file.is_file())
-    return f"{known.traits.name}, {known.traits.precision}, an export of {known.weight_bytes / 1e6:.1f} MB"
-
-
-def _adapted(section: ModelSection) -> Traits:
-    """Of weights with an adapter: both are loaded, as nothing less says whether they belong together."""
-    return load_synthesizer(
-        section.weights,
-        family=section.family,
-        device="cpu",
-        dtype=section.dtype,
-        head_width=section.head_width,
-        image_heads=section.image_heads,
-        adapter=section.adapter,
-    ).traits
-
-
-def _packaged(name: str) -> Path:
+def weights_path(weights: str) -> Path:
+    """The file that weights are in; `package:NAME` ships with the model package. Raises CheckpointError."""
+    kind, _, name = weights.partition(":")
+    if kind != "package":
+        return Path(weights)
     path = Path(str(files("gcd_model").joinpath("weights", f"{name}.safetensors")))
-    if not path.is_file():
+    if "/" in name or not path.is_file():
         raise CheckpointError(f"no weights called {name!r} ship with the package; give a path, or random:driving")
     return path
 
 
 def _traits(report: WeightsReport, section: ModelSection) -> Traits:
     """What loading would say of the weights, without loading them."""
-    device = _device(section.device)
+    device = section.device
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
     return Traits(
         name=report.name,
         config=report.config,
@@ -218,29 +200,15 @@ def _traits(report: WeightsReport, section: ModelSection) -> Traits:
     )
 
 
-def _device(wanted: str) -> str:
-    if wanted != "auto":
-        return wanted
-    return "cuda" if torch.cuda.is_available() else "cpu"
-
-
-def measured(device: str) -> Resources:
-    """What this machine has left on a device: free memory of the GPU, or what Linux calls available."""
-    if device.startswith("cuda"):
-        return Resources(device=device, memory=torch.cuda.mem_get_info(device)[0])
-    for line in Path("/proc/meminfo").read_text().splitlines():
-        name, _, rest = line.partition(":")
-        if name == "MemAvailable":
-            return Resources(device="cpu", memory=1024 * int(rest.split()[0]))
-    return Resources(device="cpu", memory=0)
-
-
-def _memory(traits: Traits, needed: int, found: Resources) -> str:
-    line = f"weights take {needed / 2**30:.2f} GiB in {traits.precision}, {found.memory / 2**30:.2f} are free on "
-    line += f"{found.device}; what the model needs to compute comes on top and is not counted"
-    if needed > found.memory:
+def _memory(traits: Traits, needed: int, free: int | None) -> str:
+    on_gpu = traits.device.startswith("cuda")
+    if free is None:
+        free = torch.cuda.mem_get_info(traits.device)[0] if on_gpu else psutil.virtual_memory().available
+    line = f"weights take {needed / 2**30:.2f} GiB in {traits.precision}, {free / 2**30:.2f} are free on "
+    line += f"{traits.device if on_gpu else 'cpu'}; what the model needs to compute comes on top and is not counted"
+    if needed > free:
         raise CheckpointError(f"{line}. Free some, or use bfloat16 or a smaller model")
-    if needed > _MUCH_MEMORY * found.memory:
+    if needed > _MUCH_MEMORY * free:
         raise _DoubtfulError(line)
     return line
 
@@ -259,14 +227,14 @@ def _views(config: NodeConfig, traits: Traits, info: SourceInfo) -> str:
 
 def _time(config: NodeConfig, traits: Traits, info: SourceInfo) -> str:
     _, fps = prepare_run(config, traits, info)
-    period_s = (config.window.stride or traits.config.frames) / fps
-    model = config.model
+    frames, model = traits.config.frames, config.model
+    period_s = (config.window.stride or frames) / fps
     if isinstance(traits.config, ModelConfig):
         runs = Schedule.of(traits.config, drawing_options(model)).evaluations
     else:
-        runs = sampler_in_use(model, traits).steps * traits.config.frames
+        runs = sampler_in_use(model, traits).steps * frames
     runs *= model.samples * len(config.view)
-    unit = "window" if traits.config.frames > 1 else "frame"
+    unit = "window" if frames > 1 else "frame"
     return (
         f"a {unit} every {period_s:.2f} s, {runs} network evaluations each, so {1000 * period_s / runs:.1f} ms for one "
         f"if none is to be left out; {model_threads(model)} CPU threads"

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 
-from gcd_client.protocol import ClassRecord
 from gcd_model import Traits, hatched
 from gcd_node.config import ControlConfig, ModelSection, NodeConfig, PublishConfig, ViewConfig, ViewerConfig
 from gcd_node.errors import NodeError
@@ -42,13 +41,11 @@ _PAGE_WIDTH = 1000
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class DemoReport:
-    """How the demo went. model: its name. received: windows that arrived in the other process. noise: the weights are
-    random. files: the pictures."""
+    """How the demo went. traits: of its model. received: windows that arrived in the other process. files: pictures."""
 
     summary: Summary
-    model: str
+    traits: Traits
     received: int
-    noise: bool
     files: tuple[Path, ...]
 
 
@@ -64,21 +61,16 @@ def demo_config(folder: Path) -> NodeConfig:
     )
 
 
-def open_demo_config(folder: Path) -> NodeConfig:
-    """The same in a loop, for somebody who watches: with a page, and steered through it."""
-    config = demo_config(folder)
-    return replace(
-        config,
-        source=replace(config.source, loop=True),
-        control=ControlConfig(endpoint=f"ipc://{folder}/control"),
-        viewer=ViewerConfig(http="127.0.0.1:0"),
-    )
-
-
 def run_open_demo() -> Summary:
-    """Run the drive in a loop, in real time, until SIGINT or SIGTERM; its viewer opens the page."""
-    with tempfile.TemporaryDirectory(prefix="gcd-demo-") as name:
-        config = open_demo_config(Path(name))
+    """Run the drive in a loop, in real time, until SIGINT or SIGTERM; its viewer opens the page, which can steer it."""
+    with tempfile.TemporaryDirectory(prefix="gcd-demo-") as folder:
+        config = demo_config(Path(folder))
+        config = replace(
+            config,
+            source=replace(config.source, loop=True),
+            control=ControlConfig(endpoint=f"ipc://{folder}/control"),
+            viewer=ViewerConfig(http="127.0.0.1:0"),
+        )
         with open_session(config, options=NodeOptions(), viewer=True, show_page=True) as (node, publisher):
             return run_until_signal(node, publisher)
 
@@ -91,35 +83,29 @@ def run_demo(out: Path, on_window: Callable[[WindowReport], None]) -> DemoReport
     """
     make_folder(out)  # to know at once
     inputs: dict[int, list[Image]] = {}
+    models: list[Traits] = []
 
     def remember(report: WindowReport) -> None:
         inputs[report.window.window_id] = list(report.window.images)
         on_window(report)
 
     with tempfile.TemporaryDirectory(prefix="gcd-demo-") as name:
-        folder = Path(name)
-        config = demo_config(folder)
-        models: list[Traits] = []
-        options = NodeOptions(on_configured=models.append)
-        with (
-            open_session(config, remember, options) as (node, publisher),
-            _receiver(publisher, folder / "received") as receiver,
-        ):
+        received = Path(name) / "received"
+        session = open_session(demo_config(Path(name)), remember, NodeOptions(on_configured=models.append))
+        with session as (node, publisher), _receiver(publisher, received) as receiver:
             summary = run_until_signal(node, publisher)
             publisher.close()
-            _wait_for(receiver)
-        received = folder / "received" / VIEW_ID
-        views, maps = (_pictures(received / kind) for kind in (".", "cls"))
-        seen = {int(path.stem): list(np.load(path)) for path in (received / "vis").glob("*.npy")}
-    (traits,) = models
-    shown = moments(inputs, views, seen, maps)
-    return DemoReport(
-        summary=summary,
-        model=traits.name,
-        received=len(shown),
-        noise=not traits.trained,
-        files=tuple(_write_pictures(out, shown, ontology(traits), summary.fps)),
-    )
+            _await_end(receiver)
+        views, maps = (_pictures(received / VIEW_ID / kind) for kind in (".", "cls"))
+        seen = {int(path.stem): list(np.load(path)) for path in (received / VIEW_ID / "vis").glob("*.npy")}
+    windows = moments(inputs, views, seen, maps)
+    shown, classes = [moment for window in windows for moment in window], ontology(models[0])
+    files = video, moving, still = tuple(out / f"side_by_side.{kind}" for kind in ("mp4", "webp", "png"))
+    frames = [comparison([moment], classes, HEADINGS) for moment in shown]
+    write_video(video, frames, summary.fps)
+    write_animation(moving, [scaled(frame, _PAGE_WIDTH) for frame in frames], summary.fps)
+    write_png(still, comparison([shown[i] for i in spread(len(shown), _ROWS)], classes, HEADINGS))
+    return DemoReport(summary=summary, traits=models[0], received=len(windows), files=files)
 
 
 @contextmanager
@@ -129,9 +115,9 @@ def _receiver(publisher: Publisher, folder: Path) -> Generator[subprocess.Popen[
     command += ["--save", str(folder), "--timeout", str(_RECEIVER_TIMEOUT_S)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)  # noqa: S603
     try:
-        deadline = time.monotonic() + _RECEIVER_TIMEOUT_S
+        until_s = time.monotonic() + _RECEIVER_TIMEOUT_S
         while publisher.stats.subscribers == 0:
-            if process.poll() is not None or time.monotonic() > deadline:
+            if process.poll() is not None or time.monotonic() > until_s:
                 raise NodeError("the receiving process did not subscribe; try `gcd-node view` by hand to see why")
             time.sleep(0.02)
         yield process
@@ -140,7 +126,7 @@ def _receiver(publisher: Publisher, folder: Path) -> Generator[subprocess.Popen[
         process.wait()
 
 
-def _wait_for(receiver: subprocess.Popen[bytes]) -> None:
+def _await_end(receiver: subprocess.Popen[bytes]) -> None:
     """Until it has saved everything. Raises NodeError if it does not end by itself after the stream has."""
     try:
         receiver.wait(_RECEIVER_TIMEOUT_S)
@@ -171,29 +157,14 @@ def moments(
     Raises:
         NodeError: there is nothing to put together.
     """
-    arrived = (inputs, views, seen, maps)
-    windows = [
-        number
-        for number, frames in sorted(inputs.items())
-        if all(len(each.get(number, ())) == len(frames) for each in arrived)
-    ]
-    if not windows:
+    windows = [[each.get(window, ()) for each in (inputs, views, seen, maps)] for window in sorted(inputs)]
+    whole = [parts for parts in windows if len({len(part) for part in parts}) == 1]
+    if not whole:
         raise NodeError("no whole window arrived in the receiving process; run `gcd-node -v demo` to see why")
     return [
         [
             Moment(source=source, view=view, seen=hatched(view, visibility), classes=painted)
-            for source, view, visibility, painted in zip(*(each[window] for each in arrived), strict=True)
+            for source, view, visibility, painted in zip(*parts, strict=True)
         ]
-        for window in windows
+        for parts in whole
     ]
-
-
-def _write_pictures(out: Path, shown: list[list[Moment]], classes: Sequence[ClassRecord], fps: float) -> list[Path]:
-    """The video of all windows, the same small for a page, and a picture of a few moments."""
-    video, moving, still = (out / f"side_by_side.{kind}" for kind in ("mp4", "webp", "png"))
-    all_moments = [moment for window in shown for moment in window]
-    frames = [comparison([moment], classes, HEADINGS) for moment in all_moments]
-    write_video(video, frames, fps)
-    write_animation(moving, [scaled(frame, _PAGE_WIDTH) for frame in frames], fps)
-    write_png(still, comparison([all_moments[i] for i in spread(len(all_moments), _ROWS)], classes, HEADINGS))
-    return [video, moving, still]

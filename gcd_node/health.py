@@ -9,7 +9,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, TypeAlias, get_args
 
 SourceState: TypeAlias = Literal["closed", "connecting", "streaming", "stalled", "lost", "ended"]
@@ -66,10 +66,7 @@ class RecordHealth:
 
     def to_status(self) -> dict[str, object]:
         """The field `rec` of a status message."""
-        status: dict[str, object] = {"state": self.state}
-        if self.file is not None:
-            status |= {"file": self.file, "bytes": self.bytes, "written": self.written, "dropped": dict(self.dropped)}
-        return status
+        return {"state": self.state} if self.file is None else {**asdict(self), "dropped": dict(self.dropped)}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -279,7 +276,7 @@ class Health:
                 "skipped": counts["slot"],
             },
             "model": self._model_status(stages.get("render")),
-            "publish": {name: counts[name] for name in ("sent", "subs", "bytes")} | {"dropped": counts["queue"]},
+            "publish": {"dropped": counts["queue"], **{name: counts[name] for name in ("sent", "subs", "bytes")}},
             "drops": {hop: counts[hop] for hop in get_args(Hop)},
             "stages": {
                 name: {"p50_ms": _ms(stage.p50_s), "p99_ms": _ms(stage.p99_s), "count": stage.count}

@@ -1,4 +1,4 @@
-"""How the process fits into its machine: service manager, watchdog, log lines, and addresses of its HTTP pages."""
+"""How the process fits into its machine: service manager, watchdog, addresses of its HTTP pages, log lines."""
 
 import contextlib
 import json
@@ -6,6 +6,7 @@ import logging
 import math
 import os
 import queue
+import re
 import socket
 import sys
 import threading
@@ -33,32 +34,28 @@ _STANDARD = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", 
 
 
 class ServiceManager:
-    """Tells systemd how the node does (Type=notify, WatchdogSec). Without a service manager nothing is sent.
-
-    watchdog_s: it restarts the node after so long without `alive`; None if it does not watch this process.
-    """
+    """Tells systemd how the node does (Type=notify, WatchdogSec). Without a service manager nothing is sent. Each
+    method says whether something was sent."""
 
     def __init__(self, environment: Mapping[str, str], clock: Callable[[], float] = time.monotonic) -> None:
         """environment: normally os.environ. clock: monotonic seconds."""
         self._address = environment.get("NOTIFY_SOCKET", "")
-        self._clock, self._fed_s, self._complained = clock, -math.inf, False
+        self._clock, self._fed_s, self._failed = clock, -math.inf, False
         period, process = environment.get("WATCHDOG_USEC", ""), environment.get("WATCHDOG_PID", "")
-        watches = bool(self._address) and period.isdecimal() and process in ("", str(os.getpid()))
-        self.watchdog_s = int(period) / 1e6 or None if watches else None
+        watched = period.isdecimal() and process in ("", str(os.getpid()))
+        self._period_s = int(period) / 1e6 if watched else 0.0
 
     def ready(self) -> bool:
-        """The start is over: call it once views can come. This and the others: whether it was sent."""
+        """The start is over: call it once views can come."""
         return self._notify("READY=1")
 
     def alive(self) -> bool:
         """Feed the watchdog: call it often, and only while nothing hangs; it is sent four times in each period."""
-        if (
-            self.watchdog_s is None
-            or self._clock() - self._fed_s < self.watchdog_s / 4
-            or not self._notify("WATCHDOG=1")
-        ):
+        now_s = self._clock()
+        due = self._period_s > 0 and now_s - self._fed_s >= self._period_s / 4
+        if not (due and self._notify("WATCHDOG=1")):
             return False
-        self._fed_s = self._clock()
+        self._fed_s = now_s
         return True
 
     def extend_start(self, seconds: float) -> bool:
@@ -79,9 +76,9 @@ class ServiceManager:
                 link.connect("\0" + self._address[1:] if self._address[0] == "@" else self._address)
                 link.sendall(line.encode())
         except OSError as error:
-            if not self._complained:
+            if not self._failed:
                 _LOG.warning("cannot reach the service manager at %s: %s; going on without it", self._address, error)
-            self._complained = True
+            self._failed = True
             return False
         return True
 
@@ -100,11 +97,11 @@ class Watchdog:
         service: ServiceManager | None,
     ) -> None:
         """report: takes an event. hang_s: how long a step of the model may take. service: who started this process."""
-        self._report, self._health, self._hang_s, self._service = report, health, hang_s, service
-        self._clock = ClockWatch()
+        self._report, self._health, self._hang_s = report, health, hang_s
+        self._service, self._clock = service or ServiceManager({}), ClockWatch()
         self._watched: list[Callable[[], list[str]]] = []
         self._hung = self._was_ready = False
-        self._dead: list[str] = []
+        self._dead: set[str] = set()
 
     def watch(self, dead_threads: Callable[[], list[str]]) -> None:
         """Ask this for the names of threads that have died, from now on."""
@@ -112,55 +109,43 @@ class Watchdog:
 
     def check(self, silent_s: float) -> None:
         """Call it often. silent_s: how long the model has been at one step."""
-        self._check_model(silent_s)
-        self._check_threads()
-        step_ms = self._clock.step_ms()
-        if step_ms is not None:
+        was_hung, self._hung = self._hung, silent_s > self._hang_s
+        if self._hung and not was_hung:
+            self._health.raise_reason("MODEL_HUNG", Level.ERROR)
+            self._report("MODEL_HUNG", Level.ERROR, {"silent_s": round(silent_s, 1)})
+        elif was_hung and not self._hung:
+            self._health.clear_reason("MODEL_HUNG")
+        was_dead, self._dead = self._dead, {name for names in self._watched for name in names()}
+        for name in self._dead - was_dead:
+            self._report(THREAD_DIED, Level.ERROR, {"thread": name, "message": "restart the node"})
+            self._health.raise_reason(THREAD_DIED, Level.ERROR)
+        if (step_ms := self._clock.step_ms()) is not None:
             self._report("CLOCK_STEP", Level.WARN, {"clock": "utc", "step_ms": round(step_ms)})
-        if self._service is not None and not self._hung and not self._dead:
+        if not self._hung and not self._dead:
             self._service.alive()
 
     def loading(self) -> None:
         """The model is about to be loaded, which may take long."""
-        if self._service is not None:
-            self._service.extend_start(_LOADING_S)
+        self._service.extend_start(_LOADING_S)
 
     def ready(self) -> None:
         """The start is over: views come, or the node waits for something that is not its to bring about."""
-        if self._service is not None and not self._was_ready:
+        if not self._was_ready:
             self._service.ready()
         self._was_ready = True
 
     def stopping(self) -> None:
         """The end has begun."""
-        if self._service is not None:
-            self._service.stopping()
-
-    def _check_model(self, silent_s: float) -> None:
-        hung = silent_s > self._hang_s
-        if hung and not self._hung:
-            self._health.raise_reason("MODEL_HUNG", Level.ERROR)
-            self._report("MODEL_HUNG", Level.ERROR, {"silent_s": round(silent_s, 1)})
-        elif self._hung and not hung:
-            self._health.clear_reason("MODEL_HUNG")
-        self._hung = hung
-
-    def _check_threads(self) -> None:
-        dead = [name for names in self._watched for name in names()]
-        for name in dead:
-            if name not in self._dead:
-                self._report(THREAD_DIED, Level.ERROR, {"thread": name, "message": "restart the node"})
-                self._health.raise_reason(THREAD_DIED, Level.ERROR)
-        self._dead = dead
+        self._service.stopping()
 
 
 class ClockWatch:
     """Notices when somebody sets this machine's clock (wire protocol, section 7, F24). Ages are not affected."""
 
     def __init__(
-        self, utc_ns: Callable[[], int] | None = None, monotonic_ns: Callable[[], int] = time.monotonic_ns
+        self, utc_ns: Callable[[], int] = lambda: time.time_ns(), monotonic_ns: Callable[[], int] = time.monotonic_ns
     ) -> None:
-        self._utc_ns, self._monotonic_ns = utc_ns or (lambda: time.time_ns()), monotonic_ns
+        self._utc_ns, self._monotonic_ns = utc_ns, monotonic_ns
         self._offset_ns: int | None = None
         self.step_ms()
 
@@ -176,32 +161,24 @@ class ClockWatch:
         return (self._offset_ns - last_ns) / 1e6
 
 
-def loopback_address(address: str, setting: str) -> tuple[str, int]:
-    """Host, without brackets, and port of an HTTP page on this machine. setting: its name, for errors.
+def listen(address: str, setting: str) -> socket.socket:
+    """A listening socket for an HTTP page on this machine. setting: the address' name, for errors.
 
     Raises:
-        ConfigError: it has no port, or other machines could reach it.
+        ConfigError: it has no port, or other machines could reach it. EndpointError: the port is in use, or cannot be
+            bound.
     """
     host, _, port = address.rpartition(":")
-    if not host or not port.isdecimal() or int(port[:6]) > 65535:
+    if not host or not re.fullmatch("[0-9]{1,5}", port) or int(port) > 65535:
         raise ConfigError(f'{setting} must be "127.0.0.1:PORT", got {address[:80]!r}')
     if not is_loopback(f"tcp://{address}"):
         raise ConfigError(
             f'{setting} = "{address}" can be reached from other machines, and nothing there asks who calls: use '
             f"127.0.0.1:{port}, and a proxy on this machine or a tunnel (ssh -L {port}:127.0.0.1:{port} ROBOT)"
         )
-    return host.strip("[]"), int(port)
-
-
-def listen(address: str, setting: str) -> socket.socket:
-    """A listening socket for an HTTP page on this machine.
-
-    Raises:
-        ConfigError: see loopback_address(). EndpointError: the port is in use or cannot be bound.
-    """
-    host, port = loopback_address(address, setting)
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+        return socket.create_server((host.strip("[]"), int(port)), family=family)
     except OSError as error:
         reason = os.strerror(error.errno) if error.errno else str(error)
         raise EndpointError(
@@ -259,29 +236,31 @@ class JsonLines(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """The line, without a line break."""
-        extra = {key: _plain(value) for key, value in vars(record).items() if key not in _STANDARD}
-        line = extra | {
+        line = {key: _plain(value) for key, value in vars(record).items() if key not in _STANDARD}
+        line |= {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="microseconds")[:-6] + "Z",
             "level": record.levelname,
             "logger": record.name,
-            "message": _cut(_message(record)),
+            "message": _message(record)[:_LONGEST],
             "thread": record.threadName,
             "pid": record.process,
         }
         if record.exc_info and record.exc_info[0] is not None:
-            line["exception"] = _cut("".join(traceback.format_exception(*record.exc_info)).rstrip())
+            line["exception"] = "".join(traceback.format_exception(*record.exc_info)).rstrip()[-_LONGEST:]
         return json.dumps(line, allow_nan=False)
 
 
-def _log_uncaught(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    logging.getLogger("gcd_node").critical("uncaught %s", kind.__name__, exc_info=(kind, error, trace))
+def _log_uncaught(
+    kind: type[BaseException], error: BaseException | None, trace: TracebackType | None, where: str = ""
+) -> None:
+    if error is not None and not isinstance(error, SystemExit):
+        exc_info = (kind, error, trace)
+        logging.getLogger("gcd_node").critical("uncaught %s%s", kind.__name__, where, exc_info=exc_info)
 
 
 def _log_uncaught_in_thread(args: threading.ExceptHookArgs) -> None:
-    if args.exc_value is not None and not isinstance(args.exc_value, SystemExit):
-        name = "?" if args.thread is None else args.thread.name
-        exc_info = (args.exc_type, args.exc_value, args.exc_traceback)
-        logging.getLogger("gcd_node").critical("uncaught %s in %s", args.exc_type.__name__, name, exc_info=exc_info)
+    name = "?" if args.thread is None else args.thread.name
+    _log_uncaught(args.exc_type, args.exc_value, args.exc_traceback, f" in {name}")
 
 
 def _message(record: logging.LogRecord) -> str:
@@ -294,9 +273,8 @@ def _message(record: logging.LogRecord) -> str:
 def _plain(value: object) -> Any:
     if value is None or isinstance(value, bool) or (isinstance(value, float) and math.isfinite(value)):
         return value
-    if isinstance(value, int) and abs(value) <= _LARGEST_INTEGER:
-        return value
-    return _cut(_text(value))
+    whole = isinstance(value, int) and abs(value) <= _LARGEST_INTEGER
+    return value if whole else _text(value)[:_LONGEST]
 
 
 def _text(value: object) -> str:
@@ -304,7 +282,3 @@ def _text(value: object) -> str:
         return str(value)
     except Exception:  # a foreign object's own method
         return f"<{type(value).__name__} that cannot be written>"
-
-
-def _cut(text: str) -> str:
-    return text if len(text) <= _LONGEST else text[: _LONGEST - 3] + "..."

@@ -13,6 +13,7 @@ import time
 import traceback
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from importlib import import_module
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -60,8 +61,6 @@ class WarmCommands:
 
 
 def _serve() -> None:
-    from gcd_node.cli.commands import app as _  # noqa: F401
-
     from gcd_node.cli.main import main as node
     from gcd_train.cli.main import main as train
 
@@ -79,12 +78,13 @@ def _serve() -> None:
 
 
 def _import_what_commands_import() -> None:
-    import gcd_train.distillation.recipe
-    import gcd_train.evaluation.run
-    import gcd_train.gallery
-    import gcd_train.reports.pages
-    import gcd_train.show.open_scene
-    import gcd_train.trainer  # noqa: F401
+    from gcd_node.cli.main import COMMANDS, new_app
+
+    new_app(COMMANDS)
+    for name in ("check", "cli.view_saver", "demo", "viewer.server"):
+        import_module(f"gcd_node.{name}")
+    for name in ("distillation.recipe", "evaluation.run", "gallery", "reports.pages", "show.open_scene", "trainer"):
+        import_module(f"gcd_train.{name}")
 
 
 def _forked(main: object, argv: list[str], folder: Path) -> Ended:

@@ -1,15 +1,14 @@
 """`gcd-node ctl` and `gcd-node keys`: commands for a running node, and the keys to reach it from elsewhere."""
 
+import contextlib
 from pathlib import Path
 from typing import Annotated, TypeAlias
 
 import msgspec
 import typer
-from rich.console import Console
-from rich.pretty import Pretty
 from typer import Argument, Option
 
-from gcd_client.control import ControlClient, ControlError, Reply
+from gcd_client.control import ControlClient, ControlError
 from gcd_client.endpoints import ClientKeys, fingerprint, read_key_pair, read_public_key
 from gcd_node.auth import new_key_pair, write_key_pair
 from gcd_node.control.message import text_arguments
@@ -49,8 +48,11 @@ def ctl(
         reply = node.request(verb, arguments, dry_run=dry_run, if_view_rev=if_view_rev)
     if json:
         typer.echo(msgspec.json.encode(reply).decode())
-    else:
-        _show(reply)
+    elif reply.ok:
+        message = f": {reply.message}" if reply.message else ""
+        typer.echo(f"{reply.code}{message} (the node is {reply.state})")
+        if reply.result:
+            typer.echo(msgspec.json.format(msgspec.json.encode(reply.result)).decode())
     if not reply.ok:
         allowed = "" if reply.result is None else f" ({msgspec.json.encode(reply.result).decode()})"
         raise ControlError(f"{verb}: {reply.code}: {reply.message}{allowed}", reply.code)
@@ -75,13 +77,16 @@ def parse_settings(verb: str, settings: list[str]) -> dict[str, object]:
     Raises:
         UsageError: no `=`, or a key twice.
     """
-    wanted_text = text_arguments(verb)
+    texts = text_arguments(verb)
     found: dict[str, object] = {}
     for each in settings:
         key, equals, value = each.partition("=")
         if not equals or not key or key in found:
             raise UsageError(f"an argument is KEY=VALUE, each key once, got {each!r}")
-        found[key] = value if key in wanted_text else _value(value)
+        found[key] = value
+        if key not in texts:
+            with contextlib.suppress(msgspec.DecodeError, RecursionError, UnicodeError):  # then it is text
+                found[key] = msgspec.json.decode(value.encode())
     return found
 
 
@@ -96,23 +101,6 @@ def client_keys(folder: Path | None, node_key: str | None) -> ClientKeys | None:
     if folder is None or node_key is None:
         raise UsageError("give both --keys, our own key folder, and --node-key, the node's public key, or neither")
     return ClientKeys(own=read_key_pair(folder), server=read_public_key(node_key))
-
-
-def _value(text: str) -> object:
-    try:
-        return msgspec.json.decode(text.encode())
-    except (msgspec.DecodeError, RecursionError, UnicodeError):
-        return text
-
-
-def _show(reply: Reply) -> None:
-    if not reply.ok:
-        return
-    console = Console()
-    said = f": {reply.message}" if reply.message else ""
-    console.print(f"{reply.code}{said} (the node is {reply.state})", markup=False, soft_wrap=True)
-    if reply.result:
-        console.print(Pretty(reply.result, expand_all=True))
 
 
 def _describe(folder: Path) -> None:

@@ -3,12 +3,12 @@
 import contextlib
 import logging
 import os
+import re
 import signal
 import sys
 import threading
 from collections.abc import Collection
-from importlib import import_module
-from types import FrameType
+from importlib import import_module, metadata
 from typing import Annotated, cast
 
 import typer
@@ -17,20 +17,11 @@ from gcd_client.protocol import ClientError
 from gcd_node.errors import NodeError, SourceError
 
 COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": ("node:demo", "Replay the packaged drive through the model and over ZeroMQ into a second process."),
-    "run": (
-        "node:run",
-        "Run the node on a launch file: on a recording until that ends, else until shutdown or Ctrl-C.",
-    ),
-    "check": (
-        "check:check_launch",
-        "Look at endpoints, camera or recording, weights, memory, views and time of a launch file; loads no weights.",
-    ),
-    "view": ("node:view", "Watch the views of a node: a live table, and with --save pictures on disk."),
-    "viewer": (
-        "viewer:viewer",
-        "Serve the page for a running node, which it reads as any client does; ends with Ctrl-C.",
-    ),
+    "demo": ("run:demo", "Replay the packaged drive through the model and over ZeroMQ into a second process."),
+    "run": ("run:run", "Run the node on a launch file, until its recording ends or it is told to."),
+    "check": ("run:check", "Look at all that a launch file needs, before anything is started; loads no weights."),
+    "view": ("watch:view", "Watch the views of a node: a live table, and with --save pictures on disk."),
+    "viewer": ("watch:viewer", "Serve the page for a running node; ends with Ctrl-C."),
     "replay": (
         "replay:replay_launch",
         "Replay a launch file's recording in lockstep, as fast as the model goes, into a run that can be compared.",
@@ -39,17 +30,14 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "replay:diff",
         "Compare two runs window by window: identical, or how far apart, where first, and what they were made from.",
     ),
-    "status": ("status:status", "Watch how a node does: states, rates, ages, drops, stage times and events."),
+    "status": ("watch:status", "Watch how a node does: states, rates, ages, drops, stage times and events."),
     "synthesize": (
         "synthesize:synthesize",
         "See one clip from another camera, offline: frames, video, class map, depth, and what was seen.",
     ),
     "export": ("export:export", "Write every network of a checkpoint as an ONNX graph of one size, with a manifest."),
     "ctl": ("control:ctl", "Send one request to a running node: `gcd-node ctl set_view view=top azimuth_deg=30`."),
-    "bench": (
-        "bench:bench_command",
-        "Run a launch file in a process of its own and read its views: latency, throughput, missed frames, cost.",
-    ),
+    "bench": ("bench:bench", "Measure a node in a process of its own: latency, throughput, missed frames, cost."),
     "keys": ("control:keys", "CURVE keys, for nodes that are reached over a network."),
     "weights": ("weights:weights", "Look into checkpoints, convert them."),
 }
@@ -63,25 +51,14 @@ _UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__mro__[1])  #
 def main() -> None:
     """Entry point: runs a command; an expected error becomes one line and its exit code."""
     if _command(sys.argv[1:]) == "run":
-        signal.signal(signal.SIGTERM, _end_early)
+        signal.signal(signal.SIGTERM, lambda _number, _frame: os._exit(0))  # nothing to end until the node listens
     code = run_app(sys.argv[1:])
-    if any(thread.daemon for thread in threading.enumerate()):
-        _leave(code)
-    sys.exit(code)
-
-
-def _end_early(_: int, __: FrameType | None) -> None:
-    """Until the node itself listens to signals, there is nothing to end."""
-    os._exit(0)
-
-
-def _leave(code: int) -> None:
-    """End at once. A thread that was left behind in a driver or a library wakes up while Python clears away, and that
-    aborts the process, whatever its exit code was."""
+    if not any(thread.daemon for thread in threading.enumerate()):
+        sys.exit(code)
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):  # closed, or nobody reads
             stream.flush()
-    os._exit(code)
+    os._exit(code)  # a thread left in a driver would wake up while Python clears away, and abort the process
 
 
 def run_app(arguments: list[str]) -> int:
@@ -91,12 +68,15 @@ def run_app(arguments: list[str]) -> int:
     except (NodeError, ClientError) as error:
         return _failed(str(error), error.exit_code)
     except _UsageError as error:
-        return _bad_command_line(error)
+        message = str(error.format_message()).strip().rstrip(".")
+        if not message:  # a command without arguments shows its help
+            error.show()
+            return 64
+        return _failed(f"{message}; see --help", 64)
     except (KeyboardInterrupt, typer.Abort):
         return _failed("interrupted", 130)
     except Exception as error:
-        code = SourceError.exit_code if isinstance(error, OSError) and error.filename else _exit_code_of(error)
-        if code is None:
+        if (code := _exit_code(error)) is None:
             raise
         return _failed(str(error), code)
 
@@ -113,23 +93,27 @@ def new_app(loaded: Collection[str]) -> typer.Typer:
     app.callback()(_setup)
     for name, (place, summary) in COMMANDS.items():
         if name not in loaded:
-            app.command(name, help=summary)(_named_alone)
+            app.command(name, help=summary)(lambda: None)  # for the list of commands alone
             continue
         module, _, attribute = place.partition(":")
         command = getattr(import_module(f"gcd_node.cli.{module}"), attribute)
         if isinstance(command, typer.Typer):
             app.add_typer(command, name=name)
         else:
-            app.command(name)(command)
+            text = re.sub(r"(\[[a-z])", r"\\\1", command.__doc__ or "")  # [model] is no markup
+            app.command(name, help=text)(command)
     return app
 
 
-def _named_alone() -> None:
-    """Never called: see new_app."""
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"gcd-node {metadata.version('gcd-node')}")
+        raise typer.Exit
 
 
 def _setup(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log what happens, with times.")] = False,
+    version: Annotated[bool, typer.Option("--version", is_eager=True, callback=_print_version)] = False,
 ) -> None:
     """Log to stderr, so that stdout stays for results."""
     line = "%(asctime)s %(levelname)s %(name)s: %(message)s" if verbose else "%(levelname)s: %(message)s"
@@ -140,30 +124,14 @@ def _command(arguments: list[str]) -> str:
     return next((word for word in arguments if not word.startswith("-")), "")
 
 
-def _exit_code_of(error: Exception) -> int | None:
-    """Of an error of the model (sysexits; the node's own carry theirs); None for any other."""
-    if "gcd_model" not in sys.modules:
-        return None
-    import gcd_model as model
-
-    codes = (
-        (model.OptionError, 64),
-        (model.PoseError, 64),
-        (model.CheckpointError, 65),
-        (model.ShapeError, 65),
-        (model.Cancelled, 130),
-        (model.ModelError, 70),
-    )
-    return next((code for kind, code in codes if isinstance(error, kind)), None)
-
-
-def _bad_command_line(error: typer.BadParameter) -> int:
-    """A command without arguments shows its help, anything else is one line."""
-    message = str(error.format_message()).strip().rstrip(".")
-    if not message:
-        error.show()
-        return 64
-    return _failed(f"{message}; see --help", 64)
+def _exit_code(error: Exception) -> int | None:
+    """Of a file that cannot be opened, or an error of the model; None for any other."""
+    if isinstance(error, OSError) and error.filename:
+        return SourceError.exit_code
+    codes = {"OptionError": 64, "PoseError": 64, "CheckpointError": 65, "ShapeError": 65, "Cancelled": 130}
+    codes["ModelError"] = 70  # the root of them; by name, as their package brings torch
+    kinds = [kind.__name__ for kind in type(error).__mro__ if kind.__module__ == "gcd_model.errors"]
+    return next((codes[kind] for kind in kinds if kind in codes), None)
 
 
 def _failed(message: str, code: int) -> int:

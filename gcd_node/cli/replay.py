@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 from typer import Argument, Option
 
-from gcd_node.cli.check import Changes, ConfigPath
+from gcd_node.cli.run import Changes, ConfigPath
 from gcd_node.config import load_config
 from gcd_node.inference import WindowReport
 from gcd_node.replay.compare import RunComparison, Tolerance, compare

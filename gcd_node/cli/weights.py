@@ -10,6 +10,7 @@ from rich.text import Text
 from typer import Argument, Option, Typer
 
 from gcd_model import ModelConfig, WeightsReport, convert_weights, inspect_weights
+from gcd_node.check import weights_path
 
 weights = Typer(no_args_is_help=True, help="Look into checkpoints, convert them.")
 
@@ -17,7 +18,7 @@ WeightsPath = Annotated[
     Path,
     Argument(
         metavar="FILE",
-        help="A .ckpt of GCD, svd.safetensors, a diffusers folder, or our own .safetensors.",
+        help="A .ckpt of GCD, svd.safetensors, a diffusers folder, our own .safetensors, or package:NAME.",
         show_default=False,
     ),
 ]
@@ -41,7 +42,11 @@ def inspect(
     console = Console(markup=False)
     with Console(stderr=True, markup=False).status(Text(f"reading {file}")):
         report = inspect_weights(
-            file, family=family, head_width=head_width, image_heads=image_heads, full_digest=full_digest
+            weights_path(str(file)),
+            family=family,
+            head_width=head_width,
+            image_heads=image_heads,
+            full_digest=full_digest,
         )
     _show(console, report)
 
@@ -71,7 +76,7 @@ def convert(
             progress.update(task, completed=done, total=total)
 
         report = convert_weights(
-            file,
+            weights_path(str(file)),
             out,
             layout=layout,
             dtype=dtype,
@@ -105,6 +110,9 @@ def _facts(report: WeightsReport) -> Table:
     if report.family is not None:
         family = f"{report.family} (told by {report.told_by})"
     path = "direct" if report.move_time == 0 else f"the goal is reached in frame {report.move_time}"
+    scale = "not measured"
+    if report.uncertainty_scale is not None:
+        scale = f"{report.uncertainty_scale:.3g}: the deviation over samples times this is calibrated"
     rows = (
         ("layout", report.layout),
         ("family", family),
@@ -116,16 +124,11 @@ def _facts(report: WeightsReport) -> Table:
         ("size on disk", f"{_mb(report.size)} MB"),
         ("digest", report.digest),
         ("trained", "yes" if report.trained else "no: random weights"),
-        ("uncertainty scale", _scale(report)),
+        ("uncertainty scale", scale),
     )
     for row in rows:
         facts.add_row(*row)
     return facts
-
-
-def _scale(report: WeightsReport) -> str:
-    scale = report.uncertainty_scale
-    return "not measured" if scale is None else f"{scale:.3g}: the deviation over samples times this is calibrated"
 
 
 def _widths(report: WeightsReport) -> tuple[tuple[str, str], ...]:

@@ -14,7 +14,6 @@ import threading
 import time
 from collections.abc import Mapping
 from importlib.resources import files
-from types import TracebackType
 
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
@@ -24,8 +23,18 @@ from websockets.http11 import Request, Response
 from gcd_client.protocol import MessageError
 from gcd_node.auth import Role
 from gcd_node.service import listen
-from gcd_node.viewer.messages import MAX_REQUEST, Ask, Got, Hello, Mailbox, Watch, parse_request, text_message
-from gcd_node.viewer.node_link import NodeEndpoints, NodeLink
+from gcd_node.viewer.feed import (
+    MAX_REQUEST,
+    Ask,
+    Got,
+    Hello,
+    Mailbox,
+    NodeEndpoints,
+    NodeLink,
+    Watch,
+    parse_request,
+    text_message,
+)
 
 MOST_BROWSERS = 8  # feeds that are served at a time
 BEAT_S = 0.5  # a page that hears nothing for some of these knows that nobody lives here
@@ -84,7 +93,7 @@ class ViewerServer:
     def __enter__(self) -> "ViewerServer":
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     # What follows runs in the event loop.
@@ -111,7 +120,7 @@ class ViewerServer:
                 await asyncio.gather(*(each.close(_GOING_AWAY, "the viewer has ended") for each in self.browsers))
         finally:
             self._started.set()
-            self._link.close()
+            await self._link.close()
 
     def _answer(self, _: ServerConnection, request: Request) -> Response | None:
         """A file or a refusal; None where a feed may begin."""

@@ -11,7 +11,7 @@ from gcd_model.checkpoints import load_weights
 from gcd_model.errors import CheckpointError
 from gcd_model.own_format import Card
 from gcd_model.weights_export import write_adapter
-from gcd_node.check import check
+from gcd_node.check import check_launch
 from gcd_node.config import NodeConfig, parse_config
 from gcd_node.config_digest import config_digest
 from gcd_node.session import load_model
@@ -64,7 +64,7 @@ def test_check_names_the_adapted_weights_and_refuses_the_adapter_of_others(
     tmp_path: Path, files: dict[str, Path]
 ) -> None:
     def said(adapter: Path) -> tuple[str, str]:
-        findings = {each.topic: each for each in check(launch(tmp_path, files["tiny"], adapter))}
+        findings = {each.topic: each for each in check_launch(launch(tmp_path, files["tiny"], adapter))}
         return findings["weights"].verdict, findings["weights"].detail
 
     verdict, detail = said(files["own"])

@@ -38,10 +38,15 @@ def server(tmp_path: Path, commands: FakeCommands, events: Events) -> Iterator[C
         yield made
 
 
-def test_ctl_sends_what_the_verb_wants(server: ControlServer, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ctl_sends_what_the_verb_wants_and_shows_the_result_as_json(
+    server: ControlServer, capsys: pytest.CaptureFixture[str]
+) -> None:
     line = ["ctl", "set_view", "view=top", "azimuth_deg=30", "--endpoint", server.endpoint, "--timeout", "20"]
     assert run_app(line) == 0
-    assert "OK (the node is active)" in capsys.readouterr().out
+    assert capsys.readouterr().out.startswith("OK (the node is active)\n")
+    assert run_app(["ctl", "hello", "--endpoint", server.endpoint, "--timeout", "20"]) == 0
+    headline, _, result = capsys.readouterr().out.partition("\n")
+    assert (headline, json.loads(result)) == ("OK (the node is active)", {"role": "operator"})
 
 
 def test_ctl_prints_the_reply_as_json(server: ControlServer, capsys: pytest.CaptureFixture[str]) -> None:
@@ -116,7 +121,9 @@ def test_who_talks_to_a_running_node_does_not_wait_for_torch(tmp_path: Path) -> 
         "import sys; from gcd_node.cli.main import run_app; "
         f"ends = run_app(['-v', 'ctl', 'state', '--endpoint', 'ipc://{tmp_path}/none', '--timeout', '0.1']); "
         f"ends += run_app(['status', 'ipc://{tmp_path}/none', '--once', '--timeout', '0.1']); "
+        f"ends += run_app(['view', 'ipc://{tmp_path}/none', '--timeout', '0.1']); "
+        "ends += sum(run_app([name, '--help']) for name in ('run', 'check', 'demo', 'bench')); "
         "print(ends, sorted({'torch', 'cv2', 'kornia'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
-    assert done.stdout == "138 []\n", done.stderr
+    assert done.stdout.splitlines()[-1] == "207 []", done.stderr

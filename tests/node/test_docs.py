@@ -15,17 +15,14 @@ import pytest
 from cameras import Bench, Camera, until
 from doc_pages import (
     BLOCKS,
-    GAP,
     PAGES,
     ROOT,
     WHOLE,
     Block,
     dead_links,
     is_said,
-    mistakes,
     name_of,
     quoted_errors,
-    said_commands,
     said_texts,
     wrong_commands,
 )
@@ -38,7 +35,6 @@ from gcd_client.protocol import ClassRecord
 from gcd_client.subscriber import ReceivedView
 from gcd_node.auth import AllowFile
 from gcd_node.config import parse_config
-from gcd_node.errors import ConfigError
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -48,11 +44,6 @@ pytestmark = pytest.mark.timeout(120)
 
 def test_every_link_leads_somewhere() -> None:
     assert [dead for page in PAGES for dead in dead_links(page, page.read_text())] == []
-
-
-def test_a_dead_link_is_noticed() -> None:
-    text = "[a](nowhere.md) [b](node.md#no-such-heading) [c](node.md#states) [d](https://example.org/x)"
-    assert dead_links(ROOT / "docs" / "x.md", text) == ["x.md: nowhere.md", "x.md: node.md#no-such-heading"]
 
 
 def test_the_index_names_every_page() -> None:
@@ -83,41 +74,11 @@ def test_a_toml_block_loads(block: Block) -> None:
     load_block(block)
 
 
-@pytest.mark.parametrize(
-    ("mark", "text", "said"),
-    [
-        ("fragment", '[source]\nkind = "v4l2"\nhfov_degg = 85.0\n', "did you mean `hfov_deg`"),
-        ("launch", '[source]\nkind = "v4l2"\n', "missing required field `model`"),
-        ("", "[sourse]\n", "did you mean `source`"),
-    ],
-)
-def test_a_mistaken_toml_block_is_noticed(mark: str, text: str, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
-        load_block(Block("x.md", 1, "toml", mark, text))
-
-
 # --- commands ------------------------------------------------------------------------------------------------------
 
 
 def test_every_command_and_option_exists() -> None:
     assert [wrong for page in PAGES for wrong in wrong_commands(name_of(page), page.read_text())] == []
-
-
-@pytest.mark.parametrize(
-    ("call", "wrong"),
-    [
-        ("gcd-node runn launch/demo.toml", ["runn"]),
-        ("gcd-node view ipc --savee out", ["--savee"]),
-        ("gcd-node ctl set_views view=a", ["set_views"]),
-        ("gcd-node run x.toml --set model.stepz=4 --once", ["model.stepz=4"]),
-        ("gcd-train generate driving --clipz 8", ["--clipz"]),
-        ("gcd-node -v keys new FOLDER", []),
-        ("gcd-node ctl --endpoint tcp://robot:5582 state --json", []),
-    ],
-)
-def test_a_mistaken_command_is_noticed(call: str, wrong: list[str]) -> None:
-    (words,) = said_commands(f"$ X=1 .venv/bin/{call} | less  # a comment")
-    assert mistakes(words) == wrong
 
 
 # --- errors --------------------------------------------------------------------------------------------------------
@@ -128,14 +89,6 @@ def test_every_quoted_error_is_said_somewhere() -> None:
     assert len(quoted) > 100
     assert [each for each in quoted if not is_said(each, texts)] == []
     assert [each for each in quoted if len(each.replace("…", "").strip()) < 7] == []  # too short to tell anything
-
-
-def test_an_error_that_nobody_says_is_noticed() -> None:
-    texts = {f"there is no camera {GAP}; there is {GAP}"}
-    assert is_said("there is no camera …; there is …", texts)
-    assert not is_said("there is no camera …; there are …", texts)
-    assert not is_said("; there is … no camera", texts)
-    assert not is_said("there is no kamera", texts)
 
 
 # --- programs ------------------------------------------------------------------------------------------------------

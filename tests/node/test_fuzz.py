@@ -40,14 +40,13 @@ from gcd_client.protocol import (
 )
 from gcd_node.auth import load_clients
 from gcd_node.calibration import parse_lens
+from gcd_node.cli.watch import StatusBoard
 from gcd_node.config import parse_config
 from gcd_node.config_text import to_toml
 from gcd_node.control.message import Command, RequestError, parse_command, parse_request
 from gcd_node.control.verbs import VERBS
 from gcd_node.errors import ConfigError, NodeError, SourceError
 from gcd_node.sources import read_picture
-from gcd_node.watching.status_board import StatusBoard
-from gcd_node.watching.status_table import render_status
 
 SETTINGS = settings(
     max_examples=max(30, ROUNDS // 16),
@@ -170,7 +169,7 @@ def test_any_note_can_be_shown(fields: dict[str, Any]) -> None:
         assert isinstance(received, StatusMessage)
         board.add(received, time.monotonic(), time.time_ns())
     out = io.StringIO()
-    Console(file=out, width=100).print(render_status(board, time.monotonic()))
+    Console(file=out, width=100).print(board.render(time.monotonic()))
     assert out.getvalue().encode()
     assert json.dumps(board.record(time.monotonic()))
 

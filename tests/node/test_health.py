@@ -2,7 +2,7 @@
 
 import json
 import statistics
-import threading
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -112,26 +112,14 @@ def test_stamps_that_repeat_or_step_give_no_gap_and_no_rate(health: Health, cloc
     assert report.stages["capture_gap"].count == 4
 
 
-def test_a_silent_source_has_no_rate_and_a_growing_age(health: Health, clock: Clock) -> None:
-    work(health, clock)
-    clock.sleep(0.4)
-    health.source("stalled")
-    report = health.snapshot()
-    assert report.status["source"]["fps"] == 0.0
-    assert report.status["source"]["last_frame_age_ms"] == pytest.approx(400.0)
-
-
 # --- levels
-
-
-def test_a_working_node_is_ok_and_ready(health: Health, clock: Clock) -> None:
-    work(health, clock)
-    assert (level(health), missing(health)) == (Level.OK, ())
-    assert health.snapshot().findings == {}
 
 
 def test_a_stalled_source_warns_and_a_lost_one_is_an_error_until_it_streams(health: Health, clock: Clock) -> None:
     work(health, clock)
+    clock.sleep(0.4)
+    health.source("stalled")
+    assert (status(health)["source"]["fps"], status(health)["source"]["last_frame_age_ms"]) == (0.0, 400.0)
     seen = []
     states: tuple[SourceState, ...] = ("stalled", "lost", "connecting", "lost", "connecting", "streaming")
     for state in states:
@@ -157,17 +145,21 @@ def test_over_a_fifth_of_damaged_frames_warns_and_passes(
     assert status(health)["source"]["corrupt"] == corrupt
 
 
-@pytest.mark.parametrize(
-    ("model", "expected"),
-    [("failed", Level.ERROR), ("degraded", Level.WARN), ("busy", Level.OK), ("loading", Level.OK)],
-)
-def test_the_model_sets_the_level(health: Health, model: ModelState, expected: Level) -> None:
-    health.model(model)
-    assert level(health) is expected
+def test_the_model_sets_the_level(health: Health) -> None:
+    expected: dict[ModelState, Level] = {
+        "failed": Level.ERROR,
+        "degraded": Level.WARN,
+        "busy": Level.OK,
+        "loading": Level.OK,
+    }
+    for model, worst in expected.items():
+        health.model(model)
+        assert level(health) is worst
 
 
 def test_reasons_are_listed_worst_first_and_the_worst_is_the_level(health: Health, clock: Clock) -> None:
     work(health, clock)
+    assert (level(health), missing(health), health.snapshot().findings) == (Level.OK, (), {})
     health.raise_reason("fps", Level.WARN)
     health.raise_reason(IDLE, Level.OK)
     health.source("stalled")
@@ -230,12 +222,6 @@ def test_an_idle_node_is_ready_and_gets_time_when_somebody_comes(health: Health,
     assert (level(health), missing(health)) == (Level.OK, ("VIEWS_NOT_FRESH",))
 
 
-def test_a_thread_that_died_keeps_the_node_from_being_ready(health: Health, clock: Clock) -> None:
-    work(health, clock)
-    health.raise_reason(THREAD_DIED, Level.ERROR)
-    assert (level(health), missing(health)) == (Level.ERROR, ("THREAD_DIED",))
-
-
 def test_what_is_missing_is_named(health: Health, clock: Clock) -> None:
     assert missing(health) == ("NOT_ACTIVE", "SRC_NOT_STREAMING", "MODEL_NOT_READY", "VIEWS_NOT_FRESH")
     work(health, clock)
@@ -244,6 +230,8 @@ def test_what_is_missing_is_named(health: Health, clock: Clock) -> None:
     health.model("failed")
     health.state("inactive")
     assert missing(health) == ("NOT_ACTIVE", "SRC_NOT_STREAMING", "MODEL_NOT_READY")
+    health.raise_reason(THREAD_DIED, Level.ERROR)
+    assert missing(health)[-1] == "THREAD_DIED"
 
 
 # --- the status note
@@ -261,6 +249,10 @@ def test_a_status_holds_every_key_of_the_protocol_that_is_known(health: Health, 
     health.raise_reason("fps", Level.WARN)
     clock.sleep(0.05)
     told = status(health)
+    header = OriginHeader(node_id="gcd", boot_id="0" * 32, t_publish_ns=1)
+    received = decode(encode(StatusMessage(topic="status", header=header, fields=told)))
+    assert isinstance(received, StatusMessage)
+    assert {key: received.fields[key] for key in told} == json.loads(json.dumps(told))
     assert (told["state"], told["level"], told["reasons"], told["ready"]) == ("active", 1, ["fps"], True)
     assert told["source"] == {
         "state": "streaming",
@@ -270,12 +262,8 @@ def test_a_status_holds_every_key_of_the_protocol_that_is_known(health: Health, 
         "corrupt": 1,
         "dropped": 7,
     }
-    assert told["window"] == {
-        "built": 5,
-        "rejected": 3,
-        "reason_counts": {"WIN_GAP": 2, "CLOCK_STEP": 1},
-        "skipped": 4,
-    }
+    faults = {"WIN_GAP": 2, "CLOCK_STEP": 1}
+    assert told["window"] == {"built": 5, "rejected": 3, "reason_counts": faults, "skipped": 4}
     assert told["model"] == {
         "state": "ready",
         "ms_p50": 250.0,
@@ -292,65 +280,36 @@ def test_a_status_holds_every_key_of_the_protocol_that_is_known(health: Health, 
     assert json.dumps(told["stages"]).count("p99_ms") == 3
 
 
-@pytest.mark.parametrize("full", [False, True])
-def test_a_status_survives_the_wire(health: Health, clock: Clock, full: bool) -> None:
-    if full:
-        work(health, clock)
-        health.measure("gpu_mem_mb", 1e4 / 3)
-    told = health.report()
-    header = OriginHeader(node_id="gcd", boot_id="0" * 32, t_publish_ns=1)
-    received = decode(encode(StatusMessage(topic="status", header=header, fields=told)))
-    assert isinstance(received, StatusMessage)
-    assert {key: received.fields[key] for key in told} == json.loads(json.dumps(told))
-
-
-def test_the_heartbeat_rises_with_reports_alone(health: Health) -> None:
-    beats = []
-    for _ in range(3):
-        health.snapshot()
-        beats.append(health.report()["heartbeat_seq"])
-    assert beats == [1, 2, 3]
-
-
 def test_a_change_is_noticed_once_and_rendering_is_none(health: Health, clock: Clock) -> None:
     work(health, clock)
     assert health.changed()
-    health.report()
+    assert health.report()["heartbeat_seq"] == 1
     health.model("busy")
     health.stage("render", 0.1)
     stream(health, clock, frames=1)
     assert not health.changed()
     health.source("stalled")
     assert health.changed()
-    health.report()
+    assert health.report()["heartbeat_seq"] == 2
     assert not health.changed()
 
 
 def test_many_threads_tell_at_once_and_nothing_is_lost() -> None:
     health, rounds = Health(), 300
-    errors: list[Exception] = []
 
     def tell(start: int) -> None:
-        try:
-            for i in range(rounds):
-                health.frame(start + i, start + i)
-                health.stage("render", 0.01)
-                health.count("slot")
-                health.count("oom_count")
-                health.raise_reason("fps", Level.WARN)
-                if i % 50 == 0:
-                    health.report()
-                health.clear_reason("fps")
-        except Exception as error:
-            errors.append(error)
+        for i in range(rounds):
+            health.frame(start + i, start + i)
+            health.stage("render", 0.01)
+            health.count("slot")
+            health.raise_reason("fps", Level.WARN)
+            if i % 50 == 0:
+                health.report()
+            health.clear_reason("fps")
 
-    threads = [threading.Thread(target=tell, args=(i * S,)) for i in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(60)
+    with ThreadPoolExecutor(4) as threads:
+        list(threads.map(tell, (i * S for i in range(4))))
     report = health.snapshot()
-    assert errors == []
-    assert (report.frames, report.status["drops"]["slot"], report.status["model"]["oom_count"]) == (1200, 1200, 1200)
+    assert (report.frames, report.status["drops"]["slot"]) == (1200, 1200)
     assert report.stages["render"].count == 1200
     assert health.report()["heartbeat_seq"] == 4 * len(range(0, rounds, 50)) + 1

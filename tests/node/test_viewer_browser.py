@@ -18,7 +18,7 @@ from wire_messages import origin
 
 from gcd_node.publisher import Publisher
 from gcd_node.sockets import PublisherOptions
-from gcd_node.viewer.node_link import NodeEndpoints
+from gcd_node.viewer.feed import NodeEndpoints
 from gcd_node.viewer.server import ViewerServer
 
 CHROMIUM, DRIVER = Path("/usr/bin/chromium"), Path("/usr/bin/chromedriver")

@@ -39,17 +39,11 @@ def viewer(tmp_path: Path) -> Iterator[ViewerServer]:
 
 
 @pytest.mark.parametrize(
-    "origin", ["http://evil.example", "null", "http://127.0.0.1:1", "https://{host}", "http://localhost"]
+    "origin", ["http://evil.example", "null", "http://127.0.0.1:1", "https://{host}", "http://localhost", ""]
 )
 def test_a_foreign_page_cannot_open_the_feed(viewer: ViewerServer, origin: str) -> None:
     with pytest.raises(InvalidStatus) as refused:
         open_feed(viewer, origin.format(host=host_of(viewer)))
-    assert refused.value.response.status_code == 403
-
-
-def test_who_says_no_origin_cannot_open_the_feed(viewer: ViewerServer) -> None:
-    with pytest.raises(InvalidStatus) as refused:
-        open_feed(viewer, "")
     assert refused.value.response.status_code == 403
 
 
@@ -79,21 +73,17 @@ def test_the_page_hears_a_beat_though_no_node_lives(viewer: ViewerServer) -> Non
         assert hear(feed, "beat")["silent_ms"] is None
 
 
-@pytest.mark.parametrize(
-    "verb", ["set_view", "set_param", "get_config", "shutdown", "deactivate", "remove_view", "record_start", "nonsense"]
-)
-def test_a_viewer_is_refused_without_asking_the_node(viewer: ViewerServer, verb: str) -> None:
+@pytest.mark.parametrize(("role", "verbs"), [("viewer", ("set_view", "set_param", "get_config")), ("operator", ())])
+def test_what_a_page_may_not_ask_is_refused_without_asking_the_node(
+    viewer: ViewerServer, role: str, verbs: tuple[str, ...]
+) -> None:
     with open_feed(viewer) as feed:
-        say(feed, type="ask", id=1, verb=verb, args={"view": "main"})
-        reply = hear(feed, "reply")
-        assert (reply["id"], reply["ok"], reply["code"]) == (1, False, "FORBIDDEN")
-
-
-def test_an_operator_cannot_say_through_the_page_what_the_page_has_no_use_for(viewer: ViewerServer) -> None:
-    with open_feed(viewer) as feed:
-        say(feed, type="hello", token=TOKEN)
-        say(feed, type="ask", id=1, verb="shutdown")
-        assert hear(feed, "reply")["code"] == "FORBIDDEN"
+        if role == "operator":
+            say(feed, type="hello", token=TOKEN)
+        for verb in (*verbs, "shutdown", "remove_view", "record_start", "nonsense"):
+            say(feed, type="ask", id=1, verb=verb, args={"view": "main"})
+            reply = hear(feed, "reply")
+            assert (reply["id"], reply["ok"], reply["code"]) == (1, False, "FORBIDDEN")
 
 
 def test_a_node_without_a_control_socket_takes_no_commands(tmp_path: Path) -> None:

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 from cameras import Bench, Camera, until
-from fakes import FakeSynthesizer, painting_traits
 from msgspec.structs import replace
 from rig import Rig, rig_config
 from viewer_clients import (
@@ -115,21 +114,6 @@ def test_a_page_that_never_reads_slows_neither_node_nor_others_and_is_given_up(
         until(lambda: len(viewer.browsers) == 1)
         for each in stuck:
             each.close()
-
-
-def test_a_class_map_reaches_the_page_of_a_model_that_draws_one(tmp_path: Path) -> None:
-    camera = Camera(fps=10.0)
-    model = FakeSynthesizer(painting_traits())
-    with Rig(tmp_path, Bench(camera), model, views="[view.main]", watched=False) as rig, viewer_of(rig) as viewer:
-        rig.await_state("active")
-        with open_feed(viewer) as feed:
-            say(feed, type="watch", view="main")
-            until(lambda: rig.publisher.stats.subscribers == 6)
-            threading.Thread(target=camera.run, args=(40,), kwargs={"pause_s": 0.02}, daemon=True).start()
-            drawn = hear(feed, "picture", lambda head: head["kind"] == "cls")
-            assert len(drawn["classes"]) == 13
-            say(feed, type="ask", id=1, verb="describe")
-            assert hear(feed, "reply")["result"]["camera"] == "none"
 
 
 @pytest.mark.parametrize("role", ["viewer", "operator"])

@@ -18,7 +18,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from gcd_client.protocol import ViewMessage
 from gcd_client.subscriber import ReceivedView
-from gcd_node.viewer.node_link import NodeEndpoints
+from gcd_node.viewer.feed import NodeEndpoints
 from gcd_node.viewer.server import ViewerServer
 
 TOKEN = "a-token-of-the-tests"

@@ -1,1 +1,0 @@
-"""The reader's side of a terminal: live tables of views and of a node's status."""

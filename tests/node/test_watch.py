@@ -1,0 +1,366 @@
+"""`gcd-node view` and `status`: the tables' figures, the saved pictures, and how a watch ends; through real sockets."""
+
+import io
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from rich.console import Console, RenderableType
+from wire_messages import BOOT, CLASSES, OTHER_BOOT, class_map, depth, end, numbers, origin, pixels, visibility, window
+
+from gcd_client.protocol import EndMessage, OriginHeader, StatusMessage, StatusTopic, ViewMessage
+from gcd_client.subscriber import ReceivedView
+from gcd_model import hatched
+from gcd_node.auth import Client, ServerSecurity, new_key_pair, write_key_pair
+from gcd_node.cli.main import run_app
+from gcd_node.cli.view_saver import ViewSaver
+from gcd_node.cli.watch import StatusBoard, ViewTable
+from gcd_node.errors import OutputError
+from gcd_node.health import Health, Level
+from gcd_node.publisher import Publisher
+from gcd_node.sockets import PublisherOptions
+
+pytestmark = pytest.mark.timeout(60)
+SEEN = np.random.default_rng(0).integers(0, 3, (2, 16, 16), np.uint8)
+WALL_NS = 1_800_000_000_000_000_000
+
+
+def text_of(renderable: RenderableType, width: int = 140) -> str:
+    console = Console(width=width, record=True, file=io.StringIO())
+    console.print(renderable)
+    return console.export_text()
+
+
+# Views.
+
+
+def received(message: ViewMessage, *, skipped: int = 0) -> ReceivedView:
+    return ReceivedView(message=message, age_ms=40.0, expired=False, skipped=skipped, restarted=False)
+
+
+def picture(path: Path) -> np.ndarray:
+    return cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
+
+
+def read_video(path: Path) -> np.ndarray:
+    video = cv2.VideoCapture(str(path))
+    frames = []
+    while (frame := video.read()[1]) is not None:
+        frames.append(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB))
+    return np.stack(frames)
+
+
+def watch(folder: Path, options: list[str], *messages: ViewMessage | EndMessage, readers: int = 1) -> int:
+    """The exit code of `gcd-node view` beside a publisher that sends these."""
+    codes: list[int] = []
+    command = ["view", f"ipc://{folder}/data", "--timeout", "20", *options]
+    options_ = PublisherOptions(
+        data=command[1], status=None, lockstep=True, min_subscribers=readers, end_delay_ms=0, drain_ms=3000
+    )
+    with Publisher(options_) as publisher:
+        thread = threading.Thread(target=lambda: codes.append(run_app(command)), daemon=True)
+        thread.start()
+        for message in messages:
+            if isinstance(message, EndMessage):
+                publisher.end(message)
+            else:
+                publisher.send(message)
+        thread.join(30)
+    (code,) = codes
+    return code
+
+
+def test_a_table_has_the_figures_of_each_topic_and_fits_into_80_columns() -> None:
+    table = ViewTable()
+    for i in range(5):
+        table.add(received(window(i), skipped=2 if i == 3 else 0), now_s=10.0 + 0.5 * i)
+    table.add(received(window(123_456, view_id="a_view_name_of16")), now_s=12.0)
+    long, top = table.rows(now_s=12.25)
+    assert long[:2] == ("view/a_view_name_of16/win", "123456")
+    assert top == ("view/top/win", "4", "2x4x6x3", "290", "2.00", "2", "0.0", "live")
+    assert [row[-1] for row in table.rows(now_s=72.2)] == ["expired", "expired"]
+    assert table.rows(now_s=12.25, ended=True)[0][-1] == "ended"
+    text = text_of(table.render(99.0), width=80)
+    assert "…" not in text
+    assert max(map(len, text.splitlines())) <= 80
+    assert all(word in text for word in ("never evidence of free space", "123456", "view/top/win", "expired"))
+
+
+def test_saved_pictures_and_video_are_the_published_pixels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sent = [pixels(i, height=16, width=16) for i in range(2)]
+    messages = [window(i, images=sent[i]) for i in range(2)]
+    side = window(0, view_id="side", images=pixels(100, height=16, width=16))
+    out = tmp_path / "out"
+    assert watch(tmp_path, ["--save", str(out)], side, *messages, end(view_id="side"), end()) == 0
+    assert "3 messages, 8 files, 0 damaged; the stream ended" in capsys.readouterr().out
+    assert sorted(str(path.relative_to(out)) for path in out.rglob("*.*")) == [
+        *("side.mkv", "side/000000_00.png", "side/000000_01.png", "top.mkv"),
+        *("top/000000_00.png", "top/000000_01.png", "top/000001_00.png", "top/000001_01.png"),
+    ]
+    assert np.array_equal(read_video(out / "top.mkv"), np.concatenate(sent))
+    assert np.array_equal(picture(out / "top" / "000001_01.png"), sent[1][1])
+
+
+def test_a_watch_of_all_kinds_ends_when_all_have(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    messages = (window(0, view_id="side"), window(0), class_map(0), end(), class_map(1), end(kind="cls"))
+    assert watch(tmp_path, ["--view", "top", "--kind", "all"], *messages) == 0
+    assert "3 messages, 0 files, 0 damaged; the stream ended" in capsys.readouterr().out
+
+
+def test_a_watch_for_hatching_takes_windows_with_their_visibility(tmp_path: Path) -> None:
+    image = pixels(0, height=16, width=16)
+    messages = (window(0, images=image), class_map(0), visibility(0, seen=SEEN), end(), end(kind="vis"))
+    options = ["--view", "top", "--hatch", "--save", str(tmp_path / "out")]
+    assert watch(tmp_path, options, *messages, readers=2) == 0
+    assert np.array_equal(read_video(tmp_path / "out" / "top.mkv"), hatched(image, SEEN))
+
+
+def test_views_that_never_come_are_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(["view", f"ipc://{tmp_path}/nobody", "--timeout", "0.3"]) == 69
+    said = capsys.readouterr()
+    assert "is the node running?" in said.out
+    assert said.err.startswith(f"error: no view from ipc://{tmp_path}/nobody within 0.3 s")
+
+
+def test_maps_are_saved_in_colour_and_as_numbers_apart_from_windows(tmp_path: Path) -> None:
+    drawn = [numbers(i, height=16, width=16) for i in range(2)]
+    with ViewSaver(tmp_path) as saver:
+        for i in range(2):
+            saver.add(received(window(i, images=pixels(i, height=16, width=16))))
+            saver.add(received(class_map(i, drawn=drawn[i])))
+        saver.add(received(visibility(2, seen=SEEN)))
+        saver.add(received(depth(2, inverse=np.full((2, 16, 16), 0.1, "<f2"))))
+    assert saver.files == len([path for path in tmp_path.rglob("*.*") if path.is_file()])
+    folder = tmp_path / "top" / "cls"
+    assert np.array_equal(np.load(folder / "000001.npy"), drawn[1])
+    shown = picture(folder / "000001_01.png")
+    assert all((shown[drawn[1][1] == each.id] == each.colour).all() for each in CLASSES)
+    assert np.array_equal(read_video(tmp_path / "top" / "cls.mkv")[3], shown)
+    legend = picture(folder / "legend.png").reshape(-1, 3)
+    assert {each.colour for each in CLASSES} <= {tuple(pixel) for pixel in legend.tolist()}
+    assert len(read_video(tmp_path / "top.mkv")) == 4
+    assert np.array_equal(np.load(tmp_path / "top" / "vis" / "000002.npy"), SEEN)
+    assert (tmp_path / "top" / "vis" / "legend.png").exists()
+    metres = 1 / np.load(tmp_path / "top" / "depth" / "000002.npy")
+    assert metres.dtype == np.float32
+    assert np.allclose(metres, 10, rtol=1e-3)
+
+
+def test_saved_windows_are_hatched_where_they_are_painted_and_all_over_where_nobody_says(tmp_path: Path) -> None:
+    shown = [pixels(i, height=16, width=16) for i in range(3)]
+    with ViewSaver(tmp_path, hatch=True) as saver:
+        saver.add(received(window(0, images=shown[0])))
+        saver.add(received(visibility(0, seen=SEEN)))
+        saver.add(received(window(1, images=shown[1])))
+        saver.add(received(visibility(5, seen=SEEN)))  # of another window
+        saver.add(received(window(2, images=shown[2])))
+    expected = [hatched(image, seen) for image, seen in zip(shown, (SEEN, 0 * SEEN, 0 * SEEN), strict=True)]
+    assert np.array_equal(read_video(tmp_path / "top.mkv"), np.concatenate(expected))
+
+
+def test_a_view_that_changes_its_size_and_a_folder_that_cannot_be_written_are_errors(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    small, large = (received(window(images=pixels(height=16, width=width))) for width in (16, 32))
+    with ViewSaver(tmp_path) as saver:
+        saver.add(small)
+        with pytest.raises(OutputError):
+            saver.add(large)
+    with ViewSaver(tmp_path / "file") as saver, pytest.raises(OutputError):
+        saver.add(small)
+
+
+# Status.
+
+
+def note(topic: StatusTopic, fields: Mapping[str, Any], *, boot_id: str = BOOT, late_s: float = 0.0) -> StatusMessage:
+    header = OriginHeader(node_id="robot_7", boot_id=boot_id, t_publish_ns=WALL_NS - round(late_s * 1e9))
+    return StatusMessage(topic=topic, header=header, fields=fields)
+
+
+def board_of(*notes: StatusMessage) -> StatusBoard:
+    """A board that got these 10 s ago by its own clock, which stands at 10."""
+    board = StatusBoard()
+    for each in notes:
+        board.add(each, 10.0, WALL_NS)
+    return board
+
+
+def working() -> dict[str, object]:
+    """The status of a node at work."""
+    health = Health()
+    health.state("active")
+    health.source("streaming")
+    health.model("busy")
+    health.expect(("topdown", "a_long_view_name"), 3600.0)
+    for i in range(11):
+        health.frame(i * 100_000_000, time.monotonic_ns())
+    for view_id in ("topdown", "a_long_view_name"):
+        health.published(view_id, 0.25)
+    health.stage("render", 0.125)
+    health.windows(5, {"WIN_GAP": 2})
+    health.totals(slot=3, sent=5, subs=1, bytes=4130)
+    return health.report()
+
+
+def test_a_status_holds_until_the_node_is_silent_for_three_seconds() -> None:
+    board = StatusBoard()
+    assert (board.level(0.0), board.silent_s(0.0), board.record(0.0)) == (
+        Level.STALE,
+        None,
+        {"level": 3, "stale": True},
+    )
+    assert "no status yet" in text_of(board.render(0.0))
+    board = board_of(note("status", {"level": 1, "reasons": ["fps"]}))
+    assert [board.level(10.0 + ago) for ago in (0.0, 2.9, 3.1)] == [Level.WARN, Level.WARN, Level.STALE]
+    assert (board.record(12.0)["age_ms"], board.record(20.0)["level"]) == (2000, 3)
+
+
+def test_a_first_status_that_was_kept_for_late_readers_is_as_old_as_it_says() -> None:
+    board = board_of(note("status", {"level": 0}, late_s=60.0))
+    assert board.level(10.0) is Level.STALE
+    board.add(note("status", {"level": 0}, late_s=60.0), 11.0, WALL_NS)  # another machine's clock
+    assert board.level(11.0) is Level.OK
+    assert board_of(note("status", {"level": 0}, late_s=-60.0)).silent_s(10.5) == 0.5
+
+
+def test_a_restarted_node_begins_anew() -> None:
+    board = board_of(note("status", {"level": 2}))
+    board.add(note("event", {"code": "HELLO"}, boot_id=OTHER_BOOT), 11.0, WALL_NS)
+    assert (board.restarts, board.level(11.0)) == (1, Level.STALE)
+    board.add(note("status", {"level": 0}, boot_id=OTHER_BOOT), 11.0, WALL_NS)
+    assert (board.restarts, board.level(11.0)) == (1, Level.OK)
+
+
+def test_a_working_node_is_shown_with_its_figures_in_80_columns() -> None:
+    events = [note("event", {"code": f"E{i}", "level": 2, "epoch": i}) for i in range(20)]
+    text = text_of(board_of(note("status", working()), *events).render(10.0), width=80)
+    assert "…" not in text
+    assert max(map(len, text.splitlines())) <= 80
+    assert text.split()[:4] == ["OK", "robot_7", "active", "ready"]
+    shown = " ".join(text.split())
+    for expected in (
+        *("streaming, 10.0 FPS", "5 built, 2 rejected, 3 skipped", "WIN_GAP 2", "busy, 125.0 ms p50, 125.0 ms p99"),
+        *("5 sent, 1 subscribed, 4130 B", "a_long_view_name 0 ms ago", "slot 3", "capture_gap", "E19 epoch 19", "E12"),
+    ):
+        assert expected in shown, expected
+    assert "E11" not in shown  # only the latest
+
+
+def test_a_node_that_is_silent_or_not_ready_is_shown_as_that() -> None:
+    headline = text_of(board_of(note("status", working())).render(20.0)).splitlines()[0]
+    assert headline.split() == ["STALE", "robot_7", "silent", "for", "10", "s", "before:", "active"]
+    text = text_of(board_of(note("status", Health().report())).render(10.0))
+    assert "not ready: NOT_ACTIVE, SRC_NOT_STREAMING" in text
+
+
+HOSTILE: tuple[dict[str, Any], ...] = (
+    {},
+    {"level": "high", "reasons": "fps", "source": 3, "window": [], "stages": [1], "views": None, "drops": "many"},
+    {"level": 77, "reasons": [1, None, "\x1b[2J"], "state": {"a": 1}, "window": {"reason_counts": [1]}},
+    {"level": [], "stages": {"render": None, "[red]": {"p50_ms": "x" * 10_000}}, "views": {"a": 5, "b": {}}},
+    {"state": "[bold]\n\n", "source": {"state": "\r\x00" * 50, "fps": float("1e300")}, "ready": "yes"},
+)
+
+
+@pytest.mark.parametrize("fields", HOSTILE)
+def test_whatever_a_node_says_is_drawn_without_harm(fields: dict[str, Any]) -> None:
+    board = board_of(note("status", fields), note("event", {"code": ["\x1b"], "level": {}, "x": "[/]"}))
+    text = text_of(board.render(10.0))
+    assert "robot_7" in text
+    assert not {char for char in text if not char.isprintable()} - {"\n"}
+    assert max(map(len, text.splitlines())) <= 140
+    assert json.loads(json.dumps(board.record(10.0)))["node_id"] == "robot_7"
+
+
+@pytest.fixture
+def endpoint(tmp_path: Path) -> str:
+    return f"ipc://{tmp_path}/status"
+
+
+@pytest.fixture
+def silence(endpoint: str) -> Iterator[Callable[[], None]]:
+    """A node that repeats its status, meta and an event until this is called."""
+    stopped = threading.Event()
+    with Publisher(PublisherOptions(data=endpoint + ".data", status=endpoint)) as publisher:
+
+        def speak() -> None:
+            while not stopped.wait(0.1):
+                publisher.note("status", origin(), working())
+                publisher.note("meta", origin(), {"fps": 10.0})
+                publisher.note("event", origin(), {"code": "SRC_LOST", "level": 2})
+
+        thread = threading.Thread(target=speak, daemon=True)
+        thread.start()
+
+        def silence() -> None:
+            stopped.set()
+            thread.join(20)
+
+        yield silence
+        silence()
+
+
+@pytest.mark.usefixtures("silence")
+def test_once_prints_a_table_or_one_line_of_json(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(["status", endpoint, "--once", "--timeout", "20"]) == 0
+    assert "streaming, 10.0 FPS" in capsys.readouterr().out
+    assert run_app(["status", endpoint, "--once", "--json", "--timeout", "20"]) == 0
+    (line,) = map(json.loads, capsys.readouterr().out.splitlines())
+    assert (line["topic"], line["node_id"], line["stale"], line["level"]) == ("status", "gcd", False, 0)
+    assert line["source"]["fps"] == 10.0
+
+
+def test_once_ends_with_69_when_nobody_answers(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(["status", endpoint, "--once", "--timeout", "0.2"]) == 69
+    assert capsys.readouterr().err.startswith(f"error: no status from {endpoint} within 0.2 s: is the node running")
+
+
+@pytest.mark.usefixtures("silence")
+def test_a_stream_of_json_has_every_note_on_its_line(endpoint: str) -> None:
+    command = [sys.executable, "-m", "gcd_node", "status", endpoint, "--json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as reader:
+        assert reader.stdout is not None
+        lines: dict[str, dict[str, Any]] = {}
+        while len(lines) < 3:
+            line = json.loads(reader.stdout.readline())
+            lines[line["topic"]] = line
+        reader.terminate()
+    assert set(lines) == {"status", "meta", "event"}
+    assert lines["event"]["code"] == "SRC_LOST"
+    assert lines["meta"]["node_id"] == "gcd"
+
+
+def test_a_table_in_a_pipe_is_printed_for_every_status(endpoint: str, silence: Callable[[], None]) -> None:
+    command = [sys.executable, "-m", "gcd_node", "status", endpoint, "--timeout", "0.3"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as reader:
+        assert reader.stdout is not None
+        headlines = 0
+        while headlines < 2:
+            headlines += "robot" in (line := reader.stdout.readline()) or " gcd " in line
+        silence()
+        reader.terminate()
+
+
+@pytest.mark.parametrize(("known", "code"), [(True, 0), (False, 77)])
+def test_a_node_that_asks_for_keys_is_reached_with_them_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], known: bool, code: int
+) -> None:
+    node, ours, other = new_key_pair(), new_key_pair(), new_key_pair()
+    clients = {(ours if known else other).public: Client(name="planner", role="viewer")}
+    security = ServerSecurity(keys=node, find_client=clients.get)
+    write_key_pair(tmp_path / "keys", ours)
+    options = PublisherOptions(data=f"ipc://{tmp_path}/data", status="tcp://127.0.0.1:0", security=security)
+    with Publisher(options) as publisher:
+        publisher.note("status", origin(), working())
+        assert publisher.status_endpoint is not None
+        command = ["status", publisher.status_endpoint, "--once", "--timeout", "20"]
+        assert run_app([*command, "--keys", str(tmp_path / "keys"), "--node-key", node.public]) == code
+    assert ("streaming, 10.0 FPS" in capsys.readouterr().out) == known
