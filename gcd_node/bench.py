@@ -21,7 +21,7 @@ from msgspec.structs import replace
 
 from gcd_client.subscriber import ViewSubscriber
 from gcd_node.config import ControlConfig, NodeConfig, ViewerConfig
-from gcd_node.config_text import to_toml
+from gcd_node.config_dump import to_toml
 from gcd_node.errors import NodeError, UsageError
 from gcd_node.source_config import LIVE_KINDS, FileSource, FolderSource, McapSource, SyntheticSource
 from gcd_node.sources.pace import Pace

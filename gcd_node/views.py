@@ -1,6 +1,7 @@
 """The views a node gives: what is asked for now, the path of each one's camera, and the end of its topics."""
 
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import get_args
@@ -8,12 +9,17 @@ from typing import get_args
 import msgspec
 import torch
 
-from gcd_client.protocol import ViewKind, ViewMessage, view_topic
+from gcd_client.protocol import PREVIEW_ID, PREVIEW_TOPIC, ViewKind, ViewMessage, view_topic
 from gcd_model import CameraMount, OptionError, Orbit, SphericalDelta, Traits, Trajectory
 from gcd_node.config import ModelSection, NodeConfig, PublishConfig, ViewConfig, pose_matrix
-from gcd_node.messages import Run, end_messages, published_kinds
+from gcd_node.frame import Frame
+from gcd_node.messages import PREVIEW_PERIOD_S, end_message, end_messages, preview_message, published_kinds
 from gcd_node.preprocess import stated_sphere
 from gcd_node.publisher import MessageSink
+from gcd_node.stream_context import StreamContext
+
+_KINDS: tuple[ViewKind, ...] = get_args(ViewKind)
+_LEAST = 0.9  # of a period between two previews, so that a camera's jitter does not make it miss every second one
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -89,9 +95,6 @@ class LiveConfig:
             return removed
 
 
-NANOSECONDS = 1_000_000_000
-
-
 class VirtualView:
     """One configured virtual camera; an orbit remembers where it stands.
 
@@ -115,10 +118,17 @@ class VirtualView:
         self._goal = SphericalDelta(
             azimuth_deg=wanted.azimuth_deg, elevation_deg=wanted.elevation_deg, radius_m=wanted.radius
         )
-        self._orbit = _orbit(wanted)
+        self._orbit: Orbit | None = None
+        if wanted.rate_deg_s is not None and wanted.amplitude_deg is not None:
+            self._orbit = Orbit(
+                rate_deg_s=wanted.rate_deg_s, amplitude_deg=wanted.amplitude_deg, azimuth_deg=wanted.azimuth_deg
+            )
         self._newest: tuple[int, int] | None = None  # epoch and stamp of the last window
         self._planned: tuple[SphericalDelta, Trajectory] | None = None  # most views stand still
-        self._check_reach()
+        self._plan(self._goal)
+        if self._orbit is not None:  # as far as it swings: not to fail in the middle of a run
+            for azimuth_deg in (-self._orbit.amplitude_deg, self._orbit.amplitude_deg):
+                self._plan(replace(self._goal, azimuth_deg=azimuth_deg))
         if config.model.motion_bucket is None:
             traits.motion_bucket(self.planned())
 
@@ -129,19 +139,16 @@ class VirtualView:
         of different epochs cannot be compared: there it waits for one window. The same window may be asked for again.
         """
         if self._orbit is not None and self._newest is not None and self._newest[0] == epoch:
-            self._orbit = self._orbit.advanced((stamp_ns - self._newest[1]) / NANOSECONDS)
+            self._orbit = self._orbit.advanced((stamp_ns - self._newest[1]) / 1e9)
         self._newest = (epoch, stamp_ns)
         return self.planned()
 
     def planned(self) -> Trajectory:
         """The path to where the view is now; an orbit does not move on."""
-        goal = self._destination(self._orbit)
+        goal = self._goal if self._orbit is None else replace(self._goal, azimuth_deg=self._orbit.azimuth_deg)
         if self._planned is None or self._planned[0] != goal:
             self._planned = (goal, self._plan(goal))
         return self._planned[1]
-
-    def _destination(self, orbit: Orbit | None) -> SphericalDelta:
-        return self._goal if orbit is None else replace(self._goal, azimuth_deg=orbit.azimuth_deg)
 
     def _plan(self, goal: SphericalDelta) -> Trajectory:
         wanted, traits = self._wanted, self._traits
@@ -160,19 +167,6 @@ class VirtualView:
             None if own else goal, source=self._source, move_time=self._move_time, mount=self._mount
         )
 
-    def _check_reach(self) -> None:
-        """Raises ViewRangeError or ViewFixedError before the first window rather than in the middle of a run."""
-        self._plan(self._goal)
-        if self._orbit is not None:
-            for azimuth_deg in (-self._orbit.amplitude_deg, self._orbit.amplitude_deg):
-                self._plan(replace(self._goal, azimuth_deg=azimuth_deg))
-
-
-def _orbit(config: ViewConfig) -> Orbit | None:
-    if config.kind == "fixed" or config.rate_deg_s is None or config.amplitude_deg is None:
-        return None
-    return Orbit(rate_deg_s=config.rate_deg_s, amplitude_deg=config.amplitude_deg, azimuth_deg=config.azimuth_deg)
-
 
 class VirtualViews:
     """The views a configuration names, made anew where a command has changed one. Belongs to one thread."""
@@ -181,7 +175,7 @@ class VirtualViews:
         self._traits = traits
         self._made: dict[str, tuple[CameraMount | None, VirtualView]] = {}
 
-    def following(self, settings: Settings, mount: CameraMount | None = None) -> list[VirtualView]:
+    def sync(self, settings: Settings, mount: CameraMount | None = None) -> list[VirtualView]:
         """The views now; an orbit whose view has not changed goes on from where it was.
 
         Raises: as VirtualView.
@@ -193,23 +187,20 @@ class VirtualViews:
         return [self._made[view_id][1] for view_id in settings.revisions]
 
 
-_KINDS: tuple[ViewKind, ...] = get_args(ViewKind)
-
-
 class EndOfStream:
     """Sends views, and ends every topic once: what is made of a view now, and what was made of it before a command
     changed that."""
 
-    def __init__(self, live: LiveConfig, sink: MessageSink, run: Callable[[], Run]) -> None:
-        """run: what is known of the source now."""
-        self._live, self._sink, self._run = live, sink, run
-        self._open: set[str] = set()  # topics on which something was sent, and no end since
+    def __init__(self, live: LiveConfig, sink: MessageSink, context: Callable[[], StreamContext]) -> None:
+        """context: what is known of the source now."""
+        self._live, self._sink, self._context = live, sink, context
+        self._open: dict[str, set[str]] = {}  # of each view: topics on which something was sent, and no end since
         self._newest_goal: dict[str, tuple[int, int]] = {}
-        self.carried: Set[ViewKind] = frozenset()
-        """What the last window's views held of themselves."""
 
     def send(self, messages: Sequence[ViewMessage]) -> None:
-        """What one view of one window came to. Left out: frames that an overlapping window has sent before."""
+        """What one view of one window came to; what is made of the view no more, such as deviations of a single sample,
+        ends. Left out: frames that an overlapping window has sent before."""
+        header = messages[0].header
         for message in messages:
             if message.topic.endswith("/frm"):
                 moment = (message.header.src.epoch, message.header.src.seq[0])
@@ -217,35 +208,55 @@ class EndOfStream:
                     continue
                 self._newest_goal[message.topic] = moment
             self._sink.send(message)
-            self._open.add(message.topic)
+        topics = {message.topic for message in messages}
+        gone = self._open.get(header.view_id, topics) - topics
+        self._end(header.view_id, header.view_rev, gone, header.window_id, delay_ms=0)
+        self._open[header.view_id] = topics
 
-    def announce_due(self, last_window_id: int) -> None:
-        """End views that were taken out, and what is made of a view no more, such as deviations of a single sample."""
-        settings = self._live.settings()
+    def announce_removed(self, last_window_id: int) -> None:
+        """End views that were taken out."""
         for view_id, rev in self._live.take_removed():
-            self._end(view_id, rev, self._known(view_id, settings), last_window_id, delay_ms=0)
-        made = self._made(settings)
-        for view_id, rev in settings.revisions.items():
-            if gone := self._known(view_id, settings) - made:
-                self._end(view_id, rev, gone, last_window_id, delay_ms=0)
+            self._end(view_id, rev, self._topics(view_id), last_window_id, delay_ms=0)
 
     def announce_all(self, last_window_id: int, *, delay_ms: int | None) -> None:
         """End everything. delay_ms: see MessageSink."""
-        self.announce_due(last_window_id)
-        settings = self._live.settings()
-        for view_id, rev in settings.revisions.items():
-            self._end(view_id, rev, self._made(settings), last_window_id, delay_ms=delay_ms)
+        self.announce_removed(last_window_id)
+        for view_id, rev in self._live.settings().revisions.items():
+            self._end(view_id, rev, self._topics(view_id), last_window_id, delay_ms=delay_ms)
 
-    def _made(self, settings: Settings) -> Set[ViewKind]:
-        return {*published_kinds(replace(self._run(), config=settings.config)), *self.carried}
-
-    def _known(self, view_id: str, settings: Settings) -> Set[ViewKind]:
+    def _topics(self, view_id: str) -> Set[str]:
         """What is made of a view now, or was and has not ended."""
-        made = self._made(settings)
-        return {kind for kind in _KINDS if kind in made or view_topic(view_id, kind) in self._open}
+        now = published_kinds(replace(self._context(), config=self._live.config))
+        return self._open.pop(view_id, set[str]()) | {view_topic(view_id, kind) for kind in now}
 
-    def _end(self, view_id: str, rev: int, kinds: Set[ViewKind], last: int, *, delay_ms: int | None) -> None:
-        ordered = sorted(kinds, key=_KINDS.index)
-        for message in end_messages(self._run(), view_id, rev, last, ordered):
-            self._open.discard(message.topic)
+    def _end(self, view_id: str, rev: int, topics: Set[str], last: int, *, delay_ms: int | None) -> None:
+        kinds: list[ViewKind] = [kind for kind in _KINDS if view_topic(view_id, kind) in topics]
+        for message in end_messages(self._context(), view_id, rev, last, kinds):
             self._sink.end(message, delay_ms=delay_ms)
+
+
+class InputPreview:
+    """Shows what the camera sees to whoever subscribes, a few times a second. Belongs to the reader thread."""
+
+    def __init__(
+        self, sink: MessageSink, context: Callable[[], StreamContext], clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """context: what is known of the source now. clock: monotonic seconds."""
+        self._sink, self._context, self._clock = sink, context, clock
+        self._next_s = clock()
+        self._shown = False
+
+    def offer(self, frame: Frame, arrival_ns: int, epoch: int) -> None:
+        """A frame arrived; does not wait. With no subscriber it costs a look at a counter."""
+        now_s = self._clock()
+        if now_s < self._next_s or self._sink.stats.previews == 0:
+            return
+        self._next_s = max(self._next_s + PREVIEW_PERIOD_S, now_s + _LEAST * PREVIEW_PERIOD_S)
+        self._shown = True
+        context = self._context()
+        self._sink.preview(lambda: preview_message(context, frame, arrival_ns, epoch))
+
+    def announce_end(self, *, delay_ms: int | None) -> None:
+        """End the topic, if anybody got something on it. delay_ms: see MessageSink."""
+        if self._shown:
+            self._sink.end(end_message(self._context(), PREVIEW_TOPIC, PREVIEW_ID, 1, -1), delay_ms=delay_ms)

@@ -11,7 +11,7 @@ from typer import Argument, Option
 from gcd_node.bench import RATES_HZ, bench
 from gcd_node.cli.check import Changes
 from gcd_node.config import load_config, parse_config
-from gcd_node.config_text import to_toml
+from gcd_node.config_dump import to_toml
 from gcd_node.errors import OutputError
 
 LaunchFile: TypeAlias = Annotated[

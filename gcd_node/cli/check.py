@@ -11,7 +11,7 @@ from typer import Argument, Option
 from gcd_model import printable
 from gcd_node.check import Finding, check
 from gcd_node.config import load_config
-from gcd_node.config_text import to_toml
+from gcd_node.config_dump import to_toml
 
 ConfigPath: TypeAlias = Annotated[Path, Argument(metavar="CONFIG", help="A launch file, such as launch/demo.toml.")]
 Changes: TypeAlias = Annotated[

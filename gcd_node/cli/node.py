@@ -20,7 +20,7 @@ from gcd_model import Traits
 from gcd_node.cli.check import Changes, ConfigPath, PrintConfig
 from gcd_node.cli.control import KeyFolder, NodeKey, client_keys
 from gcd_node.config import LifeConfig, load_config
-from gcd_node.config_text import to_toml
+from gcd_node.config_dump import to_toml
 from gcd_node.demo import HEADINGS, DemoReport, run_demo, run_open_demo
 from gcd_node.inference import WindowReport
 from gcd_node.node import NodeOptions

@@ -8,22 +8,19 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from dataclasses import replace as changed
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from cameras import Bench, Camera, until
+from cameras import until
 from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, made_node, traits
 from media import frames_at
-from rig import Rig
 
 from gcd_model import (
     Augmentation,
     CameraMount,
     Clip,
     DeviceMemoryError,
-    NonFiniteError,
     RenderOptions,
     SourceFeatures,
     load_synthesizer,
@@ -262,26 +259,6 @@ def test_frames_of_windows_that_were_overtaken_are_not_encoded() -> None:
     assert model.encoded == [*range(T), *range(5 * T, 6 * T)]
 
 
-def test_a_window_waits_for_one_frame_that_is_being_encoded_and_no_more() -> None:
-    busy, go_on = threading.Event(), threading.Event()
-
-    def stall(seq: int) -> None:
-        if seq == 15:
-            busy.set()
-            assert go_on.wait(60)
-
-    model = Encoder(before=stall)
-    with Life(config(pace="realtime"), model) as life:
-        life.source.feed(T + 4)
-        assert busy.wait(60)
-        life.source.feed(2 * T + 4)  # the windows of 14 to 27 and of 28 to 41 are complete: the newer one wins
-        until(lambda: life.source.wanted == 3 * T + 8)
-        go_on.set()
-        until(lambda: len(life.windows) == 2)
-    assert sorted(life.windows) == [0, 2]
-    assert model.encoded[T : 2 * T + 2] == [14, 15, *range(28, 42)]
-
-
 def test_nothing_is_encoded_for_nobody() -> None:
     model = Encoder()
     with Life(config("life = {idle_s = 0.05}", pace="realtime"), model) as life:
@@ -331,21 +308,6 @@ def test_what_was_encoded_on_other_terms_is_encoded_anew(other: EncodeTerms) -> 
     assert len(model.encoded) == 4 * T
 
 
-def test_a_window_that_is_rendered_once_more_is_encoded_once_more_with_the_same_noise() -> None:
-    seeds: list[int] = []
-
-    def fail_once(options: RenderOptions) -> None:
-        seeds.append(options.seed)
-        if len(seeds) == 1:
-            raise NonFiniteError("NaN")
-
-    model, box = Encoder(fail_once), Box()
-    made_node(config(), model, FakeSource(T), box).run()
-    assert model.encoded == [*range(T), *range(T)]
-    assert model.seeds[:T] == model.seeds[T:]
-    assert seeds[0] != seeds[1]
-
-
 def test_a_device_that_is_full_encodes_nothing_ahead_until_the_next_window() -> None:
     calls: list[int] = []
 
@@ -363,24 +325,3 @@ def test_a_device_that_is_full_encodes_nothing_ahead_until_the_next_window() -> 
         assert calls == [0, *range(T)]
         life.source.feed(5)
         until(lambda: len(calls) == 1 + T + 5)
-
-
-def test_of_a_lost_camera_nothing_more_is_encoded(tmp_path: Path) -> None:
-    begun, go_on = threading.Event(), threading.Event()
-
-    def wait(_: int) -> None:
-        begun.set()
-        assert go_on.wait(60)
-
-    camera, model = Camera(), Encoder(before=wait)
-    bench = Bench(camera)
-    with Rig(tmp_path, bench, model, views="[view.main]") as rig:
-        rig.await_state("active")
-        camera.run(10, pause_s=0.0)
-        assert begun.wait(60)
-        camera.feed(None)
-        until(lambda: bench.tries >= 2)  # it is sought already
-        go_on.set()
-        until(lambda: bool(model.encoded))
-        time.sleep(0.1)
-    assert len(model.encoded) == 1

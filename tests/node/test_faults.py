@@ -25,13 +25,10 @@ from gcd_model import (
     SourceFeatures,
     Trajectory,
     View,
-    ViewSynthesizer,
 )
-from gcd_node.config import ModelSection
 from gcd_node.errors import ConfigError, SourceLostError, TooShortError
 from gcd_node.frame import Frame
 from gcd_node.service import ServiceManager
-from gcd_node.session import load_model
 from gcd_node.sources import open_source
 
 WAITING = "life = {autostart = false}"
@@ -219,17 +216,6 @@ def test_f7_another_picture_size_begins_a_new_epoch(tmp_path: Path) -> None:
     assert view.header.shape == (14, HEIGHT, WIDTH, 3)
 
 
-def test_f7_pictures_too_small_are_refused_unless_they_may_be_enlarged(tmp_path: Path) -> None:
-    for allowed in (False, True):
-        camera, folder = Camera(size=(48, 32)), tmp_path / str(allowed)
-        folder.mkdir()
-        with Rig(folder, Bench(camera), config=f'kind = "v4l2"\nallow_upscale = {str(allowed).lower()}') as rig:
-            if allowed:
-                rig.await_state("active")
-            else:
-                assert "allow_upscale" in rig.await_event("BAD_ARG")["message"]
-
-
 def test_f8_a_rate_below_the_trained_ones_is_flagged_and_refused_when_strict(tmp_path: Path) -> None:
     for strict in (False, True):
         folder = tmp_path / str(strict)
@@ -246,14 +232,6 @@ def test_f8_a_rate_below_the_trained_ones_is_flagged_and_refused_when_strict(tmp
             assert "fps" in rig.views[0].header.quality.ood
             assert "fps" in [reason for status in rig.statuses() for reason in status["reasons"]]
             assert max(status["level"] for status in rig.statuses()) == 1
-
-
-def test_f8_of_the_trained_rates_the_highest_the_source_can_give_is_chosen(tmp_path: Path) -> None:
-    with Rig(tmp_path, lambda _: FakeSource(30, fps=30.0), config=LOCKSTEP, once=True) as rig:
-        rig.await_state("finalized")
-    view = rig.views[0].header
-    assert (view.src.fps_in, view.src.fps_cond) == (30.0, 24.0)
-    assert "fps" not in view.quality.ood
 
 
 # F10: nobody reads.
@@ -326,15 +304,6 @@ def test_a_failed_model_is_refused_whatever_the_health_says(tmp_path: Path) -> N
         assert rig.ask("activate").code is Code.NOT_READY
 
 
-def test_a_camera_that_fails_the_health_does_not_ask_for_another_model(tmp_path: Path) -> None:
-    with Rig(tmp_path, lambda _: Steady(), FakeSynthesizer(traits()), config=LOCKSTEP) as rig:
-        rig.await_views(1)
-        assert rig.ask("deactivate").code is Code.ACCEPTED
-        rig.await_state("inactive")
-        rig.node.health.model("failed")
-        assert rig.ask("activate").code is Code.ACCEPTED
-
-
 def test_f12_pictures_that_are_no_numbers_are_never_published(tmp_path: Path) -> None:
     seeds: list[int] = []
 
@@ -396,14 +365,6 @@ def test_f14_an_impossible_view_is_refused_with_what_is_allowed_and_nothing_chan
         assert rig.ask("set_view", view="mian", azimuth_deg=5.0).code is Code.UNKNOWN_VIEW
         assert rig.ask("set_view", view="main", azimut_deg=5.0).code is Code.BAD_ARG
         assert rig.ask("views").result == before
-
-
-def test_f14_a_model_with_one_fixed_view_says_so(tmp_path: Path) -> None:
-    with Rig(tmp_path, Bench(), FakeSynthesizer(traits("driving")), views="[view.main]", more=WAITING) as rig:
-        rig.ask("configure")
-        rig.await_state("inactive")
-        assert rig.ask("set_view", view="main", azimuth_deg=5.0).code is Code.VIEW_FIXED
-        assert rig.ask("set_view", view="main", T_src_dst=np.eye(4).ravel().tolist()).code is Code.VIEW_FIXED
 
 
 def test_f15_a_window_in_work_keeps_the_view_it_was_begun_with(tmp_path: Path) -> None:
@@ -511,21 +472,3 @@ def test_f24_ages_do_not_notice_that_somebody_set_the_clock(tmp_path: Path, monk
     assert 0 <= before.age_ms < 1000 * SLACK_S
     assert after.t_capture_ns[0] - before.t_capture_ns[-1] > 3000 * 10**9  # UTC is what the clock says
     assert after.src.epoch == 0
-
-
-@pytest.mark.parametrize("content", [b"", b"<html>not found</html>", b"\x80\x04."])
-def test_f25_bad_weights_are_refused_whole(content: bytes, tmp_path: Path) -> None:
-    weights = tmp_path / "bad.ckpt"
-    weights.write_bytes(content)
-
-    def load(_: ModelSection) -> ViewSynthesizer:
-        return load_model(ModelSection(weights=str(weights)))
-
-    with Rig(tmp_path, Bench(), load, more=WAITING) as rig:
-        assert rig.ask("configure").code is Code.ACCEPTED
-        told = rig.await_event("BAD_ARG")
-        rig.await_state("unconfigured")
-        assert rig.ask("state").result is not None
-        assert rig.statuses()[-1]["model"]["state"] in ("loading", "absent")
-        until(lambda: rig.statuses()[-1]["model"]["state"] == "absent")
-    assert "bad.ckpt" in told["message"]

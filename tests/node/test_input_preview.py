@@ -16,12 +16,12 @@ from gcd_client.subscriber import ReceivedView, ViewSubscriber
 from gcd_model import ViewSynthesizer
 from gcd_node.errors import ConfigError
 from gcd_node.frame import Frame, FrameSource
-from gcd_node.messages import Run
-from gcd_node.preview import PREVIEW_WIDTH, CapturedFrame, InputPreview, preview_message
+from gcd_node.messages import PREVIEW_WIDTH, preview_message
 from gcd_node.publisher import Publisher, PublisherStats
-from gcd_node.sockets import PublisherOptions, Readers, Subscriptions
+from gcd_node.sockets import PublisherOptions, Readers
 from gcd_node.source_config import SourceConfig
-from gcd_node.stream_context import prepare_run
+from gcd_node.stream_context import StreamContext, prepare_stream
+from gcd_node.views import InputPreview
 
 pytestmark = pytest.mark.timeout(90)
 REALTIME = 'kind = "synthetic"\npace = "realtime"'
@@ -43,26 +43,23 @@ class Watched(Box):
 
     @property
     def stats(self) -> PublisherStats:
-        readers = Readers(total=self.previews, previews=self.previews, previews_alone=self.previews)
-        return PublisherStats(readers=readers)
+        return PublisherStats(subscribers=self.previews, previews=self.previews)
 
 
-def run_of(folder: Path, source: FrameSource, model: ViewSynthesizer | None = None, **settings: float) -> Run:
+def run_of(folder: Path, source: FrameSource, model: ViewSynthesizer | None = None, **settings: float) -> StreamContext:
     more = "".join(f"\n{name} = {value}" for name, value in settings.items())
     config = rig_config(folder, REALTIME + more, "[view.main]", "")
-    return prepare_run(config, traits() if model is None else model.traits, source.info)[0]
+    return prepare_stream(config, traits() if model is None else model.traits, source.info)
 
 
-def shot(width: int, height: int, *, seq: int = 7) -> CapturedFrame:
+def frame_of(width: int, height: int, *, seq: int = 7) -> Frame:
     image = np.full((height, width, 3), (200, 100, 50), np.uint8)
-    return CapturedFrame(
-        frame=Frame(image=image, stamp_ns=5_000_000_000, seq=seq), arrival_ns=time.monotonic_ns(), epoch=3
-    )
+    return Frame(image=image, stamp_ns=5_000_000_000, seq=seq)
 
 
 def preview(folder: Path, width: int, height: int, **settings: float) -> ViewMessage:
     source = FakeSource(1, size=(width, height))
-    return preview_message(run_of(folder, source, **settings), shot(width, height))
+    return preview_message(run_of(folder, source, **settings), frame_of(width, height), time.monotonic_ns(), 3)
 
 
 def next_preview(views: ViewSubscriber) -> ReceivedView:
@@ -86,15 +83,15 @@ def test_a_preview_is_the_whole_picture_and_never_wider_than_said(tmp_path: Path
 
 @pytest.mark.parametrize("topics", [[], [VIEW_KEY], [PREVIEW_KEY], [b""], [PREVIEW_KEY, b"", b"src/", VIEW_KEY]])
 def test_whoever_subscribes_is_counted_by_what_they_get_until_they_leave(topics: list[bytes]) -> None:
-    counted = Subscriptions()
+    counted = Readers()
     for topic in topics:
         counted.count(b"\1" + topic)
-    assert counted.now.total == len(topics)
-    assert counted.now.previews == sum(PREVIEW_KEY.startswith(topic) for topic in topics)
-    assert counted.now.watchers == sum(VIEW_KEY.startswith(topic) for topic in topics)
+    assert counted.total == len(topics)
+    assert counted.previews == sum(PREVIEW_KEY.startswith(topic) for topic in topics)
+    assert counted.total - counted.previews_alone == sum(VIEW_KEY.startswith(topic) for topic in topics)
     for topic in topics:
         counted.count(b"\0" + topic)
-    assert counted.now == Readers()
+    assert (counted.total, counted.previews, counted.previews_alone) == (0, 0, 0)
 
 
 # What it says.
@@ -134,12 +131,12 @@ def test_nothing_is_made_while_nobody_looks_and_at_most_five_a_second_then(tmp_p
     shown = InputPreview(box, lambda: run_of(tmp_path, FakeSource(1)), lambda: now[0])
     for seq in range(48):
         now[0] = seq / 24
-        shown.offer(shot(96, 64, seq=seq))
+        shown.offer(frame_of(96, 64, seq=seq), time.monotonic_ns(), 3)
     assert box.views == []
     box.previews = 1
     for seq in range(48, 48 + 240):  # 10 s
         now[0] = seq / 24
-        shown.offer(shot(96, 64, seq=seq))
+        shown.offer(frame_of(96, 64, seq=seq), time.monotonic_ns(), 3)
     shown.announce_end(delay_ms=None)
     seqs = [message.header.src.seq[0] for message in box.views]
     assert 0 < len(seqs) <= 50
@@ -153,7 +150,7 @@ def test_a_subscriber_sees_the_input_and_is_told_of_its_end(tmp_path: Path) -> N
     with Rig(tmp_path, Bench(camera), config='kind = "v4l2"\nhfov_deg = 60.0', watched=False) as rig:
         with ViewSubscriber(f"ipc://{tmp_path}/data", "src", "frm") as views:
             rig.await_state("active")
-            until(lambda: rig.publisher.stats.readers.previews == 1)
+            until(lambda: rig.publisher.stats.previews == 1)
             camera.run(30)
             first = next_preview(views)
             assert first.images.shape == (1, 64, 96, 3)
@@ -189,10 +186,7 @@ def test_who_looks_at_the_input_alone_keeps_no_model_busy(tmp_path: Path) -> Non
 def test_a_reader_of_previews_that_hangs_does_not_hold_up_a_lockstep_run(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
     frame = Frame(image=noise, stamp_ns=0, seq=0)
-    picture = preview_message(
-        run_of(tmp_path, FakeSource(1, size=(640, 480))),
-        CapturedFrame(frame=frame, arrival_ns=time.monotonic_ns(), epoch=0),
-    )
+    picture = preview_message(run_of(tmp_path, FakeSource(1, size=(640, 480))), frame, time.monotonic_ns(), 0)
     options = PublisherOptions(data=f"ipc://{tmp_path}/data", status=None, lockstep=True, min_subscribers=1)
     with (
         Publisher(options) as publisher,

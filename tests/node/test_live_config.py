@@ -2,7 +2,7 @@ import pytest
 from fakes import traits
 
 from gcd_node.config import NodeConfig, ViewConfig, parse_config
-from gcd_node.config_digest import config_digest
+from gcd_node.config_dump import config_digest
 from gcd_node.views import LiveConfig
 
 
