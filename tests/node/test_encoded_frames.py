@@ -240,25 +240,6 @@ def test_a_frame_of_several_windows_is_encoded_once(stride: int) -> None:
     assert model.encoded[last + 1 :] == list(range(last + 1, len(model.encoded)))
 
 
-def test_frames_of_windows_that_were_overtaken_are_not_encoded() -> None:
-    begun, go_on = threading.Event(), threading.Event()
-
-    def wait(options: RenderOptions) -> None:
-        if options.seed != 0:  # not in the warm-up
-            begun.set()
-            assert go_on.wait(60)
-
-    model = Encoder(wait)
-    with Life(config(pace="realtime"), model) as life:
-        life.source.feed(T)
-        assert begun.wait(60)
-        life.source.feed(5 * T)
-        until(lambda: life.source.wanted == 6 * T)
-        go_on.set()
-    assert sorted(life.windows) == [0, 5]
-    assert model.encoded == [*range(T), *range(5 * T, 6 * T)]
-
-
 def test_nothing_is_encoded_for_nobody() -> None:
     model = Encoder()
     with Life(config("life = {idle_s = 0.05}", pace="realtime"), model) as life:
@@ -269,23 +250,6 @@ def test_nothing_is_encoded_for_nobody() -> None:
 
 
 # What is forgotten.
-
-
-def test_frames_that_the_next_window_does_not_hold_are_forgotten() -> None:
-    builder, encoded, model = WindowBuilder(frames=T, fps=10.0, source_fps=10.0), kept(), Encoder()
-    frames = ten_fps(40)
-    placed(frames[:10], builder=builder)
-    while encoded.ahead(model, builder.filling, TERMS):
-        pass
-    assert len(encoded) == 10
-    placed(frames[12:15], builder=builder)  # two are missing
-    assert builder.filling.seqs == (12, 13, 14)
-    encoded.ahead(model, builder.filling, TERMS)
-    assert len(encoded) == 1
-    builder.restart("SRC_LOST")
-    assert not encoded.ahead(model, builder.filling, TERMS)
-    assert len(encoded) == 0
-    assert model.encoded == [*range(10), 12]
 
 
 @pytest.mark.parametrize(

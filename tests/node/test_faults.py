@@ -26,10 +26,9 @@ from gcd_model import (
     Trajectory,
     View,
 )
-from gcd_node.errors import ConfigError, SourceLostError, TooShortError
+from gcd_node.errors import ConfigError, SourceLostError
 from gcd_node.frame import Frame
 from gcd_node.service import ServiceManager
-from gcd_node.sources import open_source
 
 WAITING = "life = {autostart = false}"
 LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
@@ -102,16 +101,6 @@ def test_f2_without_a_camera_the_node_stays_inactive_and_says_which_there_are(tm
         rig.await_state("active")
 
 
-def test_f2_a_node_that_starts_by_itself_takes_the_camera_once_it_is_there(tmp_path: Path) -> None:
-    bench = Bench()
-    with Rig(tmp_path, bench) as rig:
-        rig.await_event("NOT_READY")
-        camera = bench.plug(Camera())
-        rig.await_state("active")
-        camera.run(15)
-        rig.await_views(1)
-
-
 # F3, F4: frames that are damaged, missing, or out of time.
 
 
@@ -134,17 +123,6 @@ def test_f3_damaged_frames_are_counted_and_a_gap_rejects_its_window(tmp_path: Pa
     assert all(status["level"] < 2 for status in rig.statuses())
 
 
-def test_f3_many_damaged_frames_are_a_warning(tmp_path: Path) -> None:
-    camera = Camera()
-    with Rig(tmp_path, Bench(camera)) as rig:
-        rig.await_state("active")
-        for _ in range(20):
-            camera.corrupt += 1
-            camera.run(1)
-        status = rig.await_status(lambda status: "SRC_CORRUPT" in status["reasons"])
-    assert status["level"] == 1
-
-
 def test_f4_frames_that_do_not_rise_are_dropped_and_a_step_begins_a_new_epoch(tmp_path: Path) -> None:
     camera = Camera()
     with Rig(tmp_path, Bench(camera)) as rig:
@@ -164,40 +142,6 @@ def test_f4_frames_that_do_not_rise_are_dropped_and_a_step_begins_a_new_epoch(tm
 
 
 # F5 to F8: recordings and rates.
-
-
-def test_f5_at_the_end_of_a_file_everything_whole_is_published_and_every_view_ends(tmp_path: Path) -> None:
-    with Rig(tmp_path, lambda _: FakeSource(30), config=LOCKSTEP, views=TWO_VIEWS, once=True) as rig:
-        rig.await_event("SRC_ENDED")
-        rig.await_state("finalized")
-        until(lambda: rig.ended == {"win"})
-    assert [len(rig.of(name)) for name in ("main", "other")] == [2, 2]
-    assert rig.failure is None
-    assert "inactive" in [status["state"] for status in rig.statuses()]
-
-
-def test_f5_a_file_shorter_than_a_window_is_exit_65(tmp_path: Path) -> None:
-    with Rig(tmp_path, lambda _: FakeSource(13), config=LOCKSTEP, once=True) as rig:
-        assert "n=13" in rig.await_event("TOO_SHORT")["message"]
-        rig.await_state("finalized")
-    assert isinstance(rig.failure, TooShortError)
-    assert rig.failure.exit_code == 65
-
-
-@pytest.mark.parametrize("content", [None, b"", b"no video at all" * 100])
-def test_f6_a_file_that_cannot_be_decoded_is_refused_and_named(content: bytes | None, tmp_path: Path) -> None:
-    path = tmp_path / "clip.mp4"
-    if content is not None:
-        path.write_bytes(content)
-    config = f'path = "{path}"\npace = "lockstep"'
-    with Rig(tmp_path, open_source, config=config, more=WAITING) as rig:
-        started_s = time.monotonic()
-        assert rig.ask("configure").code is Code.ACCEPTED
-        told = rig.await_event("BAD_ARG")
-        assert time.monotonic() - started_s < 2.0 + SLACK_S
-        rig.await_state("unconfigured")
-    assert told["verb"] == "configure"
-    assert "clip.mp4" in told["message"]
 
 
 def test_f7_another_picture_size_begins_a_new_epoch(tmp_path: Path) -> None:
@@ -444,15 +388,6 @@ def heard_of(listener: socket.socket) -> list[str]:
             lines += listener.recv(4096).decode().splitlines()
         except BlockingIOError:
             return lines
-
-
-def test_f22_with_nowhere_to_record_to_recording_is_refused_and_streaming_goes_on(tmp_path: Path) -> None:
-    with Rig(tmp_path, lambda _: Steady(), config=LOCKSTEP) as rig:  # with a full disk: test_recording
-        rig.await_views(1)
-        begin, end = rig.ask("record_start"), rig.ask("record_stop")
-        assert (begin.code, end.code) == (Code.NOT_READY, Code.WRONG_STATE)
-        assert "[record]" in begin.message
-        rig.await_views(len(rig.of()) + 1)
 
 
 def test_f24_ages_do_not_notice_that_somebody_set_the_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,20 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cameras import Bench, Camera, until
-from fakes import Box, FakeSource, FakeSynthesizer, traits
+from fakes import Box, FakeSource, traits
 from rig import Rig, rig_config
 from wire_messages import window
 
 from gcd_client.images import images
-from gcd_client.protocol import PREVIEW_TOPIC, MessageError, ViewMessage, topic_key, view_topic
+from gcd_client.protocol import PREVIEW_TOPIC, ViewMessage, topic_key
 from gcd_client.subscriber import ReceivedView, ViewSubscriber
 from gcd_model import ViewSynthesizer
-from gcd_node.errors import ConfigError
 from gcd_node.frame import Frame, FrameSource
 from gcd_node.messages import PREVIEW_WIDTH, preview_message
 from gcd_node.publisher import Publisher, PublisherStats
 from gcd_node.sockets import PublisherOptions, Readers
-from gcd_node.source_config import SourceConfig
 from gcd_node.stream_context import StreamContext, prepare_stream
 from gcd_node.views import InputPreview
 
@@ -115,14 +113,6 @@ def test_the_camera_matrix_is_that_of_the_smaller_picture(tmp_path: Path) -> Non
     assert preview(tmp_path, 1280, 720).header.intrinsics is None
 
 
-def test_the_input_has_one_topic_and_no_view_takes_its_name(tmp_path: Path) -> None:
-    assert view_topic("src", "frm") == PREVIEW_TOPIC
-    with pytest.raises(MessageError, match="src of kind frm"):
-        view_topic("src", "win")
-    with pytest.raises(ConfigError, match="view"):
-        rig_config(tmp_path, REALTIME, "[view.src]", "")
-
-
 # When it is made.
 
 
@@ -163,24 +153,6 @@ def test_a_subscriber_sees_the_input_and_is_told_of_its_end(tmp_path: Path) -> N
             rig.ask("deactivate")
             until(lambda: views.receive(100) is None and views.ended)
         rig.await_state("inactive")
-
-
-def test_who_looks_at_the_input_alone_keeps_no_model_busy(tmp_path: Path) -> None:
-    def open_steady(_: SourceConfig) -> Steady:
-        return Steady()
-
-    with (
-        Rig(tmp_path, open_steady, config=REALTIME, more="life = {idle_s = 0.2}", watched=False) as rig,
-        ViewSubscriber(f"ipc://{tmp_path}/data", "src", "frm") as camera,
-    ):
-        rig.await_status(lambda status: "IDLE" in status["reasons"] and status["publish"]["subs"] == 1)
-        assert isinstance(rig.model, FakeSynthesizer)
-        before = len(rig.model.asked)
-        for _ in range(5):  # a second, in which a watched node would render
-            assert next_preview(camera).header.view_id == "src"
-        assert len(rig.model.asked) == before
-        with ViewSubscriber(f"ipc://{tmp_path}/data", "main") as views:
-            assert next_preview(views).header.view_id == "main"
 
 
 def test_a_reader_of_previews_that_hangs_does_not_hold_up_a_lockstep_run(tmp_path: Path) -> None:

@@ -139,6 +139,28 @@ def test_a_view_removed_in_the_last_window_still_ends(tmp_path: Path) -> None:
     assert all(isinstance(each, EndMessage) for each in tape.said)  # what was in work when it was told to stop is lost
 
 
+WILD: list[dict[str, object]] = [
+    {"azimuth_deg": 1e308},
+    {"radius": 1e308},
+    {"radius": -1e308},
+    {"kind": "orbit", "rate_deg_s": 1e308, "amplitude_deg": 60.0},
+    {"kind": "orbit", "rate_deg_s": 1.0, "amplitude_deg": 1e308},
+    {"kind": "orbit", "rate_deg_s": 1.0, "amplitude_deg": 1e-308},
+    {"T_src_dst": [1e308] * 16},
+    {"T_src_dst": [1, 0, 0, 1e308, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]},
+]
+
+
+def test_no_number_in_a_view_can_end_the_stream(tmp_path: Path) -> None:
+    with Rig(tmp_path, lambda _: Endless(), config=LOCKSTEP) as rig:
+        rig.await_views(1)
+        for wanted in WILD:
+            reply = rig.ask("set_view", wanted, view="main")
+            assert reply.code in (Code.OK, Code.OUT_OF_RANGE, Code.BAD_ARG)
+            rig.await_views(len(rig.of()) + 3)
+        assert rig.events("MODEL_FAILED") == []
+
+
 def test_all_topics_of_a_window_agree_on_its_view_whatever_changes_meanwhile(tmp_path: Path) -> None:
     model = FakeSynthesizer(traits())
     changes: list[Callable[[Rig], object]] = [
@@ -168,25 +190,3 @@ def test_all_topics_of_a_window_agree_on_its_view_whatever_changes_meanwhile(tmp
     assert all(len(found) == 1 for found in digests.values())
     assert {len(paths) for paths, _ in model.asked} == {2}  # one batch each
     assert {told[0] for (_, view), each in by_window.items() for told in each if view == "top"} == {1, 2, 3}
-
-
-WILD: list[dict[str, object]] = [
-    {"azimuth_deg": 1e308},
-    {"radius": 1e308},
-    {"radius": -1e308},
-    {"kind": "orbit", "rate_deg_s": 1e308, "amplitude_deg": 60.0},
-    {"kind": "orbit", "rate_deg_s": 1.0, "amplitude_deg": 1e308},
-    {"kind": "orbit", "rate_deg_s": 1.0, "amplitude_deg": 1e-308},
-    {"T_src_dst": [1e308] * 16},
-    {"T_src_dst": [1, 0, 0, 1e308, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]},
-]
-
-
-def test_no_number_in_a_view_can_end_the_stream(tmp_path: Path) -> None:
-    with Rig(tmp_path, lambda _: Endless(), config=LOCKSTEP) as rig:
-        rig.await_views(1)
-        for wanted in WILD:
-            reply = rig.ask("set_view", wanted, view="main")
-            assert reply.code in (Code.OK, Code.OUT_OF_RANGE, Code.BAD_ARG)
-            rig.await_views(len(rig.of()) + 3)
-        assert rig.events("MODEL_FAILED") == []
