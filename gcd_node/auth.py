@@ -66,7 +66,7 @@ def own_endpoint(endpoint: str, channel: Channel) -> str:
     """resolve_endpoint() for who binds: the runtime folder is made, with mode 0700, if it is needed.
 
     Raises:
-        SetupError: see resolve_endpoint(). EndpointError: the folder cannot be made, or belongs to somebody else.
+        SetupError: see resolve_endpoint(). EndpointError: the folder cannot be made, or belongs to another user.
     """
     if endpoint != "ipc":
         return resolve_endpoint(endpoint, channel)
@@ -94,7 +94,7 @@ def _free_ipc_path(path: Path) -> None:
     """Remove the file that a dead process left; ZeroMQ itself would take a live endpoint away without a word.
 
     Raises:
-        EndpointError: somebody answers there, it is no socket, or its folder is missing.
+        EndpointError: a process answers there, it is no socket, or its folder is missing.
     """
     if not path.parent.is_dir():
         raise EndpointError(f"ipc://{path} needs the folder {path.parent}, which does not exist")
@@ -189,7 +189,7 @@ def load_server_security(config: SecurityConfig, on_event: EventSink | None = No
 
 
 class AllowList:
-    """Clients by public key. The file is read again when it has changed and somebody connects or sends a request.
+    """Clients by public key. The file is read again when it has changed and a client connects or sends a request.
 
     on_event gets ALLOW_CHANGED with the names that were `added` and `removed` (a new key or role is both), or
     ALLOW_REFUSED with a `message`, once for each broken file; then the list stays as it was.

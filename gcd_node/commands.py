@@ -185,7 +185,7 @@ class NodeCommands:
             return Outcome(code=Code.WRONG_STATE, message=message)
         if dry_run:
             return Outcome(message="it would be done")
-        if not (recorder.start() if begin else recorder.stop()):  # somebody, or the disk, was faster
+        if not (recorder.start() if begin else recorder.stop()):  # another command, or the disk, was faster
             return Outcome(code=Code.WRONG_STATE, message="the recording has just begun or ended; look at its state")
         return Outcome(code=Code.ACCEPTED, message="an event tells when it has")
 
@@ -200,7 +200,7 @@ class NodeCommands:
     def _require_revision(self, view_id: str, revision: int | None) -> None:
         now = self._live.revision(view_id)
         if revision is not None and revision != now:
-            message = f"{view_id} is at revision {now}, not {revision}: somebody else has changed it"
+            message = f"{view_id} is at revision {now}, not {revision}: another client has changed it"
             raise RequestError(message, Code.WRONG_STATE, result={"view_rev": now})
 
     def _fitted(self, numbers: tuple[float, ...], traits: Traits) -> DeltaFit:

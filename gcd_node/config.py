@@ -85,7 +85,7 @@ class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 class ViewConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A virtual camera.
 
-    kind: of a fixed view the goal is told as differences from the source camera; none for a checkpoint with one fixed
+    kind: of a fixed view the goal is stated as differences from the source camera; none for a checkpoint with one fixed
         view, or for the live model's view from above and behind.
     orbit: starts there and swings in azimuth by rate_deg_s, between -amplitude_deg and +amplitude_deg.
     position_m, look_at_m: of a fixed view, instead of differences, for models that take any pose: where it stands and
@@ -136,8 +136,8 @@ class ViewConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     def plain(self) -> dict[str, object]:
         """Plain values; of position_m, look_at_m and pose, which came later, those that are stated."""
         later = ("position_m", "look_at_m", "pose")
-        told: dict[str, object] = msgspec.to_builtins(self)
-        return {name: value for name, value in told.items() if name not in later or value is not None}
+        plain: dict[str, object] = msgspec.to_builtins(self)
+        return {name: value for name, value in plain.items() if name not in later or value is not None}
 
 
 def pose_matrix(pose: Pose) -> Matrix:

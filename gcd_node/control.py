@@ -82,7 +82,9 @@ class ControlServer:
         try:
             self._socket = self._context.socket(zmq.ROUTER)
             self._socket.set(zmq.ROUTER_HANDOVER, 0)
-            self._socket.set(zmq.MAXMSGSIZE, _LARGEST_READ)  # of each part; libzmq hangs up on whoever sends more
+            self._socket.set(
+                zmq.MAXMSGSIZE, _LARGEST_READ
+            )  # of each part; who sends more is disconnected
             for limit in (zmq.RCVHWM, zmq.SNDHWM):
                 self._socket.set(limit, _QUEUED)
             self._socket.set(zmq.LINGER, 0)

@@ -62,7 +62,7 @@ def oom_levels(*, views: int, samples: int, steps: int, can_halve: bool, can_par
 class FailureCounter:
     """Counts what went wrong, tells it, and says when to give up. Belongs to the model thread.
 
-    Of the device's memory it only ever asks less: whoever wants everything back activates anew.
+    Of the device's memory it only ever asks less, until the next activation.
     """
 
     def __init__(self, health: Health, announcer: Announcer, clock: Callable[[], float] = time.monotonic) -> None:
@@ -119,7 +119,7 @@ class FailureCounter:
 
 
 class Condition:
-    """A reason in the node's health while something is wrong with what comes in; told once each time it begins.
+    """A reason in the node's health while something is wrong with what comes in; announced once each time it begins.
 
     hold_s: how long it must be right again: frames, unlike windows, may be wrong every second time.
     """

@@ -51,7 +51,7 @@ class WorkCounts:
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class WindowReport:
-    """A window that was just published, for whoever watches. render_s, age_ms: see WorkCounts."""
+    """A window that was just published, for observers. render_s, age_ms: see WorkCounts."""
 
     window: FrameWindow
     render_s: float
@@ -161,7 +161,7 @@ class ModelWorker:
         return self._failures.level
 
     def _is_idle(self) -> bool:
-        """Whether nobody would see this window."""
+        """Whether no subscriber would see this window."""
         is_idle = self._idle.is_idle(self._sink.stats.watchers)
         if is_idle:
             self._health.raise_reason(IDLE, Level.OK)
@@ -273,8 +273,8 @@ class ModelWorker:
         steps = max(1, self._steps_in_full(job) // level.steps_divisor)
         with model_errors():
             views = self._draw(job, seed, steps if level.steps_divisor > 1 else job.context.config.model.steps)
-        if self._cancel.is_set():  # a model that hears no cancel: nothing may follow the end
-            raise Cancelled("the node was told to stop")
+        if self._cancel.is_set():  # a model that ignores cancel: nothing may follow the end
+            raise Cancelled("the node is stopping")
         ended_ns, offset_ns = time.monotonic_ns(), utc_offset_ns()
         self._tell_source(job.context, views[0])
         for virtual, view in zip(job.views, views, strict=True):

@@ -4,7 +4,7 @@
          ^            cleanup      |  ^   deactivate      |
          +-------------------------+  +-------------------+          shutdown from each of the three: finalized
 
-Pure: whoever holds a `Lifecycle` does the work between `begin` and its outcome. The states of the source and of the
+Pure: the holder of a `Lifecycle` does the work between `begin` and its outcome. The states of the source and of the
 model are beside this one: a lost source does not leave active.
 """
 
@@ -40,7 +40,7 @@ class State(enum.IntEnum):
 
     @property
     def settled(self) -> bool:
-        """Whether the node stays here until somebody asks for something."""
+        """Whether the node stays here until a command comes."""
         return self <= State.FINALIZED
 
 
@@ -95,7 +95,7 @@ class Lifecycle:
         self.state = self._from
 
     def error(self) -> None:
-        """Something broke on the way: nobody knows what still stands."""
+        """Something broke on the way: what still stands is unknown."""
         self.state = State.ERRORPROCESSING
 
     def recover(self, *, cleaned: bool) -> None:

@@ -32,7 +32,7 @@ from gcd_node.errors import ModelFailedError, NodeError
 
 @contextmanager
 def model_errors() -> Generator[None]:
-    """Around a call of the model: what nobody foresaw becomes ModelFailedError, so that nothing else is blamed."""
+    """Around a call of the model: what is unforeseen becomes ModelFailedError, so that nothing else is blamed."""
     try:
         yield
     except (ModelError, NodeError):
@@ -134,7 +134,7 @@ def interruptible(cancel: threading.Event) -> Generator[None]:
 
     def look(module: nn.Module, _: Any) -> None:
         if cancel.is_set() and threading.get_ident() == thread:
-            raise Cancelled(f"told to stop, before a layer ({type(module).__name__})")
+            raise Cancelled(f"cancelled before a layer ({type(module).__name__})")
 
     hook = register_module_forward_pre_hook(look)
     try:
@@ -144,16 +144,15 @@ def interruptible(cancel: threading.Event) -> Generator[None]:
 
 
 class IdleTimer:
-    """Says whether nobody watches. It has to be asked often: who came and went in between was not seen."""
+    """Says whether views have had no subscriber for a while. It counts only those that are there when it is asked."""
 
     def __init__(self, idle_s: float, clock: Callable[[], float] = time.monotonic) -> None:
-        """Begin as if somebody had just left. idle_s: patience, seconds; 0 for never. clock: monotonic seconds."""
+        """Begin as if a subscriber had just left. idle_s: patience, seconds; 0 for never. clock: monotonic seconds."""
         self._idle_s, self._clock = idle_s, clock
         self._watched_s = clock()
 
     def is_idle(self, subscribers: int) -> bool:
-        """Whether nobody has watched for `idle_s`. subscribers: of views, now; who
-        looks at the input alone keeps nobody busy."""
+        """Whether there was none for `idle_s`. subscribers: of views, now; those of the input alone do not count."""
         now_s = self._clock()
         if subscribers > 0:
             self._watched_s = now_s

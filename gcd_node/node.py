@@ -41,8 +41,8 @@ class NodeOptions:
     """How a node is run.
 
     once: end with the first source that ends, and with whatever fails; else stay and wait for commands.
-    on_configured, on_window: told of the model once it is loaded, and of every window.
-    service: the service manager to be told, if there is one.
+    on_configured, on_window: called with the model once it is loaded, and with every window.
+    service: the service manager to notify, if there is one.
     """
 
     once: bool = True
@@ -134,7 +134,7 @@ class Node:
             return Outcome(code=Code.ACCEPTED, message="ending in order")
         try:
             self._begin(verb, requested=True)
-        except ControlError as error:  # somebody else was faster
+        except ControlError as error:  # another one was faster
             return Outcome(code=Code.BUSY, message=str(error))
         self._on_its_own &= verb not in ("deactivate", "cleanup")
         return Outcome(code=Code.ACCEPTED, message=f"{verb} has begun; an event tells how it ends")
@@ -288,7 +288,7 @@ class Node:
                 self._prepare_stop()
 
     def _after_failure(self, error: Exception, verb: Verb) -> None:
-        """Give up, try again later, or wait for somebody to ask."""
+        """Give up, try again later, or wait for a command."""
         self._watchdog.ready()
         if self._stop_s is not None and verb != "shutdown":
             return

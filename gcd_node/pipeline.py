@@ -48,7 +48,7 @@ class Summary:
 class Stream:
     """Source, reader thread and model thread, started and stopped together. Implements WatchListener.
 
-    stopped: somebody wanted it to end. over: the last window was dealt with. failure: what it ended with, if not well.
+    stopped: it was interrupted. over: the last window was dealt with. failure: what it ended with, if not well.
     """
 
     def __init__(
@@ -308,7 +308,7 @@ LASTING = tuple(code for _, code, _ in _ENDINGS if code not in ("SRC_LOST", MODE
 def ending(failure: Exception | None, *, stopped: bool) -> tuple[str, SourceState]:
     """Event code, and the state of the source, after an activation that ended with this failure, or by itself.
 
-    stopped: somebody wanted it to end.
+    stopped: it was interrupted.
     """
     if failure is None:
         return ("STOPPED", "closed") if stopped else ("SRC_ENDED", "ended")

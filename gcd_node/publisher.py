@@ -152,7 +152,7 @@ class Publisher:
             self._put(Queued(self._encoded(message), delay / 1000))
 
     def note(self, topic: StatusTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
-        """Send a status, event or meta message; the last of each topic is repeated to whoever subscribes later.
+        """Send a status, event or meta message; the last of each topic is repeated to new subscribers.
 
         Raises: as send().
         """
@@ -162,11 +162,11 @@ class Publisher:
         self._wake()
 
     def stop_waiting(self) -> None:
-        """Stop waiting for readers, for a node that was told to stop: what does not leave in `linger_ms` is lost."""
+        """Stop waiting for readers, for a node that is stopping: what does not leave in `linger_ms` is lost."""
         self._hurried.set()
 
     def dead_threads(self) -> list[str]:
-        """Threads that have died, of those that nobody else waits for."""
+        """Threads that have died, of those whose end shows nowhere else."""
         return [] if self._guard.alive else ["authentication"]
 
     def check(self) -> None:
@@ -336,7 +336,7 @@ class Publisher:
                 return
 
     def _left_s(self, progress_s: float) -> float:
-        """How much longer to wait for readers at the end, after the last progress. A node that was told to stop has
+        """How much longer to wait for readers at the end, after the last progress. A node that is stopping has
         linger_ms for all of it, so that slow readers cannot stretch the end one message at a time."""
         hurried, options = self._hurried.is_set(), self._options
         patience_ms = options.drain_ms if options.lockstep and not hurried else options.linger_ms

@@ -78,7 +78,7 @@ def load_model(section: ModelSection) -> ViewSynthesizer:
 
 
 def ends_by_itself(config: NodeConfig) -> bool:
-    """Whether a run ends with its source when nobody says otherwise: recordings end, cameras and commands go on."""
+    """Whether a run ends with its source by default: recordings end, cameras and commands go on."""
     return config.source.kind not in LIVE_KINDS and config.life.autostart
 
 

@@ -114,7 +114,7 @@ class DataSocket:
 
 
 class StatusSocket:
-    """The status socket: keeps the last message of each topic for whoever comes later."""
+    """The status socket: keeps the last message of each topic for later subscribers."""
 
     def __init__(self, context: Context, guard: SocketGuard, endpoint: str) -> None:
         self.socket = _xpub(context, _STATUS_HWM, no_drop=False)

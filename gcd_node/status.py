@@ -85,7 +85,7 @@ class NodeServices:
 
 
 def metadata(context: StreamContext, settings: Settings) -> dict[str, object]:
-    """Weights, views, cameras, classes: what changes only when somebody changes it."""
+    """Weights, views, cameras, classes: what changes only with the configuration or the source."""
     traits = context.traits
     return {
         "weights": {
@@ -108,7 +108,7 @@ def metadata(context: StreamContext, settings: Settings) -> dict[str, object]:
 
 def calibration(context: StreamContext) -> dict[str, object]:
     """The camera of the views, and where the source camera is: mounted on a vehicle, or on the sphere; None for what
-    nobody knows."""
+    is unknown."""
     camera, mount, sphere = context.intrinsics, context.mount, source_pose(context)
     return {
         "K": None if camera is None else list(camera_matrix(camera)),

@@ -26,7 +26,7 @@ _KEPT_EPOCHS = 8
 class StreamContext:
     """What stays the same in every message of a stream, until its source or the configuration changes.
 
-    fps: of a window. intrinsics: of the generated picture, None if nobody knows the field of view.
+    fps: of a window. intrinsics: of the generated picture, None if the field of view is unknown.
     mount: of the source camera, for a model that uses it; None if nothing was stated.
     ood: what lies outside the trained domain from the start: "fps", "hfov".
     fit: how source pictures become the model's. lens: the calibration in use, maybe for pictures of another size.
@@ -196,7 +196,7 @@ def _depth_network(config: NodeConfig, traits: Traits, mount: CameraMount | None
 
 
 def _source_camera(config: NodeConfig, source: SourceInfo, fit: Fit | Rectifier) -> Intrinsics | None:
-    """The camera of the picture the model is given; None if nobody states a field of view."""
+    """The camera of the picture the model is given; None if no field of view is stated."""
     if isinstance(fit, Rectifier):
         return fit.camera
     hfov_deg = source.hfov_in_use(config.source.hfov_deg)

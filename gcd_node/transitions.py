@@ -191,7 +191,7 @@ class Transitions:
         self._release()
 
     def _has_ended(self, stream: Stream) -> bool:
-        """Wait for its threads: as long as a step of the model may take, or less while the node is told to stop."""
+        """Wait for its threads: as long as a step of the model may take, or less once the node is stopping."""
         begun_s = time.monotonic()
         while not stream.join(_LOOK_S):
             if time.monotonic() - begun_s > (_HURRY_S if self._interrupted else self._live.config.life.hang_s):

@@ -114,14 +114,14 @@ class VirtualView:
         self.view_id, self.rev = view_id, rev
         self._traits, self._mount, self._source = traits, mount, stated_sphere(config.source.pose)
         self._move_time = traits.move_time if config.model.move_time is None else config.model.move_time
-        wanted = self._wanted = config.view[view_id]
+        view = self._view = config.view[view_id]
         self._goal = SphericalDelta(
-            azimuth_deg=wanted.azimuth_deg, elevation_deg=wanted.elevation_deg, radius_m=wanted.radius
+            azimuth_deg=view.azimuth_deg, elevation_deg=view.elevation_deg, radius_m=view.radius
         )
         self._orbit: Orbit | None = None
-        if wanted.rate_deg_s is not None and wanted.amplitude_deg is not None:
+        if view.rate_deg_s is not None and view.amplitude_deg is not None:
             self._orbit = Orbit(
-                rate_deg_s=wanted.rate_deg_s, amplitude_deg=wanted.amplitude_deg, azimuth_deg=wanted.azimuth_deg
+                rate_deg_s=view.rate_deg_s, amplitude_deg=view.amplitude_deg, azimuth_deg=view.azimuth_deg
             )
         self._newest: tuple[int, int] | None = None  # epoch and stamp of the last window
         self._planned: tuple[SphericalDelta, Trajectory] | None = None  # most views stand still
@@ -151,18 +151,18 @@ class VirtualView:
         return self._planned[1]
 
     def _plan(self, goal: SphericalDelta) -> Trajectory:
-        wanted, traits = self._wanted, self._traits
-        if wanted.position_m is not None and wanted.look_at_m is not None:
+        view, traits = self._view, self._traits
+        if view.position_m is not None and view.look_at_m is not None:
             if self._source is not None:
                 raise OptionError(
                     f"[view.{self.view_id}] position_m is counted from what the camera is mounted on: in [source.pose] "
                     "state height_m and tilt_deg instead of elevation_deg and radius"
                 )
-            return traits.plan_placed(wanted.position_m, wanted.look_at_m, mount=self._mount)
-        if wanted.pose is not None:
-            pose = torch.tensor(pose_matrix(wanted.pose), dtype=torch.float64).view(4, 4)
+            return traits.plan_placed(view.position_m, view.look_at_m, mount=self._mount)
+        if view.pose is not None:
+            pose = torch.tensor(pose_matrix(view.pose), dtype=torch.float64).view(4, 4)
             return traits.plan_poses(pose.repeat(traits.config.frames, 1, 1), source=self._source)
-        own = traits.live and self._orbit is None and wanted.at_source
+        own = traits.live and self._orbit is None and view.at_source
         return traits.plan_view(
             None if own else goal, source=self._source, move_time=self._move_time, mount=self._mount
         )
@@ -236,7 +236,7 @@ class EndOfStream:
 
 
 class InputPreview:
-    """Shows what the camera sees to whoever subscribes, a few times a second. Belongs to the reader thread."""
+    """Shows what the camera sees to its subscribers, a few times a second. Belongs to the reader thread."""
 
     def __init__(
         self, sink: MessageSink, context: Callable[[], StreamContext], clock: Callable[[], float] = time.monotonic
