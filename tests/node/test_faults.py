@@ -3,6 +3,7 @@
 F9, F20 and F23 are in test_fault_processes.py, F16 to F19 with control and security, exit codes in test_fault_exits.py.
 """
 
+import os
 import socket
 import threading
 import time
@@ -367,6 +368,7 @@ def test_a_control_thread_that_died_is_an_error_and_the_watchdog_is_not_fed(
         with Rig(tmp_path, lambda _: Steady(), config=LOCKSTEP, service=service) as rig:
             rig.await_status(lambda status: status["ready"])
             monkeypatch.setattr(rig.control._guard, "report_failures", Broken())
+            os.eventfd_write(rig.control._wake_fd, 1)
             assert rig.await_event("THREAD_DIED")["thread"] == "control"
             status = rig.await_status(lambda status: "THREAD_DIED" in status["reasons"])
             heard_of(listener)
