@@ -65,7 +65,8 @@ def taped(folder: Path) -> Generator[Tape]:
                 if socket.poll(50):
                     message = decode(socket.recv())
                     assert not isinstance(message, StatusMessage)
-                    tape.said.append(message)
+                    if not (isinstance(message, EndMessage) and message in tape.said[-20:]):  # ends are repeated
+                        tape.said.append(message)
 
     thread = threading.Thread(target=hear, daemon=True)
     thread.start()
