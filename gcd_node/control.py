@@ -30,6 +30,7 @@ _QUEUED = 16
 _SECOND_NS = 1_000_000_000
 _LARGEST_READ = 4 * MAX_REQUEST  # what is longer than a request is refused with a reason, up to here
 _MALFORMED = (Code.BAD_JSON, Code.BAD_PROTO, Code.TOO_LARGE)
+_KEEP_S = 60.0
 _MOST_BAD_PER_S, _MOST_PEERS = 20, 256
 _LOCAL = Client(name="", role="operator")
 
@@ -75,16 +76,18 @@ class ControlServer:
         ignore_s: float = 5.0,
     ) -> None:
         self._on_event, self._on_answer, self._ignore_s = on_event, on_answer, ignore_s
-        self._answers, self._flood = Answers(handle, state), FloodGuard(ignore_s)
+        self._handle, self._state, self._flood = handle, state, FloodGuard(ignore_s)
+        self._kept: dict[Role, ReplyCache] = {  # apart, so that who only looks cannot push out an operator's
+            "operator": ReplyCache(_KEEP_S, most=4096, most_bytes=16 * 1024 * 1024),
+            "viewer": ReplyCache(_KEEP_S, most=1024, most_bytes=4 * 1024 * 1024),
+        }
         self._closing, self._wake_fd = threading.Event(), os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._context: Context = zmq.Context()
         self._guard = SocketGuard(self._context, security, on_event)
         try:
             self._socket = self._context.socket(zmq.ROUTER)
             self._socket.set(zmq.ROUTER_HANDOVER, 0)
-            self._socket.set(
-                zmq.MAXMSGSIZE, _LARGEST_READ
-            )  # of each part; who sends more is disconnected
+            self._socket.set(zmq.MAXMSGSIZE, _LARGEST_READ)  # of each part; who sends more is disconnected
             for limit in (zmq.RCVHWM, zmq.SNDHWM):
                 self._socket.set(limit, _QUEUED)
             self._socket.set(zmq.LINGER, 0)
@@ -151,7 +154,7 @@ class ControlServer:
         client = self._client(parts[-1]) if parts else None
         if client is None:
             return
-        reply, refusal = self._answers.answer([part.bytes for part in parts], client, received_ns)
+        reply, refusal = self._answer([part.bytes for part in parts], client, received_ns)
         if refusal is Code.TOO_LARGE:
             _LOG.warning("TOO_LARGE: refused a request of %d bytes", len(parts[0]))
             self._on_event("TOO_LARGE", {"level": 1, "channel": "control"})
@@ -167,18 +170,7 @@ class ControlServer:
         """Who sent this, by his key; None if the key was taken off the list since."""
         return _LOCAL if self._security is None else self._security.find_client(str(frame.get("User-Id")))
 
-
-class Answers:
-    """Turns requests into replies; knows no socket. One thread uses it. keep_s: how long replies are remembered."""
-
-    def __init__(self, handle: CommandHandler, state: Callable[[], str], keep_s: float = 60.0) -> None:
-        self._handle, self._state = handle, state
-        self._kept: dict[Role, ReplyCache] = {  # apart, so that who only looks cannot push out an operator's
-            "operator": ReplyCache(keep_s, most=4096, most_bytes=16 * 1024 * 1024),
-            "viewer": ReplyCache(keep_s, most=1024, most_bytes=4 * 1024 * 1024),
-        }
-
-    def answer(self, parts: list[bytes], client: Client, received_ns: int) -> tuple[bytes, Code | None]:
+    def _answer(self, parts: list[bytes], client: Client, received_ns: int) -> tuple[bytes, Code | None]:
         """The reply to what arrived in one message at `received_ns` of the wall clock, and why it is no command; None
         if it is one."""
         request_id = ""

@@ -1,6 +1,7 @@
 """Each row of the failure table as a test named after it, through real sockets: `pytest tests/node -k f9_`.
 
-F9, F20 and F23 are in test_fault_processes.py, F16 to F19 with control and security, exit codes in test_fault_exits.py.
+F5, F6 and F25 are in test_fault_exits.py, F7 in test_camera_changes.py, F9, F20 and F23 in test_fault_processes.py,
+F16 to F19 with control and security, F22 in test_recorder.py.
 """
 
 import os
@@ -14,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cameras import FPS, Bench, Camera, until
-from fakes import HEIGHT, WIDTH, FakeSource, FakeSynthesizer, Steady, traits
+from fakes import FakeSource, FakeSynthesizer, Steady, traits
 from rig import Rig
 
 from gcd_client.control import Code
@@ -142,23 +143,7 @@ def test_f4_frames_that_do_not_rise_are_dropped_and_a_step_begins_a_new_epoch(tm
     assert after.header.src.epoch == 1
 
 
-# F5 to F8: recordings and rates.
-
-
-def test_f7_another_picture_size_begins_a_new_epoch(tmp_path: Path) -> None:
-    camera = Camera(size=(192, 128))
-    with Rig(tmp_path, Bench(camera)) as rig:
-        rig.await_state("active")
-        camera.run(10)
-        start_ns = time.monotonic_ns()
-        for i in range(16):
-            image = np.full((200, 300, 3), 20 + i, np.uint8)
-            camera.shoot(image, stamp_ns=start_ns + round(i * 1e9 / FPS))
-            time.sleep(1 / FPS)
-        rig.await_event("SRC_FORMAT")
-        view = rig.await_views(1)[0]
-    assert (view.header.src.epoch, view.header.src.seq[0]) == (1, 10)
-    assert view.header.shape == (14, HEIGHT, WIDTH, 3)
+# F8: rates.
 
 
 def test_f8_a_rate_below_the_trained_ones_is_flagged_and_refused_when_strict(tmp_path: Path) -> None:
@@ -236,17 +221,6 @@ def test_f11_a_model_that_never_finds_memory_fails_and_the_node_stays(tmp_path: 
     assert (status["level"], status["model"]["state"]) == (2, "failed")
     assert rig.views == []
     assert rig.failure is None
-
-
-def test_a_failed_model_is_refused_whatever_the_health_says(tmp_path: Path) -> None:
-    def broken(_: RenderOptions) -> None:
-        raise RuntimeError("shapes differ")
-
-    with Rig(tmp_path, lambda _: Steady(), FakeSynthesizer(traits(), broken), config=LOCKSTEP) as rig:
-        assert "RuntimeError: shapes differ" in rig.await_event("MODEL_FAILED")["message"]
-        rig.await_state("inactive")
-        rig.node.health.model("ready")  # it reports; it decides nothing
-        assert rig.ask("activate").code is Code.NOT_READY
 
 
 def test_f12_pictures_that_are_no_numbers_are_never_published(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from gcd_model import ViewSynthesizer
 from gcd_node.frame import Frame, FrameSource
 from gcd_node.messages import PREVIEW_WIDTH, preview_message
 from gcd_node.publisher import Publisher, PublisherStats
-from gcd_node.sockets import PublisherOptions, Readers
+from gcd_node.sockets import PublisherOptions
 from gcd_node.stream_context import StreamContext, prepare_stream
 from gcd_node.views import InputPreview
 
@@ -77,19 +77,6 @@ def test_a_preview_is_the_whole_picture_and_never_wider_than_said(tmp_path: Path
     assert shown_height == pytest.approx(shown_width * height / width, abs=0.51)
     assert message.header.src.resize == ("none" if width <= PREVIEW_WIDTH else "area")
     assert np.abs(images(message)[0].astype(int) - (200, 100, 50)).max() <= 4  # JPEG
-
-
-@pytest.mark.parametrize("topics", [[], [VIEW_KEY], [PREVIEW_KEY], [b""], [PREVIEW_KEY, b"", b"src/", VIEW_KEY]])
-def test_whoever_subscribes_is_counted_by_what_they_get_until_they_leave(topics: list[bytes]) -> None:
-    counted = Readers()
-    for topic in topics:
-        counted.count(b"\1" + topic)
-    assert counted.total == len(topics)
-    assert counted.previews == sum(PREVIEW_KEY.startswith(topic) for topic in topics)
-    assert counted.total - counted.previews_alone == sum(VIEW_KEY.startswith(topic) for topic in topics)
-    for topic in topics:
-        counted.count(b"\0" + topic)
-    assert (counted.total, counted.previews, counted.previews_alone) == (0, 0, 0)
 
 
 # What it says.

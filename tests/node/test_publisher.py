@@ -1,6 +1,5 @@
 """The publisher, read by a real second process over ipc and tcp, and by plain ZeroMQ sockets."""
 
-import socket
 import stat
 import subprocess
 import sys
@@ -283,16 +282,6 @@ def test_a_live_ipc_endpoint_is_refused_and_stays_alive(tmp_path) -> None:
         first.send(window())
         first.end(end())
     assert len(lines_of(reader)) == 2
-
-
-def test_a_tcp_port_in_use_is_refused_by_name() -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        endpoint = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
-        with pytest.raises(EndpointError, match=endpoint) as caught:
-            Publisher(PublisherOptions(data=endpoint, status=None))
-    assert caught.value.exit_code == 73
 
 
 def test_the_file_of_a_dead_process_is_replaced(tmp_path) -> None:
