@@ -22,7 +22,7 @@ def to_toml(config: NodeConfig, *, secrets: bool = False) -> str:
 
 
 def to_change(key: str, value: object) -> str:
-    """A change to a launch file as with_changes() takes it, such as `model.steps=4`. value: what TOML can say."""
+    """A change to a launch file as parse_config() takes it, such as `model.steps=4`. value: what TOML can say."""
     plain = str(value) if isinstance(value, PurePath) else value
     return f"{key}={tomli_w.dumps({'value': plain}).removeprefix('value = ').strip()}"
 

@@ -128,15 +128,14 @@ class Condition:
         self._code, self._health, self._announcer, self._hold_s = code, health, announcer, hold_s
         self._wrong_s: float | None = None
 
-    def wrong(self, fields: Mapping[str, object]) -> None:
-        """It is. fields: of the event that tells when it begins."""
-        if self._wrong_s is None:
-            self._health.raise_reason(self._code, Level.WARN)
-            self._announcer.event(self._code, Level.WARN, fields)
-        self._wrong_s = time.monotonic()
-
-    def right(self) -> None:
-        """It is not, or not any more."""
-        if self._wrong_s is not None and time.monotonic() - self._wrong_s >= self._hold_s:
+    def update(self, problem: Mapping[str, object] | None) -> None:
+        """Of the newest input. problem: fields of the event that announces its begin; None if all is right."""
+        now_s = time.monotonic()
+        if problem is not None:
+            if self._wrong_s is None:
+                self._health.raise_reason(self._code, Level.WARN)
+                self._announcer.event(self._code, Level.WARN, problem)
+            self._wrong_s = now_s
+        elif self._wrong_s is not None and now_s - self._wrong_s >= self._hold_s:
             self._health.clear_reason(self._code)
             self._wrong_s = None

@@ -306,7 +306,7 @@ class ModelWorker:
         if guessed and context.config.model.on_bad_depth == "stop":
             raise DepthError(f"the depth of {guessed} frames of this window cannot be used; it is not rendered")
         if not guessed:
-            self._bad_depth.right()
+            self._bad_depth.update(None)
         encoded_s = time.monotonic()
         self._health.stage("encode", encoded_s - started_s)
         self._beat()
@@ -344,21 +344,15 @@ class ModelWorker:
     def _count_bad_depth(self, error: DepthError) -> None:
         """Of one frame."""
         self._health.count("bad_depths")
-        self._bad_depth.wrong({"message": str(error)})
+        self._bad_depth.update({"message": str(error)})
 
     def _tell_odometry(self, error: PoseError | None) -> None:
         """Of one frame: None if it can be used."""
-        if error is None:
-            self._bad_odometry.right()
-        else:
-            self._bad_odometry.wrong({"message": str(error)})
+        self._bad_odometry.update(None if error is None else {"message": str(error)})
 
     def _tell_source(self, context: StreamContext, view: View) -> None:
         """Whether the model knows such a source, and how it moved; the same for all views of a window."""
-        if view.lost:
-            self._lost_motion.wrong({"message": view.lost[0], "frames": len(view.lost)})
-        else:
-            self._lost_motion.right()
+        self._lost_motion.update({"message": view.lost[0], "frames": len(view.lost)} if view.lost else None)
         self._health.measure("ood_score", view.ood)
         if world_flags(context.traits, view):
             self._health.raise_reason("world", Level.WARN)

@@ -178,13 +178,13 @@ class Publisher:
     @property
     def stats(self) -> PublisherStats:
         """Counters since the start."""
-        data, readers = self._data, self._data.readers
+        data, readers = self._data, self._data.readers.now
         return PublisherStats(
             sent=data.sent,
             dropped=self._dropped,
             bytes=data.bytes,
             subscribers=readers.total,
-            watchers=readers.total - readers.previews_alone,
+            watchers=readers.watchers,
             previews=readers.previews,
         )
 
@@ -328,7 +328,7 @@ class Publisher:
         meanwhile: ZeroMQ skips them where a reader has no room."""
         until, ends = time.monotonic(), cycle(self._data.ends)
         until += self._left_s(until)
-        while self._data.ends and self._data.readers.total > 0 and time.monotonic() < until:
+        while self._data.ends and self._data.readers.now.total > 0 and time.monotonic() < until:
             self._serve_sockets()
             self._wait(_REPEAT_MS)
             self._data.try_send(next(ends))

@@ -44,14 +44,19 @@ class Queued(NamedTuple):
     follow_s: float | None = None  # how long it must come after the last one; None for at once
 
 
-class Readers:
-    """Counts subscriptions on the data socket as they come and go; may be read from any thread.
+class ReaderCounts(NamedTuple):
+    """Subscriptions on the data socket. watchers, previews: those that get views, previews of the input."""
 
-    total: all. previews: those that get the preview of the input. previews_alone: those that get nothing else.
-    """
+    total: int = 0
+    watchers: int = 0
+    previews: int = 0
+
+
+class Readers:
+    """Counts subscriptions as they come and go. now: may be read from any thread."""
 
     def __init__(self) -> None:
-        self.total = self.previews = self.previews_alone = 0
+        self.now = ReaderCounts()
         self._topics: Counter[bytes] = Counter()
 
     def count(self, event: bytes) -> None:
@@ -66,10 +71,12 @@ class Readers:
         self._topics[topic] += change
         if self._topics[topic] == 0:
             del self._topics[topic]
-        is_preview = _PREVIEW_KEY.startswith(topic)
-        self.total += change
-        self.previews += change * is_preview
-        self.previews_alone += change * (is_preview and topic != b"")
+        now, is_preview = self.now, _PREVIEW_KEY.startswith(topic)
+        self.now = ReaderCounts(
+            total=now.total + change,
+            watchers=now.watchers + change * (topic == b"" or not is_preview),
+            previews=now.previews + change * is_preview,
+        )
 
 
 class DataSocket:
@@ -87,8 +94,8 @@ class DataSocket:
 
     def send(self, queued: Queued) -> bool:
         """Whether it left; if not, try again later."""
-        options, watchers = self._options, self.readers.total - self.readers.previews_alone
-        if options.lockstep and not self._begun and watchers < options.min_subscribers:
+        options = self._options
+        if options.lockstep and not self._begun and self.readers.now.watchers < options.min_subscribers:
             return False
         if queued.follow_s is not None and time.monotonic() < self._last_sent + queued.follow_s:
             return False

@@ -25,8 +25,8 @@ def test_readers_are_counted_as_if_all_were_looked_at_each_time(events: list[tup
         there[topic] = max(0, there[topic] + (1 if comes else -1))
     previews = {topic: count for topic, count in there.items() if topic_key("src/frm").startswith(topic)}
     every = sum(previews.values())
-    expected = (there.total(), every, every - previews.get(b"", 0))
-    assert (counted.total, counted.previews, counted.previews_alone) == expected
+    watchers = there.total() - every + previews.get(b"", 0)
+    assert counted.now == (there.total(), watchers, every)
 
 
 def test_who_takes_back_what_nobody_asked_for_makes_no_reader_disappear(tmp_path: Path) -> None:
