@@ -39,60 +39,58 @@ class LiveConfig:
 
     def __init__(self, config: NodeConfig) -> None:
         self._lock = threading.Lock()
-        self._config = config
-        self._revisions = dict.fromkeys(config.view, 1)
+        self._revisions = dict.fromkeys(config.view, 1)  # of removed views too
         self._removed: list[tuple[str, int]] = []
+        self._settings = Settings(config=config, revisions=dict(self._revisions))
 
     @property
     def config(self) -> NodeConfig:
         """In force now."""
-        with self._lock:
-            return self._config
+        return self._settings.config
 
     @property
     def known_views(self) -> tuple[str, ...]:
         """Every view there is or has been."""
-        with self._lock:
-            return tuple(self._revisions)
+        return tuple(self._revisions)
 
     def settings(self) -> Settings:
         """In force now, with the revisions of its views."""
-        with self._lock:
-            return Settings(
-                config=self._config, revisions={view_id: self._revisions[view_id] for view_id in self._config.view}
-            )
+        return self._settings
 
     def revision(self, view_id: str) -> int:
         """Of a view there is or has been; 0 for others."""
-        with self._lock:
-            return self._revisions.get(view_id, 0)
+        return self._revisions.get(view_id, 0)
 
     def set_view(self, view_id: str, view: ViewConfig) -> int:
         """Replace or add a view; gives its new revision."""
         with self._lock:
             self._revisions[view_id] = self._revisions.get(view_id, 0) + 1
-            self._config = msgspec.structs.replace(self._config, view={**self._config.view, view_id: view})
             self._removed = [each for each in self._removed if each[0] != view_id]
+            self._replace(view={**self.config.view, view_id: view})
             return self._revisions[view_id]
 
     def remove_view(self, view_id: str) -> None:
         """Take a view out. Raises KeyError if it is not in."""
         with self._lock:
-            left = dict(self._config.view)
+            left = dict(self.config.view)
             del left[view_id]
-            self._config = msgspec.structs.replace(self._config, view=left)
             self._removed.append((view_id, self._revisions[view_id]))
+            self._replace(view=left)
 
     def change(self, model: ModelSection, publish: PublishConfig) -> None:
         """Replace how views are drawn and how they are sent."""
         with self._lock:
-            self._config = msgspec.structs.replace(self._config, model=model, publish=publish)
+            self._replace(model=model, publish=publish)
 
     def take_removed(self) -> list[tuple[str, int]]:
         """Views removed since the last call, with their last revision: their end is yet to be announced."""
         with self._lock:
             removed, self._removed = self._removed, []
             return removed
+
+    def _replace(self, **changes: object) -> None:
+        config = msgspec.structs.replace(self.config, **changes)
+        self._settings = Settings(config=config, revisions={each: self._revisions[each] for each in config.view})
 
 
 class VirtualView:
