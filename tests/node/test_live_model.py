@@ -88,7 +88,6 @@ def test_a_view_takes_any_rigid_pose_as_it_is() -> None:
         ('kind = "pose"\npose = [0, 0, 1, 0, 0, 0, 0]', "length 1"),
         ('kind = "pose"\npose = [0, 0, nan, 0, 0, 0, 1]', "finite"),
         ('kind = "pose"\npose = [0, 0, 2e4, 0, 0, 0, 1]', "10000"),
-        ("source_from_view = [1]", 'kind = "pose"'),
     ],
 )
 def test_what_is_no_pose_is_refused_with_what_would_be_one(wrong: str, reason: str) -> None:
