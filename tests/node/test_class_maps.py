@@ -58,10 +58,3 @@ def test_a_model_without_a_class_head_publishes_none(family: str) -> None:
     assert "view/main/cls" not in {message.topic for message in box.ends}
     assert next(fields for topic, fields in box.notes if topic == "meta")["classes"] == []
     assert ontology(traits(family)) == ()
-
-
-def test_class_maps_are_never_made_lossy() -> None:
-    raw, packed = (published(painting_traits(), 14, encoding=encoding) for encoding in ("rgb8", "jpeg"))
-    assert packed.of("win")[0].header.encoding == "jpeg"
-    assert packed.of("cls")[0].header.encoding == "class8"
-    assert bytes(packed.of("cls")[0].payload) == bytes(raw.of("cls")[0].payload)

@@ -1,7 +1,7 @@
 """Each row of the failure table as a test named after it, through real sockets: `pytest tests/node -k f9_`.
 
-F5, F6 and F25 are in test_fault_exits.py, F7 in test_camera_changes.py, F9, F20 and F23 in test_fault_processes.py,
-F16 to F19 with control and security, F22 in test_recorder.py.
+F5, F6 and F25 are in test_fault_exits.py, F7 in test_camera_changes.py, F9 and F23 in test_fault_processes.py,
+F16 to F19 with control and security, F20 in test_publisher.py and test_fault_exits.py, F22 in test_recorder.py.
 """
 
 import os
