@@ -1,4 +1,4 @@
-"""Who may connect over tcp, and with which role: CURVE keys, an allow-list, and ZeroMQ's authentication protocol (ZAP).
+"""Who may connect: endpoints that only this machine reaches, and over tcp CURVE keys, an allow-list and roles.
 
 The allow-list is a TOML file:
 
@@ -10,8 +10,10 @@ Encryption alone lets everybody in, so every secured socket also asks the allow-
 mode of their folder guards them.
 """
 
+import ipaddress
 import logging
 import os
+import socket
 import stat
 import threading
 import time
@@ -35,8 +37,9 @@ from gcd_client.endpoints import (
     check_key,
     fingerprint,
     read_key_pair,
+    resolve_endpoint,
+    runtime_folder,
 )
-from gcd_node.binding import check_bindable, free_ipc_path, is_ipv6
 from gcd_node.config import SecurityConfig
 from gcd_node.errors import ConfigError, EndpointError, OutputError
 
@@ -46,16 +49,79 @@ Socket: TypeAlias = "zmq.Socket[bytes]"
 Context: TypeAlias = "zmq.Context[zmq.Socket[bytes]]"
 EventSink: TypeAlias = Callable[[str, dict[str, object]], None]
 """Takes an event's code and its fields; called from threads of sockets, so it must not wait."""
+Role: TypeAlias = Literal["viewer", "operator"]
+"""What a client may do: look, or also command. A viewer's verbs change nothing."""
+ClientName: TypeAlias = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,32}$(?!\n)")]
 
 _CHANNELS: tuple[Channel, ...] = ("data", "status", "control", "frames")
 _MOST_EVENTS = 64  # of one socket at once: a flood of failing clients must not hold up the others
 _FAILED = zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+_DENIAL_SPAN_S, _MOST_DENIALS = 10.0, 8
 
-ClientName: TypeAlias = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,32}$(?!\n)")]
+
+# Endpoints.
 
 
-Role: TypeAlias = Literal["viewer", "operator"]
-"""What a client may do: look, or also command. A viewer's verbs change nothing."""
+def own_endpoint(endpoint: str, channel: Channel) -> str:
+    """resolve_endpoint() for who binds: the runtime folder is made, with mode 0700, if it is needed.
+
+    Raises:
+        SetupError: see resolve_endpoint(). EndpointError: the folder cannot be made, or belongs to another user.
+    """
+    if endpoint != "ipc":
+        return resolve_endpoint(endpoint, channel)
+    folder = runtime_folder()
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        status = folder.stat(follow_symlinks=False)
+    except OSError as error:
+        raise EndpointError(f"cannot create the runtime folder {folder}: {error.strerror}") from error
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & stat.S_IWOTH:
+        raise EndpointError(f"the runtime folder {folder} must be ours alone; remove it or set RUNTIME_DIRECTORY")
+    return resolve_endpoint(endpoint, channel)
+
+
+def is_loopback(endpoint: str) -> bool:
+    """Whether a tcp endpoint stays on this machine; a name other than localhost counts as outside."""
+    host = endpoint.removeprefix("tcp://").rpartition(":")[0].strip("[]")
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _free_ipc_path(path: Path) -> None:
+    """Remove the file that a dead process left; ZeroMQ itself would take a live endpoint away without a word.
+
+    Raises:
+        EndpointError: a process answers there, it is no socket, or its folder is missing.
+    """
+    if not path.parent.is_dir():
+        raise EndpointError(f"ipc://{path} needs the folder {path.parent}, which does not exist")
+    if not os.path.lexists(path):
+        return
+    if not path.is_socket():
+        raise EndpointError(f"ipc://{path} is taken by something that is no socket; choose another name")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.settimeout(0.5)
+        try:
+            probe.connect(str(path))
+        except ConnectionRefusedError:
+            path.unlink(missing_ok=True)
+            return
+        except OSError as error:
+            raise EndpointError(f"ipc://{path} is in use or not ours: {error}") from error
+    raise EndpointError(f"ipc://{path} is in use by a running process; stop it or choose another endpoint")
+
+
+def unbind(bound: Socket, endpoint: str, linger_ms: int) -> None:
+    """Close; an ipc file goes first, while it is still ours: ZeroMQ leaves it behind."""
+    if endpoint.startswith("ipc://"):
+        Path(endpoint.removeprefix("ipc://")).unlink(missing_ok=True)
+    bound.close(linger_ms)
+
+
+# Keys and clients.
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -123,7 +189,7 @@ def load_server_security(config: SecurityConfig, on_event: EventSink | None = No
 
 
 class AllowList:
-    """Clients by public key. The file is read again when it has changed and somebody connects or sends a request.
+    """Clients by public key. The file is read again when it has changed and a client connects or sends a request.
 
     on_event gets ALLOW_CHANGED with the names that were `added` and `removed` (a new key or role is both), or
     ALLOW_REFUSED with a `message`, once for each broken file; then the list stays as it was.
@@ -133,7 +199,7 @@ class AllowList:
     """
 
     def __init__(self, path: Path, on_event: EventSink | None = None) -> None:
-        self._path, self._on_event = path, on_event or _ignore
+        self._path, self._on_event = path, on_event
         self._lock = threading.Lock()
         self._version = _version(path)
         self._clients = load_clients(path)
@@ -153,15 +219,13 @@ class AllowList:
         try:
             clients = load_clients(self._path)
         except ConfigError as error:
-            _LOG.error("ALLOW_REFUSED: the allow-list stays as it was: %s", error)
-            self._on_event("ALLOW_REFUSED", {"level": 2, "message": str(error)})
+            _report(self._on_event, "ALLOW_REFUSED", {"level": 2, "message": str(error)})
             return
-        was, self._clients = set(self._clients.items()), clients
-        added = sorted(client.name for _, client in clients.items() - was)
-        removed = sorted(client.name for _, client in was - clients.items())
+        before, self._clients = set(self._clients.items()), clients
+        added = sorted(client.name for _, client in clients.items() - before)
+        removed = sorted(client.name for _, client in before - clients.items())
         if added or removed:
-            _LOG.warning("ALLOW_CHANGED: added %s; removed %s", ", ".join(added) or "-", ", ".join(removed) or "-")
-            self._on_event("ALLOW_CHANGED", {"level": 0, "added": added, "removed": removed})
+            _report(self._on_event, "ALLOW_CHANGED", {"level": 0, "added": added, "removed": removed})
 
 
 def load_clients(path: Path) -> dict[str, Client]:
@@ -173,20 +237,38 @@ def load_clients(path: Path) -> dict[str, Client]:
         if mode & stat.S_IWOTH:
             raise ConfigError(f"{path} can be written by everybody, mode {mode:04o}; run chmod o-w on it")
         entries = msgspec.convert(decode_toml(text), AllowFile).client
+        for name, entry in entries.items():
+            check_key(entry.key, f"{path}: the key of {name}")
     except FileError as error:
         raise ConfigError(f"cannot read the allow-list {path}: it {error}; see docs/control.md") from error
     except msgspec.ValidationError as error:
         raise ConfigError(f"{path}: {str(error).replace('`$.', '`')}; see docs/control.md") from error
+    except SetupError as error:
+        raise ConfigError(str(error)) from error
     clients: dict[str, Client] = {}
     for name, entry in entries.items():
-        try:
-            check_key(entry.key, f"{path}: the key of {name}")
-        except SetupError as error:
-            raise ConfigError(str(error)) from error
         if entry.key in clients:
             raise ConfigError(f"{path}: {name} and {clients[entry.key].name} have the same key; give each its own")
         clients[entry.key] = Client(name=name, role=entry.role)
     return clients
+
+
+def _version(path: Path) -> tuple[int, int, int] | None:
+    """Differs as soon as anything about the file has changed; None without one."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ctime_ns, status.st_ino, status.st_size
+
+
+def _report(on_event: EventSink | None, code: str, fields: dict[str, object]) -> None:
+    _LOG.warning("%s: %s", code, fields)
+    if on_event is not None:
+        on_event(code, fields)
+
+
+# Sockets.
 
 
 class SocketGuard:
@@ -196,15 +278,13 @@ class SocketGuard:
     """
 
     def __init__(self, context: Context, security: ServerSecurity | None, on_event: EventSink | None) -> None:
-        self._security = security
-        self._denials = _Denials(on_event or _ignore)
+        self._security, self._denials = security, _Denials(on_event)
         self._monitors: dict[Socket, Channel] = {}
-        self._authenticator: _Authenticator | None = None
-        if security is not None:
-            self._authenticator = _Authenticator(context, security, self._denials)
+        self._authenticator = None if security is None else _Authenticator(context, security, self._denials)
+        if self._authenticator is not None:
             self._authenticator.start()
 
-    def bind(self, socket: Socket, endpoint: str, channel: Channel) -> str:
+    def bind(self, unbound: Socket, endpoint: str, channel: Channel) -> str:
         """Bind a socket: tcp with keys if there are any, ipc for this user, and for his group if the umask lets it.
 
         Returns:
@@ -212,23 +292,27 @@ class SocketGuard:
         Raises:
             ConfigError: others than this machine could reach it without keys. EndpointError: in use, or impossible.
         """
-        secured = self._security is not None and endpoint.startswith("tcp://")
-        check_bindable(endpoint, secured=secured)
-        if endpoint.startswith("ipc://"):  # ZeroMQ itself would take a live endpoint away without a word
-            free_ipc_path(Path(endpoint.removeprefix("ipc://")))
-        if self._security is not None and secured:
-            socket.set(zmq.CURVE_SERVER, 1)
-            socket.set(zmq.CURVE_SECRETKEY, self._security.keys.secret.encode())
-            socket.set(zmq.ZAP_DOMAIN, _domain(channel).encode())
-            socket.set(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without an authenticator: closed to all, not open to all
-            self._monitors[socket.get_monitor_socket(_FAILED)] = channel
-        socket.set(zmq.IPV6, int(is_ipv6(endpoint)))
+        if endpoint.startswith("ipc://"):
+            _free_ipc_path(Path(endpoint.removeprefix("ipc://")))
+        elif self._security is not None:
+            unbound.set(zmq.CURVE_SERVER, 1)
+            unbound.set(zmq.CURVE_SECRETKEY, self._security.keys.secret.encode())
+            unbound.set(zmq.ZAP_DOMAIN, f"gcd.{channel}".encode())
+            unbound.set(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without an authenticator: closed to all, not open to all
+            self._monitors[unbound.get_monitor_socket(_FAILED)] = channel
+        elif not is_loopback(endpoint):
+            raise ConfigError(
+                f"{endpoint} can be reached from other machines, which needs CURVE keys and a list of allowed clients: "
+                "state both [security] keys and [security] allow, see `gcd-node keys`; or bind tcp://127.0.0.1:PORT, "
+                "or ipc"
+            )
+        unbound.set(zmq.IPV6, int(endpoint.startswith("tcp://[")))
         try:
-            socket.bind(endpoint)
+            unbound.bind(endpoint)
         except zmq.ZMQError as error:
             message = f"cannot bind {endpoint}: {error.strerror}; stop who uses it or choose another"
             raise EndpointError(message) from error
-        bound = socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        bound = unbound.getsockopt_string(zmq.LAST_ENDPOINT)
         if bound.startswith("ipc://"):
             path = Path(bound.removeprefix("ipc://"))
             path.chmod(path.stat().st_mode & 0o770)  # whatever folder and umask say: not for everybody
@@ -241,7 +325,7 @@ class SocketGuard:
                 if not monitor.poll(0):
                     break
                 if int(parse_monitor_message(monitor.recv_multipart())["event"]) & _FAILED:
-                    self._denials.add(None, _domain(channel), "")
+                    self._denials.add(None, f"gcd.{channel}", "")
 
     @property
     def monitors(self) -> list[Socket]:
@@ -262,13 +346,6 @@ class SocketGuard:
             self._authenticator.close()
 
 
-def unbind(socket: Socket, endpoint: str, linger_ms: int) -> None:
-    """Close; an ipc file goes first, while it is still ours: ZeroMQ leaves it behind."""
-    if endpoint.startswith("ipc://"):
-        Path(endpoint.removeprefix("ipc://")).unlink(missing_ok=True)
-    socket.close(linger_ms)
-
-
 class _Authenticator(ThreadAuthenticator):
     """Lets clients of the allow-list in; their messages carry the public key as `User-Id`."""
 
@@ -276,12 +353,12 @@ class _Authenticator(ThreadAuthenticator):
         super().__init__(context)
         self._find_client, self._denials, self._address = security.find_client, denials, ""
         for channel in _CHANNELS:  # exactly these: a provider for "*" does not apply to a socket with a domain
-            self.configure_curve_callback(_domain(channel), self)
+            self.configure_curve_callback(f"gcd.{channel}", self)
 
     def callback(self, domain: str, key: bytes) -> bool:
         """Whether a key may connect: it is on the allow-list, to push frames as an operator's; called by zmq.auth."""
         client = self._find_client(key.decode())
-        if client is not None and (client.role == "operator" or domain != _domain("frames")):
+        if client is not None and (client.role == "operator" or domain != "gcd.frames"):
             return True
         self._denials.add(key.decode(), domain, self._address)
         return False
@@ -301,10 +378,7 @@ class _Authenticator(ThreadAuthenticator):
 class _Denials:
     """AUTH_DENIED events, limited: one for each key and socket in 10 s, and at most 8 in all in that time."""
 
-    SPAN_S = 10.0
-    MOST = 8
-
-    def __init__(self, on_event: EventSink) -> None:
+    def __init__(self, on_event: EventSink | None) -> None:
         self._on_event, self._lock = on_event, threading.Lock()
         self._reported_s: dict[tuple[str | None, str], float] = {}
         self._suppressed = 0
@@ -313,30 +387,12 @@ class _Denials:
         """Report a refusal, or count it; key: None if the handshake came to none. From any thread."""
         with self._lock:
             now_s = time.monotonic()
-            self._reported_s = {each: at for each, at in self._reported_s.items() if now_s - at < self.SPAN_S}
-            if (key, domain) in self._reported_s or len(self._reported_s) >= self.MOST:
+            self._reported_s = {each: at for each, at in self._reported_s.items() if now_s - at < _DENIAL_SPAN_S}
+            if (key, domain) in self._reported_s or len(self._reported_s) >= _MOST_DENIALS:
                 self._suppressed += 1
                 return
             self._reported_s[key, domain] = now_s
             suppressed, self._suppressed = self._suppressed, 0
-        mark = None if key is None else fingerprint(key)
-        _LOG.warning("AUTH_DENIED on %s: %s", domain, "no valid handshake" if mark is None else f"key {mark}")
-        fields: dict[str, object] = {"level": 1, "fingerprint": mark, "domain": domain, "address": address}
-        self._on_event("AUTH_DENIED", fields | {"suppressed": suppressed})
-
-
-def _domain(channel: Channel) -> str:
-    return f"gcd.{channel}"
-
-
-def _version(path: Path) -> tuple[int, int, int] | None:
-    """Differs as soon as anything about the file has changed; None without one."""
-    try:
-        found = path.stat()
-    except OSError:
-        return None
-    return found.st_ctime_ns, found.st_ino, found.st_size
-
-
-def _ignore(code: str, fields: dict[str, object]) -> None:
-    """Takes the place of an event sink; the log has what it would get."""
+        fields: dict[str, object] = {"level": 1, "fingerprint": None if key is None else fingerprint(key)}
+        fields |= {"domain": domain, "address": address, "suppressed": suppressed}
+        _report(self._on_event, "AUTH_DENIED", fields)

@@ -35,7 +35,7 @@ from gcd_node.model import drawing_options, sampler_in_use
 from gcd_node.preprocess import in_words
 from gcd_node.session import load_model, model_threads, open_session
 from gcd_node.sources import open_source
-from gcd_node.stream_context import prepare_run
+from gcd_node.stream_context import prepare_stream
 from gcd_node.views import LiveConfig, VirtualViews
 
 Verdict: TypeAlias = Literal["ok", "warning", "failed"]
@@ -214,10 +214,12 @@ def _memory(traits: Traits, needed: int, free: int | None) -> str:
 
 
 def _views(config: NodeConfig, traits: Traits, info: SourceInfo) -> str:
-    run, fps = prepare_run(config, traits, info)
-    VirtualViews(traits).following(LiveConfig(config).settings(), run.mount)
+    run = prepare_stream(config, traits, info)
+    VirtualViews(traits).sync(LiveConfig(config).settings(), run.mount)
     frames = traits.config.frames
-    line = f"{', '.join(config.view)}: {f'windows of {frames} frames' if frames > 1 else 'every frame'} at {fps:g} FPS"
+    line = (
+        f"{', '.join(config.view)}: {f'windows of {frames} frames' if frames > 1 else 'every frame'} at {run.fps:g} FPS"
+    )
     camera = in_words(run.mount, config.source.pose, traits)
     line += f"; {camera}" if camera else ""
     if run.ood:
@@ -226,9 +228,8 @@ def _views(config: NodeConfig, traits: Traits, info: SourceInfo) -> str:
 
 
 def _time(config: NodeConfig, traits: Traits, info: SourceInfo) -> str:
-    _, fps = prepare_run(config, traits, info)
     frames, model = traits.config.frames, config.model
-    period_s = (config.window.stride or frames) / fps
+    period_s = (config.window.stride or frames) / prepare_stream(config, traits, info).fps
     if isinstance(traits.config, ModelConfig):
         runs = Schedule.of(traits.config, drawing_options(model)).evaluations
     else:

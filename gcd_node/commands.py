@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
-from typing import TypeAlias
 
 import msgspec
 import torch
@@ -10,188 +9,170 @@ from msgspec.structs import replace
 
 from gcd_client.control import Code
 from gcd_client.protocol import PROTO
-from gcd_model import (
-    ASSUMED_SOURCE,
-    DeltaFit,
-    ModelError,
-    Spherical,
-    Traits,
-    ViewFixedError,
-    ViewRangeError,
-    nearest_delta,
-)
+from gcd_model import ASSUMED_SOURCE, DeltaFit, ModelError, Traits, ViewFixedError, ViewRangeError, nearest_delta
 from gcd_node.auth import Role
-from gcd_node.config import NodeConfig, ViewConfig, pose_matrix
-from gcd_node.config_digest import config_digest
-from gcd_node.config_text import without_secrets
-from gcd_node.control.message import Command, Outcome, RequestError
-from gcd_node.control.verbs import RemoveView, SetParam, SetPose, SetView, schemas
-from gcd_node.health import Health, Level
+from gcd_node.config import ViewConfig, pose_matrix
+from gcd_node.config_dump import config_digest, without_secrets
+from gcd_node.control import Outcome
+from gcd_node.health import Level
 from gcd_node.lifecycle import Verb
 from gcd_node.preprocess import stated_sphere
 from gcd_node.recorder import Recorder
-from gcd_node.status import Announcer, calibration
+from gcd_node.status import NodeServices, calibration
 from gcd_node.transitions import Transitions
+from gcd_node.verbs import Command, RemoveView, RequestError, SetParam, SetPose, SetView, schemas
 from gcd_node.views import VirtualView
 
 _TOLERATED_DEG = 2.0
-
-Ask: TypeAlias = Callable[[Verb, bool], Outcome]
-"""Begins a transition of the node's life; the second argument is dry_run."""
 
 
 class NodeCommands:
     """Answers for one node; called from the control thread alone."""
 
     def __init__(
-        self, transitions: Transitions, announcer: Announcer, health: Health, ask: Ask, recorder: Recorder
+        self,
+        services: NodeServices,
+        transitions: Transitions,
+        recorder: Recorder,
+        request_transition: Callable[[Verb, bool], Outcome],
     ) -> None:
-        self._machinery, self._announcer, self._health, self._ask = transitions, announcer, health, ask
-        self._recorder = recorder
-        self._told: dict[str, Callable[[], dict[str, object]]] = {
+        """request_transition: begins one; its second argument is dry_run."""
+        self._live, self._health, self._announcer = services.live, services.health, services.announcer
+        self._transitions, self._recorder, self._request = transitions, recorder, request_transition
+        self._queries: dict[str, Callable[[], dict[str, object]]] = {
             "describe": self._describe,
             "state": self._state,
-            "stats": self._stats,
+            "stats": lambda: self._health.snapshot().status,
             "views": self._views,
             "get_config": self._config,
             "get_calib": self._calibration,
         }
 
     def handle(self, command: Command, role: Role) -> Outcome:
-        """Carry it out, or begin to; see Commands. Raises RequestError."""
-        if command.verb == "hello":
+        """Carry it out, or begin to; see CommandHandler. Raises RequestError."""
+        verb, args = command.verb, command.args
+        if verb == "hello":
             return Outcome(result=self._hello(role))
-        if command.verb in self._told:
-            return Outcome(result=self._told[command.verb]())
-        match command.verb:
+        if verb in self._queries:
+            return Outcome(result=self._queries[verb]())
+        match verb:
             case "configure" | "activate" | "deactivate" | "cleanup" | "shutdown":
-                return self._ask(command.verb, command.dry_run)
+                return self._request(verb, command.dry_run)
             case "record_start" | "record_stop":
-                return self._record(begin=command.verb == "record_start", dry_run=command.dry_run)
+                return self._record(begin=verb == "record_start", dry_run=command.dry_run)
             case _:
-                return self._change(command)
-
-    def _change(self, command: Command) -> Outcome:
-        match command.args:
-            case SetView() | SetPose() as wanted:
-                return self._set_view(wanted, command)
-            case RemoveView() as wanted:
-                return self._remove_view(wanted, command)
-            case SetParam() as wanted:
-                return self._set_param(wanted, dry_run=command.dry_run)
+                pass
+        match args:
+            case SetView() | SetPose():
+                return self._set_view(args, command)
+            case RemoveView():
+                return self._remove_view(args, command)
+            case SetParam():
+                return self._set_param(args, dry_run=command.dry_run)
             case _:
-                raise RequestError(f"this node does not know {command.verb}", Code.UNKNOWN_VERB)
+                raise RequestError(f"this node does not know {verb}", Code.UNKNOWN_VERB)
 
-    # Telling.
+    # Queries.
 
     def _hello(self, role: Role) -> dict[str, object]:
-        announcer = self._announcer
-        return {
-            "node_id": announcer.node_id,
-            "boot_id": announcer.boot_id,
-            "proto": PROTO,
-            "version": _version(),
-            "role": role,
-        }
+        try:
+            release = version("gcd-node")
+        except PackageNotFoundError:
+            release = "unknown"
+        node_id, boot_id = self._announcer.node_id, self._announcer.boot_id
+        return {"node_id": node_id, "boot_id": boot_id, "proto": PROTO, "version": release, "role": role}
 
     def _describe(self) -> dict[str, object]:
-        told: dict[str, object] = {"verbs": schemas(), "views": list(self._machinery.live.known_views)}
-        traits = self._machinery.traits
+        result: dict[str, object] = {"verbs": schemas(), "views": list(self._live.known_views)}
+        traits = self._transitions.traits
         if traits is not None:
-            limits = None if traits.family is None else traits.family.limits
-            told |= {
-                "model": {"name": traits.name, "family": None if traits.family is None else traits.family.name},
+            family, sphere = traits.family, stated_sphere(self._live.config.source.pose)
+            limits = None if family is None or family.limits is None else family.limits.allowed(sphere)
+            result |= {
+                "model": {"name": traits.name, "family": None if family is None else family.name},
                 "camera": traits.config.camera,
                 "fps": list(traits.rates),
                 "frames": traits.config.frames,
-                "limits": None if limits is None else _intervals(limits.allowed(self._sphere())),
+                "limits": None if limits is None else _intervals(limits),
             }
-        return told
+        return result
 
     def _state(self) -> dict[str, object]:
         status = self._health.snapshot().status
         states = {name: status[name]["state"] for name in ("source", "model")}
         return {key: status[key] for key in ("state", "level", "reasons")} | states
 
-    def _stats(self) -> dict[str, object]:
-        return self._health.snapshot().status
-
     def _views(self) -> dict[str, object]:
-        settings = self._machinery.live.settings()
-        return {
-            view_id: {**settings.config.view[view_id].plain, "view_rev": rev}
-            for view_id, rev in settings.revisions.items()
-        }
+        settings = self._live.settings()
+        views = settings.config.view
+        return {view_id: {**views[view_id].plain, "view_rev": rev} for view_id, rev in settings.revisions.items()}
 
     def _config(self) -> dict[str, object]:
-        config, traits = self._machinery.live.config, self._machinery.traits
+        config, traits = self._live.config, self._transitions.traits
         digest = None if traits is None else config_digest(config, traits)
         return {"config": without_secrets(config), "cfg_digest": digest}
 
     def _calibration(self) -> dict[str, object]:
-        stream, info = self._machinery.stream, self._machinery.source_info
-        told: dict[str, object] = {}
-        if info is not None:
-            told["source"] = msgspec.to_builtins(info)
-        if stream is not None:
-            told |= calibration(stream.run)
-        return told
+        stream, info = self._transitions.stream, self._transitions.source_info
+        source = {} if info is None else {"source": msgspec.to_builtins(info)}
+        return source if stream is None else source | calibration(stream.context)
 
-    # Changing.
+    # Changes.
 
-    def _set_view(self, wanted: SetView | SetPose, command: Command) -> Outcome:
-        live, traits = self._machinery.live, self._loaded()
-        if wanted.view not in live.known_views:
-            raise _unknown(wanted.view, live.known_views)
-        self._require_revision(wanted.view, command.if_view_rev)
-        view, error_deg = wanted.to_config(), 0.0
-        posed = view.pose is not None
-        if view.pose is not None and not traits.takes_any_pose:
-            fit = self._fitted(pose_matrix(view.pose), traits)
-            delta, error_deg = fit.delta, fit.rotation_error_deg
-            view = ViewConfig(azimuth_deg=delta.azimuth_deg, elevation_deg=delta.elevation_deg, radius=delta.radius_m)
-        self._check_view(wanted.view, view, traits)
-        told: dict[str, object] = {"view": wanted.view, "goal": view.plain}
-        if posed:
-            told["rotation_error_deg"] = round(error_deg, 4)
+    def _set_view(self, args: SetView | SetPose, command: Command) -> Outcome:
+        live, traits = self._live, self._transitions.traits
+        if traits is None:
+            raise RequestError("the model says which views there can be: configure first", Code.NOT_READY)
+        if args.view not in live.known_views:
+            raise _unknown(args.view, live.known_views)
+        self._require_revision(args.view, command.if_view_rev)
+        view = args.to_config()
+        result: dict[str, object] = {"view": args.view}
+        if view.pose is not None:
+            result["rotation_error_deg"] = 0.0
+            if not traits.takes_any_pose:
+                fit = self._fitted(pose_matrix(view.pose), traits)
+                result["rotation_error_deg"] = round(fit.rotation_error_deg, 4)
+                view = ViewConfig(
+                    azimuth_deg=fit.delta.azimuth_deg,
+                    elevation_deg=fit.delta.elevation_deg,
+                    radius=fit.delta.radius_m,
+                )
+        self._check_view(args.view, view, traits)
+        result["goal"] = view.plain
         if command.dry_run:
-            return Outcome(message="it would be set", result=told)
-        told["view_rev"] = live.set_view(wanted.view, view)
-        self._after_change("VIEW_SET", told)
-        return Outcome(result=told)
+            return Outcome(message="it would be set", result=result)
+        result["view_rev"] = live.set_view(args.view, view)
+        self._after_change("VIEW_SET", result)
+        return Outcome(result=result)
 
-    def _remove_view(self, wanted: RemoveView, command: Command) -> Outcome:
-        live = self._machinery.live
-        views = live.settings().revisions
-        if wanted.view not in views:
-            raise _unknown(wanted.view, tuple(views))
-        self._require_revision(wanted.view, command.if_view_rev)
+    def _remove_view(self, args: RemoveView, command: Command) -> Outcome:
+        views = self._live.settings().revisions
+        if args.view not in views:
+            raise _unknown(args.view, tuple(views))
+        self._require_revision(args.view, command.if_view_rev)
         if len(views) == 1:
-            raise RequestError(f"{wanted.view} is the last view; deactivate the node instead", Code.BAD_ARG)
-        told: dict[str, object] = {"view": wanted.view, "view_rev": views[wanted.view]}
+            raise RequestError(f"{args.view} is the last view; deactivate the node instead", Code.BAD_ARG)
+        result: dict[str, object] = {"view": args.view, "view_rev": views[args.view]}
         if not command.dry_run:
-            live.remove_view(wanted.view)
-            self._after_change("VIEW_REMOVED", told)
-        return Outcome(result=told)
+            self._live.remove_view(args.view)
+            self._after_change("VIEW_REMOVED", result)
+        return Outcome(result=result)
 
-    def _set_param(self, wanted: SetParam, *, dry_run: bool) -> Outcome:
-        config = self._machinery.live.config
-        drawing = {
-            name: value
-            for name in ("steps", "guidance", "seed", "samples")
-            if (value := getattr(wanted, name)) is not None
+    def _set_param(self, args: SetParam, *, dry_run: bool) -> Outcome:
+        stated: dict[str, object] = {
+            name: value for name in args.__struct_fields__ if (value := getattr(args, name)) is not None
         }
-        sending: dict[str, object] = {}
-        if wanted.jpeg_quality is not None:
-            sending["jpeg_quality"] = wanted.jpeg_quality
-        if wanted.publish is not None:
-            sending["encoding"] = wanted.publish
+        if "publish" in stated:
+            stated["encoding"] = stated.pop("publish")
+        sending = {name: value for name, value in stated.items() if name in ("encoding", "jpeg_quality")}
+        drawing = {name: value for name, value in stated.items() if name not in sending}
+        config = self._live.config
         model, publish = replace(config.model, **drawing), replace(config.publish, **sending)
-        told: dict[str, object] = {**drawing, **sending}
         if not dry_run:
-            self._machinery.live.change(model, publish)
-            self._after_change("PARAM_SET", told)
-        return Outcome(result=told)
+            self._live.change(model, publish)
+            self._after_change("PARAM_SET", stated)
+        return Outcome(result=stated)
 
     def _record(self, *, begin: bool, dry_run: bool) -> Outcome:
         """Begin to record, or to end that; an event tells how it went."""
@@ -204,34 +185,23 @@ class NodeCommands:
             return Outcome(code=Code.WRONG_STATE, message=message)
         if dry_run:
             return Outcome(message="it would be done")
-        done = recorder.start() if begin else recorder.stop()
-        if not done:  # somebody, or the disk, was faster
+        if not (recorder.start() if begin else recorder.stop()):  # another command, or the disk, was faster
             return Outcome(code=Code.WRONG_STATE, message="the recording has just begun or ended; look at its state")
         return Outcome(code=Code.ACCEPTED, message="an event tells when it has")
 
-    def _after_change(self, code: str, told: dict[str, object]) -> None:
-        stream = self._machinery.stream
+    def _after_change(self, code: str, fields: dict[str, object]) -> None:
+        stream = self._transitions.stream
         if stream is not None:
             stream.notice_change()
-        self._announcer.event(code, Level.OK, told)
+        self._announcer.event(code, Level.OK, fields)
 
-    def _loaded(self) -> Traits:
-        traits = self._machinery.traits
-        if traits is None:
-            raise RequestError("which views there can be, only a loaded model knows: configure first", Code.NOT_READY)
-        return traits
+    # Checks.
 
     def _require_revision(self, view_id: str, revision: int | None) -> None:
-        now = self._machinery.live.revision(view_id)
+        now = self._live.revision(view_id)
         if revision is not None and revision != now:
-            raise RequestError(
-                f"{view_id} is at revision {now}, not {revision}: somebody else has changed it",
-                Code.WRONG_STATE,
-                result={"view_rev": now},
-            )
-
-    def _sphere(self) -> Spherical | None:
-        return stated_sphere(self._machinery.live.config.source.pose)
+            message = f"{view_id} is at revision {now}, not {revision}: another client has changed it"
+            raise RequestError(message, Code.WRONG_STATE, result={"view_rev": now})
 
     def _fitted(self, numbers: tuple[float, ...], traits: Traits) -> DeltaFit:
         """The differences that a rigid goal pose comes to. Raises RequestError."""
@@ -239,7 +209,7 @@ class NodeCommands:
             raise RequestError(f"{traits.name} has one fixed view and takes no poses", Code.VIEW_FIXED)
         pose = torch.tensor(numbers, dtype=torch.float64).reshape(4, 4)
         try:
-            fit = nearest_delta(pose, self._sphere() or ASSUMED_SOURCE)
+            fit = nearest_delta(pose, stated_sphere(self._live.config.source.pose) or ASSUMED_SOURCE)
         except ModelError as error:
             raise RequestError(f"the pose: {error}", Code.BAD_ARG) from error
         if fit.rotation_error_deg > _TOLERATED_DEG:
@@ -253,9 +223,8 @@ class NodeCommands:
 
     def _check_view(self, view_id: str, view: ViewConfig, traits: Traits) -> None:
         """Raises RequestError if the checkpoint cannot give it."""
-        config: NodeConfig = self._machinery.live.config
-        stream = self._machinery.stream
-        mount = None if stream is None else stream.run.mount
+        config, stream = self._live.config, self._transitions.stream
+        mount = None if stream is None else stream.context.mount
         try:
             VirtualView(view_id, replace(config, view={**config.view, view_id: view}), traits, mount)
         except ViewFixedError as error:
@@ -267,18 +236,10 @@ class NodeCommands:
 
 
 def _unknown(view_id: str, known: tuple[str, ...]) -> RequestError:
-    return RequestError(
-        f"there is no view {view_id}; there are {', '.join(known)}", Code.UNKNOWN_VIEW, result={"views": list(known)}
-    )
+    message = f"there is no view {view_id}; there are {', '.join(known)}"
+    return RequestError(message, Code.UNKNOWN_VIEW, result={"views": list(known)})
 
 
 def _intervals(allowed: dict[str, tuple[float, float]]) -> dict[str, object]:
     """By the names a command uses."""
     return {name.removesuffix("_m"): list(interval) for name, interval in allowed.items()}
-
-
-def _version() -> str:
-    try:
-        return version("gcd-node")
-    except PackageNotFoundError:
-        return "unknown"

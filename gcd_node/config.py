@@ -1,7 +1,4 @@
-"""The node's settings, as a launch file states them (TOML).
-
-Longer than most files: one page with every section of a launch file.
-"""
+"""The node's settings, as a launch file states them (TOML): one page with every section of a launch file."""
 
 import math
 from collections.abc import Sequence
@@ -11,7 +8,6 @@ from typing import Annotated, Literal, TypeAlias
 import msgspec
 from msgspec import Meta
 
-from gcd_node.config_changes import refuse_removed, with_changes
 from gcd_node.errors import ConfigError
 from gcd_node.source_config import Count, Positive, SourceConfig, prepare_source
 
@@ -20,6 +16,8 @@ _LEAST_ROTATE_MB, _LEAST_ROTATE_S = 0.1, 1.0
 Matrix: TypeAlias = Annotated[tuple[float, ...], Meta(min_length=16, max_length=16)]
 Pose: TypeAlias = tuple[float, ...]
 _FARTHEST_M = 10_000.0
+Table: TypeAlias = dict[str, object]
+"""A TOML table: keys to plain values, lists and tables."""
 ViewId: TypeAlias = Annotated[str, Meta(pattern=r"^(?!src$)[a-z0-9_]{1,16}$(?!\n)")]  # src is the input
 
 
@@ -87,7 +85,7 @@ class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 class ViewConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A virtual camera.
 
-    kind: of a fixed view the goal is told as differences from the source camera; none for a checkpoint with one fixed
+    kind: of a fixed view the goal is stated as differences from the source camera; none for a checkpoint with one fixed
         view, or for the live model's view from above and behind.
     orbit: starts there and swings in azimuth by rate_deg_s, between -amplitude_deg and +amplitude_deg.
     position_m, look_at_m: of a fixed view, instead of differences, for models that take any pose: where it stands and
@@ -138,8 +136,8 @@ class ViewConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     def plain(self) -> dict[str, object]:
         """Plain values; of position_m, look_at_m and pose, which came later, those that are stated."""
         later = ("position_m", "look_at_m", "pose")
-        told: dict[str, object] = msgspec.to_builtins(self)
-        return {name: value for name, value in told.items() if name not in later or value is not None}
+        plain: dict[str, object] = msgspec.to_builtins(self)
+        return {name: value for name, value in plain.items() if name not in later or value is not None}
 
 
 def pose_matrix(pose: Pose) -> Matrix:
@@ -307,11 +305,42 @@ def parse_config(text: str | bytes, name: str, changes: Sequence[str] = ()) -> N
     from gcd_model import FileError, decode_toml, explain_settings_error
 
     try:
-        table = with_changes(decode_toml(text), changes)
-        refuse_removed(table, name)
+        table = _with_changes(decode_toml(text), changes)
         prepare_source(table, name)
         return msgspec.convert(table, NodeConfig, strict=True)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{name}: {explain_settings_error(str(error), NodeConfig)}") from error
     except FileError as error:
         raise ConfigError(f"{name} {error}") from error
+
+
+def _with_changes(table: Table, changes: Sequence[str]) -> Table:
+    """A launch file's content with changes such as `model.steps=4`, in their order; the original stays.
+
+    A value is read as TOML, so numbers, true and "quoted text" are what they look like; what is no TOML is text.
+    Raises:
+        ConfigError: not of the form KEY=VALUE, or a key goes through something that is no section.
+    """
+    from gcd_model import FileError, decode_toml
+
+    changed = _copied(table)
+    for change in changes:
+        key, equals, text = change.partition("=")
+        parts = [part.strip() for part in key.split(".")]
+        if not equals or not all(parts):
+            raise ConfigError(f"a change is SECTION.KEY=VALUE, such as model.steps=4, got {change!r}")
+        try:
+            value = decode_toml(f"value = {text.strip()}")["value"]
+        except (FileError, KeyError):
+            value = text.strip()
+        inner: object = changed
+        for section in parts[:-1]:
+            inner = inner.setdefault(section, {}) if isinstance(inner, dict) else None
+        if not isinstance(inner, dict):
+            raise ConfigError(f"{change!r}: {'.'.join(parts[:-1])} is no section")
+        inner[parts[-1]] = value
+    return changed
+
+
+def _copied(table: Table) -> Table:
+    return {key: _copied(value) if isinstance(value, dict) else value for key, value in table.items()}

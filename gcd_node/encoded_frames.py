@@ -8,11 +8,9 @@ last bit whether its frames were encoded when they arrived, for the window befor
 import hashlib
 from collections.abc import Callable, Set
 from dataclasses import dataclass
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from gcd_model import (
     Augmentation,
@@ -27,6 +25,7 @@ from gcd_model import (
 from gcd_node.errors import DepthError
 from gcd_node.preprocess import to_image
 from gcd_node.sources.depth import DepthSource, require_known
+from gcd_node.window import PartialWindow
 
 _Key: TypeAlias = tuple[int, int]  # epoch and stamp: a builder never gives the same twice
 
@@ -41,45 +40,6 @@ class EncodeTerms:
     mount: CameraMount | None
     lens: Intrinsics | None = None
     depth: DepthSource | None = None
-
-
-class PlacedFrames(Protocol):
-    """Frames in their places: a FrameWindow, or as much as there is of the next one (PartialWindow)."""
-
-    @property
-    def clip(self) -> NDArray[np.float32]:
-        """float32 [n, 3, H, W] in [-1, 1]."""
-        ...
-
-    @property
-    def stamps_ns(self) -> tuple[int, ...]:
-        """Of each frame."""
-        ...
-
-    @property
-    def seqs(self) -> tuple[int, ...]:
-        """Of each frame."""
-        ...
-
-    @property
-    def depths(self) -> tuple[NDArray[np.float32] | None, ...]:
-        """Of each frame, as it was measured."""
-        ...
-
-    @property
-    def odometry(self) -> tuple[NDArray[np.float64] | None, ...]:
-        """Of each frame, as it was measured."""
-        ...
-
-    @property
-    def fps(self) -> float:
-        """What the network is told."""
-        ...
-
-    @property
-    def epoch(self) -> int:
-        """Of all of them."""
-        ...
 
 
 class EncodedFrames:
@@ -115,7 +75,7 @@ class EncodedFrames:
         self._rows.clear()
         self._guessed = set()
 
-    def ahead(self, synthesizer: ViewSynthesizer, frames: PlacedFrames, terms: EncodeTerms) -> bool:
+    def ahead(self, synthesizer: ViewSynthesizer, frames: PartialWindow, terms: EncodeTerms) -> bool:
         """Encode one more of these frames, the oldest that is not yet. False, and nothing was done, if all are.
 
         Raises: as ViewSynthesizer.encode.
@@ -125,7 +85,7 @@ class EncodedFrames:
             self._encode(synthesizer, frames, missing[0], terms)
         return bool(missing)
 
-    def features(self, synthesizer: ViewSynthesizer, frames: PlacedFrames, terms: EncodeTerms) -> SourceFeatures:
+    def features(self, synthesizer: ViewSynthesizer, frames: PartialWindow, terms: EncodeTerms) -> SourceFeatures:
         """All of these frames, at least one; what is not yet encoded is now.
 
         Raises: as ViewSynthesizer.encode.
@@ -138,7 +98,7 @@ class EncodedFrames:
         self._rows = {key: joined.rows(i, i + 1) for i, key in enumerate(keys)}  # the windows before may go
         return joined
 
-    def _missing(self, frames: PlacedFrames, terms: EncodeTerms) -> list[int]:
+    def _missing(self, frames: PartialWindow, terms: EncodeTerms) -> list[int]:
         """Places of the frames that are not encoded; all other frames are forgotten."""
         if self._alike != (terms, frames.fps):
             self.forget()
@@ -147,7 +107,7 @@ class EncodedFrames:
         self._rows = {key: self._rows[key] for key in keys if key in self._rows}
         return [place for place, key in enumerate(keys) if key not in self._rows]
 
-    def _encode(self, synthesizer: ViewSynthesizer, frames: PlacedFrames, place: int, terms: EncodeTerms) -> None:
+    def _encode(self, synthesizer: ViewSynthesizer, frames: PartialWindow, place: int, terms: EncodeTerms) -> None:
         self._beat()
         video = torch.from_numpy(frames.clip[place : place + 1])
         clip = Clip(
@@ -161,7 +121,7 @@ class EncodedFrames:
         noise = Augmentation(strength=terms.strength, seed=frame_seed(terms.digest, frames.seqs[place]))
         self._rows[_keys(frames)[place]] = synthesizer.encode(clip, noise)
 
-    def _depth(self, frames: PlacedFrames, place: int, network: DepthSource | None) -> torch.Tensor | None:
+    def _depth(self, frames: PartialWindow, place: int, network: DepthSource | None) -> torch.Tensor | None:
         """Of one frame, [1, H, W], as it was measured, else as a network has it; None where neither can be used."""
         measured, depth = frames.depths[place], None
         if measured is None and network is None:
@@ -176,7 +136,7 @@ class EncodedFrames:
         self._guessed = self._guessed & self._rows.keys() | guessed
         return None if depth is None else torch.from_numpy(depth)[None]
 
-    def _odometry(self, frames: PlacedFrames, place: int) -> torch.Tensor | None:
+    def _odometry(self, frames: PartialWindow, place: int) -> torch.Tensor | None:
         """Of one frame, [1, 4, 4]; None without one, or if no camera moves so. A jump costs the frame it ends at."""
         stated, before = frames.odometry[place], self._last_pose
         if stated is None:
@@ -192,7 +152,7 @@ class EncodedFrames:
         return pose[None]
 
 
-def _keys(frames: PlacedFrames) -> list[_Key]:
+def _keys(frames: PartialWindow) -> list[_Key]:
     return [(frames.epoch, stamp_ns) for stamp_ns in frames.stamps_ns]
 
 
@@ -205,11 +165,8 @@ def window_seed(config_digest: str, window_id: int, attempt: int) -> int:
 
 
 def frame_seed(config_digest: str, seq: int) -> int:
-    """Of the noise that is added to one frame before it is encoded, below 2^48.
-
-    It knows nothing of the window, so that windows that share a frame share what was encoded of it. Nor of the stamp:
-    a recording of a camera has other stamps, and the same sequence numbers.
-    """
+    """Of the noise that is added to one frame before it is encoded, below 2^48: not of the window, as windows share
+    frames, nor of the stamp, as a recording of a camera has others, and the same sequence numbers."""
     return _seed(f"{config_digest}/frame/{seq}")
 
 

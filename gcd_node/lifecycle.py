@@ -4,7 +4,7 @@
          ^            cleanup      |  ^   deactivate      |
          +-------------------------+  +-------------------+          shutdown from each of the three: finalized
 
-Pure: whoever holds a `Lifecycle` does the work between `begin` and its outcome. The states of the source and of the
+Pure: the holder of a `Lifecycle` does the work between `begin` and its outcome. The states of the source and of the
 model are beside this one: a lost source does not leave active.
 """
 
@@ -40,21 +40,18 @@ class State(enum.IntEnum):
 
     @property
     def settled(self) -> bool:
-        """Whether the node stays here until somebody asks for something."""
+        """Whether the node stays here until a command comes."""
         return self <= State.FINALIZED
 
 
+_LIVING = frozenset({State.UNCONFIGURED, State.INACTIVE, State.ACTIVE})
 PATHS: Mapping[Verb, tuple[frozenset[State], State, State]] = types.MappingProxyType(
     {
         "configure": (frozenset({State.UNCONFIGURED}), State.CONFIGURING, State.INACTIVE),
         "activate": (frozenset({State.INACTIVE}), State.ACTIVATING, State.ACTIVE),
         "deactivate": (frozenset({State.ACTIVE}), State.DEACTIVATING, State.INACTIVE),
         "cleanup": (frozenset({State.INACTIVE}), State.CLEANINGUP, State.UNCONFIGURED),
-        "shutdown": (
-            frozenset({State.UNCONFIGURED, State.INACTIVE, State.ACTIVE}),
-            State.SHUTTINGDOWN,
-            State.FINALIZED,
-        ),
+        "shutdown": (_LIVING, State.SHUTTINGDOWN, State.FINALIZED),
     }
 )
 """Of each verb: where it may be asked, the state meanwhile, and where it leads."""
@@ -64,24 +61,18 @@ class Lifecycle:
     """Where a node stands. One transition at a time: `begin`, then one of `succeed`, `fail` and `error`."""
 
     def __init__(self) -> None:
-        self._state = State.UNCONFIGURED
-        self._from = State.UNCONFIGURED
-        self._to = State.UNCONFIGURED
-
-    @property
-    def state(self) -> State:
-        """Where it stands now."""
-        return self._state
+        self.state = self._from = self._to = State.UNCONFIGURED
+        """state: where it stands now; changed here alone."""
 
     def refusal(self, verb: Verb) -> str | None:
         """Why `verb` cannot be begun now; None if it can."""
-        allowed, passing, _ = PATHS[verb]
-        if self._state in allowed:
+        allowed, passing, goal = PATHS[verb]
+        if self.state in allowed:
             return None
-        wanted = " or ".join(sorted(state.label for state in allowed))
-        busy = "" if self._state.settled else "; wait until that is over"
-        done = " already" if self._state in (passing, self._goal(verb)) else ""
-        return f"{verb} is for a node that is {wanted}, this one is {self._state.label}{done}{busy}"
+        expected = " or ".join(sorted(state.label for state in allowed))
+        busy = "" if self.state.settled else "; wait until that is over"
+        already = " already" if self.state in (passing, goal) else ""
+        return f"{verb} is for a node that is {expected}, this one is {self.state.label}{already}{busy}"
 
     def begin(self, verb: Verb) -> None:
         """Enter the state between.
@@ -93,37 +84,20 @@ class Lifecycle:
         if refusal is not None:
             raise ControlError(refusal, "WRONG_STATE")
         _, passing, goal = PATHS[verb]
-        self._from, self._to, self._state = self._state, goal, passing
+        self._from, self._to, self.state = self.state, goal, passing
 
-    def succeed(self) -> State:
+    def succeed(self) -> None:
         """The work was done: go where the transition leads."""
-        self._require_underway()
-        self._state = self._to
-        return self._state
+        self.state = self._to
 
-    def fail(self) -> State:
+    def fail(self) -> None:
         """It could not be done, and nothing has changed: back to where it was begun."""
-        self._require_underway()
-        self._state = self._from
-        return self._state
+        self.state = self._from
 
     def error(self) -> None:
-        """Something broke on the way, or while the node was settled: nobody knows what still stands."""
-        if self._state is State.FINALIZED:
-            raise ControlError("a finalized node does not break any more", "WRONG_STATE")
-        self._state = State.ERRORPROCESSING
+        """Something broke on the way: what still stands is unknown."""
+        self.state = State.ERRORPROCESSING
 
-    def recover(self, *, cleaned: bool) -> State:
+    def recover(self, *, cleaned: bool) -> None:
         """After `error`: everything was let go, so that configuring can start anew; or it could not be."""
-        if self._state is not State.ERRORPROCESSING:
-            raise ControlError(f"only an error is recovered from, the node is {self._state.label}", "WRONG_STATE")
-        self._state = State.UNCONFIGURED if cleaned else State.FINALIZED
-        return self._state
-
-    @staticmethod
-    def _goal(verb: Verb) -> State:
-        return PATHS[verb][2]
-
-    def _require_underway(self) -> None:
-        if self._state.settled or self._state is State.ERRORPROCESSING:
-            raise ControlError(f"no transition is under way, the node is {self._state.label}", "WRONG_STATE")
+        self.state = State.UNCONFIGURED if cleaned else State.FINALIZED

@@ -1,5 +1,6 @@
 """The model a node has loaded. It may be exchanged for a lighter one while the node lives."""
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable, Generator, Sequence
@@ -31,7 +32,7 @@ from gcd_node.errors import ModelFailedError, NodeError
 
 @contextmanager
 def model_errors() -> Generator[None]:
-    """Around a call of the model: what nobody foresaw becomes ModelFailedError, so that nothing else is blamed."""
+    """Around a call of the model: what is unforeseen becomes ModelFailedError, so that nothing else is blamed."""
     try:
         yield
     except (ModelError, NodeError):
@@ -44,33 +45,26 @@ LoadModel = Callable[[ModelSection], ViewSynthesizer]
 """Loads the model of a launch file; see session.load_model()."""
 
 
-def load_streaming(load: LoadModel, section: ModelSection) -> ViewSynthesizer:
-    """The model as a node uses it: frame by frame if it can, else window by window. Raises as `load`."""
-    loaded = load(section)
-    return loaded.streaming() if isinstance(loaded, FrameSynthesizer) else loaded
-
-
 class ModelSlot:
-    """Holds the model; the only reference to it, so that an exchange gives the memory back first."""
+    """Holds the model; the only reference to it, so that an exchange gives the memory back first.
+
+    traits: of the model in use.
+    """
 
     def __init__(self, section: ModelSection, load: LoadModel) -> None:
-        """Load it, see load_streaming(). Raises as `load`."""
+        """Load it. Raises as `load`."""
         self._section, self._load = section, load
-        self._synthesizer: ViewSynthesizer | None = load_streaming(load, section)
-        self._traits = self._synthesizer.traits
+        self._synthesizer: ViewSynthesizer | None = None
+        self.traits = self.synthesizer.traits
 
     @property
     def synthesizer(self) -> ViewSynthesizer:
-        """The model in use; loaded anew if the last exchange did not succeed."""
+        """The model in use, frame by frame if it can; loaded anew if the last exchange did not succeed."""
         if self._synthesizer is None:
-            self._synthesizer = load_streaming(self._load, self._section)
-            self._traits = self._synthesizer.traits
+            loaded = self._load(self._section)
+            self._synthesizer = loaded.streaming() if isinstance(loaded, FrameSynthesizer) else loaded
+            self.traits = self._synthesizer.traits
         return self._synthesizer
-
-    @property
-    def traits(self) -> Traits:
-        """The model's."""
-        return self._traits
 
     def forget_frames(self) -> None:
         """What a model that works frame by frame remembers of the frames before; others remember nothing."""
@@ -85,14 +79,12 @@ class ModelSlot:
     @property
     def can_halve(self) -> bool:
         """Whether bfloat16 weights would be smaller, and the device is one that gains by them."""
-        return self._traits.device.startswith("cuda") and self._traits.precision == "float32"
+        return self.traits.device.startswith("cuda") and self.traits.precision == "float32"
 
     def halve(self) -> None:
         """Let the model go and load it in bfloat16. Raises as `load`."""
-        self._synthesizer = None
-        self._section = replace(self._section, dtype="bfloat16")
-        self._synthesizer = load_streaming(self._load, self._section)
-        self._traits = self._synthesizer.traits
+        self._synthesizer, self._section = None, replace(self._section, dtype="bfloat16")
+        _ = self.synthesizer
 
 
 def drawing_options(section: ModelSection) -> RenderOptions:
@@ -124,22 +116,14 @@ def render_grey(
         NonFiniteError, DeviceMemoryError, Cancelled: see ViewSynthesizer.render.
     """
     traits = synthesizer.traits
-    grey = Clip(video=torch.zeros(1, 3, *_size(traits)), fps=traits.fps, mount=mount)
+    height, width = traits.config.height, traits.config.width
+    if traits.device == "cpu":  # half of each: a whole rendering takes longer than all that happens only once
+        with contextlib.suppress(OptionError):
+            traits.check_size(height // 2, width // 2)
+            height, width = height // 2, width // 2
+    grey = Clip(video=torch.zeros(1, 3, height, width), fps=traits.fps, mount=mount)
     encoded = synthesizer.encode(grey)
     synthesizer.render(encoded.followed_by(*[encoded] * (traits.config.frames - 1)), paths, options)
-
-
-def _size(traits: Traits) -> tuple[int, int]:
-    """Height and width of the clip to warm up with: half of each on a CPU, where a whole rendering takes longer than
-    all that happens only once, and puts off the first view."""
-    height, width = traits.config.height, traits.config.width
-    if traits.device != "cpu":
-        return height, width
-    try:
-        traits.check_size(height // 2, width // 2)
-    except OptionError:
-        return height, width
-    return height // 2, width // 2
 
 
 @contextmanager
@@ -150,7 +134,7 @@ def interruptible(cancel: threading.Event) -> Generator[None]:
 
     def look(module: nn.Module, _: Any) -> None:
         if cancel.is_set() and threading.get_ident() == thread:
-            raise Cancelled(f"told to stop, before a layer ({type(module).__name__})")
+            raise Cancelled(f"cancelled before a layer ({type(module).__name__})")
 
     hook = register_module_forward_pre_hook(look)
     try:
@@ -160,16 +144,15 @@ def interruptible(cancel: threading.Event) -> Generator[None]:
 
 
 class IdleTimer:
-    """Says whether nobody watches. It has to be asked often: who came and went in between was not seen."""
+    """Says whether views have had no subscriber for a while. It counts only those that are there when it is asked."""
 
     def __init__(self, idle_s: float, clock: Callable[[], float] = time.monotonic) -> None:
-        """Begin as if somebody had just left. idle_s: patience, seconds; 0 for never. clock: monotonic seconds."""
+        """Begin as if a subscriber had just left. idle_s: patience, seconds; 0 for never. clock: monotonic seconds."""
         self._idle_s, self._clock = idle_s, clock
         self._watched_s = clock()
 
     def is_idle(self, subscribers: int) -> bool:
-        """Whether nobody has watched for `idle_s`. subscribers: of views, now; who
-        looks at the input alone keeps nobody busy."""
+        """Whether there was none for `idle_s`. subscribers: of views, now; those of the input alone do not count."""
         now_s = self._clock()
         if subscribers > 0:
             self._watched_s = now_s

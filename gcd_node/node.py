@@ -1,7 +1,4 @@
-"""The node: lives from configure to shutdown, does what it is asked, and says how it is.
-
-Longer than most files: its life is one loop, and everything in it waits for the same events.
-"""
+"""The node: lives from configure to shutdown, does what it is asked, and says how it is."""
 
 import contextlib
 import logging
@@ -17,7 +14,7 @@ from gcd_model import ModelError, Traits
 from gcd_node.auth import Role
 from gcd_node.commands import NodeCommands
 from gcd_node.config import NodeConfig
-from gcd_node.control.message import Command, Outcome
+from gcd_node.control import Outcome
 from gcd_node.errors import NodeError, SourceAbsentError, SourceError, SourceLostError
 from gcd_node.health import Health, Level
 from gcd_node.inference import WindowReport
@@ -27,8 +24,9 @@ from gcd_node.pipeline import Summary
 from gcd_node.publisher import MessageSink
 from gcd_node.recorder import Recorder, RecordingSink
 from gcd_node.service import ServiceManager, Watchdog
-from gcd_node.status import Announcer
-from gcd_node.transitions import Links, Parts, Transitions
+from gcd_node.status import Announcer, NodeServices
+from gcd_node.transitions import Parts, Transitions
+from gcd_node.verbs import Command
 from gcd_node.views import LiveConfig
 
 _LOG = logging.getLogger(__name__)
@@ -43,8 +41,8 @@ class NodeOptions:
     """How a node is run.
 
     once: end with the first source that ends, and with whatever fails; else stay and wait for commands.
-    on_configured, on_window: told of the model once it is loaded, and of every window.
-    service: the service manager to be told, if there is one.
+    on_configured, on_window: called with the model once it is loaded, and with every window.
+    service: the service manager to notify, if there is one.
     """
 
     once: bool = True
@@ -55,38 +53,34 @@ class NodeOptions:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Done:
-    """A transition is over. asked: somebody outside had asked for it."""
+    """A transition is over. requested: by a command, rather than by the node itself."""
 
     verb: Verb
-    asked: bool
+    requested: bool
     error: Exception | None
 
 
 class Node:
-    """Implements Commands. `run` blocks; `stop` and `handle` may be called from other threads, `stop` from a signal
-    handler too. Transitions are worked through in a thread of their own, so that status and commands go on."""
+    """A camera, a model and the views between them. `run` blocks; `stop` and `handle` may be called from other threads,
+    `stop` from a signal handler too. Transitions are worked through in a thread of their own, so that status and
+    commands go on."""
 
     def __init__(self, config: NodeConfig, parts: Parts, sink: MessageSink, options: NodeOptions | None = None) -> None:
         """Nothing is opened or loaded before `run`."""
         self._config, self._options = config, options or NodeOptions()
         self.health, live, boot_id = Health(), LiveConfig(config), uuid.uuid4().hex
-        self.recorder = Recorder(config, boot_id, lambda: live.config, self._say)
+        self.recorder = Recorder(config, boot_id, lambda: live.config, self._emit)
         self._sink = RecordingSink(sink, self.recorder)
         self._announcer = Announcer(config.node_id, boot_id, self._sink, self.health)
-        links = Links(
-            sink=self._sink,
-            health=self.health,
-            announcer=self._announcer,
-            on_over=self._notice_over,
-            on_window=self._options.on_window,
-            tap=self.recorder,
-        )
-        self._machinery = Transitions(live, parts, links)
-        self._commands = NodeCommands(self._machinery, self._announcer, self.health, self.ask, self.recorder)
-        self._life, self._order = Lifecycle(), threading.Lock()
+        services = NodeServices(live=live, sink=self._sink, health=self.health, announcer=self._announcer)
         self._inbox: queue.SimpleQueue[_Done | str] = queue.SimpleQueue()
+        self._transitions = Transitions(
+            services, parts, self.recorder, lambda: self._inbox.put("over"), self._options.on_window
+        )
+        self._commands = NodeCommands(services, self._transitions, self.recorder, self.request)
+        self._life, self._order = Lifecycle(), threading.Lock()
         self._work: threading.Thread | None = None
-        self._watchdog = Watchdog(self._say, self.health, config.life.hang_s, self._options.service)
+        self._watchdog = Watchdog(self._emit, self.health, config.life.hang_s, self._options.service)
         self._backoff = backoff_of(config.source.kind)
         self._stop_s: float | None = None
         self._retry_s: float | None = None
@@ -101,7 +95,7 @@ class Node:
     @property
     def left_behind(self) -> bool:
         """After `run`: whether a thread hangs that Python would wait for in vain."""
-        return self._machinery.left_behind or (self._work is not None and self._work.is_alive())
+        return self._transitions.left_behind or (self._work is not None and self._work.is_alive())
 
     def watch(self, dead_threads: Callable[[], list[str]]) -> None:
         """Ask this for the names of dead threads as long as the node runs: without them it is not ready."""
@@ -113,10 +107,10 @@ class Node:
         self._inbox.put("stop")
 
     def handle(self, command: Command, role: Role) -> Outcome:
-        """Carry a command out, or begin to; see Commands."""
+        """Carry a command out, or begin to; see CommandHandler."""
         return self._commands.handle(command, role)
 
-    def _say(self, code: str, level: Level, fields: Mapping[str, object]) -> None:
+    def _emit(self, code: str, level: Level, fields: Mapping[str, object]) -> None:
         self._announcer.event(code, level, fields)
 
     def event(self, code: str, fields: dict[str, object]) -> None:
@@ -124,23 +118,23 @@ class Node:
         level = fields.get("level")
         self._announcer.event(code, Level(level) if isinstance(level, int) else Level.WARN, fields)
 
-    def ask(self, verb: Verb, dry_run: bool) -> Outcome:
+    def request(self, verb: Verb, dry_run: bool) -> Outcome:
         """Begin a transition; an event tells how it ends."""
-        if verb == "activate" and self._machinery.model_failed:
+        if verb == "activate" and self._transitions.model_failed:
             return Outcome(code=Code.NOT_READY, message="the model has failed; cleanup and configure load it anew")
-        if verb == "activate" and self._machinery.left_behind:
+        if verb == "activate" and self._transitions.left_behind:
             return Outcome(code=Code.NOT_READY, message="a thread of the last activation hangs; restart the process")
-        refusal, busy = self._life.refusal(verb), not self.state.settled
-        if refusal is not None and not (verb == "shutdown" and busy):
-            return Outcome(code=Code.BUSY if busy else Code.WRONG_STATE, message=refusal)
+        refusal, is_busy = self._life.refusal(verb), not self.state.settled
+        if refusal is not None and not (verb == "shutdown" and is_busy):
+            return Outcome(code=Code.BUSY if is_busy else Code.WRONG_STATE, message=refusal)
         if dry_run:
             return Outcome(message=f"{verb} would begin")
         if verb == "shutdown":
             self.stop()
             return Outcome(code=Code.ACCEPTED, message="ending in order")
         try:
-            self._begin(verb, asked=True)
-        except ControlError as error:  # somebody else was faster
+            self._begin(verb, requested=True)
+        except ControlError as error:  # another one was faster
             return Outcome(code=Code.BUSY, message=str(error))
         self._on_its_own &= verb not in ("deactivate", "cleanup")
         return Outcome(code=Code.ACCEPTED, message=f"{verb} has begun; an event tells how it ends")
@@ -155,27 +149,27 @@ class Node:
         try:
             if self._config.record.autostart:
                 self.recorder.start()
-            self._turn()
+            self._publish_state()
             if self._on_its_own:
                 self._begin("configure")
             else:
                 self._watchdog.ready()
-            while self.state is not State.FINALIZED and not self._overdue():
-                self._hear()
+            while self.state is not State.FINALIZED and self._left_s(0.0) > 0:
+                self._handle_message()
                 self._tick()
         finally:
-            self._machinery.interrupt()
+            self._transitions.interrupt()
             if self._work is not None:
-                self._work.join(self._left_s())
-            self._machinery.close(self._left_s())
-            self.recorder.close(self._record_patience_s())
+                self._work.join(self._left_s(_LEAST_PATIENCE_S))
+            self._transitions.close(self._left_s(_LEAST_PATIENCE_S))
+            self.recorder.close(self._left_s(_LEAST_RECORD_S))
         if self._failure is not None:
             raise self._failure
-        return self._machinery.summary
+        return self._transitions.summary
 
     # Life loop.
 
-    def _hear(self) -> None:
+    def _handle_message(self) -> None:
         try:
             message = self._inbox.get(timeout=_TICK_S)
         except queue.Empty:
@@ -184,13 +178,13 @@ class Node:
             self._finish(message)
         elif message == "stop":
             self._prepare_stop()
-        elif self.state is State.ACTIVE and self._machinery.has_ended:
+        elif self.state is State.ACTIVE and self._transitions.has_ended:
             self._try("deactivate")
         if self._stop_s is not None:
             self._try("shutdown")
 
     def _tick(self) -> None:
-        stream = self._machinery.stream
+        stream = self._transitions.stream
         if stream is not None:
             stream.tick()
         self._watchdog.check(0.0 if stream is None else stream.worker.silent_s)
@@ -200,39 +194,31 @@ class Node:
             self._try("activate")
         self._announcer.status_if_due()
 
-    def _notice_over(self) -> None:
-        self._inbox.put("over")
-
     def _prepare_stop(self) -> None:
         if self._stop_s is None:
             self._stop_s = time.monotonic()
             self._watchdog.stopping()
-        self._machinery.interrupt()
+        self._transitions.interrupt()
 
-    def _overdue(self) -> bool:
-        """Whether the end is wanted and something holds it up for too long."""
-        return self._stop_s is not None and time.monotonic() - self._stop_s > _PATIENCE_S
-
-    def _left_s(self) -> float:
-        """How long the end may still wait for a thread."""
+    def _left_s(self, least_s: float) -> float:
+        """How long the end may still wait for a thread or the disk, so that all of it fits into the 5 s of F23."""
         since_s = 0.0 if self._stop_s is None else time.monotonic() - self._stop_s
-        return max(_LEAST_PATIENCE_S, _PATIENCE_S - since_s)
+        return max(least_s, _PATIENCE_S - since_s)
 
-    def _record_patience_s(self) -> float:
-        """How long the end may wait for the disk, so that all of it fits into the 5 s of F23."""
-        since_s = 0.0 if self._stop_s is None else time.monotonic() - self._stop_s
-        return max(_LEAST_RECORD_S, _PATIENCE_S - since_s)
+    def _publish_state(self) -> None:
+        self.health.state(self.state.label)
+        self._announcer.status()
 
     # Transitions.
 
-    def _begin(self, verb: Verb, *, asked: bool = False) -> None:
+    def _begin(self, verb: Verb, *, requested: bool = False) -> None:
         """Raises ControlError if it cannot be begun now."""
         with self._order:
             self._life.begin(verb)
-        self._turn()
+        self._publish_state()
         if verb == "configure":
             self._watchdog.loading()
-        self._work = threading.Thread(target=self._perform, args=(verb, asked), name=verb, daemon=True)
+        self._work = threading.Thread(target=self._perform, args=(verb, requested), name=verb, daemon=True)
         self._work.start()
 
     def _try(self, verb: Verb) -> None:
@@ -241,93 +227,80 @@ class Node:
             with contextlib.suppress(ControlError):
                 self._begin(verb)
 
-    def _perform(self, verb: Verb, asked: bool) -> None:
+    def _perform(self, verb: Verb, requested: bool) -> None:
         work: dict[Verb, Callable[[], None]] = {
-            "configure": self._machinery.configure,
-            "activate": self._machinery.activate,
-            "deactivate": self._machinery.deactivate,
-            "cleanup": self._machinery.cleanup,
-            "shutdown": self._machinery.deactivate,
+            "configure": self._transitions.configure,
+            "activate": self._transitions.activate,
+            "deactivate": self._transitions.deactivate,
+            "cleanup": self._transitions.cleanup,
+            "shutdown": self._transitions.deactivate,
         }
         error: Exception | None = None
         try:
             work[verb]()
         except Exception as raised:  # the end of a thread: the life loop looks at it
             error = raised
-        self._inbox.put(_Done(verb=verb, asked=asked, error=error))
+        self._inbox.put(_Done(verb=verb, requested=requested, error=error))
 
     def _finish(self, done: _Done) -> None:
         if done.error is None:
             with self._order:
                 self._life.succeed()
-            self._turn()
-            self._go_on(done)
+            self._publish_state()
+            self._after_success(done)
             return
-        expected = done.verb in ("configure", "activate") and isinstance(done.error, NodeError | ModelError)
+        is_expected = done.verb in ("configure", "activate") and isinstance(done.error, NodeError | ModelError)
         with self._order:
-            if expected:
+            if is_expected:
                 self._life.fail()
             else:
                 self._life.error()
-        if not expected:
+        if not is_expected:
             _LOG.error("%s broke", done.verb, exc_info=done.error)
-            self._recover(final=done.verb == "shutdown")
-        self._turn()
-        self._announcer.event(_code(done).value, Level.ERROR, {"verb": done.verb, "message": str(done.error)})
+            self._transitions.close(_PATIENCE_S)
+            self.health.model("absent")
+            with self._order:
+                self._life.recover(cleaned=done.verb != "shutdown")
+        self._publish_state()
+        self._announcer.event(_code(done.error).value, Level.ERROR, {"verb": done.verb, "message": str(done.error)})
         self._after_failure(done.error, done.verb)
 
-    def _recover(self, *, final: bool) -> None:
-        self._machinery.close(_PATIENCE_S)
-        self.health.model("absent")
-        with self._order:
-            self._life.recover(cleaned=not final)
-
-    def _go_on(self, done: _Done) -> None:
-        """What follows by itself after a transition that went well."""
-        if done.asked:
+    def _after_success(self, done: _Done) -> None:
+        """What follows by itself."""
+        if done.requested:
             self._announcer.event("STATE", Level.OK, {"verb": done.verb, "state": self.state.label})
         if done.verb == "configure":
-            self._tell_configured()
-            if self._on_its_own and not done.asked:
+            traits = self._transitions.traits
+            if traits is not None and self._options.on_configured is not None:
+                self._options.on_configured(traits)
+            if self._on_its_own and not done.requested:
                 self._try("activate")
         elif done.verb == "activate":
             self._backoff.reset()
             self._watchdog.ready()
-            if self._machinery.has_ended:  # before the node was active
+            if self._transitions.has_ended:  # before the node was active
                 self._try("deactivate")
-        elif done.verb == "deactivate" and not done.asked and self._stop_s is None:
-            self._after_stream(self._machinery.failure)
-
-    def _tell_configured(self) -> None:
-        traits = self._machinery.traits
-        if traits is not None and self._options.on_configured is not None:
-            self._options.on_configured(traits)
-
-    def _after_stream(self, failure: Exception | None) -> None:
-        """A stream has ended by itself."""
-        if failure is not None:
-            self._after_failure(failure, "activate")
-        elif self._options.once:
-            self._prepare_stop()
+        elif done.verb == "deactivate" and not done.requested and self._stop_s is None:
+            failure = self._transitions.failure  # the stream has ended by itself
+            if failure is not None:
+                self._after_failure(failure, "activate")
+            elif self._options.once:
+                self._prepare_stop()
 
     def _after_failure(self, error: Exception, verb: Verb) -> None:
-        """Give up, try again later, or wait for somebody to ask."""
+        """Give up, try again later, or wait for a command."""
         self._watchdog.ready()
         if self._stop_s is not None and verb != "shutdown":
             return
         if self._options.once or isinstance(error, SourceLostError):
             self._failure = error
             self._prepare_stop()
-        elif verb == "activate" and self._on_its_own and self._machinery.is_live and isinstance(error, SourceError):
+        elif verb == "activate" and self._on_its_own and self._transitions.is_live and isinstance(error, SourceError):
             self._retry_s = time.monotonic() + self._backoff.next_s()
 
-    def _turn(self) -> None:
-        self.health.state(self.state.label)
-        self._announcer.status()
 
-
-def _code(done: _Done) -> Code:
+def _code(error: Exception) -> Code:
     """What the event of a failed transition says."""
-    if isinstance(done.error, SourceAbsentError | SourceLostError):
+    if isinstance(error, SourceAbsentError | SourceLostError):
         return Code.NOT_READY
-    return Code.BAD_ARG if isinstance(done.error, NodeError | ModelError) else Code.INTERNAL
+    return Code.BAD_ARG if isinstance(error, NodeError | ModelError) else Code.INTERNAL

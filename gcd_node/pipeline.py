@@ -4,10 +4,8 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 from gcd_model import ModelError
-from gcd_node.calibration import LensModel
 from gcd_node.capture import WindowSlot, read
 from gcd_node.config import NodeConfig
 from gcd_node.errors import (
@@ -21,14 +19,14 @@ from gcd_node.errors import (
 )
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.health import Level, SourceState
-from gcd_node.inference import WORK_REASONS, ModelWorker, WorkCounts, WorkerParts
+from gcd_node.inference import WORK_REASONS, ModelWorker, WindowReport, WorkCounts
 from gcd_node.life.source_watch import Opener, Patience, SourceWatch, backoff_of
-from gcd_node.messages import Run
-from gcd_node.preview import CapturedFrame, InputPreview
+from gcd_node.model import ModelSlot
+from gcd_node.recorder import Recorder
 from gcd_node.source_config import LiveSource
-from gcd_node.status import metadata
-from gcd_node.stream_context import ActiveSource
-from gcd_node.views import VirtualViews
+from gcd_node.status import NodeServices, metadata
+from gcd_node.stream_context import ActiveSource, StreamContext
+from gcd_node.views import InputPreview, VirtualViews
 from gcd_node.window import Reason, WindowBuilder
 
 _STOP_DELAY_MS = 100
@@ -47,117 +45,111 @@ class Summary:
     window_s: float = 0.0
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ResumePoint:
-    """Where an activation goes on from the one before: numbers that must not come twice in one life of a node."""
-
-    window_id: int = 0
-    epoch: int = 0
-
-
-class FrameTap(Protocol):
-    """Who else is shown what arrives; called in the reader thread, returns at once."""
-
-    def source(self, info: SourceInfo, lens: LensModel | None) -> None:
-        """Frames are of this source from here on. lens: the calibration in use for its pictures."""
-        ...
-
-    def frame(self, frame: Frame) -> None:
-        """A frame has arrived."""
-        ...
-
-
 class Stream:
-    """Source, reader thread and model thread, started and stopped together. Implements WatchListener."""
+    """Source, reader thread and model thread, started and stopped together. Implements WatchListener.
+
+    stopped: it was interrupted. over: the last window was dealt with. failure: what it ended with, if not well.
+    """
 
     def __init__(
         self,
-        worker: WorkerParts,
+        services: NodeServices,
+        model: ModelSlot,
         source: FrameSource,
-        prepared: tuple[Run, float],
+        context: StreamContext,
         *,
         reopen: Opener,
-        begin: ResumePoint,
+        first: tuple[int, int],
         on_over: Callable[[], None],
-        tap: FrameTap | None = None,
+        on_window: Callable[[WindowReport], None] | None = None,
+        recorder: Recorder | None = None,
     ) -> None:
         """Check everything that can be checked without a frame.
 
         Args:
-            worker: what the model thread works with.
-            source: open. prepared: what prepare_run() says of it. reopen: opens it again when it is lost.
+            source: open. context: what prepare_stream() says of it. reopen: opens it again when it is lost.
+            first: window id and epoch to go on from: neither may come twice in one life of a node.
             on_over: called when the last window was dealt with, whatever the reason, from the model thread.
-            tap: see FrameTap.
+            recorder: is shown every frame.
         Raises:
-            ConfigError, OptionError, PoseError: see fit_of() and VirtualView.
+            OptionError, PoseError: see VirtualView.
         """
-        self._parts, self._on_over, self._tap = worker, on_over, tap
-        config = worker.live.config
-        traits, boot_id = worker.model.traits, worker.announcer.boot_id
-        self._known = ActiveSource(worker.live, traits, prepared, boot_id=boot_id, epoch=begin.epoch)
-        VirtualViews(traits).following(worker.live.settings(), self.run.mount)
+        self._live, self._health, self._announcer = services.live, services.health, services.announcer
+        self._model, self._on_over, self._recorder = model, on_over, recorder
+        config, traits = services.live.config, model.traits
+        self._source = ActiveSource(context, epoch=first[1])
+        VirtualViews(traits).sync(services.live.settings(), context.mount)
         self._builder = WindowBuilder(
             frames=traits.config.frames,
-            fps=self._known.fps,
+            fps=context.fps,
             stride=config.window.stride,
             max_skew=config.window.max_skew,
             source_fps=source.info.fps_nominal,
-            fit=self._known.image,
-            fit_depth=self._known.depth if traits.live else None,
-            first_id=begin.window_id,
-            first_epoch=begin.epoch,
+            fit=lambda image: self.context.fit.image(image),
+            fit_depth=(lambda depth: self.context.fit.depth(depth)) if traits.live else None,
+            first_id=first[0],
+            first_epoch=first[1],
         )
         self._newest = WindowSlot(lossless=config.source.pace == "lockstep")
         self._watch = SourceWatch(source, reopen, self, _patience(config), backoff_of(source.info.kind))
-        self._preview = InputPreview(worker.sink, lambda: self.run)
-        self.worker = ModelWorker(worker, self._known.of)
+        self._preview = InputPreview(services.sink, lambda: self.context)
+        self.worker = ModelWorker(services, model, self._source.context_at, on_window)
         self._threads = [
             threading.Thread(target=self._work, name="model", daemon=True),
-            threading.Thread(target=self._read, name="reader", daemon=True),
+            threading.Thread(target=read, args=(self._watch, self._builder, self._newest), name="reader", daemon=True),
         ]
-        self._told: dict[str, int] = {}
+        self._reported: dict[str, int] = {}
         self._corrupt = 0
-        self._was: SourceState = "closed"
+        self._state: SourceState = "closed"
         self.stopped = self.over = False
         self.failure: Exception | None = None
-        self._order = threading.Lock()
+        self._order = threading.Lock()  # what is announced is announced in the order in which it came to be
 
     @property
-    def run(self) -> Run:
+    def context(self) -> StreamContext:
         """What is known of the source now."""
-        return self._known.run
+        return self._source.context
 
     @property
-    def end(self) -> ResumePoint:
-        """Where the next activation goes on."""
-        return ResumePoint(window_id=self._builder.next_id, epoch=self._builder.epoch + 1)
+    def next(self) -> tuple[int, int]:
+        """Window id and epoch that the next activation goes on from."""
+        return self._builder.next_id, self._builder.epoch + 1
 
     @property
     def reasons(self) -> tuple[str, ...]:
         """What it raised of the node's health, to be cleared when another source is used."""
-        return (*self.run.ood, *WORK_REASONS, *LASTING)
+        return (*self.context.ood, *WORK_REASONS, *LASTING)
+
+    @property
+    def model_failed(self) -> bool:
+        """Whether it ended because the model did."""
+        return ending(self.failure, stopped=self.stopped)[0] == MODEL_FAILED
+
+    @property
+    def _window_s(self) -> float:
+        """From one window to the next."""
+        return (self._live.config.window.stride or self._builder.frames) / self.context.fps
 
     def start(self) -> None:
         """Begin. Frames are read while the model warms up: its first window is a new one, and no camera's own buffers
         grow old."""
-        self._raise_flags((), self.run.ood)
+        self._raise_flags((), self.context.ood)
         self.notice_change()
         for thread in self._threads:
             thread.start()
 
     def notice_change(self) -> None:
         """The live configuration has changed: other views are due, and the metadata says so."""
-        realtime = self._parts.live.config.source.pace == "realtime"
-        self._parts.health.expect(self._parts.live.settings().revisions, self._window_s if realtime else None)
-        self._tell_meta()
-
-    @property
-    def _window_s(self) -> float:
-        """From one window to the next."""
-        return (self._parts.live.config.window.stride or self._builder.frames) / self._known.fps
+        with self._order:
+            settings = self._live.settings()
+            is_realtime = settings.config.source.pace == "realtime"
+            self._health.expect(settings.revisions, self._window_s if is_realtime else None)
+            context = replace(self.context, config=settings.config, traits=self._model.traits)
+            self._announcer.meta(metadata(context, settings))
 
     def interrupt(self) -> None:
-        """End soon: no new window begins, the one in work is abandoned at its next layer. Does not wait."""
+        """End soon: no new window begins, the one in work is abandoned at its next layer. May wait a second for a
+        camera that does not answer."""
         self.stopped = True
         self.worker.cancel()
         self._newest.close()
@@ -174,45 +166,30 @@ class Stream:
     def tick(self) -> None:
         """Pass on what the builder and the source count, with an event for every new kind of trouble."""
         with self._order:
-            self._tick()
-
-    def _tick(self) -> None:
-        counts, health = self._builder.counts, self._parts.health
-        reasons = {str(reason): count for reason, count in counts.reasons.items()}
-        health.windows(counts.built, reasons)
-        health.totals(source=counts.dropped + self._watch.skipped, slot=self._newest.dropped)
-        corrupt = self._watch.corrupt
-        if corrupt > self._corrupt:
-            health.corrupt(corrupt - self._corrupt)
-            self._corrupt = corrupt
-        for reason, count in reasons.items():
-            if count > self._told.get(reason, 0) and reason != "SRC_LOST":
-                self._parts.announcer.event(reason, Level.WARN, {"count": count})
-            self._told[reason] = count
-
-    def _tell_meta(self) -> None:
-        """Send the metadata if anything of it has changed."""
-        settings = self._parts.live.settings()
-        run = replace(self.run, config=settings.config, traits=self._parts.model.traits)
-        self._parts.announcer.meta(metadata(run, settings, self._known.fps))
-
-    @property
-    def model_failed(self) -> bool:
-        """Whether it ended because the model did."""
-        return ending(self.failure, stopped=self.stopped)[0] == MODEL_FAILED
+            counts = self._builder.counts
+            reasons = {str(reason): count for reason, count in counts.reasons.items()}
+            self._health.windows(counts.built, reasons)
+            self._health.totals(source=counts.dropped + self._watch.skipped, slot=self._newest.dropped)
+            corrupt = self._watch.corrupt
+            if corrupt > self._corrupt:
+                self._health.corrupt(corrupt - self._corrupt)
+                self._corrupt = corrupt
+            for reason, count in reasons.items():
+                if count > self._reported.get(reason, 0) and reason != "SRC_LOST":
+                    self._announcer.event(reason, Level.WARN, {"count": count})
+                self._reported[reason] = count
 
     def announce_end(self) -> None:
         """Say how it ended, and the end of every view. After `join`."""
         self.tick()
         code, source = ending(self.failure, stopped=self.stopped)
-        health = self._parts.health
-        failed = self.failure is not None
-        health.source(source)
-        health.model("failed" if code == MODEL_FAILED else "ready")
+        has_failed = self.failure is not None
+        self._health.source(source)
+        self._health.model("failed" if code == MODEL_FAILED else "ready")
         if code in LASTING:
-            health.raise_reason(code, Level.ERROR)
-        fields = {"message": str(self.failure)} if failed else {}
-        self._parts.announcer.event(code, Level.ERROR if failed else Level.OK, fields)
+            self._health.raise_reason(code, Level.ERROR)
+        fields = {"message": str(self.failure)} if has_failed else {}
+        self._announcer.event(code, Level.ERROR if has_failed else Level.OK, fields)
         delay_ms = _STOP_DELAY_MS if self.stopped else None
         self.worker.announce_end(delay_ms=delay_ms)
         self._preview.announce_end(delay_ms=delay_ms)
@@ -222,7 +199,7 @@ class Stream:
         built = self._builder.counts
         return Summary(
             counts=self.worker.counts,
-            fps=self._known.fps,
+            fps=self.context.fps,
             dropped=self._newest.dropped,
             frames=built.frames,
             rejected={str(reason): count for reason, count in built.reasons.items()},
@@ -233,23 +210,23 @@ class Stream:
 
     def source_state(self, state: SourceState, detail: str) -> None:
         """Tell; see WatchListener."""
-        was, self._was = self._was, state
-        self._parts.health.source(state)
+        before, self._state = self._state, state
+        self._health.source(state)
         fields: dict[str, object] = {"message": detail, "source": self._watch.info.id}
         if state == "stalled":
-            self._parts.announcer.event("SRC_STALLED", Level.WARN, fields)
+            self._announcer.event("SRC_STALLED", Level.WARN, fields)
         elif state == "lost":
-            self._parts.announcer.event("SRC_LOST", Level.ERROR, fields)
-        elif state == "streaming" and was in ("stalled", "lost"):
-            self._parts.announcer.event("SRC_BACK", Level.OK, fields | {"epoch": self._builder.epoch})
+            self._announcer.event("SRC_LOST", Level.ERROR, fields)
+        elif state == "streaming" and before in ("stalled", "lost"):
+            self._announcer.event("SRC_BACK", Level.OK, fields | {"epoch": self._builder.epoch})
 
     def source_frame(self, frame: Frame) -> None:
         """Count, and show; see WatchListener."""
         now_ns = time.monotonic_ns()
-        self._parts.health.frame(frame.stamp_ns, now_ns)
-        if self._tap is not None:
-            self._tap.frame(frame)
-        self._preview.offer(CapturedFrame(frame=frame, arrival_ns=now_ns, epoch=self._builder.epoch))
+        self._health.frame(frame.stamp_ns, now_ns)
+        if self._recorder is not None:
+            self._recorder.frame(frame)
+        self._preview.offer(frame, now_ns, self._builder.epoch)
 
     def source_broken(self, reason: Reason) -> None:
         """Begin a new epoch; see WatchListener."""
@@ -259,38 +236,36 @@ class Stream:
     def source_opened(self, info: SourceInfo) -> bool:
         """Work out anew what is known of the source; see WatchListener. False if the model cannot be given what it
         gives now: no windows then, until that changes."""
-        health = self._parts.health
         try:
-            if info != self.run.source:
+            if info != self.context.source:
                 self._adapt(info)
         except ConfigError as error:
-            health.raise_reason("SRC_REFUSED", Level.ERROR)
-            self._parts.announcer.event("SRC_REFUSED", Level.ERROR, {"message": str(error), "source": info.id})
+            self._health.raise_reason("SRC_REFUSED", Level.ERROR)
+            self._announcer.event("SRC_REFUSED", Level.ERROR, {"message": str(error), "source": info.id})
             return False
         else:
-            health.clear_reason("SRC_REFUSED")
+            self._health.clear_reason("SRC_REFUSED")
             return True
         finally:
-            if self._tap is not None:
-                self._tap.source(info, self._known.lens(info))
+            if self._recorder is not None:
+                lens = self.context.lens
+                is_fitting = lens is not None and lens.fits(info.width, info.height)
+                self._recorder.source(info, lens if is_fitting else None)
 
     def _adapt(self, info: SourceInfo) -> None:
         """To another size, rate or camera. Raises ConfigError, and changes nothing then."""
-        before = self.run.ood
-        self._known.adapt(info, self._builder.epoch)
-        self._builder.run_at(self._known.fps, info.fps_nominal)
-        self._raise_flags(before, self.run.ood)
+        before = self.context.ood
+        self._source.adapt(self._live.config, info, self._builder.epoch)
+        self._builder.run_at(self.context.fps, info.fps_nominal)
+        self._raise_flags(before, self.context.ood)
         self.notice_change()
 
     def _raise_flags(self, before: tuple[str, ...], now: tuple[str, ...]) -> None:
         """What lies outside the trained domain, in the node's health."""
         for code in set(before) - set(now):
-            self._parts.health.clear_reason(code)
+            self._health.clear_reason(code)
         for code in now:
-            self._parts.health.raise_reason(code, Level.WARN)
-
-    def _read(self) -> None:
-        read(self._watch, self._builder, self._newest)
+            self._health.raise_reason(code, Level.WARN)
 
     def _work(self) -> None:
         try:
@@ -333,7 +308,7 @@ LASTING = tuple(code for _, code, _ in _ENDINGS if code not in ("SRC_LOST", MODE
 def ending(failure: Exception | None, *, stopped: bool) -> tuple[str, SourceState]:
     """Event code, and the state of the source, after an activation that ended with this failure, or by itself.
 
-    stopped: somebody wanted it to end.
+    stopped: it was interrupted.
     """
     if failure is None:
         return ("STOPPED", "closed") if stopped else ("SRC_ENDED", "ended")

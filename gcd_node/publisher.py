@@ -21,9 +21,9 @@ import zmq
 from msgspec.structs import replace
 
 from gcd_client.protocol import ClientError, EndMessage, OriginHeader, StatusMessage, StatusTopic, ViewMessage, encode
-from gcd_node.auth import EventSink, SocketGuard
+from gcd_node.auth import Context, EventSink, SocketGuard, unbind
 from gcd_node.errors import EndpointError, NodeError, PublisherError
-from gcd_node.sockets import NO_READERS, DataSocket, Parcel, PublisherOptions, Readers, StatusSocket
+from gcd_node.sockets import DataSocket, PublisherOptions, Queued, StatusSocket, pending_events
 
 _LOG = logging.getLogger(__name__)
 _RETRY_MS, _REPEAT_MS = 3, 10
@@ -33,17 +33,16 @@ _LEAST_LINGER_MS = 100
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PublisherStats:
     """sent, bytes: handed to ZeroMQ on the data socket. dropped: refused because the queue was full. What ZeroMQ drops
-    for a slow reader shows in no counter here: that reader sees a gap in the sequence."""
+    for a slow reader shows in no counter here: that reader sees a gap in the sequence.
+    subscribers: subscriptions on the data socket now; watchers, previews: those that get views, previews of the input.
+    """
 
     sent: int = 0
     dropped: int = 0
     bytes: int = 0
-    readers: Readers = NO_READERS
-
-    @property
-    def subscribers(self) -> int:
-        """Subscriptions on the data socket now."""
-        return self.readers.total
+    subscribers: int = 0
+    watchers: int = 0
+    previews: int = 0
 
 
 class MessageSink(Protocol):
@@ -87,7 +86,7 @@ class Publisher:
 
     def __init__(self, options: PublisherOptions, on_event: EventSink | None = None) -> None:
         self._options = options
-        self._queue: queue.Queue[Parcel] = queue.Queue(options.queue_size)
+        self._queue: queue.Queue[Queued] = queue.Queue(options.queue_size)
         self._notes: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._preview: Callable[[], ViewMessage] | None = None
         self._sequences: Counter[tuple[str, str]] = Counter()
@@ -97,7 +96,7 @@ class Publisher:
         self._failure: Exception | None = None
         self._dropped, self._closing_s = 0, 0.0
         self._wake_fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._context = zmq.Context()
+        self._context: Context = zmq.Context()
         self._guard = SocketGuard(self._context, options.security, on_event)
         try:
             self._data = DataSocket(self._context, self._guard, options)
@@ -129,7 +128,7 @@ class Publisher:
             if self._queue.full() and not self._options.lockstep:
                 self._dropped += 1
                 return False
-            self._put(Parcel(part=self._encoded(message)))
+            self._put(Queued(self._encoded(message)))
         time.sleep(0)  # lets the thread begin now, instead of when the caller has time
         return True
 
@@ -150,10 +149,10 @@ class Publisher:
         delay = self._options.end_delay_ms if delay_ms is None else delay_ms
         with self._hand_over:
             self.check()
-            self._put(Parcel(part=self._encoded(message), follow_s=delay / 1000))
+            self._put(Queued(self._encoded(message), delay / 1000))
 
     def note(self, topic: StatusTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
-        """Send a status, event or meta message; the last of each topic is repeated to whoever subscribes later.
+        """Send a status, event or meta message; the last of each topic is repeated to new subscribers.
 
         Raises: as send().
         """
@@ -163,11 +162,11 @@ class Publisher:
         self._wake()
 
     def stop_waiting(self) -> None:
-        """Stop waiting for readers, for a node that was told to stop: what does not leave in `linger_ms` is lost."""
+        """Stop waiting for readers, for a node that is stopping: what does not leave in `linger_ms` is lost."""
         self._hurried.set()
 
     def dead_threads(self) -> list[str]:
-        """Threads that have died, of those that nobody else waits for."""
+        """Threads that have died, of those whose end shows nowhere else."""
         return [] if self._guard.alive else ["authentication"]
 
     def check(self) -> None:
@@ -179,8 +178,15 @@ class Publisher:
     @property
     def stats(self) -> PublisherStats:
         """Counters since the start."""
-        data = self._data
-        return PublisherStats(sent=data.sent, dropped=self._dropped, bytes=data.bytes, readers=data.subscriptions.now)
+        data, readers = self._data, self._data.readers.now
+        return PublisherStats(
+            sent=data.sent,
+            dropped=self._dropped,
+            bytes=data.bytes,
+            subscribers=readers.total,
+            watchers=readers.watchers,
+            previews=readers.previews,
+        )
 
     @property
     def endpoint(self) -> str:
@@ -199,9 +205,9 @@ class Publisher:
         Raises:
             EndpointError: lockstep messages that no reader took. Else whatever stopped the thread.
         """
-        first = not self._closed.is_set()
+        is_first = not self._closed.is_set()
         self._shut(orderly)
-        if first:
+        if is_first:
             self._raise_failure()
 
     def __enter__(self) -> "Publisher":
@@ -222,19 +228,19 @@ class Publisher:
         self._sequences[key] += 1
         return part
 
-    def _put(self, parcel: Parcel) -> None:
+    def _put(self, queued: Queued) -> None:
         while not self._hurried.is_set():
             try:
-                self._queue.put(parcel, timeout=0.05)
+                self._queue.put(queued, timeout=0.05)
             except queue.Full:
                 self.check()
             else:
                 self._wake()
                 return
-        if parcel.follow_s is not None:
+        if queued.follow_s is not None:
             self._queue.maxsize += 1  # room of its own: an end is never lost to a full queue
         try:
-            self._queue.put_nowait(parcel)
+            self._queue.put_nowait(queued)
         except queue.Full:
             self._dropped += 1
         self._wake()
@@ -282,24 +288,26 @@ class Publisher:
         except Exception as error:
             self._failure = error
         finally:
-            self._data.close(linger_ms)
+            unbind(self._data.socket, self._data.endpoint, linger_ms)
             if self._status is not None:
-                self._status.close(linger_ms)
+                unbind(self._status.socket, self._status.endpoint, linger_ms)
 
     def _run(self) -> None:
-        parcel: Parcel | None = None
+        queued: Queued | None = None
         progress = time.monotonic()
         while not self._abandoned.is_set():
             closing = self._closing.is_set()  # read first: what was queued before it is seen below
             self._serve_sockets()
-            parcel = parcel or self._take()
-            if parcel is None:
+            if queued is None:
+                with contextlib.suppress(queue.Empty):
+                    queued = self._queue.get_nowait()
+            if queued is None:
                 if closing:
                     return
                 self._wait(None)
                 progress = time.monotonic()
-            elif self._data.send(parcel):
-                parcel, progress = None, time.monotonic()
+            elif self._data.send(queued):
+                queued, progress = None, time.monotonic()
             elif closing and self._left_s(progress) < 0:
                 if self._hurried.is_set():
                     return
@@ -320,7 +328,7 @@ class Publisher:
         meanwhile: ZeroMQ skips them where a reader has no room."""
         until, ends = time.monotonic(), cycle(self._data.ends)
         until += self._left_s(until)
-        while self._data.ends and self._data.subscriptions.now.total > 0 and time.monotonic() < until:
+        while self._data.ends and self._data.readers.now.total > 0 and time.monotonic() < until:
             self._serve_sockets()
             self._wait(_REPEAT_MS)
             self._data.try_send(next(ends))
@@ -328,7 +336,7 @@ class Publisher:
                 return
 
     def _left_s(self, progress_s: float) -> float:
-        """How much longer to wait for readers at the end, after the last progress. A node that was told to stop has
+        """How much longer to wait for readers at the end, after the last progress. A node that is stopping has
         linger_ms for all of it, so that slow readers cannot stretch the end one message at a time."""
         hurried, options = self._hurried.is_set(), self._options
         patience_ms = options.drain_ms if options.lockstep and not hurried else options.linger_ms
@@ -336,7 +344,8 @@ class Publisher:
 
     def _serve_sockets(self) -> None:
         self._guard.report_failures()
-        self._data.serve()
+        for event in pending_events(self._data.socket):
+            self._data.readers.count(event)
         made, self._preview = self._preview, None
         if made is not None:
             try:
@@ -348,16 +357,11 @@ class Publisher:
             if self._status is not None:
                 self._status.send(part)
         if self._status is not None:
-            self._status.serve()
-
-    def _take(self) -> Parcel | None:
-        try:
-            return self._queue.get_nowait()
-        except queue.Empty:
-            return None
+            self._status.repeat()
 
     def _undelivered(self) -> str:
-        count, seconds = self._queue.qsize() + 1, self._options.drain_ms / 1000
-        have, wanted = self._data.subscriptions.now.watchers, self._options.min_subscribers
-        readers = f"{have} subscribers, wanted {wanted}"
-        return f"{count} messages were not taken within {seconds:g} s at {self.endpoint} ({readers}); start the reader"
+        count, seconds, readers = self._queue.qsize() + 1, self._options.drain_ms / 1000, self.stats.watchers
+        return (
+            f"{count} messages were not taken within {seconds:g} s at {self.endpoint} ({readers} subscribers, wanted "
+            f"{self._options.min_subscribers}); start the reader"
+        )

@@ -19,7 +19,7 @@ from gcd_client.protocol import EndMessage, OriginHeader, StatusTopic, ViewMessa
 from gcd_node.auth import Client
 from gcd_node.calibration import LensModel
 from gcd_node.config import NodeConfig
-from gcd_node.config_text import to_toml
+from gcd_node.config_dump import to_toml
 from gcd_node.errors import NodeError
 from gcd_node.frame import Frame, SourceInfo
 from gcd_node.health import Level, RecordHealth

@@ -15,9 +15,9 @@ from gcd_client.protocol import OriginHeader, StatusTopic, ViewHeader, ViewMessa
 from gcd_node.auth import Client
 from gcd_node.calibration import LensModel
 from gcd_node.config import NodeConfig, RecordConfig
-from gcd_node.control.verbs import VERBS
 from gcd_node.frame import Frame, SourceInfo
 from gcd_node.health import Level
+from gcd_node.verbs import VERBS
 
 IMAGE_TOPIC, COMMAND_TOPIC = "/src/image", "/gcd/command"
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"

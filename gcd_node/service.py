@@ -18,7 +18,7 @@ from logging.handlers import QueueHandler, QueueListener
 from types import TracebackType
 from typing import Any
 
-from gcd_node.binding import is_loopback
+from gcd_node.auth import is_loopback
 from gcd_node.errors import ConfigError, EndpointError
 from gcd_node.health import THREAD_DIED, Health, Level
 

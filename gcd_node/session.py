@@ -18,7 +18,7 @@ from gcd_client.endpoints import read_key_pair
 from gcd_model import OptionError, ViewSynthesizer, load_synthesizer
 from gcd_node.auth import ServerSecurity, load_server_security
 from gcd_node.config import ModelSection, NodeConfig
-from gcd_node.control.server import ControlOptions, ControlServer
+from gcd_node.control import ControlServer
 from gcd_node.errors import ConfigError
 from gcd_node.health import Health
 from gcd_node.inference import WindowReport
@@ -78,7 +78,7 @@ def load_model(section: ModelSection) -> ViewSynthesizer:
 
 
 def ends_by_itself(config: NodeConfig) -> bool:
-    """Whether a run ends with its source when nobody says otherwise: recordings end, cameras and commands go on."""
+    """Whether a run ends with its source by default: recordings end, cameras and commands go on."""
     return config.source.kind not in LIVE_KINDS and config.life.autostart
 
 
@@ -101,24 +101,30 @@ def open_session(
             stays open.
     """
     options = replace(options or NodeOptions(once=ends_by_itself(config)), on_window=on_window)
-    heard: list[Node] = []
+    nodes: list[Node] = []  # none yet: what publishes the node's events is made before it
 
-    def tell(code: str, fields: dict[str, object]) -> None:
-        for node in heard:
+    def emit(code: str, fields: dict[str, object]) -> None:
+        for node in nodes:
             node.event(code, fields)
 
-    security = load_server_security(config.security, tell)
+    security = load_server_security(config.security, emit)
     with ExitStack() as stack:
-        publisher = stack.enter_context(Publisher(publisher_options(config, security), tell))
-        parts = Parts(open_source=lambda source: open_source(source, security, tell), load_model=load_model)
+        publisher = stack.enter_context(Publisher(publisher_options(config, security), emit))
+        parts = Parts(open_source=lambda source: open_source(source, security, emit), load_model=load_model)
         node = Node(config, parts, publisher, options)
-        heard.append(node)
+        nodes.append(node)
         node.watch(publisher.dead_threads)
         control: str | None = None
         if config.control.endpoint is not None:
-            wanted = ControlOptions(endpoint=config.control.endpoint, security=security)
             server = stack.enter_context(
-                ControlServer(wanted, node, lambda: node.state.label, tell, node.recorder.command)
+                ControlServer(
+                    config.control.endpoint,
+                    node.handle,
+                    state=lambda: node.state.label,
+                    on_event=emit,
+                    on_answer=node.recorder.command,
+                    security=security,
+                )
             )
             node.watch(server.dead_threads)
             control = server.endpoint

@@ -4,13 +4,14 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 
 from gcd_client.protocol import OriginHeader, to_json
 from gcd_node.health import Health, Level
-from gcd_node.messages import Run, camera_matrix, published_kinds, source_pose
+from gcd_node.messages import camera_matrix, family_name, ontology, published_kinds, source_pose
 from gcd_node.publisher import MessageSink
-from gcd_node.views import Settings
+from gcd_node.stream_context import StreamContext
+from gcd_node.views import LiveConfig, Settings
 
 _LOG = logging.getLogger(__name__)
 _PERIOD_S = 1.0
@@ -39,21 +40,22 @@ class Announcer:
     def event(self, code: str, level: Level, fields: Mapping[str, object] | None = None) -> None:
         """Something has happened. code: stable, for programs; fields: plain JSON, a `message` for people. Warnings and
         worse are logged too, each code at most once in ten seconds."""
-        told = {**(fields or {}), "code": code, "level": int(level)}
-        self._sink.note("event", self._origin(), told)
+        event = {**(fields or {}), "code": code, "level": int(level)}
+        self._sink.note("event", self._origin(), event)
         if level >= Level.WARN and self._clock() >= self._logged_s.get(code, 0.0):
             self._logged_s[code] = self._clock() + _LOG_PERIOD_S
-            at = logging.ERROR if level is Level.ERROR else logging.WARNING
-            _LOG.log(at, "%s %s", code, _words(fields or {}), extra={"event": told})
+            rest = ", ".join(f"{name}: {value}" for name, value in (fields or {}).items() if name != "message")
+            text = " ".join(part for part in (str(event.get("message", "")), f"({rest})" if rest else "") if part)
+            severity = logging.ERROR if level is Level.ERROR else logging.WARNING
+            _LOG.log(severity, "%s %s", code, text, extra={"event": event})
 
     def status(self) -> None:
         """Say how it is, now."""
         with self._order:
             self._next_s = self._clock() + _PERIOD_S
             sent = self._sink.stats
-            health = self._health
-            health.totals(sent=sent.sent, subs=sent.subscribers, bytes=sent.bytes, queue=sent.dropped)
-            self._sink.note("status", self._origin(), health.report())
+            self._health.totals(sent=sent.sent, subs=sent.subscribers, bytes=sent.bytes, queue=sent.dropped)
+            self._sink.note("status", self._origin(), self._health.report())
 
     def status_if_due(self) -> None:
         """The same once a second, and as soon as something that matters has changed."""
@@ -72,40 +74,44 @@ class Announcer:
         return OriginHeader(node_id=self.node_id, boot_id=self.boot_id, t_publish_ns=time.time_ns())
 
 
-def metadata(run: Run, settings: Settings, fps: float) -> dict[str, object]:
-    """Weights, views, cameras, classes: what changes only when somebody changes it. fps: of a window."""
-    traits = run.traits
+@dataclass(frozen=True, kw_only=True, slots=True)
+class NodeServices:
+    """What every part of a node shares: the configuration in force, where messages go, how it does, what it says."""
+
+    live: LiveConfig
+    sink: MessageSink
+    health: Health
+    announcer: Announcer
+
+
+def metadata(context: StreamContext, settings: Settings) -> dict[str, object]:
+    """Weights, views, cameras, classes: what changes only with the configuration or the source."""
+    traits = context.traits
     return {
         "weights": {
             "name": traits.name,
-            "family": "unknown" if traits.family is None else traits.family.name,
+            "family": family_name(traits),
             "sha256_12": traits.sha256_12,
             "trained": traits.trained,
             "uncertainty_scale": traits.uncertainty_scale,
         },
         "views": list(settings.revisions),
         "view_revs": dict(settings.revisions),
-        "kinds": list(published_kinds(run)),
-        **calibration(run),
-        "classes": [to_json(each) for each in run.classes],
+        "kinds": list(published_kinds(context)),
+        **calibration(context),
+        "classes": [to_json(each) for each in ontology(traits)],
         "size": [traits.config.width, traits.config.height],
-        "fps": fps,
-        "cfg_digest": run.digest,
+        "fps": context.fps,
+        "cfg_digest": context.digest,
     }
 
 
-def calibration(run: Run) -> dict[str, object]:
+def calibration(context: StreamContext) -> dict[str, object]:
     """The camera of the views, and where the source camera is: mounted on a vehicle, or on the sphere; None for what
-    nobody knows."""
-    camera, mount, sphere = run.intrinsics, run.mount, source_pose(run)
+    is unknown."""
+    camera, mount, sphere = context.intrinsics, context.mount, source_pose(context)
     return {
         "K": None if camera is None else list(camera_matrix(camera)),
         "mount": None if mount is None else {**asdict(mount), "assumed": False},
         "src_pose": None if sphere is None else to_json(sphere),
     }
-
-
-def _words(fields: Mapping[str, object]) -> str:
-    """The message first, then the rest."""
-    rest = ", ".join(f"{name}: {value}" for name, value in fields.items() if name != "message")
-    return " ".join(part for part in (str(fields.get("message", "")), f"({rest})" if rest else "") if part)

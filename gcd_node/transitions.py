@@ -11,20 +11,17 @@ from msgspec.structs import replace
 
 from gcd_model import Traits
 from gcd_node.frame import FrameSource, SourceInfo
-from gcd_node.health import Health
-from gcd_node.inference import WindowReport, WorkerParts
-from gcd_node.messages import Run
+from gcd_node.inference import WindowReport
 from gcd_node.model import LoadModel, ModelSlot
-from gcd_node.pipeline import FrameTap, ResumePoint, Stream, Summary
-from gcd_node.publisher import MessageSink
+from gcd_node.pipeline import Stream, Summary
+from gcd_node.recorder import Recorder
 from gcd_node.source_config import LIVE_KINDS, OakSource, SourceConfig
-from gcd_node.status import Announcer
-from gcd_node.stream_context import prepare_run
-from gcd_node.views import LiveConfig, VirtualViews
+from gcd_node.status import NodeServices
+from gcd_node.stream_context import StreamContext, prepare_stream
+from gcd_node.views import VirtualViews
 
 _LOG = logging.getLogger(__name__)
-_LOOK_S = 0.1
-_HURRY_S = 2.0
+_LOOK_S, _HURRY_S = 0.1, 2.0
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -38,45 +35,42 @@ class Parts:
     load_model: LoadModel
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Links:
-    """Through what a node speaks. on_over: called when a stream has ended. tap: sees every frame."""
-
-    sink: MessageSink
-    health: Health
-    announcer: Announcer
-    on_over: Callable[[], None]
-    on_window: Callable[[WindowReport], None] | None = None
-    tap: FrameTap | None = None
-
-
 class Transitions:
     """The parts that work. `configure`, `activate`, `deactivate` and `cleanup` may take long; each either succeeds or
-    raises and leaves nothing half done."""
+    raises and leaves nothing half done.
 
-    def __init__(self, live: LiveConfig, parts: Parts, links: Links) -> None:
-        self.live = live
-        self._parts, self._links = parts, links
+    stream: the activation under way. summary: of the last one. failure: what it ended with, None if it ended well.
+    model_failed: the model has to be loaded anew.
+    """
+
+    def __init__(
+        self,
+        services: NodeServices,
+        parts: Parts,
+        recorder: Recorder,
+        on_over: Callable[[], None],
+        on_window: Callable[[WindowReport], None] | None,
+    ) -> None:
+        """on_over: called when a stream has ended."""
+        self._services, self._health, self._live = services, services.health, services.live
+        self._parts, self._recorder, self._on_over, self._on_window = parts, recorder, on_over, on_window
         self._model: ModelSlot | None = None
         self._source: FrameSource | None = None
         self._info: SourceInfo | None = None
-        self._stream: Stream | None = None
-        self._prepared: tuple[Run, float] | None = None
-        self._begin = ResumePoint()
+        self._context: StreamContext | None = None
+        self._first = (0, 0)
         self._interrupted = False
-        self._said: tuple[str, ...] = ()
-        self.summary = Summary()
-        """Of the last activation."""
-        self.model_failed = False
-        """Whether the model has to be loaded anew."""
-        self.failure: Exception | None = None
-        """What the last activation ended with, None if it ended well."""
+        self._raised: tuple[str, ...] = ()
         self._stuck: list[Stream] = []
+        self.stream: Stream | None = None
+        self.summary = Summary()
+        self.failure: Exception | None = None
+        self.model_failed = False
 
     @property
     def is_live(self) -> bool:
         """Whether the source is a camera, rather than a recording."""
-        return self.live.config.source.kind in LIVE_KINDS
+        return self._live.config.source.kind in LIVE_KINDS
 
     @property
     def traits(self) -> Traits | None:
@@ -86,7 +80,8 @@ class Transitions:
     @property
     def source_info(self) -> SourceInfo | None:
         """Of the source in use, or used last."""
-        return self._info if self._stream is None else self._stream.run.source
+        stream = self.stream
+        return self._info if stream is None else stream.context.source
 
     @property
     def left_behind(self) -> bool:
@@ -95,14 +90,9 @@ class Transitions:
         return bool(self._stuck)
 
     @property
-    def stream(self) -> Stream | None:
-        """The activation under way."""
-        return self._stream
-
-    @property
     def has_ended(self) -> bool:
         """Whether there is a stream, and it has ended by itself."""
-        stream = self._stream
+        stream = self.stream
         return stream is not None and stream.over
 
     def configure(self) -> None:
@@ -112,15 +102,17 @@ class Transitions:
             SourceError, CheckpointError, ConfigError, OptionError, PoseError: see there.
         """
         if not self.is_live:
-            self._source = self._opened()
+            self._source = self._open()
         try:
-            self._links.health.model("loading")
-            self._model = ModelSlot(self.live.config.model, self._parts.load_model)
-            self._check(self._model.traits)
+            self._health.model("loading")
+            self._model = ModelSlot(self._live.config.model, self._parts.load_model)
+            self._context = None if self._source is None else self._prepare(self._model, self._source)
+            mount = None if self._context is None else self._context.mount
+            VirtualViews(self._model.traits).sync(self._live.settings(), mount)
         except BaseException:
             self.cleanup()
             raise
-        self._links.health.model("ready")
+        self._health.model("ready")
 
     def activate(self) -> None:
         """Open the source, and let views come once the model is warm.
@@ -130,19 +122,30 @@ class Transitions:
         """
         model = self._model
         assert model is not None, "the lifecycle configures before it activates"
-        for code in self._said:
-            self._links.health.clear_reason(code)
-        self._links.health.source("connecting")
+        for code in self._raised:
+            self._health.clear_reason(code)
+        self._health.source("connecting")
         source, self._source, self.failure = self._source, None, None
+        context, self._context = self._context, None
         try:
-            source = self._opened() if source is None else source
-            stream = self._new_stream(model, source)
+            source = self._open() if source is None else source
+            stream = Stream(
+                self._services,
+                model,
+                source,
+                context or self._prepare(model, source),
+                reopen=lambda before: self._parts.open_source(same_camera(self._live.config.source, before)),
+                first=self._first,
+                on_over=self._on_over,
+                on_window=self._on_window,
+                recorder=self._recorder,
+            )
         except BaseException:
-            self._links.health.source("closed")
+            self._health.source("closed")
             if source is not None:
                 source.close()
             raise
-        self._stream = stream
+        self.stream = stream
         if self._interrupted:
             stream.interrupt()
         stream.start()
@@ -150,7 +153,7 @@ class Transitions:
 
     def deactivate(self) -> None:
         """Stop the stream, if it has not ended by itself, and say how it ended."""
-        stream = self._stream
+        stream = self.stream
         if stream is None:
             return
         if not stream.over:
@@ -158,10 +161,9 @@ class Transitions:
         if not self._has_ended(stream):
             _LOG.error("a thread of the stream does not end; it is left behind")
             self._stuck.append(stream)
-        self._stream = None
-        self._info, self.summary, self.failure = stream.run.source, stream.summary(), stream.failure
-        self._begin, self._said = stream.end, stream.reasons
-        self.model_failed = stream.model_failed
+        self.stream = None
+        self._info, self.summary, self.failure = stream.context.source, stream.summary(), stream.failure
+        self._first, self._raised, self.model_failed = stream.next, stream.reasons, stream.model_failed
         stream.announce_end()
         del stream
         gc.collect()  # its pixels hang on objects that refer to each other
@@ -170,18 +172,18 @@ class Transitions:
         """Let go of the model."""
         self._release()
         gc.collect()
-        self._links.health.model("absent")
+        self._health.model("absent")
 
     def interrupt(self) -> None:
         """End what is under way soon, for good; from another thread than the transitions'."""
         self._interrupted = True
-        stream = self._stream
+        stream = self.stream
         if stream is not None:
             stream.interrupt()
 
     def close(self, patience_s: float) -> None:
         """Let everything go, in whatever state, without a word. patience_s: for threads to end."""
-        stream, self._stream = self._stream, None
+        stream, self.stream = self.stream, None
         if stream is not None:
             stream.interrupt()
             if not stream.join(patience_s):
@@ -189,51 +191,27 @@ class Transitions:
         self._release()
 
     def _has_ended(self, stream: Stream) -> bool:
-        """Wait for its threads: as long as a step of the model may take, or less while the node is told to stop."""
+        """Wait for its threads: as long as a step of the model may take, or less once the node is stopping."""
         begun_s = time.monotonic()
         while not stream.join(_LOOK_S):
-            if time.monotonic() - begun_s > (_HURRY_S if self._interrupted else self.live.config.life.hang_s):
+            if time.monotonic() - begun_s > (_HURRY_S if self._interrupted else self._live.config.life.hang_s):
                 return False
         return True
 
     def _release(self) -> None:
-        source, self._source, self._model = self._source, None, None
+        source, self._source, self._model, self._context = self._source, None, None, None
         self.model_failed = False
         if source is not None:
             source.close()
 
-    def _opened(self) -> FrameSource:
-        source = self._parts.open_source(self.live.config.source)
+    def _open(self) -> FrameSource:
+        source = self._parts.open_source(self._live.config.source)
         self._info = source.info
         return source
 
-    def _check(self, traits: Traits) -> None:
-        """Everything about views and source that can be known before the source streams."""
-        self._prepared = None
-        if self._source is not None:
-            self._prepared = prepare_run(self.live.config, traits, self._source.info)
-        mount = None if self._prepared is None else self._prepared[0].mount
-        VirtualViews(traits).following(self.live.settings(), mount)
-
-    def _new_stream(self, model: ModelSlot, source: FrameSource) -> Stream:
-        links = self._links
-        worker = WorkerParts(
-            model=model,
-            live=self.live,
-            sink=links.sink,
-            health=links.health,
-            announcer=links.announcer,
-            on_window=links.on_window,
-        )
-        prepared, self._prepared = self._prepared, None
-        if prepared is None:
-            prepared = prepare_run(self.live.config, model.traits, source.info)
-        return Stream(
-            worker, source, prepared, reopen=self._reopen, begin=self._begin, on_over=links.on_over, tap=links.tap
-        )
-
-    def _reopen(self, before: SourceInfo) -> FrameSource:
-        return self._parts.open_source(same_camera(self.live.config.source, before))
+    def _prepare(self, model: ModelSlot, source: FrameSource) -> StreamContext:
+        boot_id = self._services.announcer.boot_id
+        return prepare_stream(self._live.config, model.traits, source.info, boot_id=boot_id)
 
 
 def same_camera(config: SourceConfig, before: SourceInfo) -> SourceConfig:

@@ -1,6 +1,7 @@
 """The views a node gives: what is asked for now, the path of each one's camera, and the end of its topics."""
 
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import get_args
@@ -8,12 +9,17 @@ from typing import get_args
 import msgspec
 import torch
 
-from gcd_client.protocol import ViewKind, ViewMessage, view_topic
+from gcd_client.protocol import PREVIEW_ID, PREVIEW_TOPIC, ViewKind, ViewMessage, view_topic
 from gcd_model import CameraMount, OptionError, Orbit, SphericalDelta, Traits, Trajectory
 from gcd_node.config import ModelSection, NodeConfig, PublishConfig, ViewConfig, pose_matrix
-from gcd_node.messages import Run, end_messages, published_kinds
+from gcd_node.frame import Frame
+from gcd_node.messages import PREVIEW_PERIOD_S, end_message, end_messages, preview_message, published_kinds
 from gcd_node.preprocess import stated_sphere
 from gcd_node.publisher import MessageSink
+from gcd_node.stream_context import StreamContext
+
+_KINDS: tuple[ViewKind, ...] = get_args(ViewKind)
+_LEAST = 0.9  # of a period between two previews, so that a camera's jitter does not make it miss every second one
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -33,54 +39,48 @@ class LiveConfig:
 
     def __init__(self, config: NodeConfig) -> None:
         self._lock = threading.Lock()
-        self._config = config
-        self._revisions = dict.fromkeys(config.view, 1)
+        self._revisions = dict.fromkeys(config.view, 1)  # of removed views too
         self._removed: list[tuple[str, int]] = []
+        self._settings = Settings(config=config, revisions=dict(self._revisions))
 
     @property
     def config(self) -> NodeConfig:
         """In force now."""
-        with self._lock:
-            return self._config
+        return self._settings.config
 
     @property
     def known_views(self) -> tuple[str, ...]:
         """Every view there is or has been."""
-        with self._lock:
-            return tuple(self._revisions)
+        return tuple(self._revisions)
 
     def settings(self) -> Settings:
         """In force now, with the revisions of its views."""
-        with self._lock:
-            return Settings(
-                config=self._config, revisions={view_id: self._revisions[view_id] for view_id in self._config.view}
-            )
+        return self._settings
 
     def revision(self, view_id: str) -> int:
         """Of a view there is or has been; 0 for others."""
-        with self._lock:
-            return self._revisions.get(view_id, 0)
+        return self._revisions.get(view_id, 0)
 
     def set_view(self, view_id: str, view: ViewConfig) -> int:
         """Replace or add a view; gives its new revision."""
         with self._lock:
             self._revisions[view_id] = self._revisions.get(view_id, 0) + 1
-            self._config = msgspec.structs.replace(self._config, view={**self._config.view, view_id: view})
             self._removed = [each for each in self._removed if each[0] != view_id]
+            self._replace(view={**self.config.view, view_id: view})
             return self._revisions[view_id]
 
     def remove_view(self, view_id: str) -> None:
         """Take a view out. Raises KeyError if it is not in."""
         with self._lock:
-            left = dict(self._config.view)
+            left = dict(self.config.view)
             del left[view_id]
-            self._config = msgspec.structs.replace(self._config, view=left)
             self._removed.append((view_id, self._revisions[view_id]))
+            self._replace(view=left)
 
     def change(self, model: ModelSection, publish: PublishConfig) -> None:
         """Replace how views are drawn and how they are sent."""
         with self._lock:
-            self._config = msgspec.structs.replace(self._config, model=model, publish=publish)
+            self._replace(model=model, publish=publish)
 
     def take_removed(self) -> list[tuple[str, int]]:
         """Views removed since the last call, with their last revision: their end is yet to be announced."""
@@ -88,8 +88,9 @@ class LiveConfig:
             removed, self._removed = self._removed, []
             return removed
 
-
-NANOSECONDS = 1_000_000_000
+    def _replace(self, **changes: object) -> None:
+        config = msgspec.structs.replace(self.config, **changes)
+        self._settings = Settings(config=config, revisions={each: self._revisions[each] for each in config.view})
 
 
 class VirtualView:
@@ -111,14 +112,21 @@ class VirtualView:
         self.view_id, self.rev = view_id, rev
         self._traits, self._mount, self._source = traits, mount, stated_sphere(config.source.pose)
         self._move_time = traits.move_time if config.model.move_time is None else config.model.move_time
-        wanted = self._wanted = config.view[view_id]
+        view = self._view = config.view[view_id]
         self._goal = SphericalDelta(
-            azimuth_deg=wanted.azimuth_deg, elevation_deg=wanted.elevation_deg, radius_m=wanted.radius
+            azimuth_deg=view.azimuth_deg, elevation_deg=view.elevation_deg, radius_m=view.radius
         )
-        self._orbit = _orbit(wanted)
+        self._orbit: Orbit | None = None
+        if view.rate_deg_s is not None and view.amplitude_deg is not None:
+            self._orbit = Orbit(
+                rate_deg_s=view.rate_deg_s, amplitude_deg=view.amplitude_deg, azimuth_deg=view.azimuth_deg
+            )
         self._newest: tuple[int, int] | None = None  # epoch and stamp of the last window
         self._planned: tuple[SphericalDelta, Trajectory] | None = None  # most views stand still
-        self._check_reach()
+        self._plan(self._goal)
+        if self._orbit is not None:  # as far as it swings: not to fail in the middle of a run
+            for azimuth_deg in (-self._orbit.amplitude_deg, self._orbit.amplitude_deg):
+                self._plan(replace(self._goal, azimuth_deg=azimuth_deg))
         if config.model.motion_bucket is None:
             traits.motion_bucket(self.planned())
 
@@ -129,49 +137,33 @@ class VirtualView:
         of different epochs cannot be compared: there it waits for one window. The same window may be asked for again.
         """
         if self._orbit is not None and self._newest is not None and self._newest[0] == epoch:
-            self._orbit = self._orbit.advanced((stamp_ns - self._newest[1]) / NANOSECONDS)
+            self._orbit = self._orbit.advanced((stamp_ns - self._newest[1]) / 1e9)
         self._newest = (epoch, stamp_ns)
         return self.planned()
 
     def planned(self) -> Trajectory:
         """The path to where the view is now; an orbit does not move on."""
-        goal = self._destination(self._orbit)
+        goal = self._goal if self._orbit is None else replace(self._goal, azimuth_deg=self._orbit.azimuth_deg)
         if self._planned is None or self._planned[0] != goal:
             self._planned = (goal, self._plan(goal))
         return self._planned[1]
 
-    def _destination(self, orbit: Orbit | None) -> SphericalDelta:
-        return self._goal if orbit is None else replace(self._goal, azimuth_deg=orbit.azimuth_deg)
-
     def _plan(self, goal: SphericalDelta) -> Trajectory:
-        wanted, traits = self._wanted, self._traits
-        if wanted.position_m is not None and wanted.look_at_m is not None:
+        view, traits = self._view, self._traits
+        if view.position_m is not None and view.look_at_m is not None:
             if self._source is not None:
                 raise OptionError(
                     f"[view.{self.view_id}] position_m is counted from what the camera is mounted on: in [source.pose] "
                     "state height_m and tilt_deg instead of elevation_deg and radius"
                 )
-            return traits.plan_placed(wanted.position_m, wanted.look_at_m, mount=self._mount)
-        if wanted.pose is not None:
-            pose = torch.tensor(pose_matrix(wanted.pose), dtype=torch.float64).view(4, 4)
+            return traits.plan_placed(view.position_m, view.look_at_m, mount=self._mount)
+        if view.pose is not None:
+            pose = torch.tensor(pose_matrix(view.pose), dtype=torch.float64).view(4, 4)
             return traits.plan_poses(pose.repeat(traits.config.frames, 1, 1), source=self._source)
-        own = traits.live and self._orbit is None and wanted.at_source
+        own = traits.live and self._orbit is None and view.at_source
         return traits.plan_view(
             None if own else goal, source=self._source, move_time=self._move_time, mount=self._mount
         )
-
-    def _check_reach(self) -> None:
-        """Raises ViewRangeError or ViewFixedError before the first window rather than in the middle of a run."""
-        self._plan(self._goal)
-        if self._orbit is not None:
-            for azimuth_deg in (-self._orbit.amplitude_deg, self._orbit.amplitude_deg):
-                self._plan(replace(self._goal, azimuth_deg=azimuth_deg))
-
-
-def _orbit(config: ViewConfig) -> Orbit | None:
-    if config.kind == "fixed" or config.rate_deg_s is None or config.amplitude_deg is None:
-        return None
-    return Orbit(rate_deg_s=config.rate_deg_s, amplitude_deg=config.amplitude_deg, azimuth_deg=config.azimuth_deg)
 
 
 class VirtualViews:
@@ -181,7 +173,7 @@ class VirtualViews:
         self._traits = traits
         self._made: dict[str, tuple[CameraMount | None, VirtualView]] = {}
 
-    def following(self, settings: Settings, mount: CameraMount | None = None) -> list[VirtualView]:
+    def sync(self, settings: Settings, mount: CameraMount | None = None) -> list[VirtualView]:
         """The views now; an orbit whose view has not changed goes on from where it was.
 
         Raises: as VirtualView.
@@ -193,23 +185,20 @@ class VirtualViews:
         return [self._made[view_id][1] for view_id in settings.revisions]
 
 
-_KINDS: tuple[ViewKind, ...] = get_args(ViewKind)
-
-
 class EndOfStream:
     """Sends views, and ends every topic once: what is made of a view now, and what was made of it before a command
     changed that."""
 
-    def __init__(self, live: LiveConfig, sink: MessageSink, run: Callable[[], Run]) -> None:
-        """run: what is known of the source now."""
-        self._live, self._sink, self._run = live, sink, run
-        self._open: set[str] = set()  # topics on which something was sent, and no end since
+    def __init__(self, live: LiveConfig, sink: MessageSink, context: Callable[[], StreamContext]) -> None:
+        """context: what is known of the source now."""
+        self._live, self._sink, self._context = live, sink, context
+        self._open: dict[str, set[str]] = {}  # of each view: topics on which something was sent, and no end since
         self._newest_goal: dict[str, tuple[int, int]] = {}
-        self.carried: Set[ViewKind] = frozenset()
-        """What the last window's views held of themselves."""
 
     def send(self, messages: Sequence[ViewMessage]) -> None:
-        """What one view of one window came to. Left out: frames that an overlapping window has sent before."""
+        """What one view of one window came to; what is made of the view no more, such as deviations of a single sample,
+        ends. Left out: frames that an overlapping window has sent before."""
+        header = messages[0].header
         for message in messages:
             if message.topic.endswith("/frm"):
                 moment = (message.header.src.epoch, message.header.src.seq[0])
@@ -217,35 +206,55 @@ class EndOfStream:
                     continue
                 self._newest_goal[message.topic] = moment
             self._sink.send(message)
-            self._open.add(message.topic)
+        topics = {message.topic for message in messages}
+        gone = self._open.get(header.view_id, topics) - topics
+        self._end(header.view_id, header.view_rev, gone, header.window_id, delay_ms=0)
+        self._open[header.view_id] = topics
 
-    def announce_due(self, last_window_id: int) -> None:
-        """End views that were taken out, and what is made of a view no more, such as deviations of a single sample."""
-        settings = self._live.settings()
+    def announce_removed(self, last_window_id: int) -> None:
+        """End views that were taken out."""
         for view_id, rev in self._live.take_removed():
-            self._end(view_id, rev, self._known(view_id, settings), last_window_id, delay_ms=0)
-        made = self._made(settings)
-        for view_id, rev in settings.revisions.items():
-            if gone := self._known(view_id, settings) - made:
-                self._end(view_id, rev, gone, last_window_id, delay_ms=0)
+            self._end(view_id, rev, self._topics(view_id), last_window_id, delay_ms=0)
 
     def announce_all(self, last_window_id: int, *, delay_ms: int | None) -> None:
         """End everything. delay_ms: see MessageSink."""
-        self.announce_due(last_window_id)
-        settings = self._live.settings()
-        for view_id, rev in settings.revisions.items():
-            self._end(view_id, rev, self._made(settings), last_window_id, delay_ms=delay_ms)
+        self.announce_removed(last_window_id)
+        for view_id, rev in self._live.settings().revisions.items():
+            self._end(view_id, rev, self._topics(view_id), last_window_id, delay_ms=delay_ms)
 
-    def _made(self, settings: Settings) -> Set[ViewKind]:
-        return {*published_kinds(replace(self._run(), config=settings.config)), *self.carried}
-
-    def _known(self, view_id: str, settings: Settings) -> Set[ViewKind]:
+    def _topics(self, view_id: str) -> Set[str]:
         """What is made of a view now, or was and has not ended."""
-        made = self._made(settings)
-        return {kind for kind in _KINDS if kind in made or view_topic(view_id, kind) in self._open}
+        now = published_kinds(replace(self._context(), config=self._live.config))
+        return self._open.pop(view_id, set[str]()) | {view_topic(view_id, kind) for kind in now}
 
-    def _end(self, view_id: str, rev: int, kinds: Set[ViewKind], last: int, *, delay_ms: int | None) -> None:
-        ordered = sorted(kinds, key=_KINDS.index)
-        for message in end_messages(self._run(), view_id, rev, last, ordered):
-            self._open.discard(message.topic)
+    def _end(self, view_id: str, rev: int, topics: Set[str], last: int, *, delay_ms: int | None) -> None:
+        kinds: list[ViewKind] = [kind for kind in _KINDS if view_topic(view_id, kind) in topics]
+        for message in end_messages(self._context(), view_id, rev, last, kinds):
             self._sink.end(message, delay_ms=delay_ms)
+
+
+class InputPreview:
+    """Shows what the camera sees to its subscribers, a few times a second. Belongs to the reader thread."""
+
+    def __init__(
+        self, sink: MessageSink, context: Callable[[], StreamContext], clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """context: what is known of the source now. clock: monotonic seconds."""
+        self._sink, self._context, self._clock = sink, context, clock
+        self._next_s = clock()
+        self._shown = False
+
+    def offer(self, frame: Frame, arrival_ns: int, epoch: int) -> None:
+        """A frame arrived; does not wait. With no subscriber it costs a look at a counter."""
+        now_s = self._clock()
+        if now_s < self._next_s or self._sink.stats.previews == 0:
+            return
+        self._next_s = max(self._next_s + PREVIEW_PERIOD_S, now_s + _LEAST * PREVIEW_PERIOD_S)
+        self._shown = True
+        context = self._context()
+        self._sink.preview(lambda: preview_message(context, frame, arrival_ns, epoch))
+
+    def announce_end(self, *, delay_ms: int | None) -> None:
+        """End the topic, if anybody got something on it. delay_ms: see MessageSink."""
+        if self._shown:
+            self._sink.end(end_message(self._context(), PREVIEW_TOPIC, PREVIEW_ID, 1, -1), delay_ms=delay_ms)

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from gcd_model import FAMILIES, SVD_14, NonFiniteError, RenderOptions, SourceFeatures, Traits, View
 from gcd_node.config import ControlConfig, ModelSection, NodeConfig, PublishConfig, ViewConfig
-from gcd_node.control.server import ControlOptions, ControlServer
+from gcd_node.control import ControlServer
 from gcd_node.errors import NodeError, SourceAbsentError, SourceLostError
 from gcd_node.frame import Frame, SourceInfo
 from gcd_node.inference import WindowReport
@@ -237,8 +237,9 @@ def running_node(
         parts = Parts(open_source=lambda _: script.open(), load_model=lambda _: model)
         with Publisher(publisher_options(config)) as publisher:
             node = Node(config, parts, publisher, NodeOptions(once=False, on_window=on_window))
-            options = ControlOptions(endpoint=str(config.control.endpoint))
-            with ControlServer(options, node, lambda: node.state.label, node.event) as control:
+            with ControlServer(
+                str(config.control.endpoint), node.handle, lambda: node.state.label, node.event
+            ) as control:
                 rig = Rig(node, publisher, control.endpoint)
                 try:
                     yield rig

@@ -11,9 +11,8 @@ from typer import Argument, Option
 from gcd_client.control import ControlClient, ControlError
 from gcd_client.endpoints import ClientKeys, fingerprint, read_key_pair, read_public_key
 from gcd_node.auth import new_key_pair, write_key_pair
-from gcd_node.control.message import text_arguments
-from gcd_node.control.verbs import VERBS
 from gcd_node.errors import UsageError
+from gcd_node.verbs import VERBS, text_arguments
 
 keys = typer.Typer(no_args_is_help=True, help="CURVE keys, for nodes that are reached over a network.")
 

@@ -10,8 +10,7 @@ import zmq
 
 from gcd_client.frames import PushedFrame, decode_frame
 from gcd_client.protocol import MAX_HEADER, MAX_PAYLOAD, PREFIX, ClientError, MessageError
-from gcd_node.auth import Context, EventSink, ServerSecurity, SocketGuard, unbind
-from gcd_node.binding import own_endpoint
+from gcd_node.auth import Context, EventSink, ServerSecurity, SocketGuard, own_endpoint, unbind
 from gcd_node.errors import DepthError, SourceError, SourceLostError
 from gcd_node.frame import Frame, SourceInfo
 from gcd_node.sources.depth import DepthPicture, clean_depth

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from wire_messages import end, window
 
-from gcd_node.control.message import Command, Outcome
-from gcd_node.control.server import ControlOptions, ControlServer
+from gcd_node.control import ControlServer, Outcome
 from gcd_node.publisher import Publisher
 from gcd_node.sockets import PublisherOptions
+from gcd_node.verbs import Command
 
 CLIENT = Path(__file__).parents[2] / "client"
 LIGHTEST_IMPORT_S = 0.15
@@ -40,8 +40,10 @@ def test_the_client_alone_reads_views_and_commands(tmp_path: Path) -> None:
     subprocess.run([sys.executable, "-m", "venv", tmp_path / "venv"], check=True, timeout=100)
     subprocess.run([python, "-m", "pip", "install", "-q", CLIENT], check=True, timeout=300, env=clean)
     options = PublisherOptions(data=f"ipc://{tmp_path}/d", status=None, lockstep=True, min_subscribers=1)
-    control = ControlOptions(endpoint=f"ipc://{tmp_path}/c")
-    with ControlServer(control, Views(), lambda: "active", print) as server, Publisher(options) as publisher:
+    with (
+        ControlServer(f"ipc://{tmp_path}/c", Views().handle, lambda: "active", print) as server,
+        Publisher(options) as publisher,
+    ):
         command = [python, "-c", PROGRAM, publisher.endpoint, server.endpoint]
         reader = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=clean, cwd=tmp_path)
         message = window(4)

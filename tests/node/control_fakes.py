@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 from gcd_client.control import Code
 from gcd_node.auth import Role
-from gcd_node.control.message import Command, Outcome, RequestError
-from gcd_node.control.verbs import SetView
+from gcd_node.control import Outcome
 from gcd_node.errors import NodeError
+from gcd_node.verbs import Command, RequestError, SetView
 
 
 class FakeCommands:

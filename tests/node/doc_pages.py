@@ -13,8 +13,8 @@ import typer
 
 from gcd_node.cli.main import COMMANDS, new_app
 from gcd_node.config import parse_config
-from gcd_node.control.verbs import VERBS
 from gcd_node.errors import ConfigError
+from gcd_node.verbs import VERBS
 from gcd_train.cli.main import app as train_app
 
 ROOT = Path(__file__).parent.parent.parent

@@ -18,7 +18,7 @@ from gcd_client.protocol import ViewHeader
 from gcd_client.subscriber import ReceivedView, StatusSubscriber, ViewSubscriber
 from gcd_model import ViewSynthesizer
 from gcd_node.config import ModelSection, NodeConfig, parse_config
-from gcd_node.control.server import ControlOptions, ControlServer
+from gcd_node.control import ControlServer
 from gcd_node.frame import FrameSource
 from gcd_node.node import Node, NodeOptions
 from gcd_node.pipeline import Summary
@@ -94,8 +94,8 @@ class Rig:
         self.publisher = Publisher(publisher_options(self.config))
         self.node = Node(self.config, parts, self.publisher, NodeOptions(once=once, service=service))
         self.control = ControlServer(
-            ControlOptions(endpoint=f"ipc://{folder}/control"),
-            self.node,
+            f"ipc://{folder}/control",
+            self.node.handle,
             lambda: self.node.state.label,
             self.node.event,
             self.node.recorder.command,

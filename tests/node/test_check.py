@@ -8,7 +8,7 @@ from tiny_weights import write_tiny
 from gcd_node.check import check_launch
 from gcd_node.cli.main import run_app
 from gcd_node.config import NodeConfig, load_config, parse_config
-from gcd_node.config_text import to_toml
+from gcd_node.config_dump import to_toml
 from gcd_node.errors import ConfigError
 from gcd_node.publisher import Publisher
 from gcd_node.sockets import PublisherOptions

@@ -14,7 +14,7 @@ from gcd_client.endpoints import fingerprint, read_key_pair
 from gcd_node.auth import load_server_security, new_key_pair, write_key_pair
 from gcd_node.cli.main import run_app
 from gcd_node.config import SecurityConfig
-from gcd_node.control.server import ControlOptions, ControlServer
+from gcd_node.control import ControlServer
 
 pytestmark = pytest.mark.timeout(90)
 
@@ -34,7 +34,7 @@ def events() -> Events:
 
 @pytest.fixture
 def server(tmp_path: Path, commands: FakeCommands, events: Events) -> Iterator[ControlServer]:
-    with ControlServer(ControlOptions(endpoint=f"ipc://{tmp_path}/c"), commands, lambda: "active", events) as made:
+    with ControlServer(f"ipc://{tmp_path}/c", commands.handle, lambda: "active", events) as made:
         yield made
 
 
@@ -92,8 +92,7 @@ def test_keys_made_on_the_command_line_open_the_door(
     stanza = shown[shown.rindex("[client.NAME]") :].replace("NAME", "desk")
     (tmp_path / "allow.toml").write_text(stanza)
     security = load_server_security(SecurityConfig(keys=str(tmp_path / "node"), allow=str(tmp_path / "allow.toml")))
-    options = ControlOptions(endpoint=LOOPBACK, security=security)
-    with ControlServer(options, commands, lambda: "active", events) as server:
+    with ControlServer(LOOPBACK, commands.handle, lambda: "active", events, security=security) as server:
         line = ["ctl", "hello", "--json", "--endpoint", server.endpoint, "--timeout", "20"]
         line += ["--keys", str(tmp_path / "desk"), "--node-key", str(tmp_path / "node" / "public.key")]
         assert run_app(line) == 0

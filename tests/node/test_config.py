@@ -1,8 +1,6 @@
-from pathlib import Path
-
 import pytest
 
-from gcd_node.config import NodeConfig, load_config, parse_config
+from gcd_node.config import NodeConfig, parse_config
 from gcd_node.errors import ConfigError
 
 MINIMAL = """
@@ -16,13 +14,6 @@ weights = "random:driving"
 
 def parsed(text: str) -> NodeConfig:
     return parse_config(text.encode(), "test.toml")
-
-
-def test_every_launch_file_for_this_package_is_valid() -> None:
-    paths = sorted((Path(__file__).parents[2] / "launch").glob("*.toml"))
-    assert paths
-    for path in paths:
-        assert load_config(path).view
 
 
 def test_defaults_are_those_of_a_live_node_on_this_machine() -> None:
@@ -72,11 +63,6 @@ def test_a_wrong_value_is_an_error_that_says_what_was_wanted(wrong: str, reason:
     with pytest.raises(ConfigError) as caught:
         parsed(wrong)
     assert reason in str(caught.value)
-
-
-def test_a_missing_launch_file_is_an_error_that_names_it(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"no\.toml"):
-        load_config(tmp_path / "no.toml")
 
 
 @pytest.mark.parametrize(

@@ -8,22 +8,19 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from dataclasses import replace as changed
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from cameras import Bench, Camera, until
+from cameras import until
 from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, made_node, traits
 from media import frames_at
-from rig import Rig
 
 from gcd_model import (
     Augmentation,
     CameraMount,
     Clip,
     DeviceMemoryError,
-    NonFiniteError,
     RenderOptions,
     SourceFeatures,
     load_synthesizer,
@@ -243,45 +240,6 @@ def test_a_frame_of_several_windows_is_encoded_once(stride: int) -> None:
     assert model.encoded[last + 1 :] == list(range(last + 1, len(model.encoded)))
 
 
-def test_frames_of_windows_that_were_overtaken_are_not_encoded() -> None:
-    begun, go_on = threading.Event(), threading.Event()
-
-    def wait(options: RenderOptions) -> None:
-        if options.seed != 0:  # not in the warm-up
-            begun.set()
-            assert go_on.wait(60)
-
-    model = Encoder(wait)
-    with Life(config(pace="realtime"), model) as life:
-        life.source.feed(T)
-        assert begun.wait(60)
-        life.source.feed(5 * T)
-        until(lambda: life.source.wanted == 6 * T)
-        go_on.set()
-    assert sorted(life.windows) == [0, 5]
-    assert model.encoded == [*range(T), *range(5 * T, 6 * T)]
-
-
-def test_a_window_waits_for_one_frame_that_is_being_encoded_and_no_more() -> None:
-    busy, go_on = threading.Event(), threading.Event()
-
-    def stall(seq: int) -> None:
-        if seq == 15:
-            busy.set()
-            assert go_on.wait(60)
-
-    model = Encoder(before=stall)
-    with Life(config(pace="realtime"), model) as life:
-        life.source.feed(T + 4)
-        assert busy.wait(60)
-        life.source.feed(2 * T + 4)  # the windows of 14 to 27 and of 28 to 41 are complete: the newer one wins
-        until(lambda: life.source.wanted == 3 * T + 8)
-        go_on.set()
-        until(lambda: len(life.windows) == 2)
-    assert sorted(life.windows) == [0, 2]
-    assert model.encoded[T : 2 * T + 2] == [14, 15, *range(28, 42)]
-
-
 def test_nothing_is_encoded_for_nobody() -> None:
     model = Encoder()
     with Life(config("life = {idle_s = 0.05}", pace="realtime"), model) as life:
@@ -292,23 +250,6 @@ def test_nothing_is_encoded_for_nobody() -> None:
 
 
 # What is forgotten.
-
-
-def test_frames_that_the_next_window_does_not_hold_are_forgotten() -> None:
-    builder, encoded, model = WindowBuilder(frames=T, fps=10.0, source_fps=10.0), kept(), Encoder()
-    frames = ten_fps(40)
-    placed(frames[:10], builder=builder)
-    while encoded.ahead(model, builder.filling, TERMS):
-        pass
-    assert len(encoded) == 10
-    placed(frames[12:15], builder=builder)  # two are missing
-    assert builder.filling.seqs == (12, 13, 14)
-    encoded.ahead(model, builder.filling, TERMS)
-    assert len(encoded) == 1
-    builder.restart("SRC_LOST")
-    assert not encoded.ahead(model, builder.filling, TERMS)
-    assert len(encoded) == 0
-    assert model.encoded == [*range(10), 12]
 
 
 @pytest.mark.parametrize(
@@ -331,21 +272,6 @@ def test_what_was_encoded_on_other_terms_is_encoded_anew(other: EncodeTerms) -> 
     assert len(model.encoded) == 4 * T
 
 
-def test_a_window_that_is_rendered_once_more_is_encoded_once_more_with_the_same_noise() -> None:
-    seeds: list[int] = []
-
-    def fail_once(options: RenderOptions) -> None:
-        seeds.append(options.seed)
-        if len(seeds) == 1:
-            raise NonFiniteError("NaN")
-
-    model, box = Encoder(fail_once), Box()
-    made_node(config(), model, FakeSource(T), box).run()
-    assert model.encoded == [*range(T), *range(T)]
-    assert model.seeds[:T] == model.seeds[T:]
-    assert seeds[0] != seeds[1]
-
-
 def test_a_device_that_is_full_encodes_nothing_ahead_until_the_next_window() -> None:
     calls: list[int] = []
 
@@ -363,24 +289,3 @@ def test_a_device_that_is_full_encodes_nothing_ahead_until_the_next_window() -> 
         assert calls == [0, *range(T)]
         life.source.feed(5)
         until(lambda: len(calls) == 1 + T + 5)
-
-
-def test_of_a_lost_camera_nothing_more_is_encoded(tmp_path: Path) -> None:
-    begun, go_on = threading.Event(), threading.Event()
-
-    def wait(_: int) -> None:
-        begun.set()
-        assert go_on.wait(60)
-
-    camera, model = Camera(), Encoder(before=wait)
-    bench = Bench(camera)
-    with Rig(tmp_path, bench, model, views="[view.main]") as rig:
-        rig.await_state("active")
-        camera.run(10, pause_s=0.0)
-        assert begun.wait(60)
-        camera.feed(None)
-        until(lambda: bench.tries >= 2)  # it is sought already
-        go_on.set()
-        until(lambda: bool(model.encoded))
-        time.sleep(0.1)
-    assert len(model.encoded) == 1

@@ -165,12 +165,3 @@ def test_f25_weights_that_do_not_fit_are_exit_65_and_the_first_five_are_named(
     assert code == 65
     assert f"7 of {count} weights are {damage}" in said
     assert sum(name in said for name in spoilt) == 5
-
-
-@pytest.mark.parametrize("content", [b"", b"<html>not found</html>", b"\x80\x04.", b"cos\nsystem\n(S'true'\ntR."])
-def test_f25_a_file_of_something_else_is_exit_65(run: Outcome, content: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "bad.ckpt"
-    path.write_bytes(content)
-    code, said = run(weights=str(path), opened=FakeSource(14), fake=False)
-    assert code == 65
-    assert "bad.ckpt" in said

@@ -1,4 +1,4 @@
-"""Rows of the failure table in which processes meet: a reader that sleeps, an endpoint in use, SIGTERM.
+"""Rows of the failure table in which processes meet: a reader that sleeps, SIGTERM.
 
 See test_faults.py for the others.
 """
@@ -6,7 +6,6 @@ See test_faults.py for the others.
 import os
 import resource
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -76,28 +75,6 @@ def test_f9_a_stalled_reader_disturbs_nobody(tmp_path: Path) -> None:
     assert sorted(view.age_ms for view in healthy)[30] < 50 + 1000 * SLACK_S
     assert after_kb - before_kb < 64 * 1024
     assert sum(begun < window_id < newest for window_id in seen) <= 10  # of 60 it slept through
-
-
-def test_f20_an_endpoint_in_use_is_refused_and_a_dead_ones_file_is_cleared_away(tmp_path: Path) -> None:
-    with socket.socket(socket.AF_UNIX) as dead:
-        dead.bind(str(tmp_path / "data"))  # closed below without being unlinked, as after a kill
-    with Rig(tmp_path, lambda _: Steady(), config=LOCKSTEP) as rig:
-        rig.await_views(1)
-        launch = tmp_path / "second.toml"
-        launch.write_text(f"""
-            [source]
-            kind = "synthetic"
-            [model]
-            weights = "random:driving"
-            [view.main]
-            [publish]
-            data = "ipc://{tmp_path}/data"
-            status = "ipc://{tmp_path}/other"
-        """)
-        done = subprocess.run(command("run", str(launch)), capture_output=True, text=True, timeout=START_S)
-        assert done.returncode == 73, done.stderr
-        assert f"{tmp_path}/data" in done.stderr
-        rig.await_views(len(rig.of()) + 1)  # whoever was first goes on
 
 
 def test_f23_sigterm_ends_every_view_and_the_process_with_0(tmp_path: Path) -> None:

@@ -6,22 +6,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cameras import Bench, Camera, until
-from fakes import Box, FakeSource, FakeSynthesizer, traits
+from fakes import Box, FakeSource, traits
 from rig import Rig, rig_config
 from wire_messages import window
 
 from gcd_client.images import images
-from gcd_client.protocol import PREVIEW_TOPIC, MessageError, ViewMessage, topic_key, view_topic
+from gcd_client.protocol import PREVIEW_TOPIC, ViewMessage, topic_key
 from gcd_client.subscriber import ReceivedView, ViewSubscriber
 from gcd_model import ViewSynthesizer
-from gcd_node.errors import ConfigError
 from gcd_node.frame import Frame, FrameSource
-from gcd_node.messages import Run
-from gcd_node.preview import PREVIEW_WIDTH, CapturedFrame, InputPreview, preview_message
+from gcd_node.messages import PREVIEW_WIDTH, preview_message
 from gcd_node.publisher import Publisher, PublisherStats
-from gcd_node.sockets import PublisherOptions, Readers, Subscriptions
-from gcd_node.source_config import SourceConfig
-from gcd_node.stream_context import prepare_run
+from gcd_node.sockets import PublisherOptions
+from gcd_node.stream_context import StreamContext, prepare_stream
+from gcd_node.views import InputPreview
 
 pytestmark = pytest.mark.timeout(90)
 REALTIME = 'kind = "synthetic"\npace = "realtime"'
@@ -43,26 +41,23 @@ class Watched(Box):
 
     @property
     def stats(self) -> PublisherStats:
-        readers = Readers(total=self.previews, previews=self.previews, previews_alone=self.previews)
-        return PublisherStats(readers=readers)
+        return PublisherStats(subscribers=self.previews, previews=self.previews)
 
 
-def run_of(folder: Path, source: FrameSource, model: ViewSynthesizer | None = None, **settings: float) -> Run:
+def run_of(folder: Path, source: FrameSource, model: ViewSynthesizer | None = None, **settings: float) -> StreamContext:
     more = "".join(f"\n{name} = {value}" for name, value in settings.items())
     config = rig_config(folder, REALTIME + more, "[view.main]", "")
-    return prepare_run(config, traits() if model is None else model.traits, source.info)[0]
+    return prepare_stream(config, traits() if model is None else model.traits, source.info)
 
 
-def shot(width: int, height: int, *, seq: int = 7) -> CapturedFrame:
+def frame_of(width: int, height: int, *, seq: int = 7) -> Frame:
     image = np.full((height, width, 3), (200, 100, 50), np.uint8)
-    return CapturedFrame(
-        frame=Frame(image=image, stamp_ns=5_000_000_000, seq=seq), arrival_ns=time.monotonic_ns(), epoch=3
-    )
+    return Frame(image=image, stamp_ns=5_000_000_000, seq=seq)
 
 
 def preview(folder: Path, width: int, height: int, **settings: float) -> ViewMessage:
     source = FakeSource(1, size=(width, height))
-    return preview_message(run_of(folder, source, **settings), shot(width, height))
+    return preview_message(run_of(folder, source, **settings), frame_of(width, height), time.monotonic_ns(), 3)
 
 
 def next_preview(views: ViewSubscriber) -> ReceivedView:
@@ -82,19 +77,6 @@ def test_a_preview_is_the_whole_picture_and_never_wider_than_said(tmp_path: Path
     assert shown_height == pytest.approx(shown_width * height / width, abs=0.51)
     assert message.header.src.resize == ("none" if width <= PREVIEW_WIDTH else "area")
     assert np.abs(images(message)[0].astype(int) - (200, 100, 50)).max() <= 4  # JPEG
-
-
-@pytest.mark.parametrize("topics", [[], [VIEW_KEY], [PREVIEW_KEY], [b""], [PREVIEW_KEY, b"", b"src/", VIEW_KEY]])
-def test_whoever_subscribes_is_counted_by_what_they_get_until_they_leave(topics: list[bytes]) -> None:
-    counted = Subscriptions()
-    for topic in topics:
-        counted.count(b"\1" + topic)
-    assert counted.now.total == len(topics)
-    assert counted.now.previews == sum(PREVIEW_KEY.startswith(topic) for topic in topics)
-    assert counted.now.watchers == sum(VIEW_KEY.startswith(topic) for topic in topics)
-    for topic in topics:
-        counted.count(b"\0" + topic)
-    assert counted.now == Readers()
 
 
 # What it says.
@@ -118,14 +100,6 @@ def test_the_camera_matrix_is_that_of_the_smaller_picture(tmp_path: Path) -> Non
     assert preview(tmp_path, 1280, 720).header.intrinsics is None
 
 
-def test_the_input_has_one_topic_and_no_view_takes_its_name(tmp_path: Path) -> None:
-    assert view_topic("src", "frm") == PREVIEW_TOPIC
-    with pytest.raises(MessageError, match="src of kind frm"):
-        view_topic("src", "win")
-    with pytest.raises(ConfigError, match="view"):
-        rig_config(tmp_path, REALTIME, "[view.src]", "")
-
-
 # When it is made.
 
 
@@ -134,12 +108,12 @@ def test_nothing_is_made_while_nobody_looks_and_at_most_five_a_second_then(tmp_p
     shown = InputPreview(box, lambda: run_of(tmp_path, FakeSource(1)), lambda: now[0])
     for seq in range(48):
         now[0] = seq / 24
-        shown.offer(shot(96, 64, seq=seq))
+        shown.offer(frame_of(96, 64, seq=seq), time.monotonic_ns(), 3)
     assert box.views == []
     box.previews = 1
     for seq in range(48, 48 + 240):  # 10 s
         now[0] = seq / 24
-        shown.offer(shot(96, 64, seq=seq))
+        shown.offer(frame_of(96, 64, seq=seq), time.monotonic_ns(), 3)
     shown.announce_end(delay_ms=None)
     seqs = [message.header.src.seq[0] for message in box.views]
     assert 0 < len(seqs) <= 50
@@ -153,7 +127,7 @@ def test_a_subscriber_sees_the_input_and_is_told_of_its_end(tmp_path: Path) -> N
     with Rig(tmp_path, Bench(camera), config='kind = "v4l2"\nhfov_deg = 60.0', watched=False) as rig:
         with ViewSubscriber(f"ipc://{tmp_path}/data", "src", "frm") as views:
             rig.await_state("active")
-            until(lambda: rig.publisher.stats.readers.previews == 1)
+            until(lambda: rig.publisher.stats.previews == 1)
             camera.run(30)
             first = next_preview(views)
             assert first.images.shape == (1, 64, 96, 3)
@@ -168,31 +142,10 @@ def test_a_subscriber_sees_the_input_and_is_told_of_its_end(tmp_path: Path) -> N
         rig.await_state("inactive")
 
 
-def test_who_looks_at_the_input_alone_keeps_no_model_busy(tmp_path: Path) -> None:
-    def open_steady(_: SourceConfig) -> Steady:
-        return Steady()
-
-    with (
-        Rig(tmp_path, open_steady, config=REALTIME, more="life = {idle_s = 0.2}", watched=False) as rig,
-        ViewSubscriber(f"ipc://{tmp_path}/data", "src", "frm") as camera,
-    ):
-        rig.await_status(lambda status: "IDLE" in status["reasons"] and status["publish"]["subs"] == 1)
-        assert isinstance(rig.model, FakeSynthesizer)
-        before = len(rig.model.asked)
-        for _ in range(5):  # a second, in which a watched node would render
-            assert next_preview(camera).header.view_id == "src"
-        assert len(rig.model.asked) == before
-        with ViewSubscriber(f"ipc://{tmp_path}/data", "main") as views:
-            assert next_preview(views).header.view_id == "main"
-
-
 def test_a_reader_of_previews_that_hangs_does_not_hold_up_a_lockstep_run(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
     frame = Frame(image=noise, stamp_ns=0, seq=0)
-    picture = preview_message(
-        run_of(tmp_path, FakeSource(1, size=(640, 480))),
-        CapturedFrame(frame=frame, arrival_ns=time.monotonic_ns(), epoch=0),
-    )
+    picture = preview_message(run_of(tmp_path, FakeSource(1, size=(640, 480))), frame, time.monotonic_ns(), 0)
     options = PublisherOptions(data=f"ipc://{tmp_path}/data", status=None, lockstep=True, min_subscribers=1)
     with (
         Publisher(options) as publisher,

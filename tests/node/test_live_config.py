@@ -1,8 +1,6 @@
 import pytest
-from fakes import traits
 
 from gcd_node.config import NodeConfig, ViewConfig, parse_config
-from gcd_node.config_digest import config_digest
 from gcd_node.views import LiveConfig
 
 
@@ -42,13 +40,3 @@ def test_the_end_of_a_removed_view_is_announced_once_unless_it_came_back() -> No
     live.remove_view("a")
     live.set_view("a", ViewConfig())
     assert live.take_removed() == []
-
-
-def test_every_change_of_what_is_rendered_has_another_digest() -> None:
-    live = LiveConfig(config())
-    digests = [config_digest(live.config, traits())]
-    live.set_view("a", ViewConfig(azimuth_deg=5.0))
-    digests.append(config_digest(live.config, traits()))
-    live.remove_view("b")
-    digests.append(config_digest(live.config, traits()))
-    assert len(set(digests)) == 3

@@ -10,14 +10,14 @@ from msgspec.structs import replace
 from gcd_model import CameraMount, OptionError, load_synthesizer
 from gcd_node.cli.main import run_app
 from gcd_node.config import NodeConfig, ViewConfig, parse_config
-from gcd_node.config_digest import config_digest
-from gcd_node.control.verbs import SetView
+from gcd_node.config_dump import config_digest
 from gcd_node.errors import ConfigError
 from gcd_node.frame import SourceInfo
 from gcd_node.preprocess import assumed_hfov_deg, stated_mount
 from gcd_node.replay.run import open_run
 from gcd_node.source_config import SourcePose
-from gcd_node.stream_context import prepare_run
+from gcd_node.stream_context import prepare_stream
+from gcd_node.verbs import SetView
 from gcd_node.views import VirtualView
 
 LAUNCH = """
@@ -88,7 +88,6 @@ def test_a_view_takes_any_rigid_pose_as_it_is() -> None:
         ('kind = "pose"\npose = [0, 0, 1, 0, 0, 0, 0]', "length 1"),
         ('kind = "pose"\npose = [0, 0, nan, 0, 0, 0, 1]', "finite"),
         ('kind = "pose"\npose = [0, 0, 2e4, 0, 0, 0, 1]', "10000"),
-        ("source_from_view = [1]", 'kind = "pose"'),
     ],
 )
 def test_what_is_no_pose_is_refused_with_what_would_be_one(wrong: str, reason: str) -> None:
@@ -139,11 +138,11 @@ def test_the_lens_is_the_stated_one_or_is_assumed_and_published() -> None:
     ):
         source = replace(config().source, hfov_deg=hfov_deg, pose=pose)
         views = {"main": ViewConfig()}
-        run, _ = prepare_run(replace(config(), source=source, view=views), TRAITS, INFO)
+        run = prepare_stream(replace(config(), source=source, view=views), TRAITS, INFO)
         assert run.intrinsics is not None
         assert run.intrinsics.hfov_deg == pytest.approx(wanted)
         assert run.ood == ()
-    wide, _ = prepare_run(replace(config(), source=replace(config().source, hfov_deg=140.0)), TRAITS, INFO)
+    wide = prepare_stream(replace(config(), source=replace(config().source, hfov_deg=140.0)), TRAITS, INFO)
     assert wide.ood == ("hfov",)
 
 

@@ -3,11 +3,9 @@
 import threading
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
-import msgspec
-import pytest
 import zmq
 from cameras import until
 from fakes import FakeSource, FakeSynthesizer, painting_traits, traits
@@ -15,10 +13,7 @@ from rig import Rig
 
 from gcd_client.control import Code
 from gcd_client.protocol import EndMessage, StatusMessage, ViewMessage, decode
-from gcd_model import ModelError, RenderOptions
-from gcd_node.config import parse_config
-from gcd_node.control.verbs import SetView
-from gcd_node.views import VirtualView
+from gcd_model import RenderOptions
 
 LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
 REALTIME = 'kind = "synthetic"\npace = "realtime"'
@@ -70,7 +65,8 @@ def taped(folder: Path) -> Generator[Tape]:
                 if socket.poll(50):
                     message = decode(socket.recv())
                     assert not isinstance(message, StatusMessage)
-                    tape.said.append(message)
+                    if not (isinstance(message, EndMessage) and message in tape.said[-20:]):  # ends are repeated
+                        tape.said.append(message)
 
     thread = threading.Thread(target=hear, daemon=True)
     thread.start()
@@ -144,6 +140,28 @@ def test_a_view_removed_in_the_last_window_still_ends(tmp_path: Path) -> None:
     assert all(isinstance(each, EndMessage) for each in tape.said)  # what was in work when it was told to stop is lost
 
 
+WILD: list[dict[str, object]] = [
+    {"azimuth_deg": 1e308},
+    {"radius": 1e308},
+    {"radius": -1e308},
+    {"kind": "orbit", "rate_deg_s": 1e308, "amplitude_deg": 60.0},
+    {"kind": "orbit", "rate_deg_s": 1.0, "amplitude_deg": 1e308},
+    {"kind": "orbit", "rate_deg_s": 1.0, "amplitude_deg": 1e-308},
+    {"T_src_dst": [1e308] * 16},
+    {"T_src_dst": [1, 0, 0, 1e308, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]},
+]
+
+
+def test_no_number_in_a_view_can_end_the_stream(tmp_path: Path) -> None:
+    with Rig(tmp_path, lambda _: Endless(), config=LOCKSTEP) as rig:
+        rig.await_views(1)
+        for wanted in WILD:
+            reply = rig.ask("set_view", wanted, view="main")
+            assert reply.code in (Code.OK, Code.OUT_OF_RANGE, Code.BAD_ARG)
+            rig.await_views(len(rig.of()) + 3)
+        assert rig.events("MODEL_FAILED") == []
+
+
 def test_all_topics_of_a_window_agree_on_its_view_whatever_changes_meanwhile(tmp_path: Path) -> None:
     model = FakeSynthesizer(traits())
     changes: list[Callable[[Rig], object]] = [
@@ -173,42 +191,3 @@ def test_all_topics_of_a_window_agree_on_its_view_whatever_changes_meanwhile(tmp
     assert all(len(found) == 1 for found in digests.values())
     assert {len(paths) for paths, _ in model.asked} == {2}  # one batch each
     assert {told[0] for (_, view), each in by_window.items() for told in each if view == "top"} == {1, 2, 3}
-
-
-WILD: list[dict[str, object]] = [
-    {"azimuth_deg": 1e308},
-    {"radius": 1e308},
-    {"radius": -1e308},
-    {"kind": "orbit", "rate_deg_s": 1e308, "amplitude_deg": 60.0},
-    {"kind": "orbit", "rate_deg_s": 1.0, "amplitude_deg": 1e308},
-    {"kind": "orbit", "rate_deg_s": 1.0, "amplitude_deg": 1e-308},
-    {"T_src_dst": [1e308] * 16},
-    {"T_src_dst": [1, 0, 0, 1e308, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]},
-]
-
-
-def test_no_number_in_a_view_can_end_the_stream(tmp_path: Path) -> None:
-    with Rig(tmp_path, lambda _: Endless(), config=LOCKSTEP) as rig:
-        rig.await_views(1)
-        for wanted in WILD:
-            reply = rig.ask("set_view", wanted, view="main")
-            assert reply.code in (Code.OK, Code.OUT_OF_RANGE, Code.BAD_ARG)
-            rig.await_views(len(rig.of()) + 3)
-        assert rig.events("MODEL_FAILED") == []
-
-
-@pytest.mark.parametrize("wanted", [each for each in WILD if "T_src_dst" not in each])
-def test_without_limits_a_view_is_refused_at_once_or_stays_finite(wanted: dict[str, object]) -> None:
-    text = b'[source]\nkind = "synthetic"\n[model]\nweights = "fake"\nmotion_bucket = 127.0\n[view.main]'
-    config = parse_config(text, "test")
-    asked = msgspec.convert({"view": "main", **wanted}, SetView).to_config()
-    unknown = replace(traits(), family=None)  # a checkpoint whose training nobody knows
-    try:
-        view = VirtualView("main", msgspec.structs.replace(config, view={"main": asked}), unknown)
-    except ModelError:
-        return
-    for window in range(3):
-        path = view.trajectory(window * 1_000_000_000, 0)
-        assert path.source_from_target.isfinite().all()
-        assert path.delta is not None
-        assert path.delta.isfinite().all()

@@ -70,15 +70,6 @@ class Loader:
         return made
 
 
-def test_the_wide_model_is_gone_before_the_halved_one_is_loaded() -> None:
-    load = Loader()
-    slot = ModelSlot(ModelSection(weights="fake"), load)
-    assert slot.can_halve
-    slot.halve()
-    assert load.still_there == [0, 0]
-    assert not slot.can_halve
-
-
 def test_f11_a_full_gpu_gets_the_same_model_in_bfloat16(tmp_path: Path) -> None:
     load = Loader()
     gc.disable()  # what only a collection would free is still on the device when the next model is loaded

@@ -69,20 +69,6 @@ def test_a_node_goes_through_its_life_as_it_is_asked(tmp_path: Path) -> None:
     assert [view.sequence for view in rig.of()] == [0, 2]  # 1 was the end of the first stream
 
 
-def test_the_end_of_a_recording_is_told_at_once_and_not_when_its_last_window_is_drawn(tmp_path: Path) -> None:
-    gate = Gate()
-    model = FakeSynthesizer(traits(), gate)
-    with Rig(tmp_path, lambda _: FakeSource(14), model, config=LOCKSTEP) as rig:
-        until(lambda: gate.begun == 1)
-        told = rig.await_status(lambda status: status["source"]["state"] == "ended")
-        assert (told["state"], told["model"]["state"], told["level"]) == ("active", "busy", 0)
-        assert not told["ready"]
-        assert rig.of() == []
-        gate.waits.release()
-        rig.await_event("SRC_ENDED")
-        rig.await_views(1)
-
-
 def test_a_dry_run_changes_nothing(tmp_path: Path) -> None:
     with Rig(tmp_path, Bench(), more="life = {autostart = false}") as rig:
         assert rig.try_out("configure").code is Code.OK
@@ -263,24 +249,6 @@ def test_an_operator_who_deactivates_keeps_a_node_that_would_end_with_its_source
     assert ids == sorted(set(ids))
 
 
-def test_live_stamps_are_utc_with_one_offset_for_all_views_of_a_window(tmp_path: Path) -> None:
-    camera = Camera()
-    with Rig(tmp_path, Bench(camera), views=TWO_VIEWS) as rig:
-        rig.await_state("active")
-        began_ns = time.time_ns()
-        camera.run(30)
-        rig.await_views(1)
-        rig.await_views(1, "swing")
-    header, other = rig.of()[0].header, rig.of("swing")[0].header
-    assert header.clock == "realtime"
-    assert header.t_capture_ns == other.t_capture_ns
-    assert began_ns - 50_000_000 <= header.t_capture_ns[0] <= header.t_capture_ns[-1] <= header.t_infer_start_ns
-    steps = {b - a for a, b in zip(header.t_capture_ns, header.t_capture_ns[1:], strict=False)}
-    assert max(steps) - min(steps) <= 1  # nanoseconds: nobody makes new stamps
-    since_ms = (header.t_publish_ns - header.t_capture_ns[-1]) / 1e6
-    assert header.age_ms == pytest.approx(since_ms, abs=20)
-
-
 def test_whoever_starts_the_node_is_told_when_it_is_ready_and_that_it_lives(tmp_path: Path) -> None:
     address = str(tmp_path / "notify")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
@@ -300,3 +268,21 @@ def test_whoever_starts_the_node_is_told_when_it_is_ready_and_that_it_lives(tmp_
     assert sum("READY=1" in line for line in heard) == 1
     assert "WATCHDOG=1" in heard
     assert sum("STOPPING=1" in line for line in heard) == 1
+
+
+def test_live_stamps_are_utc_with_one_offset_for_all_views_of_a_window(tmp_path: Path) -> None:
+    camera = Camera()
+    with Rig(tmp_path, Bench(camera), views=TWO_VIEWS) as rig:
+        rig.await_state("active")
+        began_ns = time.time_ns()
+        camera.run(30)
+        rig.await_views(1)
+        rig.await_views(1, "swing")
+    header, other = rig.of()[0].header, rig.of("swing")[0].header
+    assert header.clock == "realtime"
+    assert header.t_capture_ns == other.t_capture_ns
+    assert began_ns - 50_000_000 <= header.t_capture_ns[0] <= header.t_capture_ns[-1] <= header.t_infer_start_ns
+    steps = {b - a for a, b in zip(header.t_capture_ns, header.t_capture_ns[1:], strict=False)}
+    assert max(steps) - min(steps) <= 1  # nanoseconds: nobody makes new stamps
+    since_ms = (header.t_publish_ns - header.t_capture_ns[-1]) / 1e6
+    assert header.age_ms == pytest.approx(since_ms, abs=20)

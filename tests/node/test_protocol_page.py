@@ -7,9 +7,8 @@ import msgspec
 import pytest
 
 from gcd_client.control import Code, decode_reply
-from gcd_node.control.message import parse_command, parse_request
-from gcd_node.control.verbs import VERBS
 from gcd_node.health import Health
+from gcd_node.verbs import VERBS, parse_command, parse_request
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "protocol.md").read_text()
@@ -87,7 +86,9 @@ def test_every_key_of_a_status_is_there() -> None:
 
 
 def test_every_event_that_is_named_in_the_code_is_explained() -> None:
-    calls = re.compile(r'(?:\.event|on_event|self\._tell|self\._say|_after_change)\(\s*"([A-Z_]{4,})"')
+    calls = re.compile(
+        r'(?:\.event|on_event|self\._tell|self\._say|_after_change|_report)\(\s*(?:self\._on_event, )?"([A-Z_]{4,})"'
+    )
     told = {code for path in (ROOT / "gcd_node").rglob("*.py") for code in calls.findall(path.read_text())}
     assert {
         "STATE",

@@ -18,7 +18,7 @@ from gcd_node.config import NodeConfig, parse_config
 from gcd_node.errors import ConfigError
 from gcd_node.frame import Image, SourceInfo
 from gcd_node.preprocess import Fit, Rectifier, project, widest_camera
-from gcd_node.stream_context import fit_of, prepare_run
+from gcd_node.stream_context import prepare_stream
 
 BARREL = LensModel(
     width=1280,
@@ -303,29 +303,29 @@ def info(lens: LensModel | None = None, width: int = 1280, height: int = 720) ->
 
 
 def test_a_calibration_file_cuts_to_the_trained_field_of_view_and_publishes_it(tmp_path: Path) -> None:
-    run, _ = prepare_run(config(camera_file(tmp_path, fx=800.0)), traits(), info())
+    run = prepare_stream(config(camera_file(tmp_path, fx=800.0)), traits(), info())
     assert run.intrinsics is not None
     assert run.intrinsics.hfov_deg == pytest.approx(53.13)
-    assert (run.resize, run.ood) == ("remap2x_area", ())
+    assert (run.fit.resize, run.ood) == ("remap2x_area", ())
 
 
 def test_the_calibration_of_the_source_itself_is_used_at_its_own_size() -> None:
-    run, _ = prepare_run(config(), traits(), info(lens=BARREL, width=640, height=360))
+    run = prepare_stream(config(), traits(), info(lens=BARREL, width=640, height=360))
     assert run.intrinsics is not None
     assert run.intrinsics.hfov_deg == pytest.approx(53.13)
 
 
 def test_a_stated_field_of_view_overrides_the_calibration_of_the_source() -> None:
-    run, _ = prepare_run(config("hfov_deg = 40.0"), traits(), info(lens=BARREL))
-    assert (run.resize, run.ood) == ("released", ("hfov",))
+    run = prepare_stream(config("hfov_deg = 40.0"), traits(), info(lens=BARREL))
+    assert (run.fit.resize, run.ood) == ("released", ("hfov",))
 
 
 def test_a_stated_field_of_view_that_is_too_wide_is_cut_to_the_trained_one() -> None:
-    run, _ = prepare_run(config("hfov_deg = 90.0"), traits(), info())
+    run = prepare_stream(config("hfov_deg = 90.0"), traits(), info())
     assert run.intrinsics is not None
     assert run.intrinsics.hfov_deg == pytest.approx(53.13, abs=0.05)
     assert run.ood == ()
-    fit = fit_of(config("hfov_deg = 90.0"), traits(), info())
+    fit = run.fit
     assert isinstance(fit, Fit)
     left, top, wide, high = fit.crop_box(1280, 720)
     assert (left, top) == ((1280 - wide) // 2, (720 - high) // 2)
@@ -335,7 +335,7 @@ def test_a_stated_field_of_view_that_is_too_wide_is_cut_to_the_trained_one() -> 
 @pytest.mark.parametrize("allowed", [False, True])
 def test_a_cut_that_would_leave_too_few_pixels_is_not_made_unless_they_may_be_enlarged(allowed: bool) -> None:
     stated = f"hfov_deg = 90.0\nallow_upscale = {str(allowed).lower()}"
-    run, _ = prepare_run(config(stated), traits(), info(width=WIDTH, height=HEIGHT))
+    run = prepare_stream(config(stated), traits(), info(width=WIDTH, height=HEIGHT))
     assert run.ood == (() if allowed else ("hfov",))
     assert run.intrinsics is not None
     assert run.intrinsics.hfov_deg == pytest.approx(53.13 if allowed else 90.0, abs=1.0)
@@ -344,38 +344,41 @@ def test_a_cut_that_would_leave_too_few_pixels_is_not_made_unless_they_may_be_en
 def test_a_calibration_for_another_shape_is_refused_at_the_start_and_left_out_in_mid_stream(tmp_path: Path) -> None:
     stated = config(camera_file(tmp_path, fx=800.0))
     with pytest.raises(ConfigError, match="which is another shape"):
-        prepare_run(stated, traits(), info(width=640, height=480))
-    run, _ = prepare_run(stated, traits(), info(width=640, height=480), changed=True)
-    assert (run.resize, run.ood) == ("released", ("hfov",))
-    kept, _ = prepare_run(stated, traits(), info(width=640, height=360), changed=True)
-    assert (kept.resize, kept.ood) == ("remap2x_area", ())
+        prepare_stream(stated, traits(), info(width=640, height=480))
+    before = prepare_stream(stated, traits(), info())
+    run = prepare_stream(stated, traits(), info(width=640, height=480), before=before)
+    assert (run.fit.resize, run.ood) == ("released", ("hfov",))
+    kept = prepare_stream(stated, traits(), info(width=640, height=360), before=before)
+    assert (kept.fit.resize, kept.ood) == ("remap2x_area", ())
     own = info(lens=BARREL, width=640, height=480)
-    assert prepare_run(config(), traits(), own, changed=True)[0].ood == ("hfov",)
+    assert prepare_stream(
+        config(), traits(), own, before=prepare_stream(config(), traits(), info(lens=BARREL))
+    ).ood == ("hfov",)
 
 
 def test_a_lens_too_narrow_for_the_model_is_flagged_and_refused_if_strict(tmp_path: Path) -> None:
     stated = camera_file(tmp_path, fx=2400.0)
-    run, _ = prepare_run(config(stated), traits(), info())
+    run = prepare_stream(config(stated), traits(), info())
     assert run.intrinsics is not None
-    assert (run.ood, run.resize) == (("hfov",), "remap2x_area")
+    assert (run.ood, run.fit.resize) == (("hfov",), "remap2x_area")
     assert run.intrinsics.hfov_deg < 30.0
     with pytest.raises(ConfigError, match="strict: field of view"):
-        prepare_run(config(stated, top="strict = true"), traits(), info())
+        prepare_stream(config(stated, top="strict = true"), traits(), info())
 
 
 def test_a_calibration_and_a_field_of_view_contradict_each_other(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="calibration and hfov_deg"):
-        fit_of(config(camera_file(tmp_path, 800.0) + "\nhfov_deg = 60.0"), traits(), info())
+        prepare_stream(config(camera_file(tmp_path, 800.0) + "\nhfov_deg = 60.0"), traits(), info())
 
 
 def test_a_stated_rate_that_is_a_trained_one_but_for_rounding_is_not_flagged() -> None:
     for fps, flags in ((23.976, ()), (20.0, ("fps",))):
-        run, rate = prepare_run(config(top=f"window = {{fps = {fps}}}"), traits(), info())
-        assert (rate, run.ood) == (fps, flags)
+        run = prepare_stream(config(top=f"window = {{fps = {fps}}}"), traits(), info())
+        assert (run.fps, run.ood) == (fps, flags)
 
 
 def test_without_calibration_nothing_changes() -> None:
-    fit = fit_of(config('resize = "area"'), traits(), info())
+    fit = prepare_stream(config('resize = "area"'), traits(), info()).fit
     assert isinstance(fit, Fit)
     assert fit.resize == "area"
 
@@ -390,3 +393,12 @@ def test_depth_goes_where_its_picture_goes_and_nothing_between_is_made_up(lens: 
     clear = (image < 5) | (image > 250)
     assert clear.mean() > 0.2
     assert np.mean(depth[clear] == np.where(image[clear] > 128, 2.0, 7.0)) > 0.995
+
+
+def test_a_running_node_does_not_follow_a_calibration_file_that_is_edited(tmp_path: Path) -> None:
+    stated = config(camera_file(tmp_path, fx=800.0))
+    before = prepare_stream(stated, traits(), info())
+    camera_file(tmp_path, fx=2400.0)
+    after = prepare_stream(stated, traits(), info(width=640, height=360), before=before)
+    assert after.lens == before.lens
+    assert after.intrinsics == before.intrinsics

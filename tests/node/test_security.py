@@ -2,18 +2,16 @@
 
 import os
 import stat
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-import zmq
 from control_fakes import Events, FakeCommands, wait_for
-from wire_messages import origin, window
+from wire_messages import window
 
 from gcd_client.control import ControlClient, ControlError
-from gcd_client.endpoints import AuthError, ClientKeys, KeyPair, SetupError, fingerprint, read_key_pair, read_public_key
-from gcd_client.subscriber import ReceivedView, StatusSubscriber, ViewSubscriber
+from gcd_client.endpoints import AuthError, ClientKeys, KeyPair, SetupError, fingerprint, read_key_pair
+from gcd_client.subscriber import ReceivedView, ViewSubscriber
 from gcd_node.auth import (
     AllowList,
     Client,
@@ -22,9 +20,8 @@ from gcd_node.auth import (
     new_key_pair,
     write_key_pair,
 )
-from gcd_node.binding import check_bindable
 from gcd_node.config import SecurityConfig
-from gcd_node.control.server import ControlOptions, ControlServer
+from gcd_node.control import ControlServer
 from gcd_node.errors import ConfigError, OutputError
 from gcd_node.publisher import Publisher
 from gcd_node.sockets import PublisherOptions
@@ -56,8 +53,7 @@ def commands() -> FakeCommands:
 
 @pytest.fixture
 def server(commands: FakeCommands, events: Events) -> Iterator[ControlServer]:
-    options = ControlOptions(endpoint=LOOPBACK, security=SECURITY)
-    with ControlServer(options, commands, lambda: "active", events) as made:
+    with ControlServer(LOOPBACK, commands.handle, lambda: "active", events, security=SECURITY) as made:
         yield made
 
 
@@ -123,15 +119,6 @@ def test_f18_a_client_without_keys_gets_no_reply(server: ControlServer, commands
     assert commands.heard == []
 
 
-def test_f18_a_client_refused_before_it_asks_is_told_why(server: ControlServer) -> None:
-    with ControlClient(server.endpoint, timeout_s=20.0) as client:
-        guard_s = time.monotonic() + 20.0
-        while client._connection.socket.poll(10, zmq.POLLOUT) and time.monotonic() < guard_s:  # pyright: ignore[reportPrivateUsage]
-            time.sleep(0.01)
-        with pytest.raises(AuthError, match="it asks for keys, none were given"):
-            client.request("hello")
-
-
 def test_f18_a_client_with_the_wrong_node_key_gets_no_reply(
     server: ControlServer, commands: FakeCommands, events: Events
 ) -> None:
@@ -170,15 +157,6 @@ def test_f18_strangers_get_no_views_and_readers_beside_them_do(
         assert publisher.stats.subscribers == 1
 
 
-def test_f18_a_reader_is_told_that_it_is_not_let_in(publisher: Publisher) -> None:
-    with (
-        ViewSubscriber(publisher.endpoint, "top", keys=keys(STRANGER)) as views,
-    ):
-        for _ in range(2):  # ZeroMQ tries no more, so every call says it
-            with pytest.raises(AuthError, match="is not on its list"):
-                views.receive(20_000)
-
-
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_an_authenticator_that_died_is_reported_lets_nobody_in_and_holds_up_no_end() -> None:
     def broken(key: str) -> Client | None:
@@ -193,27 +171,11 @@ def test_an_authenticator_that_died_is_reported_lets_nobody_in_and_holds_up_no_e
             assert heard(reader) is None
 
 
-def test_notes_travel_encrypted_too(publisher: Publisher) -> None:
-    assert publisher.status_endpoint is not None
-    publisher.note("status", origin(), {"state": "active"})
-    with StatusSubscriber(publisher.status_endpoint, ("status",), keys(VIEWER)) as notes:
-        note = notes.receive(20_000)
-    assert note is not None
-    assert note.fields["state"] == "active"
-
-
 def test_keys_for_a_node_that_uses_none_are_refused_with_a_reason(commands: FakeCommands, events: Events) -> None:
-    with ControlServer(ControlOptions(endpoint=LOOPBACK), commands, lambda: "active", events) as server:
+    with ControlServer(LOOPBACK, commands.handle, lambda: "active", events) as server:
         with pytest.raises(AuthError, match="uses no keys"):
             ask(server, keys(VIEWER), "hello")
         assert events.codes() == []
-
-
-def test_ipc_beside_keys_stays_this_users(tmp_path: Path, commands: FakeCommands, events: Events) -> None:
-    options = ControlOptions(endpoint=f"ipc://{tmp_path}/c", security=SECURITY)
-    with ControlServer(options, commands, lambda: "active", events) as server:
-        assert ask(server, None, "set_view") == "OK"
-    assert [role for _, role in commands.heard] == ["operator"]
 
 
 # Where a node may be reached
@@ -222,54 +184,20 @@ def test_ipc_beside_keys_stays_this_users(tmp_path: Path, commands: FakeCommands
 def test_an_ipc_endpoint_is_never_open_to_everybody(tmp_path: Path, commands: FakeCommands, events: Events) -> None:
     before = os.umask(0)
     try:
-        with ControlServer(ControlOptions(endpoint=f"ipc://{tmp_path}/c"), commands, lambda: "active", events):
+        with ControlServer(f"ipc://{tmp_path}/c", commands.handle, lambda: "active", events):
             assert stat.S_IMODE((tmp_path / "c").stat().st_mode) == 0o770
     finally:
         os.umask(before)
 
 
 def test_f19_with_keys_and_clients_a_wider_bind_is_allowed(commands: FakeCommands, events: Events) -> None:
-    options = ControlOptions(endpoint="tcp://0.0.0.0:0", security=SECURITY)
-    with ControlServer(options, commands, lambda: "active", events) as server:
+    with ControlServer("tcp://0.0.0.0:0", commands.handle, lambda: "active", events, security=SECURITY) as server:
         port = server.endpoint.rpartition(":")[2]
         with ControlClient(f"tcp://127.0.0.1:{port}", keys=keys(VIEWER), timeout_s=20.0) as client:
             assert client.request("hello").ok
 
 
-def test_f19_without_them_it_is_refused_and_both_settings_are_named() -> None:
-    with pytest.raises(ConfigError, match=r"\[security\] keys and \[security\] allow") as caught:
-        check_bindable("tcp://0.0.0.0:5580")
-    assert caught.value.exit_code == 78
-    check_bindable("tcp://0.0.0.0:5580", secured=True)
-
-
-def test_a_socket_whose_gate_is_gone_lets_nobody_in() -> None:
-    with zmq.Context() as context:
-        router = context.socket(zmq.ROUTER)
-        for option, value in (
-            (zmq.CURVE_SERVER, 1),
-            (zmq.CURVE_SECRETKEY, NODE.secret.encode()),
-            (zmq.ZAP_DOMAIN, b"gcd.control"),
-            (zmq.ZAP_ENFORCE_DOMAIN, 1),
-        ):
-            router.set(option, value)
-        router.bind(LOOPBACK)
-        endpoint = router.getsockopt_string(zmq.LAST_ENDPOINT)
-        with ControlClient(endpoint, keys=keys(OPERATOR), timeout_s=0.5) as client:
-            with pytest.raises((ControlError, AuthError)):
-                client.call("hello")
-            assert not router.poll(0)
-        context.destroy(linger=0)
-
-
 # Keys as files
-
-
-def test_keys_survive_the_disk_and_only_their_owner_reads_them(tmp_path: Path) -> None:
-    write_key_pair(tmp_path / "k", NODE)
-    assert read_key_pair(tmp_path / "k") == NODE
-    assert stat.S_IMODE((tmp_path / "k").stat().st_mode) == 0o700
-    assert stat.S_IMODE((tmp_path / "k" / "secret.key").stat().st_mode) == 0o600
 
 
 def test_keys_are_never_overwritten(tmp_path: Path) -> None:
@@ -295,19 +223,6 @@ def test_a_damaged_key_is_refused_and_never_shown(tmp_path: Path, name: str, tex
     with pytest.raises(SetupError) as caught:
         read_key_pair(tmp_path)
     assert name == "public.key" or not text or text not in str(caught.value)
-
-
-def test_halves_of_two_pairs_are_refused() -> None:
-    with pytest.raises(SetupError, match="do not belong together"):
-        KeyPair(public=NODE.public, secret=STRANGER.secret)
-
-
-def test_a_public_key_is_given_as_text_file_or_folder(tmp_path: Path) -> None:
-    write_key_pair(tmp_path, NODE)
-    for given in (NODE.public, str(tmp_path / "public.key"), str(tmp_path)):
-        assert read_public_key(given) == NODE.public
-    with pytest.raises(SetupError, match="cannot read the key"):
-        read_public_key(str(tmp_path / "absent"))
 
 
 # The list of clients
@@ -351,13 +266,6 @@ def test_a_list_everybody_may_write_is_refused(tmp_path: Path) -> None:
     config = allow(tmp_path, f"[client.a]\nkey = '{VIEWER.public}'\n")
     (tmp_path / "allow.toml").chmod(0o666)
     with pytest.raises(ConfigError, match="chmod o-w"):
-        load_server_security(config)
-
-
-def test_a_missing_list_is_named(tmp_path: Path) -> None:
-    config = allow(tmp_path, "")
-    (tmp_path / "allow.toml").unlink()
-    with pytest.raises(ConfigError, match=r"cannot read the allow-list .*allow.toml"):
         load_server_security(config)
 
 
@@ -425,9 +333,9 @@ def test_a_broken_list_leaves_in_who_was_in_and_is_reported_once(
 def test_a_key_that_was_removed_gets_no_new_connection_and_a_role_counts_at_once(
     listed: AllowList, list_path: Path, commands: FakeCommands, events: Events
 ) -> None:
-    options = ControlOptions(endpoint=LOOPBACK, security=ServerSecurity(keys=NODE, find_client=listed.find))
+    security = ServerSecurity(keys=NODE, find_client=listed.find)
     with (
-        ControlServer(options, commands, lambda: "active", events) as server,
+        ControlServer(LOOPBACK, commands.handle, lambda: "active", events, security=security) as server,
         ControlClient(server.endpoint, keys=keys(OPERATOR), timeout_s=20.0) as hand,
     ):
         assert hand.request("set_view", {"view": "top"}).code == "OK"

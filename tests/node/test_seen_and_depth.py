@@ -10,7 +10,6 @@ from fakes import Box, FakeSource, FakeSynthesizer, fake_config, fake_maps, made
 
 from gcd_client.images import depth_m, images, inverse_depth
 from gcd_client.subscriber import ReceivedView, ViewSubscriber
-from gcd_model import View
 from gcd_node.publisher import Publisher
 from gcd_node.sockets import PublisherOptions
 
@@ -90,32 +89,6 @@ def test_one_sample_of_a_model_that_states_its_spread_has_a_deviation() -> None:
     assert np.allclose(levels, 25.5, atol=0.1)  # a tenth, in grey levels
     assert published(frames=14).of("std") == []
     assert len(published("log_variance", frames=28).ends) == len(published(frames=28).ends) + 1
-
-
-def test_a_spread_that_is_stated_counts_however_many_samples_there_are() -> None:
-    one, several = (published("log_variance", samples=n, frames=14).of("std")[0] for n in (1, 3))
-    assert bytes(one.payload) == bytes(several.payload)
-
-
-def test_uncertainty_is_stated_or_scaled_from_several_samples() -> None:
-    maps = fake_maps()
-    video = torch.rand(2, 14, 3, 64, 96)
-    trajectory = traits().plan_view()
-
-    def view(samples: torch.Tensor, **more: object) -> View:
-        return View(samples=samples, latents=video, trajectory=trajectory, motion_bucket=0.0, **more)
-
-    assert view(video[:1]).uncertainty is None
-    stated = view(video[:1], log_variance=maps["log_variance"]).uncertainty
-    assert stated is not None
-    assert torch.allclose(stated, torch.tensor(0.1))
-    both = view(video, log_variance=maps["log_variance"], uncertainty_scale=2.0)
-    assert both.uncertainty is not None
-    assert torch.equal(both.uncertainty, stated)
-    several = view(video, uncertainty_scale=2.0)
-    assert several.std is not None
-    assert several.uncertainty is not None
-    assert torch.equal(several.uncertainty, 2.0 * several.std)
 
 
 def test_a_reader_of_both_kinds_gets_exactly_what_was_published_in_order(tmp_path: Path) -> None:

@@ -126,21 +126,6 @@ def test_while_a_transition_is_under_way_the_node_is_busy_and_can_still_be_ended
     assert rig.failure is None
 
 
-def test_a_step_that_takes_long_is_waited_for_and_nothing_of_it_is_published(tmp_path: Path) -> None:
-    deaf = Deaf()
-    with Rig(tmp_path, lambda _: FakeSource(10_000), FakeSynthesizer(traits(), deaf), config=LOCKSTEP) as rig:
-        assert deaf.begun.wait(30)
-        assert rig.ask("deactivate").code is Code.ACCEPTED
-        assert rig.ask("activate").code is Code.BUSY
-        assert rig.node.state.label == "deactivating"
-        deaf.go_on.set()
-        rig.await_state("inactive")
-        assert not rig.node.left_behind
-        assert rig.views == []
-        assert rig.ask("activate").code is Code.ACCEPTED
-        rig.await_views(1)
-
-
 def test_a_thread_left_behind_keeps_the_node_from_starting_only_until_it_ends(tmp_path: Path) -> None:
     deaf, more = Deaf(), "life = {hang_s = 0.3}"
     model = FakeSynthesizer(traits(), deaf)

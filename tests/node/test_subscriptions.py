@@ -12,20 +12,21 @@ from zmtp import GREETING, message, ready
 from gcd_client.protocol import topic_key
 from gcd_client.subscriber import ViewSubscriber
 from gcd_node.publisher import Publisher
-from gcd_node.sockets import PublisherOptions, Readers, Subscriptions
+from gcd_node.sockets import PublisherOptions, Readers
 
 TOPICS = [b"", b"src/", topic_key("src/frm"), b"view/", topic_key("view/a/win")]
 
 
 @given(st.lists(st.tuples(st.booleans(), st.sampled_from(TOPICS))))
 def test_readers_are_counted_as_if_all_were_looked_at_each_time(events: list[tuple[bool, bytes]]) -> None:
-    counted, there = Subscriptions(), Counter[bytes]()
+    counted, there = Readers(), Counter[bytes]()
     for comes, topic in events:
         counted.count(bytes([comes]) + topic)
         there[topic] = max(0, there[topic] + (1 if comes else -1))
     previews = {topic: count for topic, count in there.items() if topic_key("src/frm").startswith(topic)}
     every = sum(previews.values())
-    assert counted.now == Readers(total=there.total(), previews=every, previews_alone=every - previews.get(b"", 0))
+    watchers = there.total() - every + previews.get(b"", 0)
+    assert counted.now == (there.total(), watchers, every)
 
 
 def test_who_takes_back_what_nobody_asked_for_makes_no_reader_disappear(tmp_path: Path) -> None:

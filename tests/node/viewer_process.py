@@ -10,7 +10,7 @@ import numpy as np
 from fakes import FakeSynthesizer, traits
 from rig import rig_config
 
-from gcd_node.control.server import ControlOptions, ControlServer
+from gcd_node.control import ControlServer
 from gcd_node.frame import Frame, SourceInfo
 from gcd_node.node import Node, NodeOptions
 from gcd_node.publisher import Publisher
@@ -59,8 +59,7 @@ def main(folder: Path) -> None:
             publisher,
             NodeOptions(once=False),
         )
-        options = ControlOptions(endpoint=f"ipc://{folder}/control")
-        with ControlServer(options, node, lambda: node.state.label, node.event):
+        with ControlServer(f"ipc://{folder}/control", node.handle, lambda: node.state.label, node.event):
             print("there", flush=True)
             node.run()
 

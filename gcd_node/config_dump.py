@@ -1,14 +1,58 @@
-"""The name of a configuration: equal for configurations that render the same, however they are written."""
+"""A configuration written down: as a launch file, without its secrets, and as a short name for what it renders."""
 
 import hashlib
+from pathlib import PurePath
+from urllib.parse import urlsplit, urlunsplit
 
 import msgspec
+import tomli_w
 from msgspec.structs import replace
 
 from gcd_model import ASSUMED_SOURCE, CameraMount, ModelConfig, Traits
-from gcd_node.config import ModelSection, NodeConfig, WindowConfig
+from gcd_node.config import ModelSection, NodeConfig, Table
 from gcd_node.model import sampler_in_use
 from gcd_node.source_config import SourcePose
+
+_HIDDEN = "***"
+
+
+def to_toml(config: NodeConfig, *, secrets: bool = False) -> str:
+    """The whole configuration, defaults included, as a launch file. secrets: with passwords, which are hidden else."""
+    return tomli_w.dumps(_stated(msgspec.to_builtins(config) if secrets else without_secrets(config)))
+
+
+def to_change(key: str, value: object) -> str:
+    """A change to a launch file as parse_config() takes it, such as `model.steps=4`. value: what TOML can say."""
+    plain = str(value) if isinstance(value, PurePath) else value
+    return f"{key}={tomli_w.dumps({'value': plain}).removeprefix('value = ').strip()}"
+
+
+def without_secrets(config: NodeConfig) -> Table:
+    """The configuration as plain values, with the password of a url hidden."""
+    table: Table = msgspec.to_builtins(config)
+    source = table["source"]
+    if isinstance(source, dict) and isinstance(source.get("url"), str):
+        source["url"] = _without_password(source["url"])
+    return table
+
+
+def _stated(table: Table) -> Table:
+    """Without what is None: TOML has no word for it."""
+    stated = {key: value for key, value in table.items() if value is not None}
+    return {key: _stated(value) if isinstance(value, dict) else value for key, value in stated.items()}
+
+
+def _without_password(url: str) -> str:
+    try:
+        split = urlsplit(url)
+        if split.password is None and not split.query:
+            return url
+        name, at, host = split.netloc.rpartition("@")
+        user = name.partition(":")[0]
+        shown = f"{user}:{_HIDDEN}{at}{host}" if split.password is not None else split.netloc
+        return urlunsplit((split.scheme, shown, split.path, _HIDDEN if split.query else "", ""))
+    except ValueError:
+        return _HIDDEN
 
 
 def config_digest(config: NodeConfig, traits: Traits) -> str:
@@ -25,7 +69,9 @@ def config_digest(config: NodeConfig, traits: Traits) -> str:
     """
     source = config.source
     taken = source.resize, source.allow_upscale, source.hfov_deg, _pose(source.pose, traits)
-    filled = taken, _model(config.model, traits), _views(config), _window(config.window, traits)
+    views = {view_id: view.plain for view_id, view in config.view.items()}
+    window = replace(config.window, stride=config.window.stride or traits.config.frames)
+    filled = taken, _model(config.model, traits), views, window
     plain = _without_negative_zero(msgspec.to_builtins(filled))
     return hashlib.sha256(msgspec.json.encode(plain, order="deterministic")).hexdigest()[:12]
 
@@ -54,14 +100,6 @@ def _model(section: ModelSection, traits: Traits) -> ModelSection:
         head_width=None if networks is None else networks.unet.head_width,
         image_heads=None if tower is None else tower.heads,
     )
-
-
-def _views(config: NodeConfig) -> dict[str, dict[str, object]]:
-    return {view_id: view.plain for view_id, view in config.view.items()}
-
-
-def _window(section: WindowConfig, traits: Traits) -> WindowConfig:
-    return replace(section, stride=section.stride or traits.config.frames)
 
 
 def _pose(pose: SourcePose | None, traits: Traits) -> SourcePose | None:

@@ -1,0 +1,301 @@
+"""The control socket: one thread owns the ROUTER and answers at once (wire protocol, section 5).
+
+Who reaches it over ipc, or over loopback where no keys are set up, is an operator: it is this machine's own user.
+Elsewhere the key decides. The client: gcd_client.control.
+"""
+
+import hashlib
+import logging
+import os
+import threading
+import time
+from collections import OrderedDict, deque
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+from types import TracebackType
+from typing import TypeAlias
+
+import msgspec
+import zmq
+
+from gcd_client.control import MAX_REPLY, MAX_REQUEST, Code, Reply
+from gcd_client.protocol import ClientError
+from gcd_node.auth import Client, Context, EventSink, Role, ServerSecurity, SocketGuard, own_endpoint, unbind
+from gcd_node.errors import NodeError
+from gcd_node.verbs import VERBS, Command, RequestError, parse_command, parse_request
+
+_LOG = logging.getLogger(__name__)
+_LINGER_MS = 500
+_QUEUED = 16
+_SECOND_NS = 1_000_000_000
+_LARGEST_READ = 4 * MAX_REQUEST  # what is longer than a request is refused with a reason, up to here
+_MALFORMED = (Code.BAD_JSON, Code.BAD_PROTO, Code.TOO_LARGE)
+_KEEP_S = 60.0
+_MOST_BAD_PER_S, _MOST_PEERS = 20, 256
+_LOCAL = Client(name="", role="operator")
+
+AnswerSink: TypeAlias = Callable[[bytes, bytes, Client], None]
+"""Gets every request, its reply as it was sent, and who asked; called in the control thread, returns at once."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Outcome:
+    """What became of a command; `result` is plain JSON."""
+
+    code: Code = Code.OK
+    message: str = ""
+    result: dict[str, object] | None = None
+
+
+CommandHandler: TypeAlias = Callable[[Command, Role], Outcome]
+"""Carries a command out, or begins it and says ACCEPTED: Node.handle. Called in the control thread, so it takes a few
+ms at most. The role may use the verb, that is checked; `time` never comes here, and no repeat of a request."""
+
+
+class ControlServer:
+    """Answers requests until closed. Use it as a context manager.
+
+    state: the node's lifecycle state, for every reply. on_event: gets AUTH_DENIED, TOO_LARGE and CONTROL_FLOOD, each
+    with its fields. on_answer: see AnswerSink. All are called from threads of this server. ignore_s: for how long a
+    client that sends too much nonsense is ignored.
+
+    Raises:
+        EndpointError: the endpoint is in use or cannot be bound.
+        ConfigError: the endpoint is none, or others than this machine could reach it without keys.
+    """
+
+    def __init__(
+        self,
+        endpoint: str,
+        handle: CommandHandler,
+        state: Callable[[], str],
+        on_event: EventSink,
+        on_answer: AnswerSink | None = None,
+        *,
+        security: ServerSecurity | None = None,
+        ignore_s: float = 5.0,
+    ) -> None:
+        self._on_event, self._on_answer, self._ignore_s = on_event, on_answer, ignore_s
+        self._handle, self._state, self._flood = handle, state, FloodGuard(ignore_s)
+        self._kept: dict[Role, ReplyCache] = {  # apart, so that who only looks cannot push out an operator's
+            "operator": ReplyCache(_KEEP_S, most=4096, most_bytes=16 * 1024 * 1024),
+            "viewer": ReplyCache(_KEEP_S, most=1024, most_bytes=4 * 1024 * 1024),
+        }
+        self._closing, self._wake_fd = threading.Event(), os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._context: Context = zmq.Context()
+        self._guard = SocketGuard(self._context, security, on_event)
+        try:
+            self._socket = self._context.socket(zmq.ROUTER)
+            self._socket.set(zmq.ROUTER_HANDOVER, 0)
+            self._socket.set(zmq.MAXMSGSIZE, _LARGEST_READ)  # of each part; who sends more is disconnected
+            for limit in (zmq.RCVHWM, zmq.SNDHWM):
+                self._socket.set(limit, _QUEUED)
+            self._socket.set(zmq.LINGER, 0)
+            self.endpoint = self._guard.bind(self._socket, own_endpoint(endpoint, "control"), "control")
+        except BaseException:
+            self._guard.close()
+            self._context.destroy(linger=0)
+            os.close(self._wake_fd)
+            raise
+        self._security = security if self.endpoint.startswith("tcp://") else None
+        self._thread = threading.Thread(target=self._serve, name="control", daemon=True)
+        self._thread.start()
+
+    def dead_threads(self) -> list[str]:
+        """Threads of this server that have died."""
+        alive = {"control": self._thread.is_alive(), "control authentication": self._guard.alive}
+        return [] if self._closing.is_set() else [name for name, lives in alive.items() if not lives]
+
+    def close(self) -> None:
+        """Stop answering; replies on their way get half a second to leave. A second call does nothing."""
+        if self._closing.is_set():
+            return
+        self._closing.set()
+        os.eventfd_write(self._wake_fd, 1)
+        self._thread.join()
+        self._guard.close()
+        self._context.term()
+        os.close(self._wake_fd)
+
+    def __enter__(self) -> "ControlServer":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        self.close()
+
+    # What follows runs in the control thread alone.
+
+    def _serve(self) -> None:
+        poller = zmq.Poller()
+        for source in (self._wake_fd, self._socket, *self._guard.monitors):
+            poller.register(source, zmq.POLLIN)
+        try:
+            while not self._closing.is_set():
+                poller.poll()
+                self._guard.report_failures()
+                if self._socket.poll(0) and not self._closing.is_set():
+                    self._receive_safely()
+        except Exception:
+            _LOG.exception("the control thread died")
+        finally:
+            unbind(self._socket, self.endpoint, _LINGER_MS)
+
+    def _receive_safely(self) -> None:
+        try:
+            self._receive()
+        except Exception:
+            _LOG.exception("one request stays without a reply; the control socket goes on")
+
+    def _receive(self) -> None:
+        received_ns = time.time_ns()
+        peer, *parts = self._socket.recv_multipart(copy=False)
+        if self._flood.ignores(peer.bytes, time.monotonic()):
+            return
+        client = self._client(parts[-1]) if parts else None
+        if client is None:
+            return
+        reply, refusal = self._answer([part.bytes for part in parts], client, received_ns)
+        if refusal is Code.TOO_LARGE:
+            _LOG.warning("TOO_LARGE: refused a request of %d bytes", len(parts[0]))
+            self._on_event("TOO_LARGE", {"level": 1, "channel": "control"})
+        if refusal in _MALFORMED and self._flood.bad(peer.bytes, time.monotonic()):
+            _LOG.warning("CONTROL_FLOOD: a client sends nonsense and is ignored for %g s", self._ignore_s)
+            self._on_event("CONTROL_FLOOD", {"level": 1, "client": client.name, "ignored_s": self._ignore_s})
+            return
+        self._socket.send_multipart((peer.bytes, reply), zmq.NOBLOCK)  # to a peer that left: thrown away
+        if self._on_answer is not None:
+            self._on_answer(parts[0].bytes, reply, client)
+
+    def _client(self, frame: zmq.Frame) -> Client | None:
+        """Who sent this, by his key; None if the key was taken off the list since."""
+        return _LOCAL if self._security is None else self._security.find_client(str(frame.get("User-Id")))
+
+    def _answer(self, parts: list[bytes], client: Client, received_ns: int) -> tuple[bytes, Code | None]:
+        """The reply to what arrived in one message at `received_ns` of the wall clock, and why it is no command; None
+        if it is one."""
+        request_id = ""
+        try:
+            if len(parts) != 1:
+                raise RequestError(f"a request is one part, got {len(parts)}; use a DEALER socket", Code.BAD_JSON)
+            request = parse_request(parts[0])
+            request_id = request.id
+            return self._reply(parse_command(request), request_id, parts[0], client, received_ns), None
+        except RequestError as error:
+            outcome = Outcome(code=error.reason, message=str(error), result=error.result)
+            return self._encoded(error.request_id or request_id, outcome), error.reason
+
+    def _reply(self, command: Command, request_id: str, part: bytes, client: Client, received_ns: int) -> bytes:
+        """Raises RequestError."""
+        needed = VERBS[command.verb].role
+        if needed == "operator" and client.role != "operator":
+            message = f"{command.verb} needs the operator role, {client.name or 'this client'} is a {client.role}"
+            raise RequestError(message, Code.FORBIDDEN)
+        cache, key = self._kept[needed], (client.name, request_id)
+        try:
+            kept = cache.find(key, part, time.monotonic())
+        except KeyError as error:
+            message = f"the id {request_id} was used for another request; take a new one for each"
+            raise RequestError(message, Code.BAD_ARG) from error
+        if kept is None:
+            kept = self._encoded(request_id, self._outcome(command, client.role, received_ns))
+            cache.keep(key, part, kept, time.monotonic())
+        return kept
+
+    def _outcome(self, command: Command, role: Role, received_ns: int) -> Outcome:
+        if command.verb == "time":
+            return Outcome(result={"t_rx": divmod(received_ns, _SECOND_NS), "t_tx": divmod(time.time_ns(), _SECOND_NS)})
+        try:
+            return self._handle(command, role)
+        except RequestError as error:
+            return Outcome(code=error.reason, message=str(error), result=error.result)
+        except (NodeError, ClientError) as error:
+            return Outcome(code=Code.INTERNAL, message=str(error))
+        except Exception as error:
+            _LOG.exception("%s failed", command.verb)
+            return Outcome(code=Code.INTERNAL, message=f"{command.verb} failed: {type(error).__name__}; see the log")
+
+    def _encoded(self, request_id: str, outcome: Outcome) -> bytes:
+        try:
+            part = self._written(request_id, outcome)
+        except (TypeError, ValueError, RecursionError, OverflowError):
+            _LOG.exception("a result is not plain JSON")
+            return self._written(request_id, Outcome(code=Code.INTERNAL, message="the result is not plain JSON"))
+        if len(part) > MAX_REPLY:
+            message = f"the result has {len(part)} bytes, a reply at most {MAX_REPLY}"
+            return self._written(request_id, Outcome(code=Code.INTERNAL, message=message))
+        return part
+
+    def _written(self, request_id: str, outcome: Outcome) -> bytes:
+        code = outcome.code
+        ok, state = code in (Code.OK, Code.ACCEPTED), self._state()
+        reply = Reply(id=request_id, ok=ok, code=code, message=outcome.message, state=state, result=outcome.result)
+        return msgspec.json.encode(reply)
+
+
+class ReplyCache:
+    """Replies of the last seconds, so that a request sent twice is carried out once. Time: monotonic seconds.
+
+    The key says who asked and under which id; the same id for another request is no repeat.
+    """
+
+    def __init__(self, seconds: float, most: int, most_bytes: int) -> None:
+        self._seconds, self._most, self._most_bytes = seconds, most, most_bytes
+        self._kept: OrderedDict[Hashable, tuple[bytes, bytes, float]] = OrderedDict()  # digest, reply, until
+        self._bytes = 0
+
+    def find(self, key: Hashable, request: bytes, now_s: float) -> bytes | None:
+        """The reply to the same request under this key, None if there is none.
+
+        Raises:
+            KeyError: the key was used for another request.
+        """
+        while self._kept and next(iter(self._kept.values()))[2] <= now_s:
+            self._drop_oldest()
+        digest, reply, _ = self._kept.get(key, (None, None, 0.0))
+        if digest is not None and digest != hashlib.sha256(request).digest():
+            raise KeyError(key)
+        return reply
+
+    def keep(self, key: Hashable, request: bytes, reply: bytes, now_s: float) -> None:
+        """Remember a reply; the oldest make way when it gets too much."""
+        self._kept[key] = hashlib.sha256(request).digest(), reply, now_s + self._seconds
+        self._bytes += len(reply)
+        while len(self._kept) > self._most or self._bytes > self._most_bytes:
+            self._drop_oldest()
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def _drop_oldest(self) -> None:
+        self._bytes -= len(self._kept.popitem(last=False)[1][1])
+
+
+class FloodGuard:
+    """Ignores a peer for `ignore_s` that sends more than 20 malformed requests in a second. Time: monotonic seconds."""
+
+    def __init__(self, ignore_s: float) -> None:
+        self._ignore_s = ignore_s
+        self._bad_s: OrderedDict[bytes, deque[float]] = OrderedDict()  # the peers that were bad last are at the end
+        self._ignored_until_s: dict[bytes, float] = {}
+
+    def __len__(self) -> int:
+        """Peers remembered."""
+        return len(self._bad_s)
+
+    def ignores(self, peer: bytes, now_s: float) -> bool:
+        """Whether to throw away what this peer sends."""
+        return now_s < self._ignored_until_s.get(peer, now_s)
+
+    def bad(self, peer: bytes, now_s: float) -> bool:
+        """Count a malformed request; True if the peer is ignored from now on."""
+        times = self._bad_s.pop(peer, None) or deque[float](maxlen=_MOST_BAD_PER_S + 1)
+        self._bad_s[peer] = times
+        times.append(now_s)
+        if len(self._bad_s) > _MOST_PEERS:
+            self._bad_s.popitem(last=False)
+        if len(times) <= _MOST_BAD_PER_S or now_s - times[0] > 1.0:
+            return False
+        del self._bad_s[peer]
+        self._ignored_until_s = {each: until for each, until in self._ignored_until_s.items() if until > now_s}
+        self._ignored_until_s[peer] = now_s + self._ignore_s
+        return True
