@@ -32,7 +32,7 @@ from gcd_node.calibration import HALF_PIXEL
 from gcd_node.config import NodeConfig
 from gcd_node.config_digest import config_digest
 from gcd_node.frame import Image, SourceInfo
-from gcd_node.pictures.files import to_u8
+from gcd_node.image_io import to_u8
 from gcd_node.preprocess import ResizePath, stated_sphere
 from gcd_node.sources.depth import DepthSource
 from gcd_node.window import FrameWindow

@@ -12,9 +12,9 @@ from fakes import FakeSynthesizer, live_traits
 from tiny_weights import HEIGHT, WIDTH, write_tiny
 
 from gcd_model import DRIVING_CLASSES, CameraMount
-from gcd_node.cli import synthesize as cli_synthesize
+from gcd_node.cli import offline as cli_offline
 from gcd_node.cli.main import run_app
-from gcd_node.pictures.files import write_video
+from gcd_node.image_io import write_video
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_the_mount_reaches_clip_and_path(
     options: list[str], mount: CameraMount | None, clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = FakeSynthesizer(live_traits())
-    monkeypatch.setattr(cli_synthesize, "load_synthesizer", lambda *_, **__: model)
+    monkeypatch.setattr(cli_offline, "load_synthesizer", lambda *_, **__: model)
     assert synthesize(clip, "fake", tmp_path / "out", *options) == 0
     assert model.clips[0].mount == mount
     wanted = model.traits.plan_view(mount=mount).source_from_target
@@ -84,7 +84,7 @@ def test_the_mount_reaches_clip_and_path(
 def test_a_video_is_cropped_and_its_field_of_view_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_video(tmp_path / "wide.mkv", [np.zeros((2 * WIDTH, 4 * WIDTH, 3), np.uint8)] * 14, 10.0)
     model = FakeSynthesizer(live_traits())
-    monkeypatch.setattr(cli_synthesize, "load_synthesizer", lambda *_, **__: model)
+    monkeypatch.setattr(cli_offline, "load_synthesizer", lambda *_, **__: model)
     assert synthesize(tmp_path / "wide.mkv", "fake", tmp_path / "out", "--hfov-deg", "90", "--mount-height", "2") == 0
     mount = model.clips[0].mount
     assert mount is not None

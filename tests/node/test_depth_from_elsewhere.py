@@ -18,8 +18,8 @@ from gcd_model import RenderOptions, SourceFeatures, Trajectory, View, load_synt
 from gcd_node.cli.main import run_app
 from gcd_node.errors import ConfigError, DepthError, SourceError, TooShortError, UsageError
 from gcd_node.frame import Frame, Image
-from gcd_node.offline_clip import ClipRequest, OfflineClip, read_clip
-from gcd_node.pictures.files import write_video
+from gcd_node.image_io import write_video
+from gcd_node.offline import ClipRequest, OfflineClip, read_clip
 
 LIVE = load_synthesizer("random:live", device="cpu").traits
 FRAMES = 14
@@ -139,7 +139,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("rectified", [False, True])
 def test_a_stereo_pair_gives_its_rectified_left_picture_with_lens_and_depth(pair: Path, rectified: bool) -> None:
-    source = read(pair / "left.mkv", right=pair / "right.mkv", calibration=pair / "calib.json", rectified=rectified)
+    source = read(pair / "left.mkv", depth=pair / "right.mkv", calibration=pair / "calib.json", rectified=rectified)
     depth, lens = source.clip.depth, source.clip.lens
     assert depth is not None
     assert lens is not None
@@ -153,13 +153,13 @@ def test_a_stereo_pair_gives_its_rectified_left_picture_with_lens_and_depth(pair
 def test_a_pair_that_is_none_is_refused_in_one_line(pair: Path, tmp_path: Path) -> None:
     left, right, calibration = (pair / name for name in ("left.mkv", "right.mkv", "calib.json"))
     with pytest.raises(DepthError):
-        read(right, right=left, calibration=calibration)
+        read(right, depth=left, calibration=calibration)
     with pytest.raises(ConfigError):
-        read(left, right=right, calibration=tmp_path / "missing.json")
+        read(left, depth=right, calibration=tmp_path / "missing.json")
     write_video(tmp_path / "short.mkv", [np.zeros((256, 384, 3), np.uint8)] * 5, 10.0)
     with pytest.raises(TooShortError):
-        read(left, right=tmp_path / "short.mkv", calibration=calibration)
-    for half in ({"right": right}, {"calibration": calibration}, {"rectified": True}):
+        read(left, depth=tmp_path / "short.mkv", calibration=calibration)
+    for half in ({"calibration": calibration}, {"rectified": True}, {"depth": right, "rectified": True}):
         with pytest.raises(UsageError):
             ClipRequest(**half)
 
