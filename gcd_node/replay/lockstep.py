@@ -204,25 +204,24 @@ class RunWriter:
         if self._on_window is not None:
             self._on_window(report)
 
-    def preview(self, made: Callable[[], ViewMessage]) -> None:
-        """Nobody looks; see MessageSink."""
-
-    def end(self, message: EndMessage, *, delay_ms: int | None = None) -> None:
-        """Nothing follows from it; see MessageSink."""
-
     def note(self, topic: StatusTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
         """Keep what the model could not do; see MessageSink."""
         if topic == "event" and fields["code"] in _TROUBLES:
             detail = fields["rung"] if "rung" in fields else f"seeds {', '.join(map(str, fields['seeds']))}"
             self.troubles.append(TroubleEntry(code=fields["code"], window_id=fields["window_id"], detail=detail))
 
-    def stop_waiting(self) -> None:
-        """Nobody is waited for; see MessageSink."""
-
     @property
     def stats(self) -> PublisherStats:
         """Messages taken; see MessageSink."""
         return PublisherStats(sent=self._sent)
+
+    # Nobody looks, and nobody is waited for:
+
+    def preview(self, made: Callable[[], ViewMessage]) -> None: ...
+
+    def end(self, message: EndMessage, *, delay_ms: int | None = None) -> None: ...
+
+    def stop_waiting(self) -> None: ...
 
 
 # What a run is made from.

@@ -1,21 +1,17 @@
-"""The pytest plugin in a robot team's project: golden runs made, kept, missed and renewed; and the page about it."""
+"""The pytest plugin in a robot team's project: golden runs made, kept, missed and renewed."""
 
 import json
 import os
 import re
-import shlex
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
 import pytest
-import yaml
 from runs import LAUNCH, parts
-from typer.main import get_command
 
 import gcd_node.testing  # noqa: F401  loaded before the inner sessions, which put sys.modules back
-from gcd_node.cli.main import COMMANDS, new_app
 from gcd_node.replay import compare, lockstep  # noqa: F401  the same
 from gcd_node.replay.run import MANIFEST
 
@@ -23,7 +19,6 @@ pytest_plugins = ["pytester"]
 pytestmark = pytest.mark.timeout(60)
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "replay-testing.md"
 TEST = """
 def test_drive(gcd_replay):
     run = gcd_replay("launch.toml", {settings})
@@ -127,26 +122,3 @@ def test_the_plugin_brings_no_model_into_a_session_that_replays_nothing(pytester
 def test_an_installed_package_brings_the_plugin_by_itself() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert project["entry-points"]["pytest11"] == {"gcd_node.testing": "gcd_node.testing"}
-
-
-# The page.
-
-
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.DOTALL)
-
-
-def test_every_command_of_the_page_exists_with_its_options() -> None:
-    workflows = [yaml.safe_load(block) for block in blocks("yaml")]
-    steps = [step for workflow in workflows for job in workflow["jobs"].values() for step in job["steps"]]
-    assert steps
-    scripts = blocks("sh") + [step["run"] for step in steps if "run" in step]
-    lines = "\n".join(scripts).replace("\\\n", " ").splitlines()
-    found = [shlex.split(line, comments=True) for line in lines if line.lstrip().startswith("gcd-node ")]
-    known = get_command(new_app(COMMANDS)).commands  # type: ignore[attr-defined]
-    assert {words[1] for words in found} >= {"replay", "diff"}
-    for words in found:
-        options = {option for each in known[words[1]].params for option in each.opts}
-        assert {word for word in words[2:] if word.startswith("--")} <= options, words
-    for block in blocks("python"):
-        compile(block, "page", "exec")
