@@ -21,14 +21,12 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from gcd_client.protocol import ClassRecord
-from gcd_model import FileError, decode_json, printable, read_small
+from gcd_model import FileError, read_json
 from gcd_node.config import Count, ViewId
 from gcd_node.errors import DamagedRunError, OutputError, SourceError
 from gcd_node.image_io import make_folder
 from gcd_node.sources.opencv_camera import quiet_opencv
 
-FORMAT = "gcd-run/2"
-"""Of the folder and its manifest; another number is another layout."""
 MANIFEST = "manifest.json"
 _MAX_MANIFEST = 64 * 2**20  # bytes: a day of windows
 _MATROSKA = b"\x1a\x45\xdf\xa3"
@@ -106,12 +104,13 @@ class WindowEntry(_Entry, frozen=True, kw_only=True):
 class Manifest(_Entry, frozen=True, kw_only=True):
     """A whole run.
 
+    format: another number is another layout.
     made_from: all that decides its pixels beside the configuration, such as "weights sha256_12" or "version torch".
     config: TOML, without secrets. cfg_digest: see config_digest(). fps: of a window. classes: the ontology of the class
     maps, empty without. windows: by rising id.
     """
 
-    format: Literal["gcd-run/2"] = FORMAT
+    format: Literal["gcd-run/2"] = "gcd-run/2"
     made_from: dict[str, str]
     config: str
     cfg_digest: str
@@ -131,10 +130,6 @@ class Manifest(_Entry, frozen=True, kw_only=True):
     def views(self) -> tuple[str, ...]:
         """Ids of all views, in the order they first occur."""
         return tuple(dict.fromkeys(view_id for window in self.windows for view_id in window.views))
-
-
-class _Stated(msgspec.Struct, frozen=True):
-    format: object = None
 
 
 def encode_manifest(manifest: Manifest) -> bytes:
@@ -167,16 +162,11 @@ def open_run(path: Path) -> RunFolder:
     if not file.exists():
         raise DamagedRunError(f"{path} has no {MANIFEST}: it is no run, or one that did not finish; replay again")
     try:
-        text = read_small(file, _MAX_MANIFEST)
-        stated = decode_json(text, _Stated).format
-        if stated != FORMAT:
-            raise DamagedRunError(
-                f"{file} must be of format {FORMAT}, got {printable(stated)}; replay the recording again with this "
-                "version of gcd-node"
-            )
-        return RunFolder(path=path, manifest=decode_json(text, Manifest))
+        return RunFolder(path=path, manifest=read_json(file, Manifest, _MAX_MANIFEST))
     except FileError as error:
-        raise DamagedRunError(f"{file} is no manifest of a run: it {error}; replay the recording again") from error
+        raise DamagedRunError(
+            f"{file} is no manifest of a run as this version writes it: it {error}; replay the recording again"
+        ) from error
 
 
 # Pixels.
@@ -228,8 +218,8 @@ def read_windows(run: RunFolder) -> Iterator[WindowPixels]:
                     pixels = views[view_id][kind] = _next_window(video, path, run.manifest.size, kind)
                     if pixel_digest(pixels) != sha256:
                         raise DamagedRunError(
-                            f"{path}: the pixels of window {window.window_id} do not have the SHA-256 that {MANIFEST} "
-                            "states; one of the two was changed or damaged: replay again"
+                            f"{path}: the pixels of window {window.window_id} do not have the SHA-256 that "
+                            "manifest.json states; one of the two was changed or damaged: replay again"
                         )
             yield WindowPixels(entry=window, views=views)
         for path, video in videos.items():
