@@ -97,15 +97,21 @@ def test_one_bad_frame_is_not_hidden_by_thirteen_good_ones(golden: RunFolder, tm
     assert comparison.failures(EXACT) == (comparison.first_divergence,) == (view,)
 
 
-def test_class_pixels_have_a_bound_of_their_own(tmp_path: Path) -> None:
-    view = compare(classed(tmp_path / "a", {}), classed(tmp_path / "b", {1: 24})).views[1]
+def test_class_pixels_have_a_bound_of_their_own_and_are_shown_where_they_differ(tmp_path: Path) -> None:
+    comparison = compare(classed(tmp_path / "a", {}), classed(tmp_path / "b", {1: 48}))
+    view = comparison.views[1]
     assert view.distance is not None
-    share = 24 / 96 / FRAMES  # a quarter of the columns, in one frame
+    share = 48 / 96 / FRAMES  # half of the columns, in one frame
     assert view.distance.shares == {"cls": pytest.approx(share)}
     assert (view.distance.worst_class_frame, view.distance.largest) == (0, 0)
     assert not view.within(Tolerance(min_psnr_db=10.0))
     assert not view.within(Tolerance(max_class_share=0.9 * share))
     assert view.within(Tolerance(max_class_share=1.1 * share))
+    (path,) = write_report(tmp_path / "out", comparison, EXACT)
+    picture = cv2.imread(str(path))
+    assert picture is not None
+    assert np.all(picture[-150, -340] == 255)  # the last row of pictures, above the legend: where classes differ
+    assert np.all(picture[-150, -20] == 0)
 
 
 class MovedMaps(LevelModel):
@@ -272,15 +278,6 @@ def test_pictures_show_the_worst_views_and_where_they_differ(golden: RunFolder, 
     right = picture[:, -100:]  # of the last column, the difference: black but for the middle row of three
     rows = [right[int(part * right.shape[0])].mean() for part in (0.2, 0.5, 0.8)]
     assert rows == [0.0, 9.0 * 16, 0.0]  # as bright as it can be
-
-
-def test_class_maps_are_shown_where_they_differ(tmp_path: Path) -> None:
-    comparison = compare(classed(tmp_path / "a", {}), classed(tmp_path / "b", {0: 48}))
-    (path,) = write_report(tmp_path / "out", comparison, EXACT)
-    picture = cv2.imread(str(path))
-    assert picture is not None
-    assert np.all(picture[-150, -340] == 255)  # the last row of pictures, above the legend: where classes differ
-    assert np.all(picture[-150, -20] == 0)
 
 
 def test_exit_codes_tell_same_different_damaged_and_missing(
