@@ -9,19 +9,20 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from msgspec.structs import replace
 
+from gcd_client.protocol import ClassRecord
 from gcd_model import Traits, hatched
 from gcd_node.config import ControlConfig, ModelSection, NodeConfig, PublishConfig, ViewConfig, ViewerConfig
 from gcd_node.errors import NodeError
 from gcd_node.frame import Image
+from gcd_node.image_io import enlarged, make_folder, sheet, spread, strip, write_animation, write_png, write_video
 from gcd_node.inference import WindowReport
 from gcd_node.messages import ontology
 from gcd_node.node import NodeOptions
-from gcd_node.pictures.comparison import Moment, comparison
-from gcd_node.pictures.files import make_folder, scaled, spread, write_animation, write_png, write_video
 from gcd_node.pipeline import Summary
 from gcd_node.publisher import Publisher
 from gcd_node.session import open_session, run_until_signal
@@ -37,6 +38,8 @@ _MOUNT = SourcePose(height_m=1.55, forward_m=1.6, left_m=0.0, tilt_deg=0.0)
 _RECEIVER_TIMEOUT_S = 60.0
 _ROWS = 4
 _PAGE_WIDTH = 1000
+Moment: TypeAlias = tuple[Image, Image, Image, Image]
+"""One moment: the camera's picture, the view made of it, the same with what is painted hatched, and its class map."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -101,10 +104,10 @@ def run_demo(out: Path, on_window: Callable[[WindowReport], None]) -> DemoReport
     windows = moments(inputs, views, seen, maps)
     shown, classes = [moment for window in windows for moment in window], ontology(models[0])
     files = video, moving, still = tuple(out / f"side_by_side.{kind}" for kind in ("mp4", "webp", "png"))
-    frames = [comparison([moment], classes, HEADINGS) for moment in shown]
+    frames = [comparison([moment], classes) for moment in shown]
     write_video(video, frames, summary.fps)
-    write_animation(moving, [scaled(frame, _PAGE_WIDTH) for frame in frames], summary.fps)
-    write_png(still, comparison([shown[i] for i in spread(len(shown), _ROWS)], classes, HEADINGS))
+    write_animation(moving, frames, summary.fps, _PAGE_WIDTH)
+    write_png(still, comparison([shown[i] for i in spread(len(shown), _ROWS)], classes))
     return DemoReport(summary=summary, traits=models[0], received=len(windows), files=files)
 
 
@@ -163,8 +166,15 @@ def moments(
         raise NodeError("no whole window arrived in the receiving process; run `gcd-node -v demo` to see why")
     return [
         [
-            Moment(source=source, view=view, seen=hatched(view, visibility), classes=painted)
+            (source, view, hatched(view, visibility), painted)
             for source, view, visibility, painted in zip(*parts, strict=True)
         ]
         for parts in whole
     ]
+
+
+def comparison(shown: Sequence[Moment], classes: Sequence[ClassRecord]) -> Image:
+    """A row for each moment under headings, and what the colours mean; photographs are enlarged smoothly, maps without
+    new colours."""
+    rows = [[enlarged(each, smooth=column < 2) for column, each in enumerate(moment)] for moment in shown]
+    return sheet(strip(rows), HEADINGS, classes)

@@ -141,20 +141,15 @@ class McapFile:
 
     def cut_back(self) -> bool:
         """After an error: end the file behind what was flushed, without an index. Returns whether it has an end."""
-        try:
-            self.size, self.messages = self._flushed
+        self.size, self.messages = self._flushed
+        builder = RecordBuilder()
+        DataEnd(data_section_crc=0).write(builder)
+        Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(builder)
+        end = builder.end() + MCAP0_MAGIC
+        with contextlib.suppress(OSError), contextlib.closing(self._file.raw):  # what is buffered has no place any more
             if self.size == 0:
                 self._path.unlink()
                 return False
-            builder = RecordBuilder()
-            DataEnd(data_section_crc=0).write(builder)
-            Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(builder)
-            end = builder.end() + MCAP0_MAGIC
             os.ftruncate(self._file.fileno(), self.size)
             self.size += os.pwrite(self._file.fileno(), end, self.size)
-            return self.size == self._flushed[0] + len(end)
-        except OSError:
-            return False
-        finally:
-            with contextlib.suppress(OSError):
-                self._file.raw.close()  # not the buffer: what is in it has no place any more
+        return self.size == self._flushed[0] + len(end)

@@ -33,7 +33,7 @@ from gcd_client.protocol import (
 from gcd_model import ASSUMED_SOURCE, Intrinsics, Traits, Trajectory, View
 from gcd_node.calibration import HALF_PIXEL
 from gcd_node.frame import Frame, Image
-from gcd_node.pictures.files import to_u8
+from gcd_node.image_io import to_u8
 from gcd_node.preprocess import stated_sphere
 from gcd_node.stream_context import StreamContext
 from gcd_node.window import FrameWindow

@@ -162,7 +162,8 @@ class Recorder:
 
 
 class RecordingSink:
-    """Implements MessageSink over another one, and shows the recorder what leaves. What is published goes first."""
+    """Implements MessageSink over another one, and shows the recorder what leaves. What is published goes first.
+    Previews are not recorded: the recorder has the frames themselves."""
 
     def __init__(self, sink: MessageSink, recorder: Recorder) -> None:
         self._sink, self._recorder = sink, recorder
@@ -173,7 +174,6 @@ class RecordingSink:
         return sent
 
     def preview(self, made: Callable[[], ViewMessage]) -> None:
-        """See MessageSink. The recorder has the frames themselves."""
         self._sink.preview(made)
 
     def end(self, message: EndMessage, *, delay_ms: int | None = None) -> None:
@@ -205,7 +205,7 @@ class _Item:
 
 class _Queue:
     """What waits for the disk; when there is no room, the oldest pictures go. waits: in lockstep whoever has a picture
-    waits for room instead, for 5 s at most."""
+    waits for room instead, for 5 s at most. dropped: what found no room or could not be written, by topic."""
 
     def __init__(self, *, waits: bool) -> None:
         self._waits, self._end_s = waits, math.inf
@@ -213,7 +213,6 @@ class _Queue:
         self._items: deque[_Item] = deque()
         self._bytes = 0
         self.dropped: Counter[str] = Counter()
-        """What found no room or could not be written, by topic: frames, windows, notes."""
 
     @property
     def over(self) -> bool:
@@ -257,20 +256,18 @@ class _Queue:
             self._changed.notify_all()
 
     def close(self, patience_s: float) -> None:
-        """Take nothing more in; what is in there may be taken for so long, then it counts as dropped."""
+        """Take nothing more in; what is in there may be taken for so long. Without any, it counts as dropped now."""
         self._end_s = min(self._end_s, time.monotonic() + patience_s)
         self.hurry()
+        if patience_s <= 0:
+            with self._changed:
+                self.drop(*self._items)
+                self._items.clear()
 
     def drop(self, *items: _Item) -> None:
         """Count what is lost."""
         with self._changed:
             self.dropped.update(item.topic for item in items)
-
-    def clear(self) -> None:
-        """Give up what is left."""
-        with self._changed:
-            self.drop(*self._items)
-            self._items.clear()
 
     def _has_room(self, item: _Item) -> bool:
         return self._bytes == 0 or self._bytes + item.size <= _QUEUED_BYTES  # one always finds room
@@ -381,7 +378,6 @@ class _Recording:
 
     def _end(self) -> None:
         self.queue.close(0.0)
-        self.queue.clear()
         if self._file is not None:
             self._close(self._file)
         reason, message = self._failure or (self._stop or "INTERNAL", "")

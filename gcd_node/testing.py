@@ -9,6 +9,7 @@ the model comes with the first replay.
 """
 
 import contextlib
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -56,41 +57,55 @@ class ReplayedRun:
             AssertionError: it differs, or there is no golden run yet. DamagedRunError: the golden is damaged.
         """
         __tracebackhide__ = True
+        from gcd_node.replay.compare import Tolerance, compare, report_text, write_report
+        from gcd_node.replay.run import open_run
+
         path = self._config.rootpath / golden
         if self._config.getoption(_UPDATE):
-            self._renew(path)
+            if _renew(self._run, path):
+                self._config.stash[_RENEWED].append(str(path))
             return
         if not path.exists():
             raise AssertionError(
                 f"no golden run at {path}: make one with `pytest {_UPDATE}`, look at it, and commit it"
             )
-        text = self._difference(path, min_psnr, max_class_share)
-        if text is not None:
-            raise AssertionError(text)
+        tolerance = Tolerance(min_psnr_db=min_psnr, max_class_share=max_class_share)
+        comparison = compare(open_run(path), self._run)
+        if comparison.failures(tolerance):
+            folder = self.folder.with_name(f"{self.folder.name}-differences")
+            pictures = write_report(folder, comparison, tolerance)
+            shown = "\n".join(f"  {each}" for each in pictures) or f"  {folder}: no pictures, see diff.json"
+            raise AssertionError(
+                f"{report_text(comparison, tolerance)}\nA is the golden run {path}\nB is this run {self.folder}\n"
+                f"pictures:\n{shown}\nIf this is how it should be: pytest {_UPDATE}"
+            )
 
-    def _renew(self, golden: Path) -> None:
-        from gcd_node.replay.compare import renew_golden
 
-        if renew_golden(self._run, golden):
-            self._config.stash[_RENEWED].append(str(golden))
+def _renew(run: "RunFolder", golden: Path) -> bool:
+    """Make `golden` a copy of the run; whether anything changed. One that already says the same stays untouched, unlike
+    one that is damaged or of an earlier version.
 
-    def _difference(self, golden: Path, min_psnr: float | None, max_class_share: float) -> str | None:
-        """What to say of a run that is too far from its golden; None for one that is near enough."""
-        from gcd_node.replay.compare import Tolerance, compare
-        from gcd_node.replay.diff_report import report_text, write_report
-        from gcd_node.replay.run import open_run
+    Raises:
+        OutputError: `golden` is something else than a run, or cannot be written. DamagedRunError: the run is damaged.
+    """
+    from gcd_node.errors import DamagedRunError, OutputError
+    from gcd_node.replay.compare import compare
+    from gcd_node.replay.run import MANIFEST, new_folder, open_run
 
-        tolerance, expected = Tolerance(min_psnr_db=min_psnr, max_class_share=max_class_share), open_run(golden)
-        comparison = compare(expected, self._run)
-        if not comparison.failures(tolerance):
-            return None
-        folder = self.folder.with_name(f"{self.folder.name}-differences")
-        pictures = write_report(folder, comparison, tolerance, (expected, self._run))
-        shown = "\n".join(f"  {path}" for path in pictures) or f"  {folder}: no pictures, see diff.json"
-        return (
-            f"{report_text(comparison, tolerance)}\nA is the golden run {golden}\nB is this run {self.folder}\n"
-            f"pictures:\n{shown}\nIf this is how it should be: pytest {_UPDATE}"
-        )
+    if golden.is_dir() and any(golden.iterdir()):
+        if not (golden / MANIFEST).is_file():
+            raise OutputError(f"{golden} is there and is no golden run (it has no {MANIFEST}); name another folder")
+        with contextlib.suppress(DamagedRunError):
+            comparison = compare(open_run(golden), run)
+            if comparison.first_divergence is None and not comparison.facts:
+                return False
+        try:
+            shutil.rmtree(golden)
+        except OSError as error:
+            raise OutputError(f"cannot replace {golden}: {error.strerror}; check its permissions") from error
+    with new_folder(golden) as folder:
+        shutil.copytree(run.path, folder, dirs_exist_ok=True)
+    return True
 
 
 class ReplayFixture:
@@ -118,8 +133,7 @@ class ReplayFixture:
         folder = self._folder / f"gcd-run-{self._count}"
         self._count += 1
         with contextlib.chdir(self._config.rootpath):
-            run = replay(load_config(Path(launch), changes), folder)
-        return ReplayedRun(run, self._config)
+            return ReplayedRun(replay(load_config(Path(launch), changes), folder), self._config)
 
 
 @pytest.fixture

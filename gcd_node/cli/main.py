@@ -32,10 +32,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "status": ("watch:status", "Watch how a node does: states, rates, ages, drops, stage times and events."),
     "synthesize": (
-        "synthesize:synthesize",
+        "offline:synthesize",
         "See one clip from another camera, offline: frames, video, class map, depth, and what was seen.",
     ),
-    "export": ("export:export", "Write every network of a checkpoint as an ONNX graph of one size, with a manifest."),
+    "export": ("offline:export", "Write every network of a checkpoint as an ONNX graph of one size, with a manifest."),
     "ctl": ("control:ctl", "Send one request to a running node: `gcd-node ctl set_view view=top azimuth_deg=30`."),
     "bench": ("bench:bench", "Measure a node in a process of its own: latency, throughput, missed frames, cost."),
     "keys": ("control:keys", "CURVE keys, for nodes that are reached over a network."),

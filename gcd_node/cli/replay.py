@@ -1,7 +1,7 @@
 """`gcd-node replay` and `diff`: a recording through the model into a run on disk, and two such runs compared."""
 
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated
 
 import msgspec
 import typer
@@ -13,25 +13,24 @@ from typer import Argument, Option
 from gcd_node.cli.run import Changes, ConfigPath
 from gcd_node.config import load_config
 from gcd_node.inference import WindowReport
-from gcd_node.replay.compare import RunComparison, Tolerance, compare
-from gcd_node.replay.diff_report import REPORT, divergence, tables, to_plain, verdict, write_report
+from gcd_node.replay.compare import REPORT, Tolerance, compare, divergence, tables, to_plain, verdict, write_report
 from gcd_node.replay.lockstep import replay
 from gcd_node.replay.run import RunFolder, open_run
 
-RunOut: TypeAlias = Annotated[Path, Option("--out", metavar="RUN", help="Folder for the run; new, or empty.")]
-RunA: TypeAlias = Annotated[Path, Argument(metavar="RUN_A", help="A run of `gcd-node replay`, such as the golden one.")]
-RunB: TypeAlias = Annotated[Path, Argument(metavar="RUN_B", help="The run to compare with it.")]
-MinPsnr: TypeAlias = Annotated[
+RunOut = Annotated[Path, Option("--out", metavar="RUN", help="Folder for the run; new, or empty.")]
+RunA = Annotated[Path, Argument(metavar="RUN_A", help="A run of `gcd-node replay`, such as the golden one.")]
+RunB = Annotated[Path, Argument(metavar="RUN_B", help="The run to compare with it.")]
+MinPsnr = Annotated[
     float | None,
     Option(metavar="DB", help="What each frame of each view must reach; else all pixels must be identical."),
 ]
-MaxClassShare: TypeAlias = Annotated[
+MaxClassShare = Annotated[
     float, Option(metavar="SHARE", help="Of a view's class pixels in a window, how many may differ, 0 to 1.")
 ]
-DiffOut: TypeAlias = Annotated[
+DiffOut = Annotated[
     Path | None, Option("--out", metavar="DIR", help="Folder for diff.json and pictures of the worst windows.")
 ]
-AsJson: TypeAlias = Annotated[bool, Option("--json", help="Print the whole comparison as one line of JSON.")]
+AsJson = Annotated[bool, Option("--json", help="Print the whole comparison as one line of JSON.")]
 
 
 def replay_launch(config: ConfigPath, out: RunOut, changes: Changes = None) -> None:
@@ -68,23 +67,17 @@ def diff(
     runs = open_run(run_a), open_run(run_b)
     with Console(stderr=True, markup=False).status("comparing"):
         comparison = compare(*runs)
-        pictures = () if out is None else write_report(out, comparison, tolerance, runs)
+        written = () if out is None else (out / REPORT, *write_report(out, comparison, tolerance))
     if as_json:
         typer.echo(msgspec.json.encode(to_plain(comparison, tolerance)).decode())
     else:
-        _print(comparison, tolerance)
-        for path in () if out is None else (out / REPORT, *pictures):
-            Console(markup=False).print(f"wrote {path}", soft_wrap=True, highlight=False)
+        console = Console(markup=False)
+        console.print(*tables(comparison, tolerance), sep="\n")
+        for line in (verdict(comparison, tolerance), divergence(comparison), *(f"wrote {path}" for path in written)):
+            if line is not None:
+                console.print(line, soft_wrap=True, highlight=False)
     if comparison.failures(tolerance):
         raise typer.Exit(1)
-
-
-def _print(comparison: RunComparison, tolerance: Tolerance) -> None:
-    console = Console(markup=False)
-    console.print(*tables(comparison, tolerance), sep="\n")
-    first = divergence(comparison)
-    for line in (verdict(comparison, tolerance), *(() if first is None else (first,))):
-        console.print(line, soft_wrap=True, highlight=False)
 
 
 def _run_table(run: RunFolder) -> Table:

@@ -10,9 +10,7 @@ from gcd_client.subscriber import ReceivedView
 from gcd_model import hatched
 from gcd_node.errors import OutputError
 from gcd_node.frame import Image
-from gcd_node.pictures.array_file import write_npy
-from gcd_node.pictures.comparison import legend
-from gcd_node.pictures.files import video_writer, write_png
+from gcd_node.image_io import legend, video_writer, write_npy, write_png
 
 _LEGEND_WIDTH = 384
 

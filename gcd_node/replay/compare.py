@@ -1,38 +1,37 @@
-"""Two runs, window by window: the same pixels, or how far apart they are; and what the two were made from."""
+"""Two runs, window by window: the same pixels or how far apart, and what the two were made from; in words, as tables,
+as JSON, and in pictures of where they differ most."""
 
 import math
-import shutil
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from rich.table import Table
 
+from gcd_client.images import paint
 from gcd_model import FileError, decode_toml, printable
 from gcd_node.errors import DamagedRunError, OutputError, UsageError
-from gcd_node.pictures.files import make_folder
-from gcd_node.replay.run import (
-    MANIFEST,
-    Manifest,
-    Pixels,
-    RunFolder,
-    WindowPixels,
-    new_folder,
-    open_run,
-    read_windows,
-)
+from gcd_node.frame import Image
+from gcd_node.image_io import enlarged, make_folder, sheet, strip, write_png
+from gcd_node.replay.run import MANIFEST, Manifest, Pixels, RunFolder, WindowPixels, read_windows
 
-MAP_NAMES = {"cls": "class map", "vis": "visibility", "depth": "depth"}
-"""Of each kind of map, for people."""
-ABSENT = "-"
-"""Shown for what one of the runs does not have."""
+REPORT = "diff.json"
+WORST = 4
+"""As many pictures are made."""
 
+_MAP_NAMES = {"cls": "class map", "vis": "visibility", "depth": "depth"}
+_ABSENT = "-"  # shown for what one of the runs does not have
 _TOP = 255.0
 _DEPTH_SLACK = 0.01  # ten times what f16 rounds away, a tenth of what depth networks err
 _SECTIONS = ("strict", "source", "model", "view", "window")  # what a replay uses of a launch file
+_ROWS, _LINES = 40, 10
+_HIGHEST_GAIN = 64
+_PATTERN = "window-*-view-*.png"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -54,6 +53,10 @@ class Tolerance:
         if not 0 <= self.max_class_share <= 1:
             raise UsageError(f"the share of class pixels that may differ lies in 0 to 1, got {self.max_class_share}")
 
+    def __str__(self) -> str:
+        pictures = "identical" if self.min_psnr_db is None else f"within {self.min_psnr_db:g} dB in every frame"
+        return pictures + (f" and {self.max_class_share:.2%} of the class pixels" if self.max_class_share else "")
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Distance:
@@ -70,11 +73,6 @@ class Distance:
     largest: int
     shares: dict[str, float]
     worst_class_frame: int = 0
-
-    @property
-    def worst_share(self) -> float:
-        """Of the map that differs most."""
-        return max(self.shares.values(), default=0.0)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -103,7 +101,19 @@ class ViewComparison:
         if self.facts or distance is None:
             return False
         least_db = math.inf if tolerance.min_psnr_db is None else tolerance.min_psnr_db
-        return distance.worst_psnr_db >= least_db and distance.worst_share <= tolerance.max_class_share
+        share = max(distance.shares.values(), default=0.0)
+        return distance.worst_psnr_db >= least_db and share <= tolerance.max_class_share
+
+    def __str__(self) -> str:
+        if self.identical:
+            return "identical"
+        parts: list[str] = []
+        if self.distance is not None:
+            far, shares = self.distance, self.distance.shares
+            worst = f"frame {far.worst_frame} {far.worst_psnr_db:.2f} dB"
+            parts += [f"{far.psnr_db:.2f} dB, {worst}, up to {far.largest} levels"] if far.largest else []
+            parts += [f"{share:.3%} of the {_MAP_NAMES[kind]}" for kind, share in shares.items() if share]
+        return "; ".join(parts + [f"other {fact}" for fact in self.facts])
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -113,6 +123,9 @@ class Missing:
     window_id: int
     view_id: str
     only_in: str
+
+    def __str__(self) -> str:
+        return f"only in {self.only_in}"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -128,8 +141,8 @@ class Fact:
 class RunComparison:
     """Two runs. facts: what they were made from, as far as it differs. views, missing: by window, then view."""
 
-    a: Path
-    b: Path
+    a: RunFolder
+    b: RunFolder
     facts: tuple[Fact, ...]
     views: tuple[ViewComparison, ...]
     missing: tuple[Missing, ...]
@@ -144,13 +157,6 @@ class RunComparison:
         far = [*(view for view in self.views if not view.within(tolerance)), *self.missing]
         return tuple(sorted(far, key=lambda each: (each.window_id, each.view_id)))
 
-    def worst(self, count: int) -> tuple[ViewComparison, ...]:
-        """Views whose pictures differ, those first that differ most; at most so many."""
-        apart = [(view, view.distance) for view in self.views if view.distance is not None]
-        differing = [(view, d) for view, d in apart if d.largest or d.worst_share]
-        differing.sort(key=lambda each: (each[1].worst_psnr_db, -each[1].worst_share, each[0].window_id))
-        return tuple(view for view, _ in differing[:count])
-
 
 def compare(a: RunFolder, b: RunFolder) -> RunComparison:
     """Compare two runs; every pixel of both is read and checked against its digest.
@@ -162,37 +168,26 @@ def compare(a: RunFolder, b: RunFolder) -> RunComparison:
     views: list[ViewComparison] = []
     missing: list[Missing] = []
     same_size = a.manifest.size == b.manifest.size
-    for in_a, in_b in paired_windows(a, b):
+    for window_id, in_a, in_b in _paired_windows(a, b):
         ids_a, ids_b = ({} if each is None else each.views for each in (in_a, in_b))
-        one = in_a or in_b
-        assert one is not None, "a pair has at least one window"
         for view_id in dict.fromkeys((*ids_a, *ids_b)):
             if in_a is not None and in_b is not None and view_id in ids_a and view_id in ids_b:
                 views.append(_compare_view(view_id, in_a, in_b, same_size=same_size))
             else:
                 only_in = "A" if view_id in ids_a else "B"
-                missing.append(Missing(window_id=one.entry.window_id, view_id=view_id, only_in=only_in))
-    facts = different_facts(a.manifest, b.manifest)
-    return RunComparison(a=a.path, b=b.path, facts=facts, views=tuple(views), missing=tuple(missing))
+                missing.append(Missing(window_id=window_id, view_id=view_id, only_in=only_in))
+    facts = _different_facts(a.manifest, b.manifest)
+    return RunComparison(a=a, b=b, facts=facts, views=tuple(views), missing=tuple(missing))
 
 
-def paired_windows(a: RunFolder, b: RunFolder) -> Iterator[tuple[WindowPixels | None, WindowPixels | None]]:
+def _paired_windows(a: RunFolder, b: RunFolder) -> Iterator[tuple[int, WindowPixels | None, WindowPixels | None]]:
     """The windows of two runs by window_id; None where one has no such window."""
     rest_a, rest_b = read_windows(a), read_windows(b)
-    window_a, window_b = next(rest_a, None), next(rest_b, None)
-    while window_a is not None or window_b is not None:
-        id_a = math.inf if window_a is None else window_a.entry.window_id
-        id_b = math.inf if window_b is None else window_b.entry.window_id
-        yield window_a if id_a <= id_b else None, window_b if id_b <= id_a else None
-        if id_a <= id_b:
-            window_a = next(rest_a, None)
-        if id_b <= id_a:
-            window_b = next(rest_b, None)
-
-
-def psnr_db(squares: float, count: int) -> float:
-    """Peak signal-to-noise ratio of u8 pictures from the sum of squared differences of `count` levels."""
-    return math.inf if squares == 0 else 10 * math.log10(_TOP**2 * count / squares)
+    ids_a, ids_b = ({window.window_id for window in run.manifest.windows} for run in (a, b))
+    for window_id in sorted(ids_a | ids_b):
+        yield window_id, next(rest_a) if window_id in ids_a else None, next(rest_b) if window_id in ids_b else None
+    for rest in (rest_a, rest_b):
+        next(rest, None)  # to look at their ends
 
 
 def _compare_view(view_id: str, a: WindowPixels, b: WindowPixels, *, same_size: bool) -> ViewComparison:
@@ -201,7 +196,7 @@ def _compare_view(view_id: str, a: WindowPixels, b: WindowPixels, *, same_size: 
     facts = [name for name in ("stamps", "seqs", "epoch") if getattr(a.entry, name) != getattr(b.entry, name)]
     facts += ["ood"] if entry_a.ood != entry_b.ood else []
     facts += [] if same_size else ["size"]
-    facts += [name for kind, name in MAP_NAMES.items() if (kind in pixels_a) != (kind in pixels_b)]
+    facts += [name for kind, name in _MAP_NAMES.items() if (kind in pixels_a) != (kind in pixels_b)]
     return ViewComparison(
         window_id=a.entry.window_id,
         view_id=view_id,
@@ -212,19 +207,24 @@ def _compare_view(view_id: str, a: WindowPixels, b: WindowPixels, *, same_size: 
     )
 
 
-def _distance(a: dict[str, Pixels], b: dict[str, Pixels]) -> Distance:
+def _distance(a: Mapping[str, Pixels], b: Mapping[str, Pixels]) -> Distance:
     pairs = list(zip(a["win"], b["win"], strict=True))
     squares = [float(cv2.norm(one, other, cv2.NORM_L2SQR)) for one, other in pairs]
     worst = int(np.argmax(squares))
-    shares = {kind: _shares(kind, a[kind], b[kind]) for kind in MAP_NAMES if kind in a and kind in b}
+    shares = {kind: _shares(kind, a[kind], b[kind]) for kind in _MAP_NAMES if kind in a and kind in b}
     return Distance(
-        psnr_db=psnr_db(sum(squares), a["win"].size),
+        psnr_db=_psnr_db(sum(squares), a["win"].size),
         worst_frame=worst,
-        worst_psnr_db=psnr_db(squares[worst], a["win"][worst].size),
+        worst_psnr_db=_psnr_db(squares[worst], a["win"][worst].size),
         largest=max(int(cv2.absdiff(one, other).max()) for one, other in pairs),
         shares={kind: float(frames.mean()) for kind, frames in shares.items()},
         worst_class_frame=int(np.argmax(shares["cls"])) if "cls" in shares else 0,
     )
+
+
+def _psnr_db(squares: float, count: int) -> float:
+    """Peak signal-to-noise ratio of u8 pictures from the sum of squared differences of `count` levels."""
+    return math.inf if squares == 0 else 10 * math.log10(_TOP**2 * count / squares)
 
 
 def _shares(kind: str, a: Pixels, b: Pixels) -> NDArray[np.float64]:
@@ -236,35 +236,24 @@ def _shares(kind: str, a: Pixels, b: Pixels) -> NDArray[np.float64]:
     return np.maximum(far, (a != b).any(axis=(1, 2)) / one[0].size)
 
 
-# What two runs were made from.
-
-
-def different_facts(a: Manifest, b: Manifest) -> tuple[Fact, ...]:
-    """Everything that differs: settings, weights, recording, versions, machine, size, totals, troubles; in this order.
-
-    Raises:
-        DamagedRunError: the configuration of a manifest is not TOML.
-    """
+def _different_facts(a: Manifest, b: Manifest) -> tuple[Fact, ...]:
+    """What differs: settings, weights, recording, versions, machine, size, totals, troubles; in this order."""
     all_a, all_b = dict(_facts(a)), dict(_facts(b))
-    pairs = ((name, all_a.get(name, ABSENT), all_b.get(name, ABSENT)) for name in all_a | all_b)
+    pairs = ((name, all_a.get(name, _ABSENT), all_b.get(name, _ABSENT)) for name in all_a | all_b)
     return tuple(Fact(name=printable(name), a=printable(a), b=printable(b)) for name, a, b in pairs if a != b)
 
 
 def _facts(manifest: Manifest) -> Iterator[tuple[str, str]]:
-    config = _config(manifest.config)
+    try:
+        config = decode_toml(manifest.config)
+    except FileError as error:
+        raise DamagedRunError(f"the config in {MANIFEST} {error}; replay the recording again") from error
     yield from _flat("config", {key: config[key] for key in _SECTIONS if key in config})
     yield from manifest.made_from.items()
     yield from _flat("size", {**msgspec.to_builtins(manifest.size), "fps": manifest.fps})
     yield from _flat("total", msgspec.to_builtins(manifest.totals))
     for trouble in manifest.troubles:
         yield f"trouble {trouble.code} in window {trouble.window_id}", trouble.detail
-
-
-def _config(text: str) -> Mapping[str, object]:
-    try:
-        return decode_toml(text)
-    except FileError as error:
-        raise DamagedRunError(f"the config in {MANIFEST} {error}; replay the recording again") from error
 
 
 def _flat(group: str, table: Mapping[str, object], place: str = "") -> Iterator[tuple[str, str]]:
@@ -276,34 +265,134 @@ def _flat(group: str, table: Mapping[str, object], place: str = "") -> Iterator[
             yield f"{group} {place}{key}", value if isinstance(value, str) else msgspec.json.encode(value).decode()
 
 
-# Golden runs.
+# In words.
 
 
-def renew_golden(run: RunFolder, golden: Path) -> bool:
-    """Make `golden` a copy of the run; whether anything changed. A golden that already says the same stays untouched.
+def verdict(comparison: RunComparison, tolerance: Tolerance) -> str:
+    """How the comparison ends, in one line."""
+    total = len(comparison.views) + len(comparison.missing)
+    same, far = sum(view.identical for view in comparison.views), len(comparison.failures(tolerance))
+    if same == total:
+        return f"identical: all {total} views"
+    if not far:
+        return f"near enough: {same} of {total} views are identical, the others {tolerance}"
+    return f"DIFFERENT: {far} of {total} views are not {tolerance}"
 
+
+def divergence(comparison: RunComparison) -> str | None:
+    """Where the runs first differ and what that says, in one line; None if they are identical."""
+    first, cause = comparison.first_divergence, ""
+    if first is None:
+        return None
+    if isinstance(first, ViewComparison):
+        cause = "; the model was given the same pictures"
+        if not first.same_input:
+            cause = "; the model was given other pictures already: look at the recording and its decoder"
+        elif not first.same_seed:
+            cause += " and another seed, as any other setting brings one"
+    return f"first divergence: window {first.window_id}, view {first.view_id}: {first}{cause}"
+
+
+def report_text(comparison: RunComparison, tolerance: Tolerance) -> str:
+    """The whole comparison for an assertion or a log: verdict, causes, first divergence, the worst views."""
+    lines = [verdict(comparison, tolerance)]
+    if comparison.facts:
+        lines += ["what A and B were made from differs (A, B):"]
+        lines += [f"  {fact.name}: {fact.a}, {fact.b}" for fact in comparison.facts]
+    first, failures = divergence(comparison), comparison.failures(tolerance)
+    lines += [] if first is None else [first]
+    lines += [f"  window {each.window_id}, view {each.view_id}: {each}" for each in failures[:_LINES]]
+    lines += [f"  and {len(failures) - _LINES} more"] if len(failures) > _LINES else []
+    return "\n".join(lines)
+
+
+def tables(comparison: RunComparison, tolerance: Tolerance) -> list[Table]:
+    """What the runs were made from, if that differs, and every view of every window; of many, those that differ."""
+    facts = Table("differs", "A", "B", title="What the runs were made from", title_style="dim")
+    for fact in comparison.facts:
+        facts.add_row(fact.name, fact.a, fact.b)
+    rows = sorted((*comparison.views, *comparison.missing), key=lambda each: (each.window_id, each.view_id))
+    rows = rows if len(rows) <= _ROWS else list(comparison.failures(Tolerance()))
+    views = Table("window", "view", "difference", title="Views of windows", title_style="dim")
+    failures = comparison.failures(tolerance)
+    for each in rows[:_ROWS]:
+        views.add_row(str(each.window_id), each.view_id, str(each), style="red" if each in failures else None)
+    if len(rows) > _ROWS:
+        views.caption = f"and {len(rows) - _ROWS} more that differ; --json has them all"
+    return [facts, views] if comparison.facts else [views]
+
+
+def to_plain(comparison: RunComparison, tolerance: Tolerance) -> dict[str, Any]:
+    """Everything as plain values for JSON, which has null for the PSNR of identical pictures, infinite here."""
+    first = comparison.first_divergence
+    return {
+        "a": str(comparison.a.path),
+        "b": str(comparison.b.path),
+        "passed": not comparison.failures(tolerance),
+        "identical": first is None,
+        **asdict(tolerance),
+        "facts": [asdict(fact) for fact in comparison.facts],
+        "first_divergence": None if first is None else {"window_id": first.window_id, "view_id": first.view_id},
+        "views": [
+            {**asdict(view), "identical": view.identical, "passed": view.within(tolerance)} for view in comparison.views
+        ],
+        "missing": [asdict(each) for each in comparison.missing],
+    }
+
+
+# In pictures.
+
+
+def write_report(folder: Path, comparison: RunComparison, tolerance: Tolerance) -> tuple[Path, ...]:
+    """Write diff.json and a picture of each of the worst views; gives the paths of the pictures, worst first.
+
+    Pictures of an earlier comparison in the same folder are removed.
     Raises:
-        OutputError: `golden` is something else than a run, or cannot be written. DamagedRunError: see compare().
+        OutputError: `folder` cannot be written. DamagedRunError: see read_windows().
     """
-    if golden.is_dir() and any(golden.iterdir()):
-        if not (golden / MANIFEST).is_file():
-            raise OutputError(f"{golden} is there and is no golden run (it has no {MANIFEST}); name another folder")
-        if _says_the_same(run, golden):
-            return False
-        try:
-            shutil.rmtree(golden)
-        except OSError as error:
-            raise OutputError(f"cannot replace {golden}: {error.strerror}; check its permissions") from error
-    make_folder(golden.parent)
-    with new_folder(golden) as folder:
-        shutil.copytree(run.path, folder, dirs_exist_ok=True)
-    return True
-
-
-def _says_the_same(run: RunFolder, golden: Path) -> bool:
-    """A damaged golden, or one of an earlier version, never does."""
+    make_folder(folder)
     try:
-        comparison = compare(open_run(golden), run)
-    except DamagedRunError:
-        return False
-    return comparison.first_divergence is None and not comparison.facts
+        for old in folder.glob(_PATTERN):
+            old.unlink()
+        (folder / REPORT).write_bytes(msgspec.json.encode(to_plain(comparison, tolerance)) + b"\n")
+    except OSError as error:
+        raise OutputError(f"cannot write to {folder}: {error.strerror}; name another folder") from error
+    views = [(view, view.distance) for view in comparison.views if view.distance is not None]
+    views = [(view, far) for view, far in views if far.largest or any(far.shares.values())]
+    views.sort(key=lambda each: (each[1].worst_psnr_db, -max(each[1].shares.values(), default=0.0), each[0].window_id))
+    worst = {
+        folder / f"window-{view.window_id:06d}-view-{view.view_id}.png": (view, far) for view, far in views[:WORST]
+    }
+    for window_id, a, b in _paired_windows(comparison.a, comparison.b) if worst else ():  # cheaper than to keep all
+        for path, (view, far) in worst.items():
+            if a is not None and b is not None and window_id == view.window_id:
+                pixels = a.views[view.view_id], b.views[view.view_id]
+                write_png(path, _side_by_side(window_id, far, *pixels, comparison))
+    return tuple(worst)
+
+
+def _side_by_side(
+    window_id: int, distance: Distance, a: Mapping[str, Pixels], b: Mapping[str, Pixels], comparison: RunComparison
+) -> Image:
+    """A, B and their difference at the first frame, the one that differs most and the last; class maps below, at the
+    frame where most of their pixels differ.
+
+    Levels of the difference are multiplied by the heading's number; class pixels that differ are white.
+    """
+    chosen = sorted({0, distance.worst_frame, len(a["win"]) - 1})
+    gain = _HIGHEST_GAIN
+    while gain > 1 and gain * distance.largest > _TOP:
+        gain //= 2
+    rows: list[list[Image]] = []
+    for one, other in ((a["win"][i], b["win"][i]) for i in chosen):
+        rows.append([one, other, np.asarray(cv2.convertScaleAbs(cv2.absdiff(one, other), alpha=gain), np.uint8)])
+    head = f"window {window_id}, frames {' '.join(map(str, chosen))}"
+    classes = [run.manifest.classes for run in (comparison.a, comparison.b)]
+    if "cls" in a and "cls" in b:
+        at = distance.worst_class_frame
+        one, other = a["cls"][at], b["cls"][at]
+        differs = np.where(one != other, np.uint8(255), np.uint8(0))
+        rows.append([paint(one, classes[0]), paint(other, classes[1]), np.repeat(differs[..., None], 3, axis=2)])
+        head += f", classes {at}"
+    body = strip([[enlarged(picture) for picture in row] for row in rows])
+    return sheet(body, (f"A: {head}", "B", f"difference x {gain}"), classes[0])

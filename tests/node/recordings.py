@@ -35,8 +35,8 @@ LENS = LensModel(
 class Calibrated(FakeSource):
     """A source that knows its lens, with noise that no coder keeps whole."""
 
-    def __init__(self, count: int = 30) -> None:
-        super().__init__(count, size=(192, 128))
+    def __init__(self, count: int = 30, fps: float = 24.0) -> None:
+        super().__init__(count, fps=fps, size=(192, 128))
         self.info = replace(self.info, lens=LENS)
 
     def frames(self) -> Iterator[Frame]:

@@ -14,7 +14,7 @@ from typer.main import get_command
 from gcd_node import session
 from gcd_node.cli.main import COMMANDS, new_app, run_app
 from gcd_node.config import load_config
-from gcd_node.pictures.files import write_png, write_video
+from gcd_node.image_io import write_png, write_video
 from gcd_node.publisher import Publisher
 from gcd_node.session import open_session
 from gcd_node.sockets import PublisherOptions

@@ -150,13 +150,6 @@ def test_the_virtual_camera_stands_where_the_header_says(run: tuple[list[Said], 
         assert (each.header.frame_id, each.child_frame_id) == (header.src_frame_id, "main_optical")
 
 
-def test_a_scene_without_metres_has_no_transforms(tmp_path: Path) -> None:
-    recorded(recorder_config(tmp_path), FakeSource(14))
-    heard = said(files(tmp_path)[0])
-    assert of(heard, "/view/main/header")
-    assert not of(heard, "/tf")
-
-
 def test_a_recording_says_who_made_it_with_what(tmp_path: Path) -> None:
     source = 'kind = "rtsp"\nurl = "rtsp://robot:hunter2@camera/stream"'
     _, box = recorded(recorder_config(tmp_path, source=source), Calibrated(14))
@@ -187,7 +180,7 @@ def test_a_view_that_was_published_as_jpeg_is_not_coded_again(tmp_path: Path) ->
     assert b"".join(each.value.data for each in of(said(files(tmp_path)[0]), "/view/main/image")) == message.payload
 
 
-def test_only_what_is_wanted_is_recorded(tmp_path: Path) -> None:
+def test_only_what_is_wanted_is_recorded_and_no_transforms_without_metres(tmp_path: Path) -> None:
     for what, wanted, unwanted in (
         ("inputs", "/src/image", "/view/main/image"),
         ("views", "/view/main/image", "/src/image"),
@@ -195,7 +188,7 @@ def test_only_what_is_wanted_is_recorded(tmp_path: Path) -> None:
         recorded(recorder_config(tmp_path / what, record=f'what = ["{what}"]'), FakeSource(14))
         heard = said(files(tmp_path / what)[0])
         assert of(heard, wanted)
-        assert not of(heard, unwanted)
+        assert not of(heard, unwanted) + of(heard, "/tf")
         assert of(heard, "/gcd/event")
 
 
@@ -232,29 +225,22 @@ def test_a_status_is_a_diagnosis_of_every_part() -> None:
 
 @pytest.mark.parametrize("known", ["stated", "source", "lens", "none"])
 def test_camera_info_says_what_is_known_of_the_camera(known: str, tmp_path: Path) -> None:
-    """Found by trying: it was all zero though a field of view was stated."""
-
-    class Wide(Calibrated):
-        def __init__(self) -> None:
-            super().__init__(14)
-            hfov_deg = 90.0 if known == "source" else None
-            self.info = replace(self.info, lens=LENS if known == "lens" else None, hfov_deg=hfov_deg)
-
+    made, hfov_deg = Calibrated(14), None if known in ("lens", "none") else 90.0
+    lens = LENS if known == "lens" else None
+    made.info = replace(made.info, lens=lens, hfov_deg=90.0 if known == "source" else None)
     stated = "hfov_deg = 90.0" if known == "stated" else ""
-    source = f'kind = "synthetic"\npace = "lockstep"\n{stated}'
-    recorded(recorder_config(tmp_path, source=source), Wide())
-    for each in of(said(files(tmp_path)[0]), "/src/camera_info"):
-        k, d = np.reshape(each.value.k, (3, 3)), tuple(each.value.d)
-        assert (each.value.width, each.value.height) == (192, 128)
-        if known == "lens":
-            np.testing.assert_array_equal(k, LENS.matrix)
-            assert (each.value.distortion_model, d) == ("plumb_bob", LENS.coefficients)
-        elif known == "none":
-            assert not k.any()
-        else:
-            np.testing.assert_allclose(k, [[96, 0, 95.5], [0, 96, 63.5], [0, 0, 1]])
-            np.testing.assert_allclose(np.reshape(each.value.p, (3, 4))[:, :3], k)
-    lens, hfov_deg = {"lens": (LENS, None), "none": (None, None)}.get(known, (None, 90.0))
+    recorded(recorder_config(tmp_path, source=f'kind = "synthetic"\npace = "lockstep"\n{stated}'), made)
+    each = of(said(files(tmp_path)[0]), "/src/camera_info")[0].value
+    k = np.reshape(each.k, (3, 3))
+    assert (each.width, each.height) == (192, 128)
+    if known == "lens":
+        assert (each.distortion_model, tuple(each.d)) == ("plumb_bob", LENS.coefficients)
+        np.testing.assert_array_equal(k, LENS.matrix)
+    elif known == "none":
+        assert not k.any()
+    else:
+        np.testing.assert_allclose(k, [[96, 0, 95.5], [0, 96, 63.5], [0, 0, 1]])
+        np.testing.assert_allclose(np.reshape(each.p, (3, 4))[:, :3], k)
     info = replayed(files(tmp_path)[0])[0].info
     assert (info.lens, info.hfov_deg, info.stamp_uncertainty_us) == (lens, hfov_deg, 500)
 

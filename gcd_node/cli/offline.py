@@ -1,0 +1,306 @@
+"""`gcd-node synthesize` and `export`: one clip seen from another camera, and a checkpoint as ONNX graphs."""
+
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Literal
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+from typer import Argument, Option
+
+from gcd_model import (
+    Augmentation,
+    EngineName,
+    ExportPrecision,
+    Manifest,
+    Quality,
+    RenderOptions,
+    SolverName,
+    Trajectory,
+    ViewSynthesizer,
+    export_weights,
+    load_synthesizer,
+    visibility_of,
+)
+from gcd_node.cli.weights import FamilyOption, HeadWidth, ImageHeads
+from gcd_node.errors import SourceError, UsageError
+from gcd_node.image_io import write_npz
+from gcd_node.messages import ontology
+from gcd_node.offline import ClipRequest, plan, read_clip, read_noise, write_view
+from gcd_node.preprocess import require_usable
+from gcd_node.source_config import SourcePose
+
+_view = partial(Option, rich_help_panel="The view")
+_clip = partial(Option, rich_help_panel="The clip")
+_sampling = partial(Option, rich_help_panel="Sampling")
+_model = partial(Option, rich_help_panel="The model")
+_mount = partial(Option, rich_help_panel="The camera's mount; what is left out is as the model was trained")
+_depth = partial(Option, rich_help_panel="Depth from elsewhere, for the live model; for others it tells what was seen")
+_narrow = partial(Option, rich_help_panel="Narrower numbers")
+
+Input = Annotated[
+    Path,
+    Argument(metavar="INPUT", help="A video, a folder of pictures, a still, or .npy: float32 [T, H, W, 3] in 0..1."),
+]
+AnyWeights = Annotated[
+    str, Option(help="A checkpoint, a diffusers folder, an export, package:NAME, or random:FAMILY (noise).")
+]
+Out = Annotated[Path, Option(help="Folder for frames, video and pictures.")]
+
+Azimuth = Annotated[float | None, _view(help="Destination minus source, to the camera's right.")]
+Elevation = Annotated[float | None, _view(help="Destination minus source, up.")]
+Radius = Annotated[float | None, _view(help="Destination minus source, away.")]
+Poses = Annotated[Path | None, _view(help="The whole path instead: .npy of [T, 4, 4], source-from-target.")]
+PathKind = Annotated[str | None, _view(help="gradual or direct; else as the checkpoint was trained.")]
+MoveTime = Annotated[int | None, _view(help="Frame in which the goal is reached.")]
+SourceElevation = Annotated[
+    float | None, _view(help="Where an orbit's source camera stands, above its centre. Else 5.")
+]
+SourceRadius = Annotated[float | None, _view(help="Its distance to the scene's centre. Else 15.")]
+
+MountHeight = Annotated[float | None, _mount(help="Camera above the ground, metres, for the live model.")]
+MountForward = Annotated[float | None, _mount(help="Camera ahead of the vehicle's origin, metres.")]
+MountLeft = Annotated[float | None, _mount(help="And to its left, metres.")]
+MountTilt = Annotated[float | None, _mount(help="How far the camera looks down, degrees.")]
+FieldOfView = Annotated[float | None, _mount(help="Horizontal field of view of the input, degrees.")]
+
+Depth = Annotated[
+    Path | None,
+    _depth(help="A folder of 16-bit PNG in mm, .npy of [T, H, W] metres, a network as .onnx, or a pair's right video."),
+]
+DepthKind = Annotated[
+    Literal["metric", "inverse"],
+    _depth(help="What a network gives: metres, or relative inverse depth (state the mount)."),
+]
+Calibration = Annotated[Path | None, _depth(help="Of the stereo pair: JSON as DepthAI writes it.")]
+Rectified = Annotated[bool, _depth("--rectified", help="The device has rectified the pair.")]
+UnitM = Annotated[float, _depth(help="Metres in one unit of a radius, for models whose radius is none in metres.")]
+
+Start = Annotated[int, _clip(help="First frame of the input.")]
+Stride = Annotated[int, _clip(help="Take every so-many-th frame.")]
+Fps = Annotated[float | None, _clip(help="Frame rate the network is told; else the clip's own.")]
+Height = Annotated[int | None, _clip(help="Instead of the trained height.")]
+Width = Annotated[int | None, _clip(help="Instead of the trained width.")]
+
+QualityChoice = Annotated[
+    Quality, _sampling(help="As the model was made for, or in fewer steps where it takes many; other options win.")
+]
+Steps = Annotated[int | None, _sampling(help="Denoising steps.")]
+Solver = Annotated[SolverName | None, _sampling(help="Euler steps as published, or of second order.")]
+Guidance = Annotated[
+    tuple[float, float] | None, _sampling(metavar="FIRST LAST", help="Scale of the first and the last frame.")
+]
+GuidanceInterval = Annotated[
+    tuple[float, float] | None,
+    _sampling(metavar="LOW HIGH", help="Noise levels at which guidance applies; by default all."),
+]
+Seed = Annotated[int, _sampling(help="Of all random draws.")]
+Samples = Annotated[int, _sampling(help="Draws of the view; with several, a picture shows where they differ.")]
+MotionBucket = Annotated[float | None, _sampling(help="The motion number; else by the formula.")]
+CondAug = Annotated[float | None, _sampling(help="Strength of the noise on the conditioning frames; else the model's.")]
+Noise = Annotated[Path | None, _sampling(help=".npz with `initial` and `augmentation` instead of draws.")]
+Save = Annotated[Path | None, _sampling(help=".npz to write `latents` and `frames` to.")]
+
+AdapterFile = Annotated[Path | None, _model("--adapter", help="Low-rank adapter trained on these weights.")]
+Device = Annotated[str, _model(help="auto, cpu, cuda, cuda:1, ...")]
+EngineChoice = Annotated[
+    EngineName | None, _model("--engine", help="What computes: cuda for a GPU, onnxruntime for an export.")
+]
+Provider = Annotated[
+    list[str] | None, _model(help="Execution provider of onnxruntime, by its own name; several, best first.")
+]
+Dtype = Annotated[str | None, _model(help="float32, bfloat16 or float16.")]
+
+
+def synthesize(
+    input_path: Input,
+    weights: AnyWeights,
+    out: Out,
+    azimuth_deg: Azimuth = None,
+    elevation_deg: Elevation = None,
+    radius: Radius = None,
+    poses: Poses = None,
+    trajectory: PathKind = None,
+    move_time: MoveTime = None,
+    source_elevation_deg: SourceElevation = None,
+    source_radius: SourceRadius = None,
+    mount_height: MountHeight = None,
+    mount_forward: MountForward = None,
+    mount_left: MountLeft = None,
+    mount_tilt: MountTilt = None,
+    hfov_deg: FieldOfView = None,
+    depth: Depth = None,
+    calibration: Calibration = None,
+    rectified: Rectified = False,
+    depth_kind: DepthKind = "metric",
+    unit_m: UnitM = 1.0,
+    start: Start = 0,
+    stride: Stride = 1,
+    fps: Fps = None,
+    height: Height = None,
+    width: Width = None,
+    quality: QualityChoice = "exact",
+    steps: Steps = None,
+    solver: Solver = None,
+    guidance: Guidance = None,
+    guidance_interval: GuidanceInterval = None,
+    seed: Seed = 0,
+    samples: Samples = 1,
+    motion_bucket: MotionBucket = None,
+    cond_aug: CondAug = None,
+    noise: Noise = None,
+    save: Save = None,
+    family: FamilyOption = None,
+    device: Device = "auto",
+    engine: EngineChoice = None,
+    provider: Provider = None,
+    dtype: Dtype = None,
+    head_width: HeadWidth = None,
+    image_heads: ImageHeads = None,
+    adapter: AdapterFile = None,
+) -> None:
+    """See one clip from another camera, offline: frames, video, class map, depth, and what was seen."""
+    clip = ClipRequest(start=start, stride=stride, fps=fps, height=height, width=width, unit_m=unit_m, depth=depth)
+    clip = replace(clip, hfov_deg=hfov_deg, calibration=calibration, rectified=rectified, depth_kind=depth_kind)
+    pose = _pose(source_elevation_deg, source_radius, (mount_height, mount_forward, mount_left, mount_tilt))
+    path = partial(plan, poses=poses, trajectory=trajectory, move_time=move_time, source=pose)
+    path = partial(path, change=(azimuth_deg, elevation_deg, radius))
+    first, second = (None, None) if noise is None else read_noise(noise)
+    options = RenderOptions(steps=steps, solver=solver, guidance=guidance, quality=quality, samples=samples, seed=seed)
+    options = replace(options, guidance_interval=guidance_interval, motion_bucket=motion_bucket, initial_noise=first)
+    augmentation = Augmentation(strength=cond_aug, seed=seed, noise=second)
+    load = partial(load_synthesizer, weights, adapter=adapter, family=family, device=device, dtype=dtype, engine=engine)
+    load = partial(load, head_width=head_width, image_heads=image_heads, providers=provider or ())
+    _run(input_path, out, save, clip, pose, load, path, options, augmentation)
+
+
+def _pose(elevation_deg: float | None, radius: float | None, mount: tuple[float | None, ...]) -> SourcePose | None:
+    """mount: height, forward and left in metres, tilt in degrees."""
+    if all(number is None for number in (elevation_deg, radius, *mount)):
+        return None
+    height_m, forward_m, left_m, tilt_deg = mount
+    sphere = {"elevation_deg": elevation_deg, "radius": radius}
+    try:
+        return SourcePose(**sphere, height_m=height_m, forward_m=forward_m, left_m=left_m, tilt_deg=tilt_deg)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+
+
+def _run(
+    input_path: Path,
+    out: Path,
+    save: Path | None,
+    clip: ClipRequest,
+    pose: SourcePose | None,
+    load: Callable[[], ViewSynthesizer],
+    path: Callable[..., Trajectory],
+    options: RenderOptions,
+    augmentation: Augmentation,
+) -> None:
+    if save is not None and options.samples != 1:
+        raise UsageError("--save holds one sample; leave out --samples")
+    if not input_path.exists():
+        raise SourceError(f"{input_path} does not exist; give a video, a folder of pictures, a still or a .npy file")
+    with Console(stderr=True, markup=False).status("loading the weights"):
+        model = load()
+    traits = model.traits
+    require_usable(pose, traits)
+    source = read_clip(input_path, clip, traits, pose)
+    trajectory = path(traits, mount=source.clip.mount)
+    with _progress("encoding") as advance:
+        features = model.encode(source.clip, augmentation)
+        progress = partial(advance, "denoising")
+        view = model.render(features, [trajectory], replace(options, progress=progress))[0]
+    if view.visibility is None and source.clip.depth is not None:
+        view = replace(view, visibility=visibility_of(source.clip, trajectory))
+    console = Console(markup=False)
+    if not traits.trained:
+        console.print(f"{traits.name}: these weights are random, so the picture is noise.")
+    written = write_view(out, source, view, ontology(traits))
+    if save is not None:
+        frames = view.video.permute(0, 2, 3, 1).contiguous()
+        write_npz(save, {"latents": view.latents[0].numpy(), "frames": frames.numpy()})
+        written.append(save)
+    for each in written:
+        console.print(f"wrote {each}", soft_wrap=True)
+
+
+@contextmanager
+def _progress(first: str) -> Generator[Callable[[str, int, int], None]]:
+    """A bar on a terminal. Gives what moves it: what is being done, how much of it is done, and how much there is."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
+    console = Console(stderr=True, markup=False)
+    with Progress(
+        *columns, TimeElapsedColumn(), console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
+        task = bar.add_task(first, total=None)
+        yield lambda what, done, total: bar.update(task, description=what, completed=done, total=total)
+
+
+# Export.
+
+OnnxFolder = Annotated[
+    Path, Option("--onnx", metavar="DIR", help="Folder to write; it appears whole or not at all.", show_default=False)
+]
+Checkpoint = Annotated[
+    str, Option(help="A checkpoint, a diffusers folder, package:NAME, or random:FAMILY (noise).", show_default=False)
+]
+Half = Annotated[bool, _narrow("--fp16", help="Half precision, for GPUs; decoder and plane mix stay float32.")]
+EightBits = Annotated[bool, _narrow("--int8", help="Weights of eight bits, computed in float32; as above.")]
+GraphHeight = Annotated[int | None, Option(help="Instead of the trained height; the graphs take no other.")]
+GraphWidth = Annotated[int | None, Option(help="Instead of the trained width; the graphs take no other.")]
+Adapter = Annotated[Path | None, Option("--adapter", help="Low-rank adapter trained on these weights.")]
+Overwrite = Annotated[bool, Option("--overwrite", help="Replace the export that is there.")]
+
+
+def export(
+    onnx: OnnxFolder,
+    weights: Checkpoint,
+    fp16: Half = False,
+    int8: EightBits = False,
+    height: GraphHeight = None,
+    width: GraphWidth = None,
+    family: FamilyOption = None,
+    head_width: HeadWidth = None,
+    image_heads: ImageHeads = None,
+    adapter: Adapter = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write every network of a checkpoint as an ONNX graph of one size, with a manifest.
+
+    `gcd-node synthesize --weights DIR` and `[model] weights` take the folder. Needs the extra `onnx`.
+    """
+    if fp16 and int8:
+        raise UsageError("--fp16 and --int8 exclude each other; leave one out")
+    precision: ExportPrecision = "float16" if fp16 else "int8" if int8 else "float32"
+    with _progress("loading") as advance:
+        manifest = export_weights(
+            weights,
+            onnx,
+            precision=precision,
+            height=height,
+            width=width,
+            family=family,
+            head_width=head_width,
+            image_heads=image_heads,
+            adapter=adapter,
+            overwrite=overwrite,
+            progress=advance,
+        )
+    console = Console(markup=False)
+    console.print(_table(manifest))
+    console.print(f"wrote {onnx}", soft_wrap=True)
+
+
+def _table(manifest: Manifest) -> Table:
+    table = Table(title=f"{manifest.card['gcd.name']}, {manifest.precision}, digest {manifest.sha256_12}")
+    for column in ("graph", "precision", "takes", "MB"):
+        table.add_column(column, justify="right" if column == "MB" else "left")
+    for name, graph in manifest.graphs.items():
+        takes = ", ".join(f"{each.name} {'x'.join(map(str, each.shape))}" for each in graph.inputs)
+        table.add_row(name, graph.precision, takes, f"{sum(file.size for file in graph.files) / 1e6:,.1f}")
+    return table

@@ -1,0 +1,209 @@
+"""Pictures, videos and arrays to files and back, and pictures side by side. Images are u8 RGB [H, W, 3]."""
+
+import math
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gcd_client.protocol import ClassRecord
+from gcd_node.errors import OutputError, SourceError
+from gcd_node.frame import Image
+
+_ANIMATION_QUALITY = 60  # WebP's scale of 100
+_MOST_BYTES = 2**30  # of all arrays in a file, unfolded
+_COLUMN_WIDTH = 320  # pixels; smaller pictures are enlarged by a whole factor to at least this
+_FONT, _SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.45
+_LINE, _SWATCH, _GAP, _RULE = 22, 14, 6, 4
+_INK, _PAPER = (30, 30, 30), 255
+
+
+def to_u8(video: NDArray[np.float32] | NDArray[np.uint8]) -> Image:
+    """[T, 3, H, W] in [0, 1], or in levels already -> u8 [T, H, W, 3], rounded to the nearest level."""
+    if video.dtype == np.uint8:
+        return np.ascontiguousarray(video.transpose(0, 2, 3, 1), np.uint8)
+    frames, _, height, width = video.shape
+    pixels = np.empty((frames, height, width, 3), np.uint8)
+    for picture, frame in zip(pixels, np.ascontiguousarray(video), strict=True):
+        rows = frame.reshape(-1, width)  # of all three planes; what is out of range becomes 0 or 255
+        levels = cv2.addWeighted(rows, 255.0, rows, 0.0, 0.0, dtype=cv2.CV_8U).reshape(3, height, width)
+        cv2.merge(list(levels), picture)
+    return pixels
+
+
+# Files.
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder and those above it. Raises OutputError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot create {folder}: {error.strerror}; name another folder") from error
+
+
+def write_png(path: Path, image: Image) -> None:
+    """Write one picture. Raises OutputError."""
+    make_folder(path.parent)
+    _require_written(path, cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)))
+
+
+def video_writer(path: Path, width: int, height: int, fps: float) -> cv2.VideoWriter:
+    """An open video: .mp4 is small and lossy, .mkv is lossless (FFV1). It takes BGR. Raises OutputError."""
+    make_folder(path.parent)
+    code = cv2.VideoWriter.fourcc(*("FFV1" if path.suffix == ".mkv" else "mp4v"))
+    writer = cv2.VideoWriter(str(path), code, max(fps, 1.0), (width, height))
+    _require_written(path, writer.isOpened())
+    return writer
+
+
+def write_video(path: Path, frames: Sequence[Image], fps: float) -> None:
+    """Write a whole video, see video_writer(). Raises OutputError."""
+    writer = video_writer(path, frames[0].shape[1], frames[0].shape[0], fps)
+    for frame in frames:
+        writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+    writer.release()
+
+
+def write_animation(path: Path, frames: Sequence[Image], fps: float, width: int) -> None:
+    """Write a moving picture that plays for ever where pictures are shown (.webp): lossy, and scaled to `width`. Raises
+    OutputError."""
+    make_folder(path.parent)
+    size = (width, round(frames[0].shape[0] * width / frames[0].shape[1]))
+    animation = cv2.Animation()
+    animation.frames = [
+        cv2.cvtColor(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2BGR) for frame in frames
+    ]
+    animation.durations = [round(1000 / max(fps, 1.0))] * len(frames)
+    quality = [cv2.IMWRITE_WEBP_QUALITY, _ANIMATION_QUALITY]
+    _require_written(path, cv2.imwriteanimation(str(path), animation, quality))
+
+
+def _require_written(path: Path, done: bool) -> None:
+    if not done:
+        raise OutputError(f"cannot write {path}; is there space, and may this user write there?")
+
+
+def read_npy(path: Path, wanted: str) -> NDArray[Any]:
+    """The array of a .npy file, never a pickle. wanted: what it should hold, for the message. Raises SourceError."""
+    loaded = _loaded(path, wanted)
+    if isinstance(loaded, dict):
+        raise SourceError(f"{path} is an archive of arrays; give {wanted}")
+    return loaded
+
+
+def read_npz(path: Path, wanted: str) -> dict[str, NDArray[Any]]:
+    """All arrays of an .npz file by name, never a pickle. Raises SourceError."""
+    loaded = _loaded(path, wanted)
+    if not isinstance(loaded, dict):
+        raise SourceError(f"{path} is a single array; give {wanted}")
+    return loaded
+
+
+def _loaded(path: Path, wanted: str) -> NDArray[Any] | dict[str, NDArray[Any]]:
+    try:
+        if path.exists() and not path.is_file():
+            raise ValueError("it is no regular file")
+        size = path.stat().st_size
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                size = sum(entry.file_size for entry in archive.infolist())
+        if size > _MOST_BYTES:
+            raise ValueError(f"it holds more than {_MOST_BYTES} bytes")
+        loaded = np.load(path, allow_pickle=False)
+        if isinstance(loaded, np.ndarray):
+            return loaded
+        with loaded:
+            return dict(loaded)
+    except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error).split("\n")[0]
+        raise SourceError(f"cannot read {path}: {reason or type(error).__name__}; give {wanted}") from error
+
+
+def write_npy(path: Path, array: NDArray[Any]) -> None:
+    """Write one array; the file appears whole or not at all. Raises OutputError."""
+    _write_whole(path, lambda file: np.save(file, array, allow_pickle=False))
+
+
+def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays by name; the file appears whole or not at all. Raises OutputError."""
+    _write_whole(path, lambda file: np.savez(file, allow_pickle=False, **arrays))
+
+
+def _write_whole(path: Path, save: Callable[[BinaryIO], None]) -> None:
+    part = path.with_name(path.name + ".part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with part.open("wb") as file:
+            save(file)
+        part.replace(path)
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}; name another file or folder") from error
+
+
+# Side by side.
+
+
+def side_by_side(*columns: Image) -> Image:
+    """Pictures of one height next to each other, a thin white line between."""
+    line = np.full((columns[0].shape[0], _RULE, 3), _PAPER, np.uint8)
+    return np.concatenate([part for column in columns for part in (line, column)][1:], axis=1)
+
+
+def strip(rows: Sequence[Sequence[Image]]) -> Image:
+    """Rows of pictures under each other, a thin white line between; every row has as many."""
+    joined = [side_by_side(*row) for row in rows]
+    line = np.full((_RULE, joined[0].shape[1], 3), _PAPER, np.uint8)
+    return np.concatenate([part for row in joined for part in (line, row)][1:], axis=0)
+
+
+def spread(count: int, most: int) -> list[int]:
+    """Up to `most` indices from 0 to count-1, first and last included, evenly spread."""
+    most = min(most, count)
+    return [math.floor(i * (count - 1) / max(most - 1, 1) + 0.5) for i in range(most)]
+
+
+def enlarged(image: Image, *, smooth: bool = False) -> Image:
+    """A picture whose columns can be told apart on a screen. smooth: a photograph; else there are no new levels."""
+    factor = max(1, -(-_COLUMN_WIDTH // image.shape[1]))
+    if smooth:
+        size = (factor * image.shape[1], factor * image.shape[0])
+        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), np.uint8)
+    return np.repeat(np.repeat(image, factor, axis=0), factor, axis=1)
+
+
+def sheet(body: Image, headings: Sequence[str], classes: Sequence[ClassRecord]) -> Image:
+    """A heading above each of as many equal columns, and below what the colours of class maps mean."""
+    width = body.shape[1]
+    line = np.full((_LINE, width, 3), _PAPER, np.uint8)
+    for index, heading in enumerate(headings):
+        _write(line, heading, _GAP + index * width // len(headings), 0)
+    return np.concatenate([line, body, *([legend(classes, width)] if classes else [])])
+
+
+def legend(classes: Sequence[ClassRecord], width: int) -> Image:
+    """Each class's colour and name, in as many lines of `width` pixels as it takes: [lines * 22, width, 3]."""
+    places: list[tuple[int, int]] = []
+    names = [each.name.replace("_", " ") for each in classes]
+    line, left = 0, _GAP
+    for name in names:
+        needed = cv2.getTextSize(name, _FONT, _SCALE, 1)[0][0] + _SWATCH + 3 * _GAP
+        if left > _GAP and left + needed > width:
+            line, left = line + 1, _GAP
+        places.append((line, left))
+        left += needed
+    picture = np.full(((line + 1) * _LINE, width, 3), _PAPER, np.uint8)
+    for each, name, (line, left) in zip(classes, names, places, strict=True):
+        top = line * _LINE + (_LINE - _SWATCH) // 2
+        picture[top : top + _SWATCH, left : left + _SWATCH] = each.colour
+        _write(picture, name, left + _SWATCH + _GAP, line)
+    return picture
+
+
+def _write(picture: Image, text: str, left: int, line: int) -> None:
+    baseline = (left, line * _LINE + _LINE - 7)
+    cv2.putText(picture, text, baseline, _FONT, _SCALE, _INK, 1, cv2.LINE_AA)

@@ -1,0 +1,124 @@
+"""Pictures and videos that are written, and the demo's picture: every column in its place, colours explained."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from wire_messages import CLASSES, numbers
+
+from gcd_client.images import paint
+from gcd_model import hatched
+from gcd_node.demo import Moment, comparison, moments
+from gcd_node.errors import NodeError, OutputError
+from gcd_node.frame import Image
+from gcd_node.image_io import legend, spread, to_u8, write_animation, write_png, write_video
+
+HEIGHT, WIDTH = 24, 36
+SEEN = np.full((HEIGHT, WIDTH), 2, np.uint8)
+
+
+def flat(level: int) -> Image:
+    return np.full((HEIGHT, WIDTH, 3), level, np.uint8)
+
+
+def gradient(red: int = 200) -> Image:
+    image = np.zeros((16, 24, 3), np.uint8)
+    image[..., 0], image[..., 2] = red, np.arange(24) * 10
+    return image
+
+
+def test_to_u8_takes_levels_as_they_are_without_a_copy_if_they_lie_as_they_are_sent() -> None:
+    levels = np.random.default_rng(0).integers(0, 256, (2, 4, 5, 3), np.uint8)
+    assert np.shares_memory(to_u8(levels.transpose(0, 3, 1, 2)), levels)
+    assert (to_u8(np.ascontiguousarray(levels.transpose(0, 3, 1, 2))) == levels).all()
+
+
+def test_to_u8_rounds_to_the_nearest_level_and_keeps_the_order_of_axes() -> None:
+    video = np.zeros((2, 3, 4, 5), np.float32)
+    video[1, 0, 2, 3], video[1, 1, 2, 3] = 100.6 / 255, 1.1
+    pixels = to_u8(video)
+    assert pixels.shape == (2, 4, 5, 3)
+    assert pixels[1, 2, 3].tolist() == [101, 255, 0]
+
+
+def test_png_and_mkv_are_lossless(tmp_path: Path) -> None:
+    frames = [gradient(red) for red in (10, 90, 250)]
+    write_png(tmp_path / "a" / "b.png", frames[0])
+    assert np.array_equal(cv2.imread(str(tmp_path / "a" / "b.png"))[..., ::-1], frames[0])
+    write_video(tmp_path / "v.mkv", frames, 10.0)
+    capture = cv2.VideoCapture(str(tmp_path / "v.mkv"))
+    assert all(np.array_equal(capture.read()[1][..., ::-1], frame) for frame in frames)
+
+
+def test_what_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(OutputError):
+        write_png(tmp_path / "file" / "x.png", gradient())
+
+
+def test_a_moving_picture_plays_every_frame_at_its_rate_and_for_ever(tmp_path: Path) -> None:
+    frames = [np.full((48, 80, 3), (level, 255 - level, 0), np.uint8) for level in (0, 120, 240)]
+    write_animation(tmp_path / "new" / "a.webp", frames, 10.0, 40)
+    read, animation = cv2.imreadanimation(str(tmp_path / "new" / "a.webp"))
+    assert read
+    assert (list(animation.durations), animation.loop_count) == ([100, 100, 100], 0)
+    for frame, shown in zip(frames, animation.frames, strict=True):
+        assert shown.shape[:2] == (24, 40)
+        assert np.abs(shown[..., 2::-1].astype(int) - frame[::2, ::2]).max() < 12
+
+
+@pytest.mark.parametrize(
+    ("count", "most", "indices"), [(14, 7, [0, 2, 4, 7, 9, 11, 13]), (3, 7, [0, 1, 2]), (1, 7, [0])]
+)
+def test_spread_takes_first_and_last(count: int, most: int, indices: list[int]) -> None:
+    assert spread(count, most) == indices
+
+
+@pytest.mark.parametrize(("width", "lines"), [(80, 3), (150, 2), (1000, 1)])
+def test_a_legend_takes_as_many_lines_as_it_needs_and_drops_no_class(width: int, lines: int) -> None:
+    picture = legend(CLASSES, width)
+    assert picture.shape == (22 * lines, width, 3)
+    for each in CLASSES:
+        assert (picture == each.colour).all(axis=-1).sum() >= 14 * 14  # its whole swatch
+
+
+def test_hatching_touches_painted_pixels_alone_and_leaves_most_of_them() -> None:
+    pictures = np.random.default_rng(0).integers(0, 256, (2, HEIGHT, WIDTH, 3), np.uint8)
+    seen = np.random.default_rng(1).integers(0, 3, (2, HEIGHT, WIDTH), np.uint8)
+    changed = (hatched(pictures, seen) != pictures).any(axis=-1)
+    assert not changed[seen > 0].any()
+    assert 0.2 < changed[seen == 0].mean() < 0.5
+
+
+# The demo's.
+
+
+def test_the_four_pictures_stand_side_by_side_under_headings_and_over_a_legend() -> None:
+    painted = paint(numbers(1, 1, HEIGHT, WIDTH)[0], CLASSES)
+    moment: Moment = (flat(50), flat(120), flat(90), painted)
+    picture = comparison([moment, moment], CLASSES)
+    factor = 9  # the smallest whole one that makes 320 pixels of 36
+    high, wide, line = factor * HEIGHT, factor * WIDTH, 22
+    whole = 4 * wide + 12
+    assert picture.shape == (line + 2 * high + 4 + len(legend(CLASSES, whole)), whole, 3)
+    for top in (line, line + high + 4):
+        row = picture[top : top + high]
+        for column, level in enumerate((50, 120, 90)):
+            assert (row[:, column * (wide + 4) : column * (wide + 4) + wide] == level).all()
+        assert np.array_equal(row[::factor, 3 * (wide + 4) :: factor], painted)
+    assert (picture[:line] < 100).any()  # something is written there
+
+
+def test_frames_of_whole_windows_are_put_together_in_order_and_the_unseen_hatched() -> None:
+    pictures = {window: [flat(10 * window + i) for i in range(2)] for window in (5, 2, 7)}
+    seen = {2: [SEEN, 0 * SEEN], 5: [SEEN, SEEN], 7: [SEEN]}  # of 7 not all has arrived
+    shown = moments(pictures, pictures, seen, pictures)
+    assert [int(view[0, 0, 0]) for window in shown for _, view, _, _ in window] == [20, 21, 50, 51]
+    assert np.array_equal(shown[0][0][2], flat(20))
+    assert np.array_equal(shown[0][1][2], hatched(flat(21), 0 * SEEN))
+
+
+def test_a_demo_in_which_nothing_arrived_says_so() -> None:
+    with pytest.raises(NodeError):
+        moments({}, {}, {}, {})
