@@ -24,7 +24,7 @@ from gcd_node.config import ControlConfig, NodeConfig, ViewerConfig
 from gcd_node.config_text import to_toml
 from gcd_node.errors import NodeError, UsageError
 from gcd_node.source_config import LIVE_KINDS, FileSource, FolderSource, McapSource, SyntheticSource
-from gcd_node.sources.pace import Pace
+from gcd_node.sources.files import Pace
 
 RATES_HZ = (5.0, 10.0, 15.0)
 """Input rates at which latency is measured."""

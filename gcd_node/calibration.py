@@ -1,6 +1,7 @@
 """What is known of a lens, and where it comes from: ROS camera_info files, CameraInfo messages, a camera's memory."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -233,9 +234,37 @@ def _parse_yaml(text: str | bytes, name: str) -> object:
         raise ConfigError(f"{name} is not valid YAML: {reason}; give a ROS camera_info YAML file") from error
 
 
-_COEFFICIENTS: dict[int, tuple[Distortion, int]] = {0: ("rational_polynomial", 14), 1: ("equidistant", 4)}
+_DEPTHAI_MODELS = {"Perspective": 14, "Fisheye": 4}  # and how many coefficients they have
+_CAMERA_TYPES = {0: "Perspective", 1: "Fisheye"}
+_RATIONAL = 8  # coefficients without prism and tilt
 _MOST_JOINTS = 16  # between two cameras of a board
 _ROTATION_TOLERANCE = 1e-3
+
+
+def depthai_lens(
+    matrix: Sequence[Sequence[float]], coefficients: Sequence[float], model: str, size: tuple[int, int]
+) -> LensModel:
+    """A lens as DepthAI describes it.
+
+    Args:
+        matrix: 3 x 3 intrinsics, pixels of pictures of `size`, width and height.
+        coefficients: of OpenCV's rational model with prism and tilt, or of its fish-eye model; zeros may be left out.
+        model: DepthAI's name of it.
+    Raises:
+        ConfigError: another model, or numbers that no camera has.
+    """
+    if model not in _DEPTHAI_MODELS or len(matrix) != 3:
+        raise ConfigError(f"a lens of model {model} with {len(matrix)} rows of intrinsics is not known here")
+    count = _DEPTHAI_MODELS[model]
+    full = (*coefficients, *[0.0] * count)[:count]
+    distortion: Distortion = "equidistant"
+    if model == "Perspective":
+        distortion = "rational_polynomial" if any(full) else "none"
+        full = full if any(full[_RATIONAL:]) else full[:_RATIONAL] if any(full) else ()
+    (fx, _, cx), (_, fy, cy), _ = matrix
+    return LensModel(
+        width=size[0], height=size[1], fx=fx, fy=fy, cx=cx, cy=cy, distortion=distortion, coefficients=full
+    )
 
 
 def read_depthai(path: Path) -> "DepthaiBoard":
@@ -299,25 +328,11 @@ class DepthaiBoard(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
     def lens(self, socket: int) -> LensModel:
         """Raises ConfigError: no such camera, or it was never calibrated."""
         camera = self._camera(socket)
-        if camera.camera_type not in _COEFFICIENTS:
-            raise ConfigError(f"the camera at socket {socket} has a lens of type {camera.camera_type}; known are 0, 1")
-        if len(camera.intrinsic_matrix) != 3:
-            raise ConfigError(f"the camera at socket {socket} must have a 3 x 3 matrix; calibrate the device")
-        distortion, count = _COEFFICIENTS[camera.camera_type]
-        (fx, _, cx), (_, fy, cy), _ = camera.intrinsic_matrix
+        model, size = _CAMERA_TYPES.get(camera.camera_type, str(camera.camera_type)), (camera.width, camera.height)
         try:
-            return LensModel(
-                width=camera.width,
-                height=camera.height,
-                fx=fx,
-                fy=fy,
-                cx=cx,
-                cy=cy,
-                distortion=distortion,
-                coefficients=(*camera.distortion_coeff, *[0.0] * count)[:count],
-            )
+            return depthai_lens(camera.intrinsic_matrix, camera.distortion_coeff, model, size)
         except ConfigError as error:
-            raise ConfigError(f"the camera at socket {socket}: {error}") from error
+            raise ConfigError(f"the camera at socket {socket}: {error}; calibrate the device") from error
 
     def transform(self, left: int, right: int) -> NDArray[np.float64]:
         """right_from_left, [4, 4], metres. Raises ConfigError if the file does not connect the two."""

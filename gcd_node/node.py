@@ -21,12 +21,12 @@ from gcd_node.control.message import Command, Outcome
 from gcd_node.errors import NodeError, SourceAbsentError, SourceError, SourceLostError
 from gcd_node.health import Health, Level
 from gcd_node.inference import WindowReport
-from gcd_node.life.source_watch import backoff_of
 from gcd_node.lifecycle import Lifecycle, State, Verb
 from gcd_node.pipeline import Summary
 from gcd_node.publisher import MessageSink
 from gcd_node.recorder import Recorder, RecordingSink
 from gcd_node.service import ServiceManager, Watchdog
+from gcd_node.sources.reconnect import backoff_of
 from gcd_node.status import Announcer
 from gcd_node.transitions import Links, Parts, Transitions
 from gcd_node.views import LiveConfig

@@ -9,7 +9,6 @@ from typing import Protocol
 from gcd_model import ModelError
 from gcd_node.calibration import LensModel
 from gcd_node.capture import WindowSlot, read
-from gcd_node.config import NodeConfig
 from gcd_node.errors import (
     ConfigError,
     EndpointError,
@@ -22,10 +21,9 @@ from gcd_node.errors import (
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.health import Level, SourceState
 from gcd_node.inference import WORK_REASONS, ModelWorker, WorkCounts, WorkerParts
-from gcd_node.life.source_watch import Opener, Patience, SourceWatch, backoff_of
 from gcd_node.messages import Run
 from gcd_node.preview import CapturedFrame, InputPreview
-from gcd_node.source_config import LiveSource
+from gcd_node.sources.reconnect import Opener, SourceWatch
 from gcd_node.status import metadata
 from gcd_node.stream_context import ActiveSource
 from gcd_node.views import VirtualViews
@@ -108,7 +106,7 @@ class Stream:
             first_epoch=begin.epoch,
         )
         self._newest = WindowSlot(lossless=config.source.pace == "lockstep")
-        self._watch = SourceWatch(source, reopen, self, _patience(config), backoff_of(source.info.kind))
+        self._watch = SourceWatch(source, reopen, self, config.source)
         self._preview = InputPreview(worker.sink, lambda: self.run)
         self.worker = ModelWorker(worker, self._known.of)
         self._threads = [
@@ -302,14 +300,6 @@ class Stream:
             self._watch.close()
             self.over = True
             self._on_over()
-
-
-def _patience(config: NodeConfig) -> Patience:
-    source = config.source
-    if not isinstance(source, LiveSource):
-        return Patience()
-    stall_s = None if source.stall_ms is None else source.stall_ms / 1000
-    return Patience(stall_s=stall_s, open_s=source.open_timeout_s, max_reconnects=source.max_reconnects)
 
 
 MODEL_FAILED = "MODEL_FAILED"

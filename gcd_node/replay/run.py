@@ -26,7 +26,7 @@ from gcd_node.config import Count, ViewId
 from gcd_node.errors import DamagedRunError, OutputError, SourceError
 from gcd_node.frame import MAX_PIXELS
 from gcd_node.pictures.files import make_folder, video_writer
-from gcd_node.sources.opencv_camera import quiet_opencv
+from gcd_node.sources.opencv import quiet_opencv
 
 FORMAT = "gcd-run/2"
 """Of the folder and its manifest; another number is another layout."""

@@ -1,4 +1,4 @@
-"""Live cameras: the thread that reads one, and the newest picture it has. What differs from kind to kind is a driver.
+"""Live cameras: the thread that reads one, and its latest pictures. What differs from kind to kind is a driver.
 
 A driver may never return from a call. So it belongs to a daemon thread, and closing leaves that thread behind if it
 does not end by itself; it lets the camera go as soon as its call returns.
@@ -6,7 +6,7 @@ does not end by itself; it lets the camera go as soon as its call returns.
 
 import logging
 import threading
-import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from statistics import median
 from typing import Protocol
@@ -17,6 +17,7 @@ from gcd_node.frame import Frame, SourceInfo
 _LOG = logging.getLogger(__name__)
 _LOWEST_FPS, _HIGHEST_FPS = 1.0, 500.0
 _MEASURED_STEPS = 8
+_WAITING = 4  # frames; with less, a reader that is late once leaves a hole in its window
 _LEAVE_AFTER_S = 0.5
 
 
@@ -47,7 +48,12 @@ class Driver(Protocol):
 
 
 class LiveCamera:
-    """A camera as a FrameSource: of what it gives, the newest picture waits to be taken."""
+    """One opening of a camera, as a FrameSource. Its latest pictures wait to be taken."""
+
+    info: SourceInfo
+    """Size of the first picture, rate as stated or, where that is nonsense, as measured."""
+    skipped = 0
+    """Pictures replaced by newer ones before they were taken."""
 
     def __init__(
         self,
@@ -71,16 +77,13 @@ class LiveCamera:
         self._name, self._hint, self._open_driver, self._on_end = name, hint, open_driver, on_end
         self._driver: Driver | None = None
         self._changed = threading.Condition()
-        self._newest: Frame | None = None
+        self._waiting: deque[Frame] = deque(maxlen=_WAITING)
         self._over = self._closed = False
         self._error: Exception | None = None
         self._described: SourceInfo | None = None
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
         self.info = self._await_first(open_timeout_s)
-
-    info: SourceInfo
-    """Size of the first picture, rate as stated or, where that is nonsense, as measured."""
 
     @property
     def corrupt(self) -> int:
@@ -93,17 +96,16 @@ class LiveCamera:
             yield frame
 
     def take(self, timeout_s: float | None = None) -> Frame | None:
-        """The newest picture, once; None: none came in time, or the camera was closed here.
+        """The oldest picture that waits, once; None: none came in time, or the camera was closed here.
 
         Raises: SourceLostError, every time: it is gone, and the last picture was taken.
         """
         with self._changed:
-            self._changed.wait_for(lambda: self._newest is not None or self._over or self._closed, timeout_s)
-            newest, self._newest = self._newest, None
-            if self._closed or not (newest is not None or self._over):
+            self._changed.wait_for(lambda: self._waiting or self._over or self._closed, timeout_s)
+            if self._closed or not (self._waiting or self._over):
                 return None
-            if newest is not None:
-                return newest
+            if self._waiting:
+                return self._waiting.popleft()
         raise self._error or SourceLostError(f"{self._name} has ended")
 
     def close(self) -> None:
@@ -155,7 +157,8 @@ class LiveCamera:
         self._described = driver.describe(frame, fps)
         while frame is not None:
             with self._changed:
-                self._newest = frame
+                self.skipped += len(self._waiting) == _WAITING
+                self._waiting.append(frame)
                 self._changed.notify_all()
             frame = self._next(driver)
 
@@ -184,22 +187,3 @@ class LiveCamera:
 def sane_fps(stated: float) -> float | None:
     """A frame rate that a camera may have, else None: drivers state 0, streams 90000."""
     return stated if _LOWEST_FPS <= stated <= _HIGHEST_FPS else None
-
-
-class SparingLog:
-    """Warns of what may happen with every picture: the first time, then once in a while with how often it was."""
-
-    def __init__(self, log: logging.Logger, every_s: float = 10.0) -> None:
-        self._log, self._every_s = log, every_s
-        self._told_s: float | None = None
-        self._untold = 0
-
-    def warn(self, text: str) -> None:
-        """Say it, or count it."""
-        now_s = time.monotonic()
-        if self._told_s is not None and now_s - self._told_s < self._every_s:
-            self._untold += 1
-            return
-        more = f" ({self._untold} more since the last such line)" if self._untold else ""
-        self._log.warning("%s%s", text, more)
-        self._told_s, self._untold = now_s, 0

@@ -4,6 +4,7 @@ The node binds, whoever has frames connects (gcd_client.FramePusher; docs/camera
 """
 
 import logging
+import math
 import time
 
 import zmq
@@ -14,8 +15,9 @@ from gcd_node.auth import Context, EventSink, ServerSecurity, SocketGuard, unbin
 from gcd_node.binding import own_endpoint
 from gcd_node.errors import DepthError, SourceError, SourceLostError
 from gcd_node.frame import Frame, SourceInfo
-from gcd_node.sources.depth import DepthPicture, clean_depth
-from gcd_node.sources.live_camera import LiveCamera, SparingLog
+from gcd_node.source_config import PushSource
+from gcd_node.sources.depth import clean_depth
+from gcd_node.sources.live_camera import LiveCamera
 
 _LOG = logging.getLogger(__name__)
 _WAIT_MS = 100
@@ -23,30 +25,25 @@ _QUEUED = 2
 _FARTHEST_NS = 10_000_000_000  # a stamp that is farther from now is of another clock
 _UNCERTAINTY_US = 10_000
 _SILENT_S = 0.5  # a pusher that is silent for so long has made way for another one
+_WARN_EVERY_S = 10.0
 _HINT = "start who pushes them, or correct endpoint in [source]; state fps there if they come slowly"
 
 
 def open_push(
-    endpoint: str,
-    *,
-    fps: float | None,
-    open_timeout_s: float,
-    security: ServerSecurity | None = None,
-    on_event: EventSink | None = None,
+    config: PushSource, security: ServerSecurity | None = None, on_event: EventSink | None = None
 ) -> LiveCamera:
     """The first who pushes frames, as a camera.
 
     Args:
-        endpoint: to bind, "ipc" for the runtime folder. fps: None to measure it.
         security: keys and clients of a tcp endpoint; only operators may push. on_event: gets AUTH_DENIED.
     Raises:
         SourceAbsentError: nobody pushed a frame in time. EndpointError, ConfigError: see SocketGuard.bind().
         SetupError: no endpoint.
     """
     return LiveCamera(
-        f"the push source at {endpoint}",
-        lambda: _PushDriver(endpoint, fps, security, on_event),
-        open_timeout_s=open_timeout_s,
+        f"the push source at {config.endpoint}",
+        lambda: _PushDriver(config, security, on_event),
+        open_timeout_s=config.open_timeout_s,
         hint=_HINT,
     )
 
@@ -54,20 +51,18 @@ def open_push(
 class _PushDriver:
     """A bound socket as a Driver. Stamps arrive in UTC; the node's are of its monotonic clock."""
 
-    def __init__(
-        self, endpoint: str, fps: float | None, security: ServerSecurity | None, on_event: EventSink | None
-    ) -> None:
+    def __init__(self, config: PushSource, security: ServerSecurity | None, on_event: EventSink | None) -> None:
         """Raises EndpointError, ConfigError, SetupError: see SocketGuard.bind()."""
-        self.fps, self.corrupt = fps, 0
+        self.fps, self.corrupt = config.fps, 0
         self._pusher, self._heard_s = "", 0.0
-        self._refusals, self._depths = SparingLog(_LOG), SparingLog(_LOG)
+        self._refusals, self._depths = _SparingLog(), _SparingLog()
         context: Context = zmq.Context()
         self._context, self._guard = context, SocketGuard(context, security, on_event)
         try:
             self._socket = context.socket(zmq.PULL)
             self._socket.set(zmq.RCVHWM, _QUEUED)
             self._socket.set(zmq.MAXMSGSIZE, PREFIX.size + MAX_HEADER + MAX_PAYLOAD)
-            self._endpoint = self._guard.bind(self._socket, own_endpoint(endpoint, "frames"), "frames")
+            self._endpoint = self._guard.bind(self._socket, own_endpoint(config.endpoint, "frames"), "frames")
         except BaseException:
             self._guard.close()
             context.destroy(linger=0)
@@ -123,7 +118,7 @@ class _PushDriver:
                 raise SourceLostError("somebody else pushes frames from now on")
             self._pusher = pushed.pusher
         self._heard_s = now_s
-        depth: DepthPicture | None = None
+        depth = None
         try:
             if pushed.depth is not None:
                 depth = clean_depth(pushed.depth, pushed.image.shape[:2])
@@ -131,3 +126,20 @@ class _PushDriver:
             self._depths.warn(f"frame {pushed.seq} goes without its depth: {error}")
         stamp_ns = time.monotonic_ns() - late_ns
         return Frame(image=pushed.image, stamp_ns=stamp_ns, seq=pushed.seq, depth=depth, odometry=pushed.odometry)
+
+
+class _SparingLog:
+    """Warns of what may happen with every frame: the first time, then once in a while with how often it was."""
+
+    def __init__(self) -> None:
+        self._warned_s, self._unsaid = -math.inf, 0
+
+    def warn(self, text: str) -> None:
+        """Warn, or count."""
+        now_s = time.monotonic()
+        if now_s - self._warned_s < _WARN_EVERY_S:
+            self._unsaid += 1
+            return
+        more = f" ({self._unsaid} more since the last such line)" if self._unsaid else ""
+        _LOG.warning("%s%s", text, more)
+        self._warned_s, self._unsaid = now_s, 0

@@ -14,8 +14,7 @@ from gcd_node.calibration import LensModel
 from gcd_node.config import parse_config
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError
 from gcd_node.source_config import OakSource
-from gcd_node.sources.oak_camera import camera_pipeline, lens_in_memory, load_depthai, open_oak, open_pipeline
-from gcd_node.sources.oak_device import Guard, find_device
+from gcd_node.sources.oak import camera_pipeline, find_device, lens_in_memory, load_depthai, open_oak, open_pipeline
 
 try:
     import oak_pipelines as pipelines
@@ -107,7 +106,7 @@ def test_a_real_camera_is_wired_by_depthais_own_names(monkeypatch: pytest.Monkey
     monkeypatch.setattr(dai, "Device", devices)
     monkeypatch.setattr(dai, "Pipeline", lambda device: pipeline if device is opened else None)
     config = OakSource(fps=15.0, socket="CAM_B", focus=130, exposure_us=8000, iso=400, anti_banding="50hz")
-    stream = camera_pipeline(config)(lambda body: body)
+    stream = camera_pipeline(config)()
     lens = stream.lens(1280, 720)
     devices.assert_called_once_with(ONE)
     opened.setMaxReconnectionAttempts.assert_called_once_with(0)
@@ -139,13 +138,13 @@ def test_an_attempt_that_was_given_up_ends_before_the_next_one_begins() -> None:
     first, second, answer = pipelines.Scripted(pipelines.steady()), pipelines.Scripted(pipelines.steady()), Event()
     running: list[bool] = []
 
-    def slow(guard: Guard) -> pipelines.OakStream:
+    def slow() -> pipelines.OakStream:
         answer.wait(PATIENT_S)
-        return first(guard)
+        return first()
 
-    def next_one(guard: Guard) -> pipelines.OakStream:
+    def next_one() -> pipelines.OakStream:
         running.append(first.pipeline is None or first.pipeline.isRunning())
-        return second(guard)
+        return second()
 
     with pytest.raises(SourceAbsentError, match="no picture within"):
         open_pipeline(slow, open_timeout_s=0.2)

@@ -11,7 +11,7 @@ import pytest
 from gcd_node.errors import SourceError
 from gcd_node.source_config import OakSource
 from gcd_node.sources.live_camera import LiveCamera
-from gcd_node.sources.oak_camera import camera_pipeline, load_depthai, open_oak, open_pipeline
+from gcd_node.sources.oak import camera_pipeline, load_depthai, open_oak, open_pipeline
 
 try:
     load_depthai()

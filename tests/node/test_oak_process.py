@@ -1,7 +1,6 @@
 """What only a process of its own can show of the OAK source: aborts, signals, standard output."""
 
 import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -9,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from gcd_node.errors import SourceError
-from gcd_node.sources.oak_camera import load_depthai
+from gcd_node.sources.oak import load_depthai
 
 try:
     load_depthai()
@@ -31,44 +30,10 @@ def in_a_process(script: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-FAILING_NODE = """
-from contextlib import closing
-import oak_pipelines as pipelines
-from gcd_node.errors import SourceLostError
-from gcd_node.sources.oak_camera import open_pipeline
-
-def script(camera):
-    camera.out.send(pipelines.picture(0))
-    raise wrong
-
-for wrong in ({errors},):
-    try:
-        with closing(open_pipeline(pipelines.Scripted(script, guarded={guarded}), open_timeout_s=30)) as camera:
-            list(camera.frames())
-    except SourceLostError as error:
-        print("lost:", error)
-"""
-
-
-def test_an_exception_in_a_host_node_does_not_abort_the_process() -> None:
-    errors = ["ValueError('boom')", "SystemExit(3)", "KeyboardInterrupt()"]
-    ended = in_a_process(FAILING_NODE.format(errors=", ".join(errors), guarded=True))
-    assert ended.returncode == 0, ended.stderr
-    said = ended.stdout.splitlines()
-    assert len(said) == len(errors)
-    for line, error in zip(said, errors, strict=True):
-        assert f"failed with {error.split('(')[0]}" in line
-
-
-def test_without_the_guard_depthai_would_abort_the_process() -> None:
-    ended = in_a_process(FAILING_NODE.format(errors="ValueError('boom')", guarded=False))
-    assert ended.returncode == -signal.SIGABRT
-
-
 SIGNALS = """
 import os, signal, sys, time
 import gcd_node.sources
-from gcd_node.sources import oak_camera
+from gcd_node.sources import oak
 assert "depthai" not in sys.modules, "imported before a camera was wanted"
 got = []
 for number in (signal.SIGTERM, signal.SIGINT):
@@ -82,7 +47,7 @@ def ours():
 before = ours()
 import oak_pipelines as pipelines
 from contextlib import closing
-with closing(oak_camera.open_pipeline(pipelines.Scripted(pipelines.steady()), open_timeout_s=30)) as camera:
+with closing(oak.open_pipeline(pipelines.Scripted(pipelines.steady()), open_timeout_s=30)) as camera:
     next(camera.frames())
     assert ours() == before, (ours(), before)
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -36,12 +36,12 @@ from gcd_node.source_config import (
     SyntheticSource,
     V4l2Source,
 )
-from gcd_node.sources import MovingPattern, open_source
-from gcd_node.sources.v4l2_device import V4l2Request, open_v4l2
+from gcd_node.sources import open_source
+from gcd_node.sources.files import MovingPattern
+from gcd_node.sources.opencv import open_v4l2
 
 if TYPE_CHECKING:
-    from gcd_node.sources.oak_camera import PipelineFactory
-    from gcd_node.sources.oak_device import Guard
+    from gcd_node.sources.oak import PipelineFactory
 
 COUNT = 12
 COLOUR = (200, 60, 20)
@@ -120,7 +120,7 @@ def open_synthetic(folder: Path, slow: bool) -> AbstractContextManager[Opened]:
 @contextmanager
 def open_v4l2_camera(folder: Path, slow: bool) -> Generator[Opened]:
     fake = FakeVideoCapture(RED)
-    source = open_v4l2("/dev/null", V4l2Request(), open_timeout_s=OPEN_S, open_capture=fake.open)
+    source = open_v4l2(V4l2Source(device="/dev/null", open_timeout_s=OPEN_S), fake.open)
     with closing(source, fake.awake.clear) as opened:
         yield opened
     fake.awake.set()
@@ -137,7 +137,7 @@ def open_rtsp(folder: Path, slow: bool) -> Generator[Opened]:
 @contextmanager
 def open_oak(folder: Path, slow: bool) -> Generator[Opened]:
     """DepthAI on this host alone: a scripted node stands in for the camera."""
-    from gcd_node.sources.oak_camera import open_pipeline
+    from gcd_node.sources.oak import open_pipeline
 
     awake = threading.Event()
     awake.set()
@@ -149,7 +149,7 @@ def scripted_pipeline(awake: threading.Event) -> "PipelineFactory":
     import depthai as dai
     from oak_pipelines import HostCamera, picture
 
-    from gcd_node.sources.oak_camera import OakStream
+    from gcd_node.sources.oak import OakStream
 
     def shoot(camera: HostCamera) -> None:
         for seq in count():
@@ -159,10 +159,10 @@ def scripted_pipeline(awake: threading.Event) -> "PipelineFactory":
             if awake.is_set():
                 camera.out.send(picture(seq, RED))
 
-    def build(guard: "Guard") -> OakStream:
+    def build() -> OakStream:
         pipeline = dai.Pipeline(createImplicitDevice=False)
         camera = pipeline.create(HostCamera)
-        camera.body = guard(lambda: shoot(camera))
+        camera.body = lambda: shoot(camera)
         return OakStream(pipeline=pipeline, output=camera.out, id="scripted", fps=25.0)
 
     return build

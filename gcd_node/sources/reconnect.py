@@ -1,23 +1,19 @@
-"""Keeps frames coming: notices silence, lets a lost camera go and opens it again (wire protocol, section 7, F1 to F4).
-
-A `SourceWatch` is itself a source. Around a recording it changes nothing. Around a live source it reads and opens in
-threads of their own, so that a call that never returns is left behind with its thread instead of holding up the node.
-"""
+"""Keeps frames coming: notices silence, lets a lost camera go, opens it again (wire protocol, section 7, F1 to F4)."""
 
 import logging
 import random
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator
-from concurrent.futures import wait
-from dataclasses import dataclass, replace
+from concurrent.futures import Future, wait
+from dataclasses import replace
 from typing import Protocol, TypeAlias
 
 from gcd_node.errors import SourceError, SourceLostError
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.health import SourceState
-from gcd_node.life.camera_threads import Reading, close_in_time, leave, open_aside
-from gcd_node.source_config import SourceKind
+from gcd_node.source_config import LiveSource, SourceConfig, SourceKind
+from gcd_node.sources.live_camera import LiveCamera
 from gcd_node.window import Reason
 
 _LOG = logging.getLogger(__name__)
@@ -31,28 +27,20 @@ Opener: TypeAlias = Callable[[SourceInfo], FrameSource]
 
 
 class Backoff:
-    """How long to wait before the next attempt: from `first_s`, doubling up to `limit_s`, with some jitter so that
-    many nodes do not knock together."""
+    """How long to wait before the next attempt: doubling up to a limit, a fifth more or less, so that many nodes do not
+    knock together."""
 
-    def __init__(
-        self,
-        *,
-        first_s: float = 0.5,
-        limit_s: float = 10.0,
-        jitter: float = 0.2,
-        draw: Callable[[], float] = random.random,
-    ) -> None:
-        self._first_s, self._limit_s, self._jitter, self._draw = first_s, limit_s, jitter, draw
-        self._attempts = 0
+    def __init__(self, *, first_s: float = 0.5, limit_s: float = 10.0) -> None:
+        self._first_s, self._limit_s, self._attempts = first_s, limit_s, 0
 
     def next_s(self) -> float:
-        """The next wait, seconds; at most `limit_s`, and `jitter` of itself away from the even series."""
+        """The next wait, seconds."""
         even_s = min(self._limit_s, self._first_s * 2.0 ** min(self._attempts, 30))
         self._attempts += 1
-        return min(self._limit_s, even_s * (1 + self._jitter * (2 * self._draw() - 1)))
+        return min(self._limit_s, even_s * random.uniform(0.8, 1.2))  # noqa: S311
 
     def reset(self) -> None:
-        """It worked: begin again from `first_s`."""
+        """It worked: begin again from the first wait."""
         self._attempts = 0
 
 
@@ -61,26 +49,11 @@ def backoff_of(kind: SourceKind) -> Backoff:
     return Backoff(limit_s=0.5) if kind == "push" else Backoff()
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Patience:
-    """How long a live source may be silent.
-
-    stall_s: until it counts as stalled; None for 3 frame periods and at least 0.2 s.
-    open_s: until its first frame after it was opened.
-    max_reconnects: attempts in a row that may fail before it is given up; None for ever.
-    """
-
-    stall_s: float | None = None
-    open_s: float = 5.0
-    max_reconnects: int | None = None
-
-    def stalled_after_s(self, fps: float) -> float:
-        """Silence that makes a source of this rate stalled."""
-        return max(_LEAST_STALL_S, _STALL_PERIODS / fps) if self.stall_s is None else self.stall_s
-
-    def lost_after_s(self, fps: float) -> float:
-        """Silence that makes it lost: within 2 s, but never before it could be seen to stall."""
-        return max(_LOST_S, 2 * self.stalled_after_s(fps))
+def patience_s(config: LiveSource, fps: float) -> tuple[float, float]:
+    """Silence that makes a source of this rate stalled, and lost: within 2 s, but never before it could be seen to
+    stall."""
+    stall_s = max(_LEAST_STALL_S, _STALL_PERIODS / fps) if config.stall_ms is None else config.stall_ms / 1000
+    return stall_s, max(_LOST_S, 2 * stall_s)
 
 
 class WatchListener(Protocol):
@@ -106,37 +79,31 @@ class WatchListener(Protocol):
 
 
 class SourceWatch:
-    """A source that is opened again when it is lost. Implements FrameSource; its frames have a rising epoch.
-
-    `frames` may be iterated once. It raises SourceLostError once `max_reconnects` attempts in a row have failed.
-    """
+    """A source that is opened again when it is lost, if it is a LiveCamera; a recording just passes. Implements
+    FrameSource; `frames` may be iterated once."""
 
     def __init__(
         self,
         first: FrameSource,
         reopen: Opener,
         listener: WatchListener,
-        patience: Patience | None = None,
+        config: SourceConfig,
         backoff: Backoff | None = None,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Watch a source that is already open.
 
         Args:
             reopen: opens it again; called in threads of their own, one at a time.
-            clock: monotonic seconds.
+            config: of the source; says how long a live one may be silent.
         """
-        self._current: FrameSource = first
-        self._info = first.info
-        self._reopen, self._listener, self._clock = reopen, listener, clock
-        self._patience, self._backoff = patience or Patience(), backoff or Backoff()
+        self._current, self._info = first, first.info
+        self._reopen, self._listener, self._config = reopen, listener, config
+        self._backoff = backoff or backoff_of(first.info.kind)
         self._closing = threading.Event()
         self._state: SourceState = "connecting"
-        self._corrupt_before = 0
+        self._corrupt_before = self._skipped_before = 0
         self._failed_in_a_row = 0
         self._wanted = True
-        self.skipped = 0
-        """Live frames replaced by newer ones before they were taken, and frames of a format nobody wanted."""
 
     @property
     def info(self) -> SourceInfo:
@@ -148,62 +115,59 @@ class SourceWatch:
         """Damaged frames so far, of all openings."""
         return self._corrupt_before + self._current.corrupt
 
+    @property
+    def skipped(self) -> int:
+        """Live frames replaced by newer ones before they were taken, and frames of a format nobody wanted."""
+        return self._skipped_before + (self._current.skipped if isinstance(self._current, LiveCamera) else 0)
+
     def frames(self) -> Iterator[Frame]:
         """Frames of the source, again and again. Ends with a recording, or with `close`.
 
         Raises:
-            SourceLostError: given up. SourceError: of a recording. What the listener raises.
+            SourceLostError: `max_reconnects` attempts in a row have failed. SourceError: of a recording. What the
+                listener raises.
         """
         self._turn("connecting")
         self._wanted = self._listener.source_opened(self._info)
         while not self._closing.is_set():
-            if not self._info.live:
-                yield from self._recorded()
+            if not isinstance(self._current, LiveCamera):
+                yield from filter(self._arrived, self._current.frames())
+                if not self._closing.is_set():
+                    self._turn("ended")
                 return
-            reason = yield from self._live()
-            if self._closing.is_set():
-                return
-            self._let_go(reason)
-            self._open_again(reason)
+            reason = yield from self._live(self._current)
+            if not self._closing.is_set():
+                self._let_go(reason)
+                self._open_again(reason)
 
     def close(self) -> None:
         """End `frames` within a second, from any thread, for good."""
         if not self._closing.is_set():
             self._closing.set()
-            close_in_time(self._current)
+            self._current.close()
 
-    def _recorded(self) -> Iterator[Frame]:
-        for frame in self._current.frames():
-            if self._arrived(frame):
-                yield frame
-        if not self._closing.is_set():
-            self._turn("ended")
-
-    def _live(self) -> Generator[Frame, None, str]:
+    def _live(self, camera: LiveCamera) -> Generator[Frame, None, str]:
         """Frames of one opening, until it is silent for too long, ends or fails; gives the reason."""
-        opening = Reading(source=self._current, since_s=self._clock())
-        opening.start()
-        stall_s = self._patience.stalled_after_s(self._info.fps_nominal)
-        lost_s = self._patience.lost_after_s(self._info.fps_nominal)
-        last_s, allowed_s = opening.since_s, max(stall_s, self._patience.open_s)
-        try:
-            while not self._closing.is_set():
-                frame = opening.take(_LOOK_S)
-                now_s = self._clock()
-                if frame is not None:
-                    last_s, allowed_s = now_s, stall_s
-                    if self._arrived(frame):
-                        yield frame
-                elif opening.exhausted:
-                    return opening.reason()
-                elif now_s - last_s > max(lost_s, allowed_s):
-                    return f"no frame for {now_s - last_s:.1f} s"
-                elif now_s - last_s > allowed_s and self._state == "streaming":
-                    self._turn("stalled", f"no frame for {now_s - last_s:.2f} s")
-        finally:
-            opening.abandoned.set()
-            self.skipped += opening.skipped
-        return "closed"
+        config, fps = self._config, self._info.fps_nominal
+        assert isinstance(config, LiveSource), "a camera is opened by the settings of one"
+        stall_s, lost_s = patience_s(config, fps)
+        last_s, allowed_s = time.monotonic(), max(stall_s, config.open_timeout_s)
+        while True:
+            try:
+                frame = camera.take(_LOOK_S)
+            except SourceError as error:
+                return str(error)
+            silent_s = time.monotonic() - last_s
+            if self._closing.is_set():
+                return "closed"
+            if frame is not None:
+                last_s, allowed_s = time.monotonic(), stall_s
+                if self._arrived(frame):
+                    yield frame
+            elif silent_s > max(lost_s, allowed_s):
+                return f"no frame for {silent_s:.1f} s"
+            elif silent_s > allowed_s and self._state == "streaming":
+                self._turn("stalled", f"no frame for {silent_s:.2f} s")
 
     def _arrived(self, frame: Frame) -> bool:
         """Tell of a frame; whether it is wanted."""
@@ -216,18 +180,19 @@ class SourceWatch:
             self._listener.source_broken("SRC_FORMAT")
             self._wanted = self._listener.source_opened(self._info)
         self._listener.source_frame(frame)
-        self.skipped += not self._wanted
+        self._skipped_before += not self._wanted
         return self._wanted
 
     def _let_go(self, reason: str) -> None:
         self._failed_in_a_row += self._state not in ("streaming", "stalled")  # opened, and never gave a frame
         self._turn("lost", reason)
         self._listener.source_broken("SRC_LOST")
-        close_in_time(self._current)
+        self._current.close()
 
     def _open_again(self, reason: str) -> None:
         """Try until it opens or the watch is closed. Raises SourceLostError."""
-        limit = self._patience.max_reconnects
+        assert isinstance(self._config, LiveSource)
+        limit = self._config.max_reconnects
         while not self._closing.is_set():
             if limit is not None and self._failed_in_a_row >= limit:
                 raise SourceLostError(
@@ -250,22 +215,42 @@ class SourceWatch:
     def _attempt(self) -> FrameSource | None:
         """The source, open again; None if the watch was closed meanwhile. Raises SourceError."""
         before = self._info
-        opening = open_aside(lambda: self._reopen(before))
+        opening = _open_aside(lambda: self._reopen(before))
         while not opening.done():
-            if self._closing.is_set():
-                leave(opening)
+            if self._closing.is_set() and opening.cancel():
                 return None
             wait({opening}, timeout=_LOOK_S)
         return opening.result()
 
     def _take_over(self, source: FrameSource) -> None:
-        self._corrupt_before += self._current.corrupt
-        self._current, self._info = source, source.info
+        before, self._current, self._info = self._current, source, source.info
+        self._corrupt_before += before.corrupt
+        self._skipped_before += before.skipped if isinstance(before, LiveCamera) else 0
         if self._closing.is_set():
-            close_in_time(source)  # closed while it was being opened
+            source.close()  # closed while it was being opened
             return
         self._wanted = self._listener.source_opened(self._info)
 
     def _turn(self, state: SourceState, detail: str = "") -> None:
         self._state = state
         self._listener.source_state(state, detail)
+
+
+def _open_aside(open_source: Callable[[], FrameSource]) -> "Future[FrameSource]":
+    """Open a source in a thread of its own. If the future is cancelled, the source is closed as soon as it is open."""
+    opening: Future[FrameSource] = Future()
+
+    def run() -> None:
+        try:
+            source = open_source()
+        except Exception as error:  # the end of a thread: whoever waits gets it
+            if opening.set_running_or_notify_cancel():
+                opening.set_exception(error)
+            return
+        if opening.set_running_or_notify_cancel():
+            opening.set_result(source)
+        else:
+            source.close()
+
+    threading.Thread(target=run, name="camera open", daemon=True).start()
+    return opening
