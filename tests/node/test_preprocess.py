@@ -93,12 +93,6 @@ def test_a_share_of_the_width_is_cut_out_of_the_middle_in_the_wanted_shape(
     assert wide >= min(share * width - 2, height * 1.5 - 2)
 
 
-@pytest.mark.parametrize("share", [0.0, 1.1, float("nan")])
-def test_a_share_that_cannot_be_is_refused(share: float) -> None:
-    with pytest.raises(ConfigError, match="share of a picture"):
-        Fit(width=48, height=32, share=share)
-
-
 def test_the_clip_spans_minus_one_to_one() -> None:
     images = np.zeros((2, 4, 5, 3), np.uint8)
     images[1, 2, 3] = (255, 51, 0)
@@ -106,9 +100,3 @@ def test_the_clip_spans_minus_one_to_one() -> None:
     assert (clip.shape, clip.dtype, clip.flags.c_contiguous) == ((2, 3, 4, 5), np.float32, True)
     np.testing.assert_allclose(clip[1, :, 2, 3], [1.0, -0.6, -1.0], atol=1e-6)
     assert clip[0].max() == -1.0
-
-
-@pytest.mark.parametrize("images", [np.zeros((2, 4, 4, 3), np.float32), np.zeros((4, 4, 3), np.uint8)])
-def test_the_clip_refuses_what_are_no_pictures(images: np.ndarray) -> None:
-    with pytest.raises(ConfigError, match=r"u8 \[T, H, W, 3\]"):
-        to_clip_tensor(images)
