@@ -175,10 +175,10 @@ class Stream:
             self._tick()
 
     def _tick(self) -> None:
-        counts, health = self._builder.counts, self._parts.health
-        reasons = {str(reason): count for reason, count in counts.reasons.items()}
-        health.windows(counts.built, reasons)
-        health.totals(source=counts.dropped + self._watch.skipped, slot=self._newest.dropped)
+        builder, health = self._builder, self._parts.health
+        reasons = {str(reason): count for reason, count in builder.reasons.items()}
+        health.windows(builder.built, reasons)
+        health.totals(source=builder.dropped + self._watch.skipped, slot=self._newest.dropped)
         corrupt = self._watch.corrupt
         if corrupt > self._corrupt:
             health.corrupt(corrupt - self._corrupt)
@@ -217,13 +217,12 @@ class Stream:
 
     def summary(self) -> Summary:
         """What it came to so far."""
-        built = self._builder.counts
         return Summary(
             counts=self.worker.counts,
             fps=self._known.fps,
             dropped=self._newest.dropped,
-            frames=built.frames,
-            rejected={str(reason): count for reason, count in built.reasons.items()},
+            frames=self._builder.pushed,
+            rejected={str(reason): count for reason, count in self._builder.reasons.items()},
             window_s=self._window_s,
         )
 

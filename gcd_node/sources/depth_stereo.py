@@ -126,8 +126,9 @@ class StereoDepth:
         start, step = self._scale // 2, self._scale  # every pixel of the picture's size: no mean over an edge
         depth = np.ascontiguousarray(self._depth(disparity)[start::step, start::step])
         if self._scale > 1:
-            left = cv2.resize(left, (self.lens.width, self.lens.height), interpolation=cv2.INTER_AREA)
-        return np.asarray(left, np.uint8), depth
+            size = (self.lens.width, self.lens.height)
+            left = np.asarray(cv2.resize(left, size, interpolation=cv2.INTER_AREA), np.uint8)
+        return left, depth
 
     def _depth(self, disparity: NDArray[np.float32]) -> DepthPicture:
         """disparity: pixels, [H, W]; under 0 is unknown."""

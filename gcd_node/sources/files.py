@@ -5,7 +5,7 @@ import math
 import re
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import count
@@ -140,7 +140,9 @@ class VideoFile(Recording):
                     stamp_ns = rising_stamp_ns(capture.get(cv2.CAP_PROP_POS_MSEC), stamp_ns, round(1e9 / fps))
                 else:
                     stamp_ns = round(seq * 1e9 / fps)
-                yield Frame(image=np.asarray(cv2.cvtColor(read[1], cv2.COLOR_BGR2RGB)), stamp_ns=stamp_ns, seq=seq)
+                yield Frame(
+                    image=np.asarray(cv2.cvtColor(read[1], cv2.COLOR_BGR2RGB), np.uint8), stamp_ns=stamp_ns, seq=seq
+                )
             promised = capture.get(cv2.CAP_PROP_FRAME_COUNT)
         if not self._stopped.is_set() and seq + 1 < _COMPLETE * promised < 1e8:  # more is nonsense
             _LOG.warning("%s ended after %d of %d frames: it may be truncated", self._path, seq + 1, promised)
@@ -172,7 +174,7 @@ def _check_file(path: Path) -> None:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
+def _opened(path: Path) -> Generator[cv2.VideoCapture]:
     """FFmpeg on one file, quiet on stderr. Raises SourceError."""
     with quiet_opencv():
         capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)

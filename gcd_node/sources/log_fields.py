@@ -7,7 +7,8 @@ import io
 import logging
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
 from statistics import median
 from typing import Any
@@ -17,7 +18,7 @@ import imagesize
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_node.calibration import CameraInfo, LensModel, lens_of
+from gcd_node.calibration import LensModel, lens_of
 from gcd_node.errors import ConfigError, SourceError, TooShortError
 from gcd_node.frame import MAX_FPS, MAX_PIXELS, Image
 from gcd_node.sources.log_reader import CAMERAS, CODED_IMAGES, TRANSFORMS, VIDEOS, LogMessage
@@ -202,14 +203,14 @@ class Cameras:
     """What a log says of the robot's cameras: their lenses, and where they are by /tf_static."""
 
     def __init__(self) -> None:
-        self._infos: dict[str, tuple[str, CameraInfo]] = {}  # by topic: frame_id and calibration
+        self._infos: dict[str, tuple[str, Callable[..., LensModel | None]]] = {}  # by topic: frame_id and calibration
         self._parents: dict[str, tuple[str, NDArray[np.float64]]] = {}  # of a frame: parent, parent_from_frame
 
     def add(self, message: LogMessage) -> None:
         """Keep what a message says. Raises SourceError: it has more numbers than any camera."""
         if message.kind in CAMERAS and message.topic not in self._infos and len(self._infos) < _MOST_CAMERAS:
             fields = message.decode()
-            self._infos[message.topic] = head_of(fields)[1], _camera_info(fields)
+            self._infos[message.topic] = head_of(fields)[1], _calibration(fields)
         elif message.kind == TRANSFORMS and message.topic.endswith("tf_static"):
             for each in message.decode().transforms[:_MOST_CAMERAS]:
                 pose = pose_of(each.transform.translation, each.transform.rotation)
@@ -227,7 +228,7 @@ class Cameras:
         # by the conventions of image_pipeline, pictures on image_rect... are undistorted already
         rectified = any(part.startswith("image_rect") for part in place)
         try:
-            lens = lens_of(self._infos[name][1], rectified=rectified)
+            lens = self._infos[name][1](rectified=rectified)
             return None if lens is None else lens.resized(*size)
         except ConfigError as error:
             remedy = "state calibration or hfov_deg in [source]"
@@ -252,15 +253,15 @@ class Cameras:
         return frame, pose
 
 
-def _camera_info(fields: Any) -> CameraInfo:
+def _calibration(fields: Any) -> Callable[..., LensModel | None]:
+    """lens_of() for the pictures of a message, but for whether they are rectified."""
     roi = getattr(fields, "roi", None)
-    return CameraInfo(
+    return partial(
+        lens_of,
         width=fields.width,
         height=fields.height,
-        distortion_model=fields.distortion_model,
-        d=_numbers(fields, "d"),
-        k=_numbers(fields, "k"),
-        p=_numbers(fields, "p"),
+        model=fields.distortion_model,
+        **{name: _numbers(fields, name) for name in "dkp"},
         binning=(getattr(fields, "binning_x", 1), getattr(fields, "binning_y", 1)),
         roi=(0, 0, 0, 0) if roi is None else (roi.x_offset, roi.y_offset, roi.width, roi.height),
     )

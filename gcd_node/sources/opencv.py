@@ -12,11 +12,11 @@ import socket
 import stat
 import threading
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -42,16 +42,8 @@ _STREAM_UNCERTAINTY_US = 100_000  # how long a network camera keeps a picture no
 _KNOCK_TIMEOUT_S = 1.0
 _STREAM_HINT = "check address, path and password, and that the server runs"
 
-
-class Capture(Protocol):
-    """What is used of cv2.VideoCapture, as OpenCV documents it."""
-
-    def isOpened(self) -> bool: ...  # noqa: N802
-    def get(self, prop: int, /) -> float: ...
-    def set(self, prop: int, value: float, /) -> bool: ...
-    def grab(self) -> bool: ...
-    def retrieve(self) -> tuple[bool, Any]: ...
-    def release(self) -> None: ...
+OpenCapture: TypeAlias = Callable[..., cv2.VideoCapture]
+"""Opens a path or an address with a backend, and maybe a list of parameters and their values; tests give their own."""
 
 
 class _OpenCvDriver:
@@ -63,7 +55,7 @@ class _OpenCvDriver:
     kind: SourceKind
     hint: str
 
-    def __init__(self, name: str, id_: str, open_capture: Callable[[], Capture]) -> None:
+    def __init__(self, name: str, id_: str, open_capture: Callable[[], cv2.VideoCapture]) -> None:
         """Raises SourceError as `set_up`."""
         self.name, self._id, self.corrupt, self._seq = name, id_, 0, -1
         with ExitStack() as stack:
@@ -97,12 +89,11 @@ class _OpenCvDriver:
             if stamp_ns is None:
                 raise SourceLostError(f"{self.name} gives no more pictures; {self.hint}")
             self._seq += 1
-            picture = _retrieved(self.capture)
-            self.corrupt += picture is None
-            rgb = None if picture is None else np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8)
+            image = _retrieved(self.capture)
         except cv2.error as error:
             raise SourceLostError(f"{self.name} fails ({error.err}); {self.hint}") from error
-        return None if rgb is None else Frame(image=rgb, stamp_ns=stamp_ns, seq=self._seq)
+        self.corrupt += image is None
+        return None if image is None else Frame(image=image, stamp_ns=stamp_ns, seq=self._seq)
 
     def describe(self, first: Frame, fps: float) -> SourceInfo:
         """See Driver."""
@@ -124,17 +115,15 @@ def codec_name(code: float) -> str | None:
     return text if text and text.isprintable() and text.isascii() else None
 
 
-def _retrieved(capture: Capture) -> Image | None:
-    """What `capture` grabbed last, u8 [H, W, 3] BGR; None if it cannot be decoded."""
+def _retrieved(capture: cv2.VideoCapture) -> Image | None:
+    """What `capture` grabbed last, u8 [H, W, 3] RGB; None if it cannot be decoded."""
     try:
         good, picture = capture.retrieve()
     except cv2.error:
         return None
-    if not good or picture is None or picture.size == 0:
+    if not good or picture.size == 0 or picture.dtype != np.uint8 or picture.shape[2:] not in ((), (3,)):
         return None
-    if picture.ndim == 2:
-        picture = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR)
-    return np.asarray(picture, np.uint8) if picture.dtype == np.uint8 and picture.shape[2] == 3 else None
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_GRAY2RGB if picture.ndim == 2 else cv2.COLOR_BGR2RGB), np.uint8)
 
 
 @contextmanager
@@ -156,11 +145,9 @@ def quiet_opencv() -> Generator[None]:
 # Video4Linux.
 
 
-def open_v4l2(config: V4l2Source, open_capture: Callable[[str, int], Capture] = cv2.VideoCapture) -> LiveCamera:
+def open_v4l2(config: V4l2Source, open_capture: OpenCapture = cv2.VideoCapture) -> LiveCamera:
     """A camera of this machine.
 
-    Args:
-        open_capture: opens a path with a backend; tests give their own.
     Raises:
         SourceAbsentError: no such device, or it gives no picture in time; the message lists the cameras there are.
         SourceError: it is no camera, or may not be used.
@@ -198,7 +185,7 @@ class _V4l2Driver(_OpenCvDriver):
 
     kind, hint = "v4l2", _DEVICE_HINT
 
-    def __init__(self, path: Path, config: V4l2Source, open_capture: Callable[[str, int], Capture]) -> None:
+    def __init__(self, path: Path, config: V4l2Source, open_capture: OpenCapture) -> None:
         self._path, self._config, self._driver_stamps = path, config, False
         super().__init__(f"the camera {path}", path.name, lambda: open_capture(str(path), cv2.CAP_V4L2))
 
@@ -294,14 +281,13 @@ def open_stream(
     config: RtspSource,
     *,
     read_timeout_s: float = 5.0,
-    open_capture: Callable[[str, int, Sequence[int]], Capture] = cv2.VideoCapture,
+    open_capture: OpenCapture = cv2.VideoCapture,
 ) -> LiveCamera:
     """A network camera.
 
     Args:
         config: its url may hold user and password; no message does.
         read_timeout_s: silence after which the stream is lost: the decoder cannot go on after it.
-        open_capture: opens an address with a backend and a list of parameters and their values; tests give their own.
     Raises:
         ConfigError: no URL of a stream.
         SourceAbsentError: nobody answers there, or no picture in time.
@@ -359,7 +345,7 @@ class _StreamDriver(_OpenCvDriver):
 
     kind, hint = "rtsp", _STREAM_HINT
 
-    def __init__(self, open_capture: Callable[[], Capture], address: StreamAddress, fps: float | None) -> None:
+    def __init__(self, open_capture: Callable[[], cv2.VideoCapture], address: StreamAddress, fps: float | None) -> None:
         self._address, self._fps = address, fps
         super().__init__(f"the stream {address}", address.place or address.scheme, open_capture)
         self._backlog = Backlog(period_ns=round(1e9 / (self.fps or 25.0)))

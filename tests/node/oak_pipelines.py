@@ -4,7 +4,6 @@ import threading
 import time
 from collections.abc import Callable
 from datetime import timedelta
-from pathlib import Path
 from typing import cast
 
 import cv2
@@ -129,18 +128,3 @@ class Handed:
             if self._handed.acquire(timeout=0.05):
                 camera.out.send(waiting.pop(0))
         camera.idle()
-
-
-def replay(path: Path, fps: float = 30.0) -> Callable[[], OakStream]:
-    """A pipeline factory: DepthAI's own replay of a video file, once."""
-
-    def build() -> OakStream:
-        pipeline = dai.Pipeline(createImplicitDevice=False)
-        video = pipeline.create(dai.node.ReplayVideo)
-        video.setReplayVideoFile(path)
-        video.setOutFrameType(dai.ImgFrame.Type.NV12)
-        video.setFps(fps)
-        video.setLoop(False)
-        return OakStream(pipeline=pipeline, output=video.out, id=path.name, fps=fps)
-
-    return build
