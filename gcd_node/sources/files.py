@@ -1,12 +1,14 @@
 """Recordings: video files, folders of pictures, and a moving pattern in place of one; single still pictures."""
 
+import contextlib
+import io
 import logging
 import math
 import re
+import struct
 import threading
 import time
 from collections.abc import Generator, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -173,7 +175,7 @@ def _check_file(path: Path) -> None:
         raise SourceError(f"{path} is empty, or not a regular file; give a video file")
 
 
-@contextmanager
+@contextlib.contextmanager
 def _opened(path: Path) -> Generator[cv2.VideoCapture]:
     """FFmpeg on one file, quiet on stderr. Raises SourceError."""
     with quiet_opencv():
@@ -265,24 +267,31 @@ def read_depth(path: Path) -> NDArray[np.uint16]:
 
 
 def _read(path: Path, flags: int) -> NDArray[Any]:
-    """A picture as OpenCV decodes it. Its header is looked at before: a small file may state a huge picture."""
-    if path.exists() and not path.is_file():
-        raise SourceError(f"{path} is not a regular file; give a picture")
+    """A picture as OpenCV decodes it."""
+    if path.exists() and (not path.is_file() or path.stat().st_size > _MAX_BYTES):
+        raise SourceError(f"{path} is not a regular file, or has more than {_MAX_BYTES} bytes; give a picture")
     try:
-        with path.open("rb") as file:
-            width, height = imagesize.get(file, exif_rotation=False)
-        if width * height > MAX_PIXELS or path.stat().st_size > _MAX_BYTES:
-            raise SourceError(
-                f"{path} states {width} x {height} pixels; make it smaller first: at most {MAX_PIXELS} of them in "
-                f"{_MAX_BYTES} bytes"
-            )
-        picture = cv2.imdecode(np.fromfile(path, np.uint8), flags) if width > 0 and height > 0 else None
+        return decode_picture(path.read_bytes(), flags)
     except OSError as error:
         raise SourceError(f"cannot read the picture {path}: {error.strerror}; check the path") from error
-    except cv2.error:
-        picture = None
+    except SourceError as error:
+        raise SourceError(f"{path} {error}; remove or replace it") from error
+
+
+def decode_picture(coded: bytes, flags: int) -> NDArray[Any]:
+    """A picture as OpenCV decodes it. Its header is looked at before: a few bytes may state a huge picture.
+
+    Raises:
+        SourceError: damaged, of no known kind, or more than MAX_PIXELS; to be read after its name.
+    """
+    picture = None
+    with contextlib.suppress(cv2.error, ValueError, struct.error, SyntaxError):
+        width, height = imagesize.get(io.BytesIO(coded), exif_rotation=False)
+        if width * height > MAX_PIXELS:
+            raise SourceError(f"states {width} x {height} pixels, more than {MAX_PIXELS}")
+        picture = cv2.imdecode(np.frombuffer(coded, np.uint8), flags) if min(width, height) > 0 else None
     if picture is None:
-        raise SourceError(f"{path} cannot be decoded: damaged, or no {', '.join(PICTURES)}; remove or replace it")
+        raise SourceError(f"cannot be decoded: damaged, or no {', '.join(PICTURES)}")
     return picture
 
 

@@ -3,7 +3,6 @@
 What is damaged in a way that is not looked for raises whatever the library does that found it.
 """
 
-import io
 import logging
 import math
 import struct
@@ -14,13 +13,13 @@ from statistics import median
 from typing import Any
 
 import cv2
-import imagesize
 import numpy as np
 from numpy.typing import NDArray
 
 from gcd_node.calibration import LensModel, lens_of
 from gcd_node.errors import ConfigError, SourceError, TooShortError
 from gcd_node.frame import MAX_FPS, MAX_PIXELS, Image
+from gcd_node.sources.files import decode_picture
 from gcd_node.sources.log_reader import CAMERAS, CODED_IMAGES, TRANSFORMS, VIDEOS, LogMessage
 
 _LOG = logging.getLogger(__name__)
@@ -122,25 +121,10 @@ class ImageDecoder:
 def _decoded(format_: str, coded: bytes) -> tuple[Image, str]:
     if format_.startswith(_DEPTH) or "compressedDepth" in format_:
         raise SourceError(f"{format_[:40]!r} is a map of depths, not a picture")
-    picture, kind = _checked_decode(coded, format_, _COLOUR)
+    picture, codec = decode_picture(coded, _COLOUR), next((each for each in _CODECS if each in format_.lower()), "jpeg")
     # image_transport names the order it handed to the coder, which takes all for BGR
     swapped = "compressed rgb" in format_
-    return np.ascontiguousarray(picture if swapped else cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8), kind
-
-
-def _checked_decode(coded: bytes, format_: str, flags: int) -> tuple[NDArray[Any], str]:
-    codec = next((each for each in _CODECS if each in format_.lower()), "jpeg")
-    try:
-        width, height = imagesize.get(
-            io.BytesIO(coded), exif_rotation=False
-        )  # a small message can claim a huge picture
-    except (ValueError, struct.error, SyntaxError) as error:
-        raise SourceError(f"a picture of format {format_[:40]!r} is damaged ({error})") from error
-    _check_size(width, height)
-    found = cv2.imdecode(np.frombuffer(coded, np.uint8), flags)
-    if found is None or found.shape[:2] != (height, width):  # pyright: ignore[reportUnnecessaryComparison]  stub hides None
-        raise SourceError(f"a {codec} picture is damaged")
-    return found, codec
+    return np.ascontiguousarray(picture if swapped else cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8), codec
 
 
 def _unpacked(fields: Any) -> Image:
@@ -187,7 +171,7 @@ def _decoded_depth(format_: str, coded: bytes) -> NDArray[Any]:
     start = coded.find(_PNG, 0, 64)
     if start < 0:
         raise SourceError(f"depth in {format_[:40]!r} is not read; known are 16-bit PNG and compressedDepth")
-    levels, _ = _checked_decode(coded[start:], format_, cv2.IMREAD_UNCHANGED)
+    levels = decode_picture(coded[start:], cv2.IMREAD_UNCHANGED)
     if levels.dtype != np.uint16 or levels.ndim != 2:
         raise SourceError(f"depth must be one channel of 16 bits, got {levels.dtype} {list(levels.shape)}")
     if not format_.startswith("32FC1"):

@@ -34,7 +34,6 @@ _EXPLAIN_S = 0.5
 _HINT = "check its cable and power, or allow more with open_timeout_s in [source]"
 _IN_USE = threading.Lock()  # by the attempt before, even if nobody waits for that one any more
 _SYNCED_US = 500  # how well DepthAI keeps the device's clock aligned with the host's
-_LENSES_DIFFER = 0.02
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -118,7 +117,6 @@ class _OakDriver:
         return None
 
     def describe(self, first: Frame, fps: float) -> SourceInfo:
-        """See Driver."""
         message, stream, size = self._newest, self._stream, first.size
         assert message is not None
         fps = message.getFps() if message.getFps() > 0 else fps
@@ -130,12 +128,11 @@ class _OakDriver:
             height=size[1],
             fps_nominal=fps,
             clock="realtime",
-            lens=_better_lens(_lens_of(message, size), stream.lens(*size)),
+            lens=_lens_of(message, size) or stream.lens(*size),  # it knows what the sensor's mode cuts off
             stamp_uncertainty_us=_SYNCED_US if exposure_known else round(0.5e6 / fps),
         )
 
     def close(self) -> None:
-        """See Driver."""
         _stop(self._stream.pipeline)
 
     def _frame(self, message: "dai.ImgFrame") -> Frame | None:
@@ -341,20 +338,6 @@ def _known_lens(
     except ConfigError as error:
         _LOG.warning("an OAK's calibration makes no sense, it counts as uncalibrated: %s", error)
         return None
-
-
-def _better_lens(own: LensModel | None, stored: LensModel | None) -> LensModel | None:
-    """What a picture itself says, which knows what the sensor's mode cuts off; else what the memory says."""
-    if own is None:
-        return stored
-    if stored is not None and abs(own.fx / stored.fx - 1) > _LENSES_DIFFER:
-        _LOG.warning(
-            "the OAK's focal length is %.1f pixels by its pictures, %.1f by its memory: the sensor's mode cuts edges "
-            "off; the former is used",
-            own.fx,
-            stored.fx,
-        )
-    return own
 
 
 def _open(factory: PipelineFactory, loss: _Loss) -> "tuple[OakStream, dai.MessageQueue] | Exception":

@@ -79,11 +79,9 @@ class _OpenCvDriver:
 
     @property
     def fps(self) -> float | None:
-        """See Driver."""
         return sane_fps(self.capture.get(cv2.CAP_PROP_FPS))
 
     def read(self) -> Frame | None:
-        """See Driver."""
         try:
             stamp_ns = self.grab()
             if stamp_ns is None:
@@ -96,7 +94,6 @@ class _OpenCvDriver:
         return None if image is None else Frame(image=image, stamp_ns=stamp_ns, seq=self._seq)
 
     def describe(self, first: Frame, fps: float) -> SourceInfo:
-        """See Driver."""
         return SourceInfo(
             kind=self.kind,
             id=self._id,
@@ -212,7 +209,6 @@ class _V4l2Driver(_OpenCvDriver):
                 _LOG.warning("%s: asked for %s %s, it gives %s", self._path, name, *shown)
 
     def grab(self) -> int | None:
-        """See _OpenCvDriver."""
         if not self.capture.grab():
             return None
         arrival_ns = time.monotonic_ns()
@@ -223,7 +219,6 @@ class _V4l2Driver(_OpenCvDriver):
 
     @property
     def fps(self) -> float | None:
-        """See Driver."""
         return super().fps or self._config.fps
 
     def uncertainty_us(self, fps: float) -> int:
@@ -351,7 +346,6 @@ class _StreamDriver(_OpenCvDriver):
         self._backlog = Backlog(period_ns=round(1e9 / (self.fps or 25.0)))
 
     def set_up(self) -> None:
-        """See _OpenCvDriver."""
         if not self.capture.isOpened():
             raise SourceAbsentError(f"no stream from {self._address}: {_why(self._address)}; {_STREAM_HINT}")
         width, height = self.capture.get(cv2.CAP_PROP_FRAME_WIDTH), self.capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
@@ -361,7 +355,6 @@ class _StreamDriver(_OpenCvDriver):
             )
 
     def grab(self) -> int | None:
-        """See _OpenCvDriver."""
         while self.capture.grab():
             arrival_ns = time.monotonic_ns()
             if not self._backlog.holds(arrival_ns, self.capture.get(cv2.CAP_PROP_POS_MSEC)):
@@ -370,11 +363,9 @@ class _StreamDriver(_OpenCvDriver):
 
     @property
     def fps(self) -> float | None:
-        """See Driver."""
         return self._fps or super().fps
 
     def uncertainty_us(self, fps: float) -> int:
-        """See _OpenCvDriver."""
         return _STREAM_UNCERTAINTY_US
 
 

@@ -69,7 +69,6 @@ class _PushDriver:
             raise
 
     def read(self) -> Frame | None:
-        """See Driver."""
         self._guard.report_failures()
         if not self._socket.poll(_WAIT_MS):
             return None
@@ -86,7 +85,6 @@ class _PushDriver:
             return None
 
     def describe(self, first: Frame, fps: float) -> SourceInfo:
-        """See Driver."""
         return SourceInfo(
             kind="push",
             id=self._endpoint.rpartition("/")[2],
@@ -98,7 +96,6 @@ class _PushDriver:
         )
 
     def close(self) -> None:
-        """See Driver."""
         unbind(self._socket, self._endpoint, 0)
         self._guard.close()
         self._context.destroy(linger=0)

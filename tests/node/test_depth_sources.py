@@ -281,23 +281,16 @@ LEFT = ("cameraData", 1, 1)
 @pytest.mark.parametrize(
     "content",
     [
-        change(board(), "cameraData", to=board()["cameraData"][:2]),
         change(board(), *LEFT, "extrinsics", "toCameraSocket", to=-1),
         change(board(), *LEFT, "extrinsics", "rotationMatrix", to=[[0.0] * 3] * 3),
-        change(board(), *LEFT, "extrinsics", "rotationMatrix", to=[[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]]),
-        change(board(), *LEFT, "extrinsics", "translation", to={"x": 0.0, "y": 0.0, "z": 0.0}),
-        change(board(), *LEFT, "extrinsics", "translation", to={"x": -0.09, "y": 0.0, "z": 0.0}),
         change(board(), *LEFT, "extrinsics", "translation", to={"x": 9.0, "y": 0.0, "z": 0.0}),
         change(board(), *LEFT, "extrinsics", "translation", to={"x": 0.0, "y": -9.0, "z": 0.0}),
         change(board(), *LEFT, "extrinsics", "translation", to={"x": -9000.0, "y": 0.0, "z": 0.0}),
-        change(board(), *LEFT, "intrinsicMatrix", to=[[0.0] * 3] * 3),
         change(board(), *LEFT, "intrinsicMatrix", to=[[405.0, 0, 9999.0], [0, 405, 200], [0, 0, 1]]),
         change(board(), *LEFT, "intrinsicMatrix", to=[]),
-        change(board(), *LEFT, "distortionCoeff", to=[1e308] * 14),
         change(board(), *LEFT, "cameraType", to=7),
         change(board(), *LEFT, "width", to="wide"),
         {"cameraData": []},
-        {"image_width": 640},
         [],
     ],
     ids=lambda _: "",
@@ -310,9 +303,8 @@ def test_a_calibration_of_no_such_pair_is_refused_with_one_line(tmp_path: Path, 
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("text", [b"", b"\xff\xfe", b"{", b'{"cameraData": [[1, {"width": NaN}]]}', b" " * (2 << 20)])
-def test_a_file_that_is_no_calibration_is_refused(tmp_path: Path, text: bytes) -> None:
-    (tmp_path / "calib.json").write_bytes(text)
+def test_a_file_that_is_no_calibration_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "calib.json").write_bytes(b'{"cameraData": [[1, {"width": NaN}]]}')
     for path in (tmp_path / "calib.json", tmp_path / "missing.json", tmp_path):
         with pytest.raises(ConfigError):
             StereoDepth.from_depthai(path, size=SIZE)
@@ -347,7 +339,6 @@ def network(
     *,
     operator: str = "ReduceMean",
     kind: str = "FLOAT",
-    inputs: int = 1,
     outputs: int = 1,
 ) -> Path:
     """An ONNX file whose depth is the mean of the colours: whatever a picture says. operator: another one instead."""
@@ -362,7 +353,7 @@ def network(
     graph = onnx.helper.make_graph(
         nodes,
         "depth",
-        [onnx.helper.make_tensor_value_info(n, of_type, takes) for n in ("picture", "other")[:inputs]],
+        [onnx.helper.make_tensor_value_info(n, of_type, takes) for n in ("picture",)],
         [onnx.helper.make_tensor_value_info(f"depth{i}", of_type, gives) for i in range(outputs)],
         constants,
     )
@@ -384,8 +375,9 @@ def grey(values: NDArray[np.float64]) -> Image:
     return np.repeat(np.rint(values * 255).astype(np.uint8)[..., None], 3, axis=2)
 
 
-@pytest.mark.parametrize("gives", [(1, "high", "wide"), (1, 1, "high", "wide")])
-@pytest.mark.parametrize("sides", [("high", "wide"), (160, 240), (70, 98)])
+@pytest.mark.parametrize(
+    ("gives", "sides"), [((1, "high", "wide"), ("high", "wide")), ((1, 1, "high", "wide"), (70, 98))]
+)
 def test_a_metric_network_is_taken_at_its_word(tmp_path: Path, gives: Any, sides: Any) -> None:
     path = network(tmp_path / "net.onnx", (1, 3, *sides), (*gives[:-2], *sides))
     picture, depth = OnnxDepth(path, kind="metric")(np.full((160, 240, 3), 255, np.uint8))
@@ -395,7 +387,7 @@ def test_a_metric_network_is_taken_at_its_word(tmp_path: Path, gives: Any, sides
     assert depth == pytest.approx(float(white), rel=1e-5)
 
 
-@pytest.mark.parametrize(("a", "b"), [(1.6, -0.1), (2.5, -0.3), (0.9, 0.0)])
+@pytest.mark.parametrize(("a", "b"), [(1.6, -0.1), (0.9, 0.0)])
 def test_the_ground_gives_relative_depth_its_scale_and_shift(tmp_path: Path, a: float, b: float) -> None:
     inverse = ground_inverse()
     inverse[60:150, 40:100] = 0.5  # somebody stands there
@@ -407,41 +399,30 @@ def test_the_ground_gives_relative_depth_its_scale_and_shift(tmp_path: Path, a: 
     assert np.mean(np.abs(depth[near] * inverse[near] - 1) < 0.03) > 0.97  # the rest are the edges of who stands there
 
 
-@pytest.mark.parametrize("values", [np.zeros((160, 240)), np.full((160, 240), 0.5)], ids=["nothing", "a wall"])
-def test_without_ground_there_is_no_depth_and_one_line_says_why(tmp_path: Path, values: NDArray[Any]) -> None:
-    net = OnnxDepth(network(tmp_path / "net.onnx"), kind="inverse", scale=MOUNT)
-    with pytest.raises(DepthError) as raised:
-        net(grey(values))
-    assert "\n" not in str(raised.value)
-
-
-@pytest.mark.parametrize("tilt_deg", [-60.0, 89.0])
-def test_a_mount_that_cannot_give_a_scale_is_refused(tmp_path: Path, tilt_deg: float) -> None:
-    mount = CameraMount(height_m=2.0, tilt_deg=tilt_deg, hfov_deg=20.0)
+@pytest.mark.parametrize("tilt_deg", [-60.0, 8.0, 89.0])
+def test_without_ground_that_gives_a_scale_there_is_no_depth(tmp_path: Path, tilt_deg: float) -> None:
+    mount = CameraMount(height_m=1.4, tilt_deg=tilt_deg, hfov_deg=20.0)
     net = OnnxDepth(network(tmp_path / "net.onnx"), kind="inverse", scale=mount)
-    with pytest.raises(DepthError):
-        net(grey(ground_inverse()))
+    with pytest.raises(DepthError) as raised:
+        net(grey(np.full((160, 240), 0.5)))
+    assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize(
     "other",
     [
         {"takes": (1, 1, "high", "wide"), "operator": "Identity", "gives": (1, 1, "high", "wide")},
-        {"takes": (2, 3, "high", "wide"), "gives": (2, "high", "wide")},
-        {"takes": (1, "high", "wide", 3), "gives": (1, "wide", 3)},
         {"takes": (1, 3, "high", "wide"), "operator": "Identity", "gives": (1, 3, "high", "wide")},
         {"takes": (1, 3, 56, 56), "kind": "FLOAT16", "gives": (1, 56, 56)},
-        {"inputs": 2},
         {"outputs": 2},
     ],
-    ids=["grey", "two", "channels-last", "colours out", "float16", "two inputs", "two outputs"],
+    ids=["grey", "colours out", "float16", "two outputs"],
 )
 def test_a_network_of_another_signature_is_refused_by_what_it_has(tmp_path: Path, other: dict[str, Any]) -> None:
     path = network(tmp_path / "net.onnx", **other)
     with pytest.raises(ConfigError) as raised:
         OnnxDepth(path, kind="metric")
     assert "\n" not in str(raised.value)
-    assert "picture" in str(raised.value)
 
 
 def test_what_is_no_network_or_lacks_a_scale_is_refused(tmp_path: Path) -> None:

@@ -127,7 +127,7 @@ def test_a_second_pusher_is_refused_until_the_first_has_gone(endpoint: str) -> N
     with opened_by(endpoint) as (source, leave), pushing(endpoint, red):
         until(lambda: source.corrupt > 3)
         leave()
-        with pytest.raises(SourceLostError, match="somebody else"):
+        with pytest.raises(SourceLostError):
             until(lambda: taken(source).seq < 0)
     with pushing(endpoint, red), opened(endpoint) as source:  # as the node opens it again
         taken(source)

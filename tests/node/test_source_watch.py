@@ -204,7 +204,7 @@ def test_what_the_listener_refuses_ends_the_frames() -> None:
         def source_opened(self, info: SourceInfo) -> bool:
             raise ConfigError("too small")
 
-    with pytest.raises(ConfigError, match="too small"):
+    with pytest.raises(ConfigError):
         next(SourceWatch(Camera(), lambda _: Camera(), Strict(), V4l2Source()).frames())
 
 

