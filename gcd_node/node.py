@@ -26,7 +26,7 @@ from gcd_node.pipeline import Summary
 from gcd_node.publisher import MessageSink
 from gcd_node.recorder import Recorder, RecordingSink
 from gcd_node.service import ServiceManager, Watchdog
-from gcd_node.sources.reconnect import backoff_of
+from gcd_node.sources.live import backoff_s
 from gcd_node.status import Announcer
 from gcd_node.transitions import Links, Parts, Transitions
 from gcd_node.views import LiveConfig
@@ -87,7 +87,7 @@ class Node:
         self._inbox: queue.SimpleQueue[_Done | str] = queue.SimpleQueue()
         self._work: threading.Thread | None = None
         self._watchdog = Watchdog(self._say, self.health, config.life.hang_s, self._options.service)
-        self._backoff = backoff_of(config.source.kind)
+        self._waits = backoff_s(config.source.kind)
         self._stop_s: float | None = None
         self._retry_s: float | None = None
         self._on_its_own = config.life.autostart
@@ -291,7 +291,7 @@ class Node:
             if self._on_its_own and not done.asked:
                 self._try("activate")
         elif done.verb == "activate":
-            self._backoff.reset()
+            self._waits = backoff_s(self._config.source.kind)
             self._watchdog.ready()
             if self._machinery.has_ended:  # before the node was active
                 self._try("deactivate")
@@ -319,7 +319,7 @@ class Node:
             self._failure = error
             self._prepare_stop()
         elif verb == "activate" and self._on_its_own and self._machinery.is_live and isinstance(error, SourceError):
-            self._retry_s = time.monotonic() + self._backoff.next_s()
+            self._retry_s = time.monotonic() + next(self._waits)
 
     def _turn(self) -> None:
         self.health.state(self.state.label)

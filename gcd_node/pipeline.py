@@ -23,7 +23,7 @@ from gcd_node.health import Level, SourceState
 from gcd_node.inference import WORK_REASONS, ModelWorker, WorkCounts, WorkerParts
 from gcd_node.messages import Run
 from gcd_node.preview import CapturedFrame, InputPreview
-from gcd_node.sources.reconnect import Opener, SourceWatch
+from gcd_node.sources.live import Opener, SourceWatch
 from gcd_node.status import metadata
 from gcd_node.stream_context import ActiveSource
 from gcd_node.views import VirtualViews

@@ -257,13 +257,12 @@ class WindowBuilder:
 
     def _nearest(self, *candidates: _Arrived | None) -> _Arrived | None:
         """The candidate nearest to the next grid point; None if all are too far."""
-        distances = [
-            (abs(candidate.frame.stamp_ns - self._grid.next_ns), index)
-            for index, candidate in enumerate(candidates)
-            if candidate is not None
-        ]
-        distance_ns, index = min(distances, default=(self._skew_ns + 1, 0))
-        return candidates[index] if distance_ns <= self._skew_ns else None
+
+        def distance_ns(arrived: _Arrived) -> int:
+            return abs(arrived.frame.stamp_ns - self._grid.next_ns)
+
+        near = [each for each in candidates if each is not None and distance_ns(each) <= self._skew_ns]
+        return min(near, key=distance_ns, default=None)
 
     def _hole(self) -> None:
         if self._placed:

@@ -29,7 +29,7 @@ _SHAPE_TOLERANCE = 0.01
 _MM = np.float32(1e-3)
 _BEYOND_RANGE = 65535  # what cameras send in millimetres for too far
 _MEAN, _SPREAD = np.array([[0.485, 0.456, 0.406], [0.229, 0.224, 0.225]], np.float32)  # of ImageNet's pictures
-_PATCH = 14  # free sizes are rounded to this: what Depth Anything needs
+_PATCH, _TRIAL = 14, 224  # free sizes are rounded to this: what Depth Anything needs; side of a first picture
 _FARTHEST_M = 1000.0
 _NEAR_GROUND = 1 / 3  # of the nearest ground's inverse depth: farther ground says little about the scale
 _GROUND_TOLERANCE = 0.05  # relative
@@ -105,7 +105,17 @@ class OnnxDepth:
             raise ConfigError(f"{path} gives relative depth: state the camera's mount")
         self._path, self._kind, self._scale = path, kind, scale
         self._session = _open_network(path)
-        self._input, self._size = _checked_signature(self._session, path)
+        try:
+            first = self._session.get_inputs()[0]
+            high, wide = first.shape[-2:]
+            self._input, fixed = first.name, isinstance(high, int) and isinstance(wide, int)
+            self._size: tuple[int, int] | None = (wide, high) if fixed else None
+            self._run(np.zeros((_TRIAL, _TRIAL, 3), np.uint8))
+        except (DepthError, ValueError, IndexError) as error:  # as of a second input or output, or none
+            raise ConfigError(
+                "a depth network takes one float32 [1, 3, H, W] and gives one float32 [1, H, W] or [1, 1, H, W]; "
+                f"{path} does not: {_first_line(error)}"
+            ) from error
 
     def __call__(self, picture: Image) -> tuple[Image, DepthPicture]:
         """See DepthSource: the depth of a picture of any size, in the same size.
@@ -228,29 +238,6 @@ def _open_network(path: Path) -> Any:
         if not type(error).__module__.startswith("onnxruntime"):
             raise
         raise ConfigError(f"onnxruntime cannot open {path}: {_first_line(error)}; export it again") from error
-
-
-def _checked_signature(session: Any, path: Path) -> tuple[str, tuple[int, int] | None]:
-    """Name of the input, and its width and height if the file fixes them. Raises ConfigError for another signature."""
-    inputs, outputs = session.get_inputs(), session.get_outputs()
-    found = ", ".join(f"{each.name} {each.type} {each.shape}" for each in inputs)
-    gives = ", ".join(f"{each.name} {each.type} {each.shape}" for each in outputs)
-    takes_pictures = len(inputs) == 1 and inputs[0].type == "tensor(float)" and _fits(inputs[0].shape, (1, 3))
-    gives_depth = len(outputs) == 1 and outputs[0].type == "tensor(float)"
-    if not (takes_pictures and gives_depth and any(_fits(outputs[0].shape, lead) for lead in ((1,), (1, 1)))):
-        raise ConfigError(
-            f"a depth network takes one float32 [1, 3, H, W] and gives one float32 [1, H, W] or [1, 1, H, W]; {path} "
-            f"takes {found or 'nothing'} and gives {gives or 'nothing'}: export it so"
-        )
-    high, wide = inputs[0].shape[2:]
-    return inputs[0].name, (wide, high) if isinstance(high, int) and isinstance(wide, int) else None
-
-
-def _fits(shape: list[Any], lead: tuple[int, ...]) -> bool:
-    """Whether a shape is `lead` and two sides of a picture; names stand for any number."""
-    if len(shape) != len(lead) + 2 or any(isinstance(side, int) and side < _PATCH for side in shape[-2:]):
-        return False
-    return all(not isinstance(side, int) or side == wanted for side, wanted in zip(shape, lead, strict=False))
 
 
 def _rounded(side: int) -> int:

@@ -45,24 +45,6 @@ class LogLimitError(SourceError):
     """A log takes more time or memory than it may, or nobody waits for it any more."""
 
 
-class Deadline:
-    """Time to find something in a log; `renew` it with every find."""
-
-    def __init__(self, seconds: float, stopped: Callable[[], bool] = lambda: False) -> None:
-        """stopped: whether to give up at once."""
-        self._seconds, self._stopped = seconds, stopped
-        self.renew()
-
-    def renew(self) -> None:
-        """Begin again, now."""
-        self._end_s = time.monotonic() + self._seconds
-
-    def check(self) -> None:
-        """Raises LogLimitError when the time is over."""
-        if time.monotonic() > self._end_s or self._stopped():
-            raise LogLimitError(f"nothing was found in {self._seconds:g} s of reading")
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class LogMessage:
     """One message. kind: its type. sequence: as recorded, may stay 0. log_ns, sent_ns: when it was recorded and sent.
@@ -81,16 +63,31 @@ class LogMessage:
 class LogReader:
     """One reading of a log. `messages` gives those of the types in this file."""
 
-    def __init__(self, path: Path, deadline: Deadline) -> None:
-        """Look at what is there. Raises SourceError: it is missing, empty or no log."""
-        self._path, self._deadline = path, deadline
+    def __init__(self, path: Path, search_s: float, stopped: Callable[[], bool] = lambda: False) -> None:
+        """Look at what is there.
+
+        Args:
+            search_s: time to find something in it; `renew` it with every find. stopped: whether to give up at once.
+        Raises:
+            SourceError: it is missing, empty or no log.
+        """
+        self._path, self._search_s, self._stopped = path, search_s, stopped
         self._files = log_files(path)
+        self.renew()
         self.damaged = 0
         """Chunks left out so far."""
         self.topics: dict[str, str] = {}
         """Every topic so far, and the type of its messages."""
         self.metadata: dict[str, dict[str, str]] = {}
         """What a recording of this node says of itself, by name."""
+
+    def renew(self) -> None:
+        """Begin to search anew, now."""
+        self._end_s = time.monotonic() + self._search_s
+
+    def _check(self) -> None:
+        if time.monotonic() > self._end_s or self._stopped():
+            raise LogLimitError(f"nothing was found in {self._search_s:g} s of reading")
 
     def messages(self) -> Iterator[LogMessage]:
         """Messages of one file after the other.
@@ -160,7 +157,7 @@ class LogReader:
             self.damaged += 1
 
     def _records(self, stream: IO[bytes], *, in_chunk: bool) -> Iterator[McapRecord]:
-        limited = cast(IO[bytes], _LimitedStream(stream, self._deadline))
+        limited = cast(IO[bytes], _LimitedStream(stream, self._check))
         return StreamReader(limited, skip_magic=in_chunk, emit_chunks=True, record_size_limit=_MAX_BYTES).records
 
     def _bag(self, path: Path) -> Iterator[LogMessage]:
@@ -171,7 +168,7 @@ class LogReader:
                 self.topics |= {each.topic: each.msgtype for each in reader.connections}
                 wanted = [each for each in reader.connections if each.msgtype in _READABLE]
                 for connection, at_ns, data in reader.messages(connections=wanted) if wanted else ():
-                    self._deadline.check()
+                    self._check()
                     yield LogMessage(
                         topic=connection.topic,
                         kind=connection.msgtype,
@@ -189,14 +186,14 @@ class LogReader:
 
 
 class _LimitedStream:
-    """What `mcap` reads from: only before the deadline, and never very much at once."""
+    """What `mcap` reads from: only while `check` raises nothing, and never very much at once."""
 
-    def __init__(self, stream: IO[bytes], deadline: Deadline) -> None:
-        self._stream, self._deadline = stream, deadline
+    def __init__(self, stream: IO[bytes], check: Callable[[], None]) -> None:
+        self._stream, self._check = stream, check
 
     def read(self, size: int) -> bytes:
         """As of a file. Raises LogLimitError; EndOfFile for a length that cannot be."""
-        self._deadline.check()
+        self._check()
         if size > _MAX_BYTES:
             raise EndOfFile(f"{size} bytes at once, more than {_MAX_BYTES}")
         return self._stream.read(size)

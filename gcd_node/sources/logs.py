@@ -15,12 +15,12 @@ from gcd_node.frame import Frame, SourceInfo
 from gcd_node.sources.depth import clean_depth
 from gcd_node.sources.files import Pace, Recording
 from gcd_node.sources.log_fields import Cameras, ImageDecoder, are_filled_in, depth_of, head_of, pose_of, rate_of
-from gcd_node.sources.log_reader import IMAGES, ODOMETRY, Deadline, LogLimitError, LogMessage, LogReader, line_of
+from gcd_node.sources.log_reader import IMAGES, ODOMETRY, LogLimitError, LogMessage, LogReader, line_of
 
 _LOG = logging.getLogger(__name__)
 _SEARCH_S = 15.0  # of reading, for what is needed to begin, and from one picture to the next
 _SURVEYED_NS = 5_000_000_000
-_MOST_STAMPS, _MOST_TOPICS = 500, 1000
+_MOST_STAMPS = 500
 _LISTED, _SHOWN = 8, 100
 _LATEST_NS = 2**63  # in the year 2262
 _HEADER_UNCERTAINTY_US = 10_000  # drivers stamp anything from the begin of the exposure to the picture's arrival
@@ -67,15 +67,15 @@ class LogSource(Recording):
         self.info, self.topic = self._found.info, self._found.topic
 
     def _one_pass(self) -> Iterator[Frame]:
-        deadline = Deadline(_SEARCH_S, stopped=self._stopped.is_set)
-        matcher, count, before = _Matcher(self._found, LogReader(self._path, deadline)), 0, self.corrupt
+        reader = LogReader(self._path, _SEARCH_S, self._stopped.is_set)
+        matcher, count, before = _Matcher(self._found), 0, self.corrupt
         try:
-            for message in matcher.reader.messages():
+            for message in reader.messages():
                 for frame in matcher.take(message):
                     count += 1
                     yield frame
-                    deadline.renew()  # what was done with it took its own time
-                self.corrupt = before + matcher.corrupt + matcher.reader.damaged
+                    reader.renew()  # what was done with it took its own time
+                self.corrupt = before + matcher.corrupt + reader.damaged
             yield from matcher.rest()
         except LogLimitError as error:
             if not self._stopped.is_set():
@@ -83,14 +83,14 @@ class LogSource(Recording):
                     f"{self._path}: {error} after {count} pictures on {self.topic}, and the log goes on; cut it to the "
                     f"pictures: mcap filter LOG -y {self.topic} -o NEW"
                 ) from None
-        self.corrupt = before + matcher.corrupt + matcher.reader.damaged
+        self.corrupt = before + matcher.corrupt + reader.damaged
 
 
 class _Matcher:
     """Puts the frames of one pass together: a picture waits until its depth and odometry have come."""
 
-    def __init__(self, found: "_Survey", reader: LogReader) -> None:
-        self._found, self.reader, self._decoder = found, reader, ImageDecoder()
+    def __init__(self, found: "_Survey") -> None:
+        self._found, self._decoder = found, ImageDecoder()
         self._waiting: deque[tuple[int, Frame]] = deque()  # and when each was recorded
         self._depth = _Nearest(found.depth_topic, found.info.fps_nominal, 32)
         self._odometry = _Nearest(found.odometry_topic, found.info.fps_nominal, 2048)
@@ -211,7 +211,7 @@ class _Survey:
     def __init__(self, path: Path, topic: str | None, depth_topic: str | None, odometry_topic: str | None) -> None:
         """See LogSource."""
         self._path, self._wanted, self.depth_topic, self.odometry_topic = path, topic, depth_topic, odometry_topic
-        self._reader = LogReader(path, Deadline(_SEARCH_S))
+        self._reader = LogReader(path, _SEARCH_S)
         self._topics: dict[str, _Topic] = {}
         self._cameras, self._body, self._limit = Cameras(), "", ""
         first_ns = None
@@ -238,8 +238,7 @@ class _Survey:
     def _add(self, message: LogMessage) -> None:
         try:
             if message.kind in IMAGES and message.topic != self.depth_topic:
-                if message.topic in self._topics or len(self._topics) < _MOST_TOPICS:
-                    self._topics.setdefault(message.topic, _Topic(message.topic)).add(message)
+                self._topics.setdefault(message.topic, _Topic(message.topic)).add(message)
             elif message.kind == ODOMETRY and message.topic == self.odometry_topic:
                 self._body = self._body or message.decode().child_frame_id
             else:

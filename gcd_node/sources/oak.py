@@ -21,7 +21,7 @@ from gcd_node.calibration import LensModel, depthai_lens
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError, SourceLostError
 from gcd_node.frame import Frame, Image, SourceInfo
 from gcd_node.source_config import OakSource
-from gcd_node.sources.live_camera import LiveCamera
+from gcd_node.sources.live import LiveCamera
 
 if TYPE_CHECKING:
     import depthai as dai

@@ -17,7 +17,7 @@ from gcd_node.errors import DepthError, SourceError, SourceLostError
 from gcd_node.frame import Frame, SourceInfo
 from gcd_node.source_config import PushSource
 from gcd_node.sources.depth import clean_depth
-from gcd_node.sources.live_camera import LiveCamera
+from gcd_node.sources.live import LiveCamera
 
 _LOG = logging.getLogger(__name__)
 _WAIT_MS = 100

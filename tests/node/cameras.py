@@ -9,7 +9,7 @@ import numpy as np
 
 from gcd_node.errors import SourceAbsentError, SourceLostError
 from gcd_node.frame import Frame, Image, SourceInfo
-from gcd_node.sources.live_camera import LiveCamera
+from gcd_node.sources.live import LiveCamera
 
 FPS = 24.0
 

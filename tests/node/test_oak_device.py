@@ -1,8 +1,11 @@
-"""Which OAK is meant, and what is known of its lens, without one."""
+"""Which OAK is meant, what is known of its lens, and how DepthAI comes into a process; without a camera."""
 
+import os
+import subprocess
 import sys
 import time
 from contextlib import closing
+from pathlib import Path
 from threading import Event
 from unittest.mock import create_autospec
 
@@ -216,3 +219,54 @@ def test_the_lens_of_the_picture_itself_comes_before_the_memory() -> None:
     assert lens is not None
     assert (lens.fx, lens.fy, lens.cx, lens.cy) == (80.0, 81.0, 32.0, 24.0)
     assert lens.coefficients == tuple(RATIONAL)
+
+
+# What only a process of its own can show.
+
+HERE = Path(__file__).parent
+
+
+def in_a_process(script: str) -> subprocess.CompletedProcess[str]:
+    path = os.pathsep.join([str(HERE), *sys.path])
+    return subprocess.run(
+        [sys.executable, "-c", script],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
+
+
+SIGNALS = """
+import os, signal, sys, time
+import gcd_node.sources
+from gcd_node.sources import oak
+assert "depthai" not in sys.modules, "imported before a camera was wanted"
+got = []
+for number in (signal.SIGTERM, signal.SIGINT):
+    signal.signal(number, lambda number, _: got.append(number))
+
+def ours():
+    lines = open("/proc/self/status").read().splitlines()
+    masks = {line.split(":")[0]: int(line.split()[1], 16) for line in lines if line.startswith(("SigCgt", "SigIgn"))}
+    return masks["SigCgt"] & 0x7FFFFFFF, masks["SigIgn"]  # real-time signals are the C library's
+
+before = ours()
+import oak_pipelines as pipelines
+from contextlib import closing
+from pathlib import Path
+with closing(oak.open_pipeline(pipelines.Scripted(pipelines.steady()), open_timeout_s=30)) as camera:
+    next(camera.frames())
+    assert ours() == before, (ours(), before)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        os.kill(os.getpid(), number)
+    time.sleep(0.1)
+assert got == [signal.SIGTERM, signal.SIGINT], got
+"""
+
+
+def test_depthai_comes_late_leaves_our_signal_handlers_alone_and_standard_output_clean() -> None:
+    ended = in_a_process(SIGNALS)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout == ""

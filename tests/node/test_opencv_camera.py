@@ -14,7 +14,7 @@ from media import flat
 from gcd_node.errors import SourceAbsentError, SourceError, SourceLostError
 from gcd_node.source_config import V4l2Source
 from gcd_node.sources import open_source, opencv
-from gcd_node.sources.live_camera import LiveCamera
+from gcd_node.sources.live import LiveCamera
 from gcd_node.sources.opencv import list_v4l2, open_v4l2, quiet_opencv
 
 RED = flat(250, 10, 20)
@@ -125,27 +125,16 @@ def test_a_read_that_never_returns_is_left_behind(caplog: pytest.LogCaptureFixtu
     assert fake.released.wait(GUARD_S)
 
 
-def test_a_camera_that_gives_no_picture_in_time_is_absent() -> None:
+@pytest.mark.parametrize("trouble", ["silent", "gone", "in use"])
+def test_a_camera_that_gives_no_picture_is_absent(trouble: str) -> None:
     fake = FakeVideoCapture(RED)
-    fake.awake.clear()
+    fake.gone, fake.there = trouble == "gone", trouble != "in use"
+    if trouble == "silent":
+        fake.awake.clear()
     with pytest.raises(SourceAbsentError):
-        camera(fake, open_timeout_s=0.2)
+        camera(fake, open_timeout_s=0.2 if trouble == "silent" else GUARD_S)
     fake.awake.set()
     assert fake.released.wait(GUARD_S)
-
-
-def test_a_camera_that_ends_before_its_first_picture_is_absent() -> None:
-    fake = FakeVideoCapture(RED)
-    fake.gone = True
-    with pytest.raises(SourceAbsentError):
-        camera(fake)
-
-
-def test_a_device_that_another_program_uses_is_refused() -> None:
-    fake = FakeVideoCapture(RED)
-    fake.there = False
-    with pytest.raises(SourceAbsentError):
-        camera(fake)
 
 
 def test_an_absent_camera_is_told_with_those_there_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

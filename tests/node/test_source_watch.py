@@ -1,6 +1,8 @@
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import islice, repeat
 from typing import Any
 
 import numpy as np
@@ -14,11 +16,13 @@ from gcd_node.errors import ConfigError, SourceError, SourceLostError
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.health import SourceState
 from gcd_node.source_config import V4l2Source
+from gcd_node.sources.live import SourceWatch, backoff_s, patience_s
 from gcd_node.sources.opencv import open_v4l2
-from gcd_node.sources.reconnect import Backoff, SourceWatch, patience_s
 from gcd_node.window import Reason
 
-QUICK = Backoff(first_s=0.01, limit_s=0.05)
+
+def quick(_: object) -> Iterator[float]:
+    return repeat(0.02)
 
 
 @dataclass
@@ -57,7 +61,7 @@ class Reader:
     def __init__(self, first: FrameSource, bench: Bench | None = None, **patience: Any) -> None:
         self.log = Log()
         plugged = bench or Bench()
-        self.watch = SourceWatch(first, lambda _: plugged.open(), self.log, V4l2Source(**patience), QUICK)
+        self.watch = SourceWatch(first, lambda _: plugged.open(), self.log, V4l2Source(**patience), quick)
         self.frames: list[Frame] = []
         self.failure: Exception | None = None
         self.thread = threading.Thread(target=self._read, daemon=True)
@@ -284,7 +288,7 @@ def test_closing_does_not_wait_for_a_camera_that_is_being_opened() -> None:
         answer.wait(60)
         return late
 
-    watch = SourceWatch(camera, open_slowly, Log(), V4l2Source(), QUICK)
+    watch = SourceWatch(camera, open_slowly, Log(), V4l2Source(), quick)
     left = threading.Thread(target=lambda: list(watch.frames()), daemon=True)
     left.start()
     camera.feed(None)
@@ -301,11 +305,9 @@ def test_closing_does_not_wait_for_a_camera_that_is_being_opened() -> None:
 def test_waiting_doubles_up_to_its_limit_and_never_passes_it(monkeypatch: pytest.MonkeyPatch) -> None:
     for part in (0.8, 1.0, 1.2):
         monkeypatch.setattr("random.uniform", lambda *_, part=part: part)
-        backoff = Backoff()
         even = [part * wait for wait in (0.5, 1.0, 2.0, 4.0, 8.0, 10.0, 10.0)]
-        assert [backoff.next_s() for _ in range(7)] == pytest.approx([min(10.0, wait) for wait in even])
-        backoff.reset()
-        assert backoff.next_s() == pytest.approx(0.5 * part)
+        assert list(islice(backoff_s("v4l2"), 7)) == pytest.approx([min(10.0, wait) for wait in even])
+        assert list(islice(backoff_s("push"), 3)) == pytest.approx([min(0.5, 0.5 * part)] * 3)
 
 
 def test_patience_follows_the_rate_and_two_seconds() -> None:

@@ -275,13 +275,6 @@ def test_a_picture_that_would_fill_the_memory_is_refused_before_it_is_decoded(
         read_picture(tmp_path / "bomb.png")
 
 
-def test_a_looped_folder_keeps_counting(tmp_path: Path) -> None:
-    folder = write_pictures(tmp_path, {f"{i}.png": image for i, image in enumerate(ramp(3))})
-    frames = list(islice(ImageFolder(folder, fps=4.0, loop=True).frames(), 7))
-    assert [frame.stamp_ns for frame in frames] == [250_000_000 * i for i in range(7)]
-    np.testing.assert_array_equal(frames[5].image, frames[2].image)
-
-
 def test_the_packaged_clip_holds_three_windows() -> None:
     path = resolve_path("package:drive.mp4")
     frames = list(VideoFile(path).frames())

@@ -282,14 +282,6 @@ def test_the_end_completes_nothing_that_lacks_frames() -> None:
     assert (builder.pushed, builder.built) == (3, 0)
 
 
-def test_realtime_stamps_lose_no_precision() -> None:
-    start_ns = 1_790_000_000_123_456_789
-    image = np.zeros((2, 4, 3), np.uint8)
-    frames = [Frame(image=image, stamp_ns=start_ns + i * 100_000_000, seq=i) for i in range(8)]
-    windows = run(WindowBuilder(frames=4, fps=10.0, source_fps=10.0), frames)
-    assert [window.stamps_ns[0] for window in windows] == [start_ns, start_ns + 400_000_000]
-
-
 # --- rates and refusals ------------------------------------------------------------------------------------------
 
 
