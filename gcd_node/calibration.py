@@ -36,7 +36,6 @@ _LARGEST_FILE = 16384
 _DEPTHAI_MODELS = {"Perspective": 14, "Fisheye": 4}  # and how many coefficients they have
 _CAMERA_TYPES = {0: "Perspective", 1: "Fisheye"}
 _RATIONAL = 8  # coefficients without prism and tilt
-_MOST_JOINTS = 16  # between two cameras of a board
 _ROTATION_TOLERANCE = 1e-3
 HALF_PIXEL = 0.5
 """OpenCV and ROS count pixels from the centre of the first, this project from its corner."""
@@ -281,10 +280,10 @@ class _Extrinsics(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
     @property
     def transform(self) -> NDArray[np.float64] | None:
         """[4, 4], metres; None if the rotation is none."""
-        if len(self.rotation_matrix) != 3:
+        rotation, transform = np.array(self.rotation_matrix), np.eye(4)
+        if rotation.shape != (3, 3):
             return None
-        transform = np.eye(4)
-        transform[:3, :3] = rotation = np.array(self.rotation_matrix)
+        transform[:3, :3] = rotation
         transform[:3, 3] = np.array([self.translation.x, self.translation.y, self.translation.z]) / 100
         proper = np.abs(rotation @ rotation.T - np.eye(3)).max() < _ROTATION_TOLERANCE and np.linalg.det(rotation) > 0
         return transform if proper else None
@@ -308,7 +307,7 @@ class DepthaiBoard(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
         cameras = dict(self.camera_data)
         if socket not in cameras:
             there = ", ".join(map(str, sorted(cameras))) or "none"
-            raise ConfigError(f"there is no camera at socket {socket}, only at {there}: name two of these")
+            raise ConfigError(f"there is no camera at socket {socket}, only at {there}")
         return cameras[socket]
 
     def lens(self, socket: int) -> LensModel:
@@ -324,10 +323,10 @@ class DepthaiBoard(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
         """right_from_left, [4, 4], metres. Raises ConfigError if the file does not connect the two."""
         left_chain, right_chain = self._chain(left), self._chain(right)
         common = next((socket for socket in left_chain if socket in right_chain), None)
-        if common is None or left == right:
+        if common is None:
             raise ConfigError(
                 f"the file does not say how the cameras at sockets {left} and {right} stand to each other: "
-                "calibrate the pair, or name two that it knows"
+                "calibrate the pair"
             )
         return np.linalg.inv(right_chain[common]) @ left_chain[common]
 
@@ -335,11 +334,10 @@ class DepthaiBoard(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
         """other_from_socket, for each camera that the file leads to from this one; a step without a rotation ends it:
         DepthAI fills what was never calibrated with zeros."""
         chain, here = {socket: np.eye(4)}, socket
-        for _ in range(_MOST_JOINTS):
+        while True:
             extrinsics = self._camera(here).extrinsics
             onward, step = extrinsics.to_camera_socket, extrinsics.transform
             if onward < 0 or onward in chain or step is None:
-                break
+                return chain
             chain[onward] = step @ chain[here]
             here = onward
-        return chain

@@ -98,25 +98,17 @@ class WindowSlot:
             self._changed.notify_all()
 
 
-def read(
-    source: FrameSource,
-    windows: WindowBuilder,
-    newest: WindowSlot,
-    clock_ns: Callable[[], int] = time.monotonic_ns,
-) -> None:
+def read(source: FrameSource, windows: WindowBuilder, newest: WindowSlot) -> None:
     """Reader thread: every frame is used; of complete windows the newest wins.
 
     Of the window that fills, the slot shows every frame as it arrives.
 
     Returns when the source has ended or `newest` was closed; an error of the source goes to whoever takes from
     `newest`. To stop early, close `newest` first, then the source.
-
-    Args:
-        clock_ns: the monotonic clock that arrivals are stamped with.
     """
     try:
         for frame in source.frames():
-            for window in windows.push(frame, clock_ns()):
+            for window in windows.push(frame, time.monotonic_ns()):
                 newest.put(window)
             newest.show(windows.filling)
             if newest.closed:

@@ -203,6 +203,16 @@ def test_twice_the_size_is_near_full_resolution_and_far_better_than_straight() -
     assert psnr(straight, full) < ours - 6.0
 
 
+def test_very_fine_pictures_are_averaged_before_they_are_sampled() -> None:
+    lens = BARREL.resized(1920, 1080)
+    image = detailed_texture(1920, 1080)
+    rectifier = Rectifier(lens, width=96, height=64, hfov_deg=60.0)
+    full = exact(lens, rectifier.camera, image, times=16)
+    ours = psnr(rectifier.image(image), full)
+    assert ours > 34.0
+    assert psnr(exact(lens, rectifier.camera, image, times=2), full) < ours - 3.0
+
+
 # --- sizes -------------------------------------------------------------------------------------------------------
 
 
