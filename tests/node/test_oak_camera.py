@@ -4,12 +4,12 @@ import math
 import os
 import threading
 import time
-from collections.abc import Callable
 from contextlib import closing
 from itertools import islice, repeat
 
 import numpy as np
 import pytest
+from cameras import until
 from media import HEIGHT, WIDTH, flat
 
 from gcd_node.errors import SourceAbsentError, SourceError, SourceLostError
@@ -35,13 +35,6 @@ def opened(script: pipelines.Script) -> LiveCamera:
 
 def take(camera: LiveCamera, count: int) -> list[Frame]:
     return list(islice(camera.frames(), count))
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + PATIENT_S
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
 
 
 # Laws.
@@ -86,7 +79,7 @@ def test_damaged_and_foreign_messages_are_counted_and_not_yielded() -> None:
         reader.start()
         for count in (1, 2, 3):
             handed.hand()
-            wait_for(lambda count=count: camera.corrupt == count)
+            until(lambda count=count: camera.corrupt == count)
         handed.hand()
         reader.join(PATIENT_S)
     assert [frame.seq for frame in got] == [4]
@@ -179,7 +172,7 @@ def test_opening_that_hangs_is_left_to_a_thread_and_undone_there() -> None:
     with pytest.raises(SourceAbsentError, match=r"no picture within 0\.2 s"):
         open_pipeline(hangs, open_timeout_s=0.2)
     release.set()
-    wait_for(lambda: not any(thread.name == "the OAK camera" for thread in threading.enumerate()))
+    until(lambda: not any(thread.name == "the OAK camera" for thread in threading.enumerate()))
     assert factory.pipeline is not None
     assert not factory.pipeline.isRunning()
 
@@ -205,7 +198,7 @@ def test_opening_again_and_again_leaves_no_thread_and_no_file_behind() -> None:
     before = held()
     for _ in range(8):
         once()
-    wait_for(lambda: held() <= (before[0] + 1, before[1] + 1))
+    until(lambda: held() <= (before[0] + 1, before[1] + 1))
     assert held()[0] <= before[0] + 1
 
 
