@@ -26,7 +26,6 @@ _LOG = logging.getLogger(__name__)
 _COLOUR = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 _CODECS = ("jpeg", "png", "webp")
 _DEPTH = ("16UC", "32FC", "64FC", "16SC", "32SC")
-_MOST_CAMERAS, _MOST_COEFFICIENTS = 1000, 64
 _AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # body_from_camera by REP 103
 _LOWEST_FPS = 0.05
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -191,12 +190,12 @@ class Cameras:
         self._parents: dict[str, tuple[str, NDArray[np.float64]]] = {}  # of a frame: parent, parent_from_frame
 
     def add(self, message: LogMessage) -> None:
-        """Keep what a message says. Raises SourceError: it has more numbers than any camera."""
-        if message.kind in CAMERAS and message.topic not in self._infos and len(self._infos) < _MOST_CAMERAS:
+        """Keep what a message says."""
+        if message.kind in CAMERAS and message.topic not in self._infos:
             fields = message.decode()
             self._infos[message.topic] = head_of(fields)[1], _calibration(fields)
         elif message.kind == TRANSFORMS and message.topic.endswith("tf_static"):
-            for each in message.decode().transforms[:_MOST_CAMERAS]:
+            for each in message.decode().transforms:
                 pose = pose_of(each.transform.translation, each.transform.rotation)
                 self._parents[each.child_frame_id] = each.header.frame_id, pose
 
@@ -253,8 +252,6 @@ def _calibration(fields: Any) -> Callable[..., LensModel | None]:
 
 def _numbers(fields: Any, name: str) -> tuple[float, ...]:
     values = getattr(fields, name) if hasattr(fields, name) else getattr(fields, name.upper())  # as ROS 1 and Foxglove
-    if len(values) > _MOST_COEFFICIENTS:
-        raise SourceError(f"a calibration states {len(values)} numbers in {name}: it is damaged")
     return tuple(map(float, values))
 
 

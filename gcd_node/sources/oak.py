@@ -154,7 +154,7 @@ class _OakDriver:
 
 def open_oak(config: OakSource) -> LiveCamera:
     """The OAK camera a launch file asks for, open. Raises as open_pipeline()."""
-    return open_pipeline(camera_pipeline(config), open_timeout_s=config.open_timeout_s)
+    return open_pipeline(lambda: camera_pipeline(config), open_timeout_s=config.open_timeout_s)
 
 
 def open_pipeline(factory: PipelineFactory, *, open_timeout_s: float) -> LiveCamera:
@@ -162,7 +162,7 @@ def open_pipeline(factory: PipelineFactory, *, open_timeout_s: float) -> LiveCam
     two that open one device reset it under each other for ever.
 
     Args:
-        factory: camera_pipeline() makes the one for a real camera.
+        factory: of a real camera, calls camera_pipeline().
         open_timeout_s: for all of it. What DepthAI is still busy with then is left to a thread.
     Raises:
         SourceAbsentError: there is no such camera, or it does not open, or gives no picture in time.
@@ -196,39 +196,35 @@ def load_depthai() -> None:
         )
 
 
-def camera_pipeline(config: OakSource) -> PipelineFactory:
+def camera_pipeline(config: OakSource) -> OakStream:
     """Wires a real camera: a sensor's pictures, scaled to a size, what is over cut off, not undistorted: that is done
     here, by the lens that the device knows, with the user's calibration before the factory's.
 
-    Returns:
-        a factory that raises SourceAbsentError as `find_device`, or if there is no such socket.
+    Raises:
+        SourceAbsentError: see find_device(); or there is no such socket.
     """
+    import depthai as dai
 
-    def build() -> OakStream:
-        import depthai as dai
-
-        opened = _open_device(config.device)
-        opened.setMaxReconnectionAttempts(0)  # the node reconnects, with a new epoch
-        pipeline = dai.Pipeline(opened)
-        sockets = () if config.socket is None else (dai.CameraBoardSocket.__members__[config.socket],)
-        camera = pipeline.create(dai.node.Camera).build(*sockets)
-        _set_up(camera.initialControl, config)
-        size, fps = (config.width, config.height), config.fps or _FPS
-        output = camera.requestOutput(size, dai.ImgFrame.Type.NV12, fps=fps, enableUndistortion=False)
-        try:
-            memory = opened.getCalibration()  # the user's if the device has one, else the factory's
-        except RuntimeError:
-            memory = opened.readCalibration()  # the memory alone; of an empty one a default
-        socket = camera.getBoardSocket()
-        return OakStream(
-            pipeline=pipeline,
-            output=output,
-            id=opened.getDeviceId(),
-            fps=fps,
-            lens=lambda width, height: lens_in_memory(memory, socket, width, height),
-        )
-
-    return build
+    opened = _open_device(config.device)
+    opened.setMaxReconnectionAttempts(0)  # the node reconnects, with a new epoch
+    pipeline = dai.Pipeline(opened)
+    sockets = () if config.socket is None else (dai.CameraBoardSocket.__members__[config.socket],)
+    camera = pipeline.create(dai.node.Camera).build(*sockets)
+    _set_up(camera.initialControl, config)
+    size, fps = (config.width, config.height), config.fps or _FPS
+    output = camera.requestOutput(size, dai.ImgFrame.Type.NV12, fps=fps, enableUndistortion=False)
+    try:
+        memory = opened.getCalibration()  # the user's if the device has one, else the factory's
+    except RuntimeError:
+        memory = opened.readCalibration()  # the memory alone; of an empty one a default
+    socket = camera.getBoardSocket()
+    return OakStream(
+        pipeline=pipeline,
+        output=output,
+        id=opened.getDeviceId(),
+        fps=fps,
+        lens=lambda width, height: lens_in_memory(memory, socket, width, height),
+    )
 
 
 def _set_up(control: "dai.CameraControl", config: OakSource) -> None:

@@ -55,7 +55,7 @@ class _PushDriver:
         """Raises EndpointError, ConfigError, SetupError: see SocketGuard.bind()."""
         self.fps, self.corrupt = config.fps, 0
         self._pusher, self._heard_s = "", 0.0
-        self._refusals, self._depths = _SparingLog(), _SparingLog()
+        self._warned_s = -math.inf
         context: Context = zmq.Context()
         self._context, self._guard = context, SocketGuard(context, security, on_event)
         try:
@@ -81,7 +81,7 @@ class _PushDriver:
             raise
         except (ClientError, SourceError) as error:
             self.corrupt += 1
-            self._refusals.warn(f"a pushed frame is refused: {error}")
+            self._warn(f"a pushed frame is refused: {error}")
             return None
 
     def describe(self, first: Frame, fps: float) -> SourceInfo:
@@ -99,6 +99,12 @@ class _PushDriver:
         unbind(self._socket, self._endpoint, 0)
         self._guard.close()
         self._context.destroy(linger=0)
+
+    def _warn(self, text: str) -> None:
+        """Of what may happen with every frame, only once in a while."""
+        if time.monotonic() - self._warned_s > _WARN_EVERY_S:
+            _LOG.warning("%s (the next such line in %g s at the earliest)", text, _WARN_EVERY_S)
+            self._warned_s = time.monotonic()
 
     def _frame(self, pushed: PushedFrame) -> Frame:
         """Raises SourceError, MessageError: it is refused; SourceLostError: another camera takes over."""
@@ -120,23 +126,6 @@ class _PushDriver:
             if pushed.depth is not None:
                 depth = clean_depth(pushed.depth, pushed.image.shape[:2])
         except DepthError as error:
-            self._depths.warn(f"frame {pushed.seq} goes without its depth: {error}")
+            self._warn(f"frame {pushed.seq} goes without its depth: {error}")
         stamp_ns = time.monotonic_ns() - late_ns
         return Frame(image=pushed.image, stamp_ns=stamp_ns, seq=pushed.seq, depth=depth, odometry=pushed.odometry)
-
-
-class _SparingLog:
-    """Warns of what may happen with every frame: the first time, then once in a while with how often it was."""
-
-    def __init__(self) -> None:
-        self._warned_s, self._unsaid = -math.inf, 0
-
-    def warn(self, text: str) -> None:
-        """Warn, or count."""
-        now_s = time.monotonic()
-        if now_s - self._warned_s < _WARN_EVERY_S:
-            self._unsaid += 1
-            return
-        more = f" ({self._unsaid} more since the last such line)" if self._unsaid else ""
-        _LOG.warning("%s%s", text, more)
-        self._warned_s, self._unsaid = now_s, 0

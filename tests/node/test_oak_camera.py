@@ -209,7 +209,7 @@ def test_opening_again_and_again_leaves_no_thread_and_no_file_behind() -> None:
 def oak() -> LiveCamera:
     if not dai.Device.getAllAvailableDevices():
         pytest.skip("hardware: needs an OAK camera that is plugged in and free")
-    return open_pipeline(camera_pipeline(OakSource(fps=30.0)), open_timeout_s=PATIENT_S)
+    return open_pipeline(lambda: camera_pipeline(OakSource(fps=30.0)), open_timeout_s=PATIENT_S)
 
 
 @pytest.mark.hardware

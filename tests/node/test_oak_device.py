@@ -102,7 +102,7 @@ def test_a_real_camera_is_wired_by_depthais_own_names(monkeypatch: pytest.Monkey
     monkeypatch.setattr(dai, "Device", devices)
     monkeypatch.setattr(dai, "Pipeline", lambda device: pipeline if device is opened else None)
     config = OakSource(fps=15.0, socket="CAM_B", focus=130, exposure_us=8000, iso=400, anti_banding="50hz")
-    stream = camera_pipeline(config)()
+    stream = camera_pipeline(config)
     lens = stream.lens(1280, 720)
     devices.assert_called_once_with(ONE)
     opened.setMaxReconnectionAttempts.assert_called_once_with(0)
