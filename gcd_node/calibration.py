@@ -1,7 +1,8 @@
 """What is known of a lens, and where it comes from: ROS camera_info files, CameraInfo messages, a camera's memory."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -32,6 +33,10 @@ _NAMES: dict[str, Distortion] = {
 }
 _SHAPE_TOLERANCE = 0.01
 _LARGEST_FILE = 16384
+_DEPTHAI_MODELS = {"Perspective": 14, "Fisheye": 4}  # and how many coefficients they have
+_CAMERA_TYPES = {0: "Perspective", 1: "Fisheye"}
+_RATIONAL = 8  # coefficients without prism and tilt
+_ROTATION_TOLERANCE = 1e-3
 HALF_PIXEL = 0.5
 """OpenCV and ROS count pixels from the centre of the first, this project from its corner."""
 
@@ -84,70 +89,60 @@ class LensModel:
         """The same lens for the same picture at another size.
 
         Raises:
-            ConfigError: no picture, or one of another shape, so that nobody knows which part of it was kept.
+            ConfigError: of another shape, so that nobody knows which part of it was kept.
         """
-        if width < 1 or height < 1:
-            raise ConfigError(
-                f"a calibration cannot be for {width} x {height} pictures: are its binning numbers right?"
-            )
         if not self.fits(width, height):
             raise ConfigError(
                 f"the calibration is for {self.width} x {self.height} pictures, the source gives {width} x {height}, "
                 "which is another shape; calibrate at the size you run"
             )
         across, along = width / self.width, height / self.height
-        return LensModel(
+        return replace(
+            self,
             width=width,
             height=height,
             fx=self.fx * across,
             fy=self.fy * along,
             cx=(self.cx + HALF_PIXEL) * across - HALF_PIXEL,
             cy=(self.cy + HALF_PIXEL) * along - HALF_PIXEL,
-            distortion=self.distortion,
-            coefficients=self.coefficients,
         )
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class CameraInfo:
-    """What a ROS CameraInfo message or a Foxglove CameraCalibration states.
-
-    width, height: of the full picture. d: distortion; k: [9] of the raw picture; p: [12] of the rectified one, or ().
-    binning: pixels joined across and down, 0 and 1 are none. roi: left, top, width, height of the part of the full
-        picture that is sent; all 0 is the whole.
-    """
-
-    width: int
-    height: int
-    distortion_model: str
-    d: tuple[float, ...]
-    k: tuple[float, ...]
-    p: tuple[float, ...] = ()
-    binning: tuple[int, int] = (1, 1)
-    roi: tuple[int, int, int, int] = (0, 0, 0, 0)
-
-
-def lens_of(info: CameraInfo, *, rectified: bool = False) -> LensModel | None:
-    """The lens of pictures that come with a CameraInfo; None if the camera was never calibrated (k is all zero).
+def lens_of(
+    *,
+    width: int,
+    height: int,
+    model: str,
+    d: Sequence[float],
+    k: Sequence[float],
+    p: Sequence[float] = (),
+    binning: tuple[int, int] = (1, 1),
+    roi: tuple[int, int, int, int] = (0, 0, 0, 0),
+    rectified: bool = False,
+) -> LensModel | None:
+    """The lens that a ROS CameraInfo or a Foxglove CameraCalibration states; None if the camera was never calibrated.
 
     Args:
+        width, height: of the full picture. model: the name of the distortion, whose coefficients are d.
+        k: [9] of the raw picture, all zero if nobody calibrated it; p: [12] of the rectified one, or ().
+        binning: pixels joined across and down, 0 and 1 are none. roi: left, top, width, height of the part of the full
+            picture that is sent; all 0 is the whole.
         rectified: the pictures are undistorted already: p holds, and there is no distortion left.
     Raises:
         ConfigError: an unknown kind of distortion, or numbers that no camera has.
     Source: the ROS message sensor_msgs/CameraInfo.
     """
-    matrix = info.p if rectified else info.k
+    matrix, columns = (p, 4) if rectified else (k, 3)
     if not any(matrix):
         return None
-    columns = 4 if rectified else 3
     if len(matrix) != 3 * columns:
         raise ConfigError(f"a camera matrix must have {3 * columns} numbers, got {len(matrix)}")
-    kind, coefficients = ("none", ()) if rectified else _distortion(info)
-    left, top, part_wide, part_high = info.roi
-    across, along = (max(each, 1) for each in info.binning)
+    kind, coefficients = ("none", ()) if rectified else _distortion(model, tuple(d))
+    left, top, part_wide, part_high = roi
+    across, along = (max(each, 1) for each in binning)
     whole = LensModel(
-        width=part_wide or info.width,
-        height=part_high or info.height,
+        width=part_wide or width,
+        height=part_high or height,
         fx=matrix[0],
         cx=matrix[2] - left,
         fy=matrix[columns + 1],
@@ -158,16 +153,15 @@ def lens_of(info: CameraInfo, *, rectified: bool = False) -> LensModel | None:
     return whole if (across, along) == (1, 1) else whole.resized(whole.width // across, whole.height // along)
 
 
-def _distortion(info: CameraInfo) -> tuple[Distortion, tuple[float, ...]]:
-    kind = _NAMES.get(info.distortion_model.strip().lower())
+def _distortion(model: str, d: tuple[float, ...]) -> tuple[Distortion, tuple[float, ...]]:
+    kind = _NAMES.get(model.strip().lower())
     if kind is None:
-        known = ", ".join(_COUNTS)
-        raise ConfigError(f"unknown distortion_model {info.distortion_model[:40]!r}; known are {known}")
-    if not any(info.d):  # drivers of ideal cameras send no coefficients, or zeros, under any name but the fish-eye's
+        raise ConfigError(f"unknown distortion_model {model[:40]!r}; known are {', '.join(_COUNTS)}")
+    if not any(d):  # drivers of ideal cameras send no coefficients, or zeros, under any name but the fish-eye's
         return (kind, (0.0,) * 4) if kind == "equidistant" else ("none", ())
-    if kind == "plumb_bob" and len(info.d) in _COUNTS["rational_polynomial"]:
+    if kind == "plumb_bob" and len(d) in _COUNTS["rational_polynomial"]:
         kind = "rational_polynomial"  # the same formula, longer
-    return kind, info.d
+    return kind, d
 
 
 class _Matrix(msgspec.Struct, frozen=True, kw_only=True):
@@ -205,15 +199,14 @@ def parse_lens(text: str | bytes, name: str) -> LensModel:
         stated = msgspec.convert(_parse_yaml(text, name), _File, strict=False)  # YAML takes 1e-05 for a word
     except msgspec.ValidationError as error:
         raise ConfigError(f"{name} is not a ROS camera_info file: {error}") from error
-    info = CameraInfo(
-        width=stated.image_width,
-        height=stated.image_height,
-        distortion_model=stated.distortion_model or stated.camera_model or "plumb_bob",
-        d=stated.distortion_coefficients.data,
-        k=stated.camera_matrix.data,
-    )
     try:
-        lens = lens_of(info)
+        lens = lens_of(
+            width=stated.image_width,
+            height=stated.image_height,
+            model=stated.distortion_model or stated.camera_model or "plumb_bob",
+            d=stated.distortion_coefficients.data,
+            k=stated.camera_matrix.data,
+        )
     except ConfigError as error:
         raise ConfigError(f"{name}: {error}") from error
     if lens is None:
@@ -233,9 +226,30 @@ def _parse_yaml(text: str | bytes, name: str) -> object:
         raise ConfigError(f"{name} is not valid YAML: {reason}; give a ROS camera_info YAML file") from error
 
 
-_COEFFICIENTS: dict[int, tuple[Distortion, int]] = {0: ("rational_polynomial", 14), 1: ("equidistant", 4)}
-_MOST_JOINTS = 16  # between two cameras of a board
-_ROTATION_TOLERANCE = 1e-3
+def depthai_lens(
+    matrix: Sequence[Sequence[float]], coefficients: Sequence[float], model: str, size: tuple[int, int]
+) -> LensModel:
+    """A lens as DepthAI describes it.
+
+    Args:
+        matrix: 3 x 3 intrinsics, pixels of pictures of `size`, width and height.
+        coefficients: of OpenCV's rational model with prism and tilt, or of its fish-eye model; zeros may be left out.
+        model: DepthAI's name of it.
+    Raises:
+        ConfigError: another model, or numbers that no camera has.
+    """
+    if model not in _DEPTHAI_MODELS or len(matrix) != 3:
+        raise ConfigError(f"a lens of model {model} with {len(matrix)} rows of intrinsics is not known here")
+    count = _DEPTHAI_MODELS[model]
+    full = (*coefficients, *[0.0] * count)[:count]
+    distortion: Distortion = "equidistant"
+    if model == "Perspective":
+        distortion = "rational_polynomial" if any(full) else "none"
+        full = full if any(full[_RATIONAL:]) else full[:_RATIONAL] if any(full) else ()
+    (fx, _, cx), (_, fy, cy), _ = matrix
+    return LensModel(
+        width=size[0], height=size[1], fx=fx, fy=fy, cx=cx, cy=cy, distortion=distortion, coefficients=full
+    )
 
 
 def read_depthai(path: Path) -> "DepthaiBoard":
@@ -266,10 +280,10 @@ class _Extrinsics(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
     @property
     def transform(self) -> NDArray[np.float64] | None:
         """[4, 4], metres; None if the rotation is none."""
-        if len(self.rotation_matrix) != 3:
+        rotation, transform = np.array(self.rotation_matrix), np.eye(4)
+        if rotation.shape != (3, 3):
             return None
-        transform = np.eye(4)
-        transform[:3, :3] = rotation = np.array(self.rotation_matrix)
+        transform[:3, :3] = rotation
         transform[:3, 3] = np.array([self.translation.x, self.translation.y, self.translation.z]) / 100
         proper = np.abs(rotation @ rotation.T - np.eye(3)).max() < _ROTATION_TOLERANCE and np.linalg.det(rotation) > 0
         return transform if proper else None
@@ -293,40 +307,26 @@ class DepthaiBoard(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
         cameras = dict(self.camera_data)
         if socket not in cameras:
             there = ", ".join(map(str, sorted(cameras))) or "none"
-            raise ConfigError(f"there is no camera at socket {socket}, only at {there}: name two of these")
+            raise ConfigError(f"there is no camera at socket {socket}, only at {there}")
         return cameras[socket]
 
     def lens(self, socket: int) -> LensModel:
         """Raises ConfigError: no such camera, or it was never calibrated."""
         camera = self._camera(socket)
-        if camera.camera_type not in _COEFFICIENTS:
-            raise ConfigError(f"the camera at socket {socket} has a lens of type {camera.camera_type}; known are 0, 1")
-        if len(camera.intrinsic_matrix) != 3:
-            raise ConfigError(f"the camera at socket {socket} must have a 3 x 3 matrix; calibrate the device")
-        distortion, count = _COEFFICIENTS[camera.camera_type]
-        (fx, _, cx), (_, fy, cy), _ = camera.intrinsic_matrix
+        model, size = _CAMERA_TYPES.get(camera.camera_type, str(camera.camera_type)), (camera.width, camera.height)
         try:
-            return LensModel(
-                width=camera.width,
-                height=camera.height,
-                fx=fx,
-                fy=fy,
-                cx=cx,
-                cy=cy,
-                distortion=distortion,
-                coefficients=(*camera.distortion_coeff, *[0.0] * count)[:count],
-            )
+            return depthai_lens(camera.intrinsic_matrix, camera.distortion_coeff, model, size)
         except ConfigError as error:
-            raise ConfigError(f"the camera at socket {socket}: {error}") from error
+            raise ConfigError(f"the camera at socket {socket}: {error}; calibrate the device") from error
 
     def transform(self, left: int, right: int) -> NDArray[np.float64]:
         """right_from_left, [4, 4], metres. Raises ConfigError if the file does not connect the two."""
         left_chain, right_chain = self._chain(left), self._chain(right)
         common = next((socket for socket in left_chain if socket in right_chain), None)
-        if common is None or left == right:
+        if common is None:
             raise ConfigError(
                 f"the file does not say how the cameras at sockets {left} and {right} stand to each other: "
-                "calibrate the pair, or name two that it knows"
+                "calibrate the pair"
             )
         return np.linalg.inv(right_chain[common]) @ left_chain[common]
 
@@ -334,11 +334,10 @@ class DepthaiBoard(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
         """other_from_socket, for each camera that the file leads to from this one; a step without a rotation ends it:
         DepthAI fills what was never calibrated with zeros."""
         chain, here = {socket: np.eye(4)}, socket
-        for _ in range(_MOST_JOINTS):
+        while True:
             extrinsics = self._camera(here).extrinsics
             onward, step = extrinsics.to_camera_socket, extrinsics.transform
             if onward < 0 or onward in chain or step is None:
-                break
+                return chain
             chain[onward] = step @ chain[here]
             here = onward
-        return chain

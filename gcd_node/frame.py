@@ -125,7 +125,7 @@ class FrameSource(Protocol):
         """Yield frames with rising `stamp_ns`; return at the end; raise SourceLostError if the device is lost.
 
         Of a recording, every call starts at its beginning. Of a live source, frames the caller was too slow for are
-        skipped (their sequence numbers show it): the next one is always the newest.
+        skipped (their sequence numbers show it): at most the latest four wait.
         """
         ...
 

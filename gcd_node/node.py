@@ -18,12 +18,12 @@ from gcd_node.control import Outcome
 from gcd_node.errors import NodeError, SourceAbsentError, SourceError, SourceLostError
 from gcd_node.health import Health, Level
 from gcd_node.inference import WindowReport
-from gcd_node.life.source_watch import backoff_of
 from gcd_node.lifecycle import Lifecycle, State, Verb
 from gcd_node.pipeline import Summary
 from gcd_node.publisher import MessageSink
 from gcd_node.recorder import Recorder, RecordingSink
 from gcd_node.service import ServiceManager, Watchdog
+from gcd_node.sources.live import backoff_s
 from gcd_node.status import Announcer, NodeServices
 from gcd_node.transitions import Parts, Transitions
 from gcd_node.verbs import Command
@@ -81,7 +81,7 @@ class Node:
         self._life, self._order = Lifecycle(), threading.Lock()
         self._work: threading.Thread | None = None
         self._watchdog = Watchdog(self._emit, self.health, config.life.hang_s, self._options.service)
-        self._backoff = backoff_of(config.source.kind)
+        self._waits = backoff_s(config.source.kind)
         self._stop_s: float | None = None
         self._retry_s: float | None = None
         self._on_its_own = config.life.autostart
@@ -276,7 +276,7 @@ class Node:
             if self._on_its_own and not done.requested:
                 self._try("activate")
         elif done.verb == "activate":
-            self._backoff.reset()
+            self._waits = backoff_s(self._config.source.kind)
             self._watchdog.ready()
             if self._transitions.has_ended:  # before the node was active
                 self._try("deactivate")
@@ -296,7 +296,7 @@ class Node:
             self._failure = error
             self._prepare_stop()
         elif verb == "activate" and self._on_its_own and self._transitions.is_live and isinstance(error, SourceError):
-            self._retry_s = time.monotonic() + self._backoff.next_s()
+            self._retry_s = time.monotonic() + next(self._waits)
 
 
 def _code(error: Exception) -> Code:

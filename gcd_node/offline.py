@@ -38,8 +38,7 @@ from gcd_node.preprocess import Fit, assumed_hfov_deg, stated_mount, stated_sphe
 from gcd_node.source_config import SourcePose
 from gcd_node.sources.depth import DepthPicture, OnnxDepth, clean_depth
 from gcd_node.sources.depth_stereo import StereoDepth
-from gcd_node.sources.image_folder import PICTURES, ImageFolder, list_pictures, read_depth, read_picture
-from gcd_node.sources.video_file import VideoFile
+from gcd_node.sources.files import PICTURES, ImageFolder, VideoFile, list_pictures, read_depth, read_picture
 
 _LOG = logging.getLogger(__name__)
 _RATE_TOLERANCE = 0.05

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 
 from gcd_model import ModelError
 from gcd_node.capture import WindowSlot, read
-from gcd_node.config import NodeConfig
 from gcd_node.errors import (
     ConfigError,
     EndpointError,
@@ -20,10 +19,9 @@ from gcd_node.errors import (
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.health import Level, SourceState
 from gcd_node.inference import WORK_REASONS, ModelWorker, WindowReport, WorkCounts
-from gcd_node.life.source_watch import Opener, Patience, SourceWatch, backoff_of
 from gcd_node.model import ModelSlot
 from gcd_node.recorder import Recorder
-from gcd_node.source_config import LiveSource
+from gcd_node.sources.live import Opener, SourceWatch
 from gcd_node.status import NodeServices, metadata
 from gcd_node.stream_context import ActiveSource, StreamContext
 from gcd_node.views import InputPreview, VirtualViews
@@ -91,7 +89,7 @@ class Stream:
             first_epoch=first[1],
         )
         self._newest = WindowSlot(lossless=config.source.pace == "lockstep")
-        self._watch = SourceWatch(source, reopen, self, _patience(config), backoff_of(source.info.kind))
+        self._watch = SourceWatch(source, reopen, self, config.source)
         self._preview = InputPreview(services.sink, lambda: self.context)
         self.worker = ModelWorker(services, model, self._source.context_at, on_window)
         self._threads = [
@@ -166,10 +164,10 @@ class Stream:
     def tick(self) -> None:
         """Pass on what the builder and the source count, with an event for every new kind of trouble."""
         with self._order:
-            counts = self._builder.counts
-            reasons = {str(reason): count for reason, count in counts.reasons.items()}
-            self._health.windows(counts.built, reasons)
-            self._health.totals(source=counts.dropped + self._watch.skipped, slot=self._newest.dropped)
+            builder = self._builder
+            reasons = {str(reason): count for reason, count in builder.reasons.items()}
+            self._health.windows(builder.built, reasons)
+            self._health.totals(source=builder.dropped + self._watch.skipped, slot=self._newest.dropped)
             corrupt = self._watch.corrupt
             if corrupt > self._corrupt:
                 self._health.corrupt(corrupt - self._corrupt)
@@ -196,13 +194,12 @@ class Stream:
 
     def summary(self) -> Summary:
         """What it came to so far."""
-        built = self._builder.counts
         return Summary(
             counts=self.worker.counts,
             fps=self.context.fps,
             dropped=self._newest.dropped,
-            frames=built.frames,
-            rejected={str(reason): count for reason, count in built.reasons.items()},
+            frames=self._builder.pushed,
+            rejected={str(reason): count for reason, count in self._builder.reasons.items()},
             window_s=self._window_s,
         )
 
@@ -277,14 +274,6 @@ class Stream:
             self._watch.close()
             self.over = True
             self._on_over()
-
-
-def _patience(config: NodeConfig) -> Patience:
-    source = config.source
-    if not isinstance(source, LiveSource):
-        return Patience()
-    stall_s = None if source.stall_ms is None else source.stall_ms / 1000
-    return Patience(stall_s=stall_s, open_s=source.open_timeout_s, max_reconnects=source.max_reconnects)
 
 
 MODEL_FAILED = "MODEL_FAILED"

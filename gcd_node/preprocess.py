@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Literal, TypeAlias
 
 import cv2
@@ -50,12 +50,6 @@ class Fit:
     share: float = 1.0
     allow_upscale: bool = False
 
-    def __post_init__(self) -> None:
-        if not 0 < self.share <= 1:
-            raise ConfigError(f"the share of a picture that is used must lie above 0 and up to 1, got {self.share:g}")
-        if self.width < 1 or self.height < 1:
-            raise ConfigError(f"frames must be fitted to at least 1 x 1 pixels, got {self.width} x {self.height}")
-
     def crop_box(self, width: int, height: int) -> tuple[int, int, int, int]:
         """The part of a `width` x `height` picture that is used: left, top, width, height, pixels.
 
@@ -97,13 +91,7 @@ class Fit:
 
 
 def to_clip_tensor(images: Image) -> NDArray[np.float32]:
-    """u8 [T, H, W, 3] in 0..255 -> float32 [T, 3, H, W] in [-1, 1], contiguous.
-
-    Raises:
-        ConfigError: another type or shape.
-    """
-    if images.dtype != np.uint8 or images.ndim != 4 or images.shape[3] != 3:
-        raise ConfigError(f"images must be u8 [T, H, W, 3], got {images.dtype} {list(images.shape)}")
+    """u8 [T, H, W, 3] in 0..255 -> float32 [T, 3, H, W] in [-1, 1], contiguous."""
     count, height, width, _ = images.shape
     clip = np.empty((count, 3, height, width), np.float32)
     for image, planes in zip(images, clip, strict=True):
@@ -122,13 +110,13 @@ def write_planes(image: Image, planes: NDArray[np.float32]) -> None:
         cv2.LUT(levels, _LEVELS, plane)
 
 
-_WIDEST_DEG = 120.0
-_NARROWEST_DEG = 1.0
+_WIDEST_DEG, _NARROWEST_DEG = 120.0, 1.0
 _SLACK_PX = 1.0
 _ENLARGED = 1.01
 _SUPERSAMPLED = 2
 _MOST_SHRINK = 4.0
-_SIDE_POINTS, _RING_POINTS = 17, 65
+_SIDE_POINTS, _DIRECTIONS, _RINGS = 17, 32, 400
+_STEEPEST = 4.0  # of rays x / z: 76 degrees off the axis
 
 
 class Rectifier:
@@ -138,6 +126,9 @@ class Rectifier:
     and averaging, at a third of the time. Sampling straight at the wanted size would alias (24 dB).
     Pictures more than four times as fine as wanted are halved first, for the same reason.
     """
+
+    resize: Literal["remap2x_area"] = "remap2x_area"
+    """Published as `src.resize`."""
 
     def __init__(
         self, lens: LensModel, *, width: int, height: int, hfov_deg: float | None, allow_upscale: bool = False
@@ -152,21 +143,12 @@ class Rectifier:
         Raises:
             ConfigError: the lens sees next to nothing around its axis, or its picture would have to be enlarged.
         """
-        self._lens = lens
-        self._camera = widest_camera(lens, width, height, _WIDEST_DEG if hfov_deg is None else hfov_deg)
-        self._allow_upscale = allow_upscale
-        self._sampling = self._sampling_of(lens.width, lens.height)
-
-    @property
-    def resize(self) -> Literal["remap2x_area"]:
-        """Published as `src.resize`."""
-        return "remap2x_area"
-
-    @property
-    def camera(self) -> Intrinsics:
+        self._lens, self._allow_upscale = lens, allow_upscale
+        self.camera = widest_camera(lens, width, height, hfov_deg)
         """Of the fitted picture: looks along the lens's axis, square pixels, no distortion. Its field of view is the
         wanted one, or the largest of that shape which the lens sees all of."""
-        return self._camera
+        self._sampling: _Sampling | None = None  # for pictures of the latest size
+        self._sampling_for(lens.width, lens.height)
 
     def image(self, image: Image) -> Image:
         """One picture, u8 [H, W, 3] to [height, width, 3].
@@ -174,70 +156,93 @@ class Rectifier:
         Raises:
             ConfigError: of another shape than the lens was calibrated for, or too coarse.
         """
-        high, wide = image.shape[:2]
-        if (wide, high) != (self._sampling.lens.width, self._sampling.lens.height):
-            self._sampling = self._sampling_of(wide, high)
-        return self._sampling.image(image)
+        return self._sampling_for(image.shape[1], image.shape[0]).image(image)
 
     def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
         """The same of a depth picture, [H, W]; no depth between two surfaces is made up. Raises as `image`."""
-        high, wide = depth.shape
-        if (wide, high) != (self._sampling.lens.width, self._sampling.lens.height):
-            self._sampling = self._sampling_of(wide, high)
-        return self._sampling.depth(depth)
+        return self._sampling_for(depth.shape[1], depth.shape[0]).depth(depth)
 
-    def _sampling_of(self, width: int, height: int) -> "_Sampling":
-        lens = self._lens.resized(width, height)
-        enlarged = max(self._camera.fx / lens.fx, self._camera.fy / lens.fy)
+    def _sampling_for(self, width: int, height: int) -> "_Sampling":
+        sampling = self._sampling
+        if sampling is not None and (width, height) == (sampling.lens.width, sampling.lens.height):
+            return sampling
+        lens, camera = self._lens.resized(width, height), self.camera
+        enlarged = max(camera.fx / lens.fx, camera.fy / lens.fy)
         if enlarged > _ENLARGED and not self._allow_upscale:
             raise ConfigError(
                 f"a {width} x {height} picture would have to be enlarged {enlarged:.2f} times to fill the "
-                f"{self._camera.width} x {self._camera.height} the model takes at {self._camera.hfov_deg:.0f} degrees; "
+                f"{camera.width} x {camera.height} the model takes at {camera.hfov_deg:.0f} degrees; "
                 "use a larger one or set allow_upscale"
             )
-        return _Sampling(lens, self._camera)
+        self._sampling = _Sampling(lens, camera)
+        return self._sampling
 
 
-def widest_camera(lens: LensModel, width: int, height: int, hfov_deg: float) -> Intrinsics:
-    """The camera of `width` x `height` along the lens's axis with a field of view of up to `hfov_deg` across, of which
+def widest_camera(
+    lens: LensModel, width: int, height: int, hfov_deg: float | None, turn: NDArray[np.float64] | None = None
+) -> Intrinsics:
+    """The camera of `width` x `height` with a field of view of up to `hfov_deg` across, at most 120 degrees, of which
     the lens sees every pixel.
 
+    Args:
+        turn: see seen_pixels().
     Raises:
         ConfigError: not even one degree of it.
     """
-    wanted = Intrinsics.from_hfov(hfov_deg, width, height)
-    if _sees(lens, wanted):
-        return wanted
-    least, most = _NARROWEST_DEG, hfov_deg
-    if not _sees(lens, Intrinsics.from_hfov(least, width, height)):
+    u, v = np.linspace(0, width, _SIDE_POINTS), np.linspace(0, height, _SIDE_POINTS)
+
+    def sees_all(hfov_deg: float) -> bool:
+        camera = Intrinsics.from_hfov(hfov_deg, width, height)
+        return bool(seen_pixels(lens, camera, u, v, turn)[1].all())
+
+    least, most = _NARROWEST_DEG, _WIDEST_DEG if hfov_deg is None else hfov_deg
+    if sees_all(most):
+        return Intrinsics.from_hfov(most, width, height)
+    if not sees_all(least):
         raise ConfigError(
-            f"the calibration ({lens}) leaves less than {_NARROWEST_DEG:g} degree of view around the axis; "
-            "calibrate the camera again"
+            f"the calibration ({lens}) leaves less than {least:g} degree of view around the axis; calibrate again"
         )
     while most - least > 1e-3:
         middle = (least + most) / 2
-        least, most = (middle, most) if _sees(lens, Intrinsics.from_hfov(middle, width, height)) else (least, middle)
+        least, most = (middle, most) if sees_all(middle) else (least, middle)
     return Intrinsics.from_hfov(least, width, height)
 
 
-def _sees(lens: LensModel, camera: Intrinsics) -> bool:
-    """Whether every pixel of the camera is in the lens's picture. A polynomial fitted to the picture may turn back
-    beyond its edge: from the axis outwards, pixels must go outwards too."""
-    rings = np.linspace(1 / _RING_POINTS, 1, _RING_POINTS)[:, None, None] * _border_rays(camera)
-    pixels = project(lens, rings.reshape(-1, 2)).reshape(rings.shape)
-    outwards = (pixels - (lens.cx, lens.cy)) / (lens.fx, lens.fy)
-    rising = np.diff(np.hypot(outwards[..., 0], outwards[..., 1]), axis=0) > 0
+def seen_pixels(
+    lens: LensModel,
+    camera: Intrinsics,
+    u: NDArray[Any],
+    v: NDArray[Any],
+    turn: NDArray[np.float64] | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Where an ideal camera's columns u and rows v lie in the lens's picture, and which of them it sees.
+
+    Args:
+        turn: [3, 3], from the lens's axes to the ideal camera's; None: they are the same.
+    Returns: [V, U, 2] pixels from the first pixel's centre, and [V, U].
+    """
+    x, y = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
+    rays = np.stack([x, y], axis=-1)
+    if turn is not None:
+        ahead = np.concatenate([rays, np.ones_like(rays[..., :1])], axis=-1) @ turn  # each row is turn.T @ ray
+        rays = (ahead[..., :2] / np.maximum(ahead[..., 2:], 1 / _STEEPEST)).clip(-_STEEPEST, _STEEPEST)
+    pixels = project(lens, rays.reshape(-1, 2)).reshape(rays.shape)
     low, high = -HALF_PIXEL - _SLACK_PX, np.array([lens.width, lens.height]) - HALF_PIXEL + _SLACK_PX
-    edge = pixels[-1]
-    return bool(rising.all() and np.isfinite(edge).all() and (edge >= low).all() and (edge <= high).all())
+    inside = ((pixels >= low) & (pixels <= high)).all(axis=-1)
+    return pixels, inside & (np.hypot(rays[..., 0], rays[..., 1]) < _reach(lens))
 
 
-def _border_rays(camera: Intrinsics) -> NDArray[np.float64]:
-    """x / z and y / z along the four edges of the picture, [N, 2]."""
-    u, v = np.linspace(0, camera.width, _SIDE_POINTS), np.linspace(0, camera.height, _SIDE_POINTS)
-    edges = [(u, 0 * u), (u, 0 * u + camera.height), (0 * v, v), (0 * v + camera.width, v)]
-    pixels = np.concatenate([np.stack(edge, axis=1) for edge in edges])
-    return (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+@lru_cache(maxsize=8)
+def _reach(lens: LensModel) -> float:
+    """How far from the axis, as a tangent, the calibration holds: its polynomial may turn back beyond the picture it
+    was fitted to, and show there, mirrored, what lies inside."""
+    angles = np.linspace(0, 2 * math.pi, _DIRECTIONS, endpoint=False)
+    rings = np.linspace(0, _STEEPEST, _RINGS + 1)[:, None, None]
+    rays = rings * np.stack([np.cos(angles), np.sin(angles)], axis=-1)  # [R, A, 2]
+    away = (project(lens, rays.reshape(-1, 2)).reshape(rays.shape) - (lens.cx, lens.cy)) / (lens.fx, lens.fy)
+    with np.errstate(invalid="ignore"):  # a senseless polynomial ends in infinities: not rising
+        rising = (np.diff(np.hypot(away[..., 0], away[..., 1]), axis=0) > 0).all(axis=1)
+    return _STEEPEST if rising.all() else float(rings[int(np.argmin(rising)), 0, 0])
 
 
 def project(lens: LensModel, rays: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -255,12 +260,11 @@ class _Sampling:
     """Where each pixel of the camera's picture, at twice its size, lies in pictures of one size."""
 
     def __init__(self, lens: LensModel, camera: Intrinsics) -> None:
-        self.lens = lens
-        self._size = (camera.width, camera.height)
-        self._shrunk = _shrunk_size(lens, camera)
-        self._camera = camera
-        fine = camera.resized(*(_SUPERSAMPLED * side for side in self._size))
-        self._maps = self._maps_to(fine, cv2.CV_16SC2)
+        self.lens, self._camera, self._size = lens, camera, (camera.width, camera.height)
+        finer = min(lens.fx / camera.fx, lens.fy / camera.fy)
+        halvings = max(0, math.ceil(math.log2(finer / _MOST_SHRINK)))
+        self._shrunk = max(1, lens.width >> halvings), max(1, lens.height >> halvings)
+        self._maps = self._maps_to(camera.resized(*(_SUPERSAMPLED * side for side in self._size)), cv2.CV_16SC2)
 
     def _maps_to(self, camera: Intrinsics, kind: int) -> tuple[NDArray[Any], NDArray[Any]]:
         """For `cv2.remap`, from the shrunk picture."""
@@ -286,13 +290,6 @@ class _Sampling:
     def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
         small = cv2.resize(depth, self._shrunk, interpolation=cv2.INTER_NEAREST_EXACT)
         return np.asarray(cv2.remap(small, *self._depth_maps, cv2.INTER_NEAREST), np.float32)  # 0, a hole, beyond it
-
-
-def _shrunk_size(lens: LensModel, camera: Intrinsics) -> tuple[int, int]:
-    """The picture's size, halved until it is at most four times as fine as the camera's."""
-    finer = min(lens.fx / camera.fx, lens.fy / camera.fy)
-    halvings = max(0, math.ceil(math.log2(finer / _MOST_SHRINK)))
-    return max(1, lens.width >> halvings), max(1, lens.height >> halvings)
 
 
 def require_usable(pose: SourcePose | None, traits: Traits) -> None:

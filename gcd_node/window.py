@@ -8,8 +8,7 @@ from typing import Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_node.errors import ConfigError
-from gcd_node.frame import MAX_FPS, Frame, Image
+from gcd_node.frame import Frame, Image
 from gcd_node.preprocess import write_planes
 
 Reason: TypeAlias = Literal["WIN_GAP", "CLOCK_STEP", "SRC_FORMAT", "SRC_LOST"]
@@ -59,21 +58,6 @@ class FrameWindow(PartialWindow):
     arrival_ns: int
     dropped: int
     static: bool
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class WindowCounts:
-    """What a builder has done so far.
-
-    frames: pushed. placed: on the grid. built: windows. dropped: frames whose stamp did not rise.
-    reasons: how often each reason has spoilt a window or restarted the builder.
-    """
-
-    frames: int
-    placed: int
-    built: int
-    dropped: int
-    reasons: dict[Reason, int]
 
 
 class _Arrived(NamedTuple):
@@ -142,8 +126,6 @@ class WindowBuilder:
             fit: brings a picture to the network's size; called once for every frame on the grid, on arrival.
             fit_depth: the same for depth; None: nobody wants depth and odometry.
             first_id, first_epoch: of the first window, for a builder that goes on where another one ended.
-        Raises:
-            ConfigError: a number out of range.
         """
         self.frames = frames
         self._stride = frames if stride is None else stride
@@ -157,20 +139,22 @@ class WindowBuilder:
         self._arrival_ns = 0
         self._thin: NDArray[np.uint8] | None = None  # of the last window, to see whether anything changes
         self._skip = 0
-        self._first_id, self._epoch = first_id, first_epoch
-        self._totals: Counter[str] = Counter()
+        self._first_id = first_id
+        self.epoch = first_epoch
+        """Of the window being built."""
+        self.pushed = self.placed = self.built = self.dropped = 0
+        """Frames so far, those on the grid, windows, and frames whose stamp did not rise."""
         self._reasons: Counter[Reason] = Counter()
 
     @property
-    def counts(self) -> WindowCounts:
-        """What was done so far."""
-        totals = {name: self._totals[name] for name in ("frames", "placed", "built", "dropped")}
-        return WindowCounts(**totals, reasons=dict(self._reasons))
+    def reasons(self) -> dict[Reason, int]:
+        """How often each reason has spoilt a window or restarted the builder."""
+        return dict(self._reasons)
 
     @property
     def next_id(self) -> int:
         """What the next window will be called."""
-        return self._first_id + self._totals["built"]
+        return self._first_id + self.built
 
     @property
     def filling(self) -> PartialWindow:
@@ -181,15 +165,10 @@ class WindowBuilder:
             stamps_ns=tuple(each.stamp_ns for each in placed),
             seqs=tuple(each.seq for each in placed),
             fps=self.fps,
-            epoch=self._epoch,
+            epoch=self.epoch,
             depths=tuple(each.depth for each in placed),
             odometry=tuple(each.odometry for each in placed),
         )
-
-    @property
-    def epoch(self) -> int:
-        """Of the window being built."""
-        return self._epoch
 
     def push(self, frame: Frame, arrival_ns: int) -> list[FrameWindow]:
         """Take the next frame, and give the windows it completes; mostly none, hardly ever two.
@@ -200,14 +179,14 @@ class WindowBuilder:
         Raises:
             ConfigError: `fit` refuses the picture.
         """
-        self._totals["frames"] += 1
+        self.pushed += 1
         if self._newest is not None:
             if frame.size != self._newest.size:
                 self.restart("SRC_FORMAT")
             elif self._is_clock_step(frame.stamp_ns - self._newest.stamp_ns, arrival_ns - self._arrival_ns):
                 self.restart("CLOCK_STEP")
             elif frame.stamp_ns <= self._newest.stamp_ns:
-                self._totals["dropped"] += 1
+                self.dropped += 1
                 return []
         if self._newest is None:
             self._grid.start(frame.stamp_ns)
@@ -226,7 +205,7 @@ class WindowBuilder:
     def restart(self, reason: Reason) -> None:
         """Forget all frames and begin a new epoch; counted under `reason`."""
         self._reasons[reason] += 1
-        self._epoch += 1
+        self.epoch += 1
         self._placed.clear()
         self._waiting = None
         self._newest = self._thin = None
@@ -237,14 +216,7 @@ class WindowBuilder:
 
         Args:
             fps, source_fps: as of a new builder.
-        Raises:
-            ConfigError: a number out of range.
         """
-        if self.frames < 1 or self._stride < 1 or not 0 < fps <= MAX_FPS or not 0 < self._max_skew <= 0.5:
-            raise ConfigError(
-                f"a window needs frames >= 1, 0 < fps <= {MAX_FPS:g}, stride >= 1 and 0 < max_skew <= 0.5, "
-                f"got {self.frames}, {fps:g}, {self._stride} and {self._max_skew:g}"
-            )
         self.fps = fps
         self._skew_ns = self._max_skew * 1e9 / fps
         self._early_ns = _EARLY * 1e9 / (fps if source_fps is None else source_fps)
@@ -285,13 +257,12 @@ class WindowBuilder:
 
     def _nearest(self, *candidates: _Arrived | None) -> _Arrived | None:
         """The candidate nearest to the next grid point; None if all are too far."""
-        distances = [
-            (abs(candidate.frame.stamp_ns - self._grid.next_ns), index)
-            for index, candidate in enumerate(candidates)
-            if candidate is not None
-        ]
-        distance_ns, index = min(distances, default=(self._skew_ns + 1, 0))
-        return candidates[index] if distance_ns <= self._skew_ns else None
+
+        def distance_ns(arrived: _Arrived) -> int:
+            return abs(arrived.frame.stamp_ns - self._grid.next_ns)
+
+        near = [each for each in candidates if each is not None and distance_ns(each) <= self._skew_ns]
+        return min(near, key=distance_ns, default=None)
 
     def _hole(self) -> None:
         if self._placed:
@@ -301,7 +272,7 @@ class WindowBuilder:
         self._grid.advance(None)
 
     def _take(self, arrived: _Arrived) -> list[FrameWindow]:
-        self._totals["placed"] += 1
+        self.placed += 1
         self._grid.advance(arrived.frame.stamp_ns)
         if self._skip > 0:
             self._skip -= 1
@@ -326,13 +297,13 @@ class WindowBuilder:
             window_id=self.next_id,
             fps=self.fps,
             arrival_ns=placed[-1].arrival_ns,
-            dropped=self._totals["dropped"],
-            epoch=self._epoch,
+            dropped=self.dropped,
+            epoch=self.epoch,
             static=before is not None and all(np.array_equal(each, before) for each in thin),
             depths=tuple(each.depth for each in placed),
             odometry=tuple(each.odometry for each in placed),
         )
-        self._totals["built"] += 1
+        self.built += 1
         self._skip = max(0, self._stride - self.frames)
         for _ in range(min(self._stride, self.frames)):
             self._placed.popleft()

@@ -132,7 +132,7 @@ def test_only_the_socket_files_know_zeromq() -> None:
 
 
 def test_only_the_oak_source_knows_depthai_and_only_lazily() -> None:
-    assert offenders([path for path in files("gcd_node") if path.name != "oak_camera.py"], "depthai") == []
+    assert offenders([path for path in files("gcd_node") if path.name != "oak.py"], "depthai") == []
     assert offenders(files("gcd_node"), "depthai", top_level_only=True) == []
 
 

@@ -6,6 +6,7 @@ import time
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
+from itertools import chain, repeat
 
 import numpy as np
 import torch
@@ -21,6 +22,7 @@ from gcd_node.node import Node, NodeOptions
 from gcd_node.publisher import Publisher
 from gcd_node.session import publisher_options
 from gcd_node.source_config import V4l2Source
+from gcd_node.sources.live import LiveCamera
 from gcd_node.transitions import Parts
 
 VIEW = "soak"
@@ -52,11 +54,11 @@ class CameraScript:
         self._taken: OrderedDict[int, int] = OrderedDict()
         self._seq = self._back_ns = 0
 
-    def open(self) -> "ScriptedCamera":
+    def open(self) -> LiveCamera:
         if time.monotonic_ns() < self._back_ns:
             raise SourceAbsentError("the scripted camera is gone; it comes back by itself")
         self.openings += 1
-        return ScriptedCamera(self)
+        return LiveCamera("the scripted camera", lambda: ScriptedDriver(self), open_timeout_s=5.0, hint="wait")
 
     def next_act(self) -> str:
         with self._lock:
@@ -81,37 +83,41 @@ class CameraScript:
             return self._taken.get(seq)
 
 
-class ScriptedCamera:
-    """One opening of a CameraScript. Implements FrameSource."""
+class ScriptedDriver:
+    """One opening of a CameraScript, as the Driver of a LiveCamera."""
+
+    fps = FPS
 
     def __init__(self, script: CameraScript) -> None:
-        self._script, self._closed = script, threading.Event()
+        self._script = script
         self._period_ns = round(_SECOND_NS / FPS)
         self._size, self._clock_ns, self._due_ns = script.size, 0, time.monotonic_ns()
+        self._played = chain.from_iterable(self._play(script.next_act()) for _ in repeat(None))
         self.corrupt = 0
-        width, height = script.size
-        self.info = SourceInfo(
-            kind="v4l2", id="scripted", width=width, height=height, fps_nominal=FPS, clock="realtime"
-        )
 
-    def frames(self) -> Iterator[Frame]:
-        self._due_ns = time.monotonic_ns()
-        while not self._closed.is_set():
-            yield from self._play(self._script.next_act())
+    def read(self) -> Frame | None:
+        return next(self._played)
+
+    def describe(self, first: Frame, fps: float) -> SourceInfo:
+        width, height = self._script.size
+        return SourceInfo(kind="v4l2", id="scripted", width=width, height=height, fps_nominal=fps, clock="realtime")
 
     def close(self) -> None:
-        self._closed.set()
+        """It holds nothing."""
 
-    def _play(self, act: str) -> Iterator[Frame]:
+    def _play(self, act: str) -> Iterator[Frame | None]:
         half = round(FPS / 2)
         yield from self._take(half)
         if act == "deaf":
             time.sleep(3.0)
         elif act in ("stall", "silence"):
-            self._closed.wait(0.6 if act == "stall" else 30.0)
+            for _ in range(6 if act == "stall" else 300):
+                time.sleep(0.1)
+                yield None
         elif act == "drop":
             self._due_ns += 3 * self._period_ns
-        elif act in ("repeat", "reverse") and self._wait():
+        elif act in ("repeat", "reverse"):
+            self._wait()
             late = 1 if act == "repeat" else 3
             yield self._frame(self._due_ns - late * self._period_ns)
         elif act == "damage":
@@ -119,7 +125,7 @@ class ScriptedCamera:
                 self.corrupt += 1
                 self._due_ns += self._period_ns
                 yield from self._take(1)
-        elif act == "die" and not self._closed.is_set():
+        elif act == "die":
             self._script.unplug()
             raise SourceLostError("the scripted camera was unplugged")
         if act in ("stall", "silence", "deaf"):
@@ -131,14 +137,13 @@ class ScriptedCamera:
 
     def _take(self, count: int) -> Iterator[Frame]:
         for _ in range(count):
-            if not self._wait():
-                return
+            self._wait()
             yield self._frame(self._due_ns)
             self._due_ns += self._period_ns
 
-    def _wait(self) -> bool:
-        """Until the next frame is due; False if the camera was closed."""
-        return not self._closed.wait(max(0.0, (self._due_ns - time.monotonic_ns()) / _SECOND_NS))
+    def _wait(self) -> None:
+        """Until the next frame is due."""
+        time.sleep(max(0.0, (self._due_ns - time.monotonic_ns()) / _SECOND_NS))
 
     def _frame(self, stamp_ns: int) -> Frame:
         return self._script.shoot(self._size, self._due_ns, stamp_ns + self._clock_ns)

@@ -25,7 +25,7 @@ from gcd_model import FileError, read_json
 from gcd_node.config import Count, ViewId
 from gcd_node.errors import DamagedRunError, OutputError, SourceError
 from gcd_node.image_io import make_folder
-from gcd_node.sources.opencv_camera import quiet_opencv
+from gcd_node.sources.opencv import quiet_opencv
 
 MANIFEST = "manifest.json"
 _MAX_MANIFEST = 64 * 2**20  # bytes: a day of windows

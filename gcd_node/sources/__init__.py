@@ -3,8 +3,10 @@
 What needs an optional package is imported when such a source is opened.
 """
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gcd_node.errors import SourceError
 from gcd_node.frame import FrameSource
 from gcd_node.source_config import (
     FileSource,
@@ -17,28 +19,15 @@ from gcd_node.source_config import (
     SyntheticSource,
     V4l2Source,
 )
-from gcd_node.sources.image_folder import ImageFolder, list_pictures, read_picture
-from gcd_node.sources.packaged import resolve_path
-from gcd_node.sources.synthetic import MovingPattern
-from gcd_node.sources.v4l2_device import V4l2Request, open_v4l2
-from gcd_node.sources.video_file import VideoFile
-from gcd_node.sources.video_stream import open_stream
+from gcd_node.sources.files import ImageFolder, MovingPattern, VideoFile
+from gcd_node.sources.opencv import open_stream, open_v4l2
 
 if TYPE_CHECKING:
     from gcd_node.auth import EventSink, ServerSecurity
 
-__all__ = [
-    "ImageFolder",
-    "MovingPattern",
-    "V4l2Request",
-    "VideoFile",
-    "list_pictures",
-    "open_source",
-    "open_stream",
-    "open_v4l2",
-    "read_picture",
-    "resolve_path",
-]
+__all__ = ["open_source", "resolve_path"]
+
+_PACKAGE = "package:"
 
 
 def open_source(
@@ -68,20 +57,32 @@ def open_source(
                 loop=config.loop,
             )
         case SyntheticSource():
-            return MovingPattern(fps=config.fps, frames=config.frames, pace=config.pace)
+            return MovingPattern(fps=config.fps, frames=config.frames, pace=config.pace, loop=config.loop)
         case V4l2Source():
-            request = V4l2Request(width=config.width, height=config.height, fps=config.fps)
-            return open_v4l2(config.device, request, open_timeout_s=config.open_timeout_s)
+            return open_v4l2(config)
         case RtspSource():
-            return open_stream(config.url, fps=config.fps, open_timeout_s=config.open_timeout_s)
+            return open_stream(config)
         case OakSource():
-            from gcd_node.sources.oak_camera import open_oak
+            from gcd_node.sources.oak import open_oak
 
             return open_oak(config)
         case PushSource():
             from gcd_node.sources.push import open_push
 
-            timeout_s = config.open_timeout_s
-            return open_push(
-                config.endpoint, fps=config.fps, open_timeout_s=timeout_s, security=security, on_event=on_event
-            )
+            return open_push(config, security, on_event)
+
+
+def resolve_path(name: str) -> Path:
+    """The path a launch file means: `package:drive.mp4` is a file of this package, anything else is itself.
+
+    Raises:
+        SourceError: the package has no such file.
+    """
+    if not name.startswith(_PACKAGE):
+        return Path(name).expanduser()
+    assets = Path(__file__).parent.parent / "assets"
+    path = assets / name.removeprefix(_PACKAGE)
+    if path.parent != assets or not path.is_file():
+        known = ", ".join(sorted(_PACKAGE + entry.name for entry in assets.glob("*.mp4")))
+        raise SourceError(f"the package has no file {name}; it has {known or 'none, install it again'}")
+    return path

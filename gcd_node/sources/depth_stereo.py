@@ -1,9 +1,7 @@
 """Depth from two cameras side by side: a DepthAI calibration or a rectified pair, matched by OpenCV's SGBM."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,14 +13,14 @@ from gcd_model import Intrinsics
 from gcd_node.calibration import HALF_PIXEL, LensModel, read_depthai
 from gcd_node.errors import ConfigError, DepthError
 from gcd_node.frame import Image
-from gcd_node.preprocess import project
-from gcd_node.sources.depth import DepthPicture, require_picture
+from gcd_node.preprocess import seen_pixels, widest_camera
+from gcd_node.sources.depth import DepthPicture
 
+_LEFT_SOCKET, _RIGHT_SOCKET = 1, 2  # CAM_B and CAM_C
 _SHORTEST_M, _LONGEST_M = 0.005, 2.0  # of baselines
 _MOST_TURNED_DEG = 30.0
-_WIDEST_DEG, _NARROWEST_DEG = 120.0, 1.0
-_BORDER_POINTS, _DIRECTIONS, _RINGS = 33, 32, 400
-_STEEPEST = 4.0  # of rays x / z: 76 degrees off the axis
+_WIDEST_DEG = 120.0
+_NEAREST_M = 0.5  # nearer than this, depth is unknown; the time of matching grows as it falls
 _BLOCK = 5  # pixels; less is noisier, more rounds heads off
 _STEPS = 16  # of SGBM's disparities in a pixel
 _LEAST_DISPARITY = 1.0  # pixels; SGBM errs by a quarter of one: farther away that is most of the depth
@@ -45,7 +43,6 @@ class StereoDepth:
         *,
         size: tuple[int, int],
         hfov_deg: float | None = None,
-        nearest_m: float = 0.5,
         match_scale: Literal[1, 2] = 1,
     ) -> None:
         """Work out the ideal camera and how to get there.
@@ -54,31 +51,28 @@ class StereoDepth:
             lenses: of the left and the right camera; `right_from_left`: [4, 4] rigid transform, metres.
             size: width and height of the rectified picture and its depth.
             hfov_deg: horizontal field of view of the rectified picture; None for the widest of which the left lens
-                sees every pixel, at most 120 degrees. Of a wider one, `seen` tells which pixels the lens sees.
-            nearest_m: nearer than this, depth is unknown. The time of matching grows as it falls.
+                sees every pixel, at most 120 degrees. Of a wider one, what no lens sees is black, without depth.
             match_scale: matches at this many times the size. 2 doubles the farthest depth and takes eight times as
                 long: for sizes well under the camera's.
         Raises:
-            ConfigError: these are not two cameras side by side, or this size and distance cannot be matched.
+            ConfigError: these are not two cameras side by side, or this size cannot be matched.
         """
-        if min(size) < 1:
-            raise ConfigError(f"size must be a width and a height of at least 1 pixel, got {size}")
-        if not 0 < nearest_m < math.inf:
-            raise ConfigError(f"nearest_m must be a positive number of metres, got {nearest_m:g}")
         if hfov_deg is not None and not 0 < hfov_deg <= _WIDEST_DEG:
             raise ConfigError(f"hfov_deg must be over 0 and at most {_WIDEST_DEG:g} degrees, got {hfov_deg:g}")
         self.baseline_m = _checked_baseline(right_from_left)
         left_turn, right_turn = _rectifying_turns(right_from_left)
-        wanted = _widest_hfov(lenses[0], left_turn, size) if hfov_deg is None else hfov_deg
-        self.lens = Intrinsics.from_hfov(wanted, *size)
+        if hfov_deg is None:
+            self.lens = widest_camera(lenses[0], *size, None, left_turn)
+        else:
+            self.lens = Intrinsics.from_hfov(hfov_deg, *size)
         fine = self.lens.resized(*(match_scale * side for side in size))
         self._left, self._right = _View(lenses[0], left_turn, fine), _View(lenses[1], right_turn, fine)
         self._scale, self._camera = match_scale, fine
-        self._most = fine.fx * self.baseline_m / nearest_m
+        self._most = fine.fx * self.baseline_m / _NEAREST_M
         if self._most >= fine.width:
             raise ConfigError(
-                f"at {nearest_m:g} m the two pictures of {fine.width} pixels have nothing in common (they are "
-                f"{self._most:.0f} pixels apart): give a larger nearest_m"
+                f"at {_NEAREST_M:g} m the two pictures of {fine.width} pixels have nothing in common (they are "
+                f"{self._most:.0f} pixels apart): the cameras stand too far apart, or see too little"
             )
         self._margin = _STEPS * max(1, math.ceil((self._most + 1) / _STEPS))
         self._matcher = _matcher(self._margin, fine)
@@ -90,90 +84,60 @@ class StereoDepth:
         calibration: Path,
         *,
         size: tuple[int, int],
-        left_socket: int = 1,
-        right_socket: int = 2,
         rectified: bool = False,
         hfov_deg: float | None = None,
-        nearest_m: float = 0.5,
         match_scale: Literal[1, 2] = 1,
     ) -> "StereoDepth":
         """For an OAK's pictures, by the calibration in its memory.
 
         Args:
             calibration: the JSON file that DepthAI's `eepromToJsonFile` writes.
-            left_socket, right_socket: of the two cameras; CAM_B and CAM_C unless the board is a special one.
             rectified: the device has rectified the pictures, which leaves both with the right camera's matrix.
         Raises:
             ConfigError: not such a file, no such camera in it, or numbers that no pair of cameras has.
         """
         try:
             board = read_depthai(calibration)
-            left, right = board.lens(left_socket), board.lens(right_socket)
-            right_from_left = board.transform(left_socket, right_socket)
+            left, right = board.lens(_LEFT_SOCKET), board.lens(_RIGHT_SOCKET)
+            right_from_left = board.transform(_LEFT_SOCKET, _RIGHT_SOCKET)
             if rectified:
                 left = right = replace(right, distortion="none", coefficients=())
-                right_from_left = _aside(_checked_baseline(right_from_left))
-            return cls(
-                (left, right),
-                right_from_left,
-                size=size,
-                hfov_deg=hfov_deg,
-                nearest_m=nearest_m,
-                match_scale=match_scale,
-            )
+                baseline_m, right_from_left = _checked_baseline(right_from_left), np.eye(4)
+                right_from_left[0, 3] = -baseline_m
+            return cls((left, right), right_from_left, size=size, hfov_deg=hfov_deg, match_scale=match_scale)
         except ConfigError as error:
             raise ConfigError(f"{calibration}: {error}") from error
 
-    @classmethod
-    def from_rectified(
-        cls, lens: LensModel, baseline_m: float, *, size: tuple[int, int], nearest_m: float = 0.5
-    ) -> "StereoDepth":
-        """For pairs that were rectified elsewhere: both have this lens, without distortion. Raises ConfigError."""
-        if lens.distortion != "none":
-            raise ConfigError(
-                f"rectified pictures have no distortion, got {lens.distortion}: give the lens of P, not K"
-            )
-        return cls((lens, lens), _aside(baseline_m), size=size, nearest_m=nearest_m)
-
-    @property
-    def seen(self) -> NDArray[np.bool_]:
-        """[H, W], the pixels of the rectified picture that the left lens sees; the others are black, without depth."""
-        return self._sampled(self._left.seen)
-
-    def __call__(self, *pictures: Image) -> tuple[Image, DepthPicture]:
-        """See DepthSource: a left and a right picture, RGB or grey, each of any size that its calibration scales to.
+    def __call__(self, left: Image, right: Image) -> tuple[Image, DepthPicture]:
+        """The rectified left picture and its depth, of two pictures u8 [H, W, 3], each of any size that its calibration
+        scales to.
 
         Raises:
-            DepthError: not two pictures, of another shape than they were calibrated for, or the calibration is of
-                another device: until a pair with enough detail fits it, each is checked for that.
+            DepthError: of another shape than they were calibrated for, or the calibration is of another device: until a
+                pair with enough detail fits it, each is checked for that.
         """
-        if len(pictures) != 2:
-            raise DepthError(f"stereo takes a left and a right picture, got {len(pictures)}")
-        left, right = self._left.image(pictures[0], "left"), self._right.image(pictures[1], "right")
+        left, right = self._left.image(left, "left"), self._right.image(right, "right")
         grey = [cv2.cvtColor(each, cv2.COLOR_RGB2GRAY) for each in (left, right)]
         if not self._checked:
             self._checked = _rows_match(*grey)
-        depth = self._sampled(self._depth(self._disparity(grey)))
-        if self._scale > 1:
-            left = cv2.resize(left, (self.lens.width, self.lens.height), interpolation=cv2.INTER_AREA)
-        return np.asarray(left, np.uint8), depth
-
-    def _disparity(self, grey: Sequence[NDArray[Any]]) -> NDArray[np.float32]:
-        """Pixels, [H, W]; under 0 is unknown. SGBM leaves its widest disparity out at the left: hence the margin."""
+        # SGBM leaves its widest disparity out at the left: hence the margin
         wide = [cv2.copyMakeBorder(each, 0, 0, self._margin, 0, cv2.BORDER_REPLICATE) for each in grey]
-        return self._matcher.compute(*wide)[:, self._margin :].astype(np.float32) / np.float32(_STEPS)
+        disparity = self._matcher.compute(*wide)[:, self._margin :].astype(np.float32) / np.float32(_STEPS)
+        start, step = self._scale // 2, self._scale  # every pixel of the picture's size: no mean over an edge
+        depth = np.ascontiguousarray(self._depth(disparity)[start::step, start::step])
+        if self._scale > 1:
+            size = (self.lens.width, self.lens.height)
+            left = np.asarray(cv2.resize(left, size, interpolation=cv2.INTER_AREA), np.uint8)
+        return left, depth
 
     def _depth(self, disparity: NDArray[np.float32]) -> DepthPicture:
+        """disparity: pixels, [H, W]; under 0 is unknown."""
         rows, columns = np.indices(disparity.shape, dtype=np.int32)
         there = np.rint(columns - disparity).astype(np.int32)
         known = (disparity >= _LEAST_DISPARITY) & (disparity <= self._most) & (there >= 0) & self._left.seen
         known &= self._right.seen[rows, there.clip(0, disparity.shape[1] - 1)]
         reach = np.float32(self._camera.fx * self.baseline_m)
         return np.divide(reach, disparity, out=np.zeros_like(disparity), where=known)
-
-    def _sampled(self, fine: NDArray[Any]) -> NDArray[Any]:
-        """Every pixel of the picture's size: a mean over an edge would be a surface that is not there."""
-        return np.ascontiguousarray(fine[self._scale // 2 :: self._scale, self._scale // 2 :: self._scale])
 
 
 class _View:
@@ -182,14 +146,13 @@ class _View:
     def __init__(self, lens: LensModel, turn: NDArray[np.float64], camera: Intrinsics) -> None:
         self._lens, self._camera = lens, camera
         u, v = np.arange(camera.width) + HALF_PIXEL, np.arange(camera.height) + HALF_PIXEL
-        self._pixels, self.seen = _pixels(lens, turn, camera, u, v)
+        self._pixels, self.seen = seen_pixels(lens, camera, u, v, turn)
         self._sampled: tuple[int, int] = (0, 0)  # size of the pictures the maps are for
         self._shrunk = (0, 0)
         self._maps: tuple[Any, Any]
 
     def image(self, picture: Image, name: str) -> Image:
         """u8 [H, W, 3], black where the lens does not see. Raises DepthError for a picture it is not calibrated for."""
-        picture = require_picture(picture, name)
         high, wide = picture.shape[:2]
         if (wide, high) != self._sampled:
             self._prepare(wide, high, name)
@@ -213,52 +176,6 @@ class _View:
         pixels = ((self._pixels + HALF_PIXEL) * scale - HALF_PIXEL).astype(np.float32)
         self._maps = cv2.convertMaps(pixels[..., 0], pixels[..., 1], cv2.CV_16SC2)
         self._sampled = (width, height)
-
-
-def _pixels(
-    lens: LensModel, turn: NDArray[np.float64], camera: Intrinsics, u: NDArray[Any], v: NDArray[Any]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Where the ideal camera's columns u and rows v lie in the lens's picture, and which of them it sees.
-
-    turn: [3, 3], from the lens's axes to the ideal camera's.
-    Returns: [V, U, 2] pixels from the first pixel's centre, and [V, U].
-    """
-    x, y = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
-    ahead = np.stack([x, y, np.ones_like(x)], axis=-1) @ turn  # each row is turn.T @ ray
-    rays = (ahead[..., :2] / np.maximum(ahead[..., 2:], 1 / _STEEPEST)).clip(-_STEEPEST, _STEEPEST)
-    pixels = project(lens, rays.reshape(-1, 2)).reshape(rays.shape)
-    low, high = -HALF_PIXEL, np.array([lens.width, lens.height]) - HALF_PIXEL
-    inside = ((pixels >= low) & (pixels <= high)).all(axis=-1)
-    return pixels, inside & (np.hypot(rays[..., 0], rays[..., 1]) < _reach(lens))
-
-
-@lru_cache(maxsize=8)
-def _reach(lens: LensModel) -> float:
-    """How far from the axis, as a tangent, the calibration holds: its polynomial may turn back beyond the picture it
-    was fitted to, and show there, mirrored, what lies inside."""
-    angles = np.linspace(0, 2 * math.pi, _DIRECTIONS, endpoint=False)
-    rings = np.linspace(0, _STEEPEST, _RINGS + 1)[:, None, None]
-    rays = rings * np.stack([np.cos(angles), np.sin(angles)], axis=-1)  # [R, A, 2]
-    away = (project(lens, rays.reshape(-1, 2)).reshape(rays.shape) - (lens.cx, lens.cy)) / (lens.fx, lens.fy)
-    with np.errstate(invalid="ignore"):  # a senseless polynomial ends in infinities: not rising
-        rising = (np.diff(np.hypot(away[..., 0], away[..., 1]), axis=0) > 0).all(axis=1)
-    return _STEEPEST if rising.all() else float(rings[int(np.argmin(rising)), 0, 0])
-
-
-def _widest_hfov(lens: LensModel, turn: NDArray[np.float64], size: tuple[int, int]) -> float:
-    """The widest field of view, degrees, of which the lens sees every pixel. Raises ConfigError if there is none."""
-    u, v = (np.linspace(0, side, _BORDER_POINTS) for side in size)
-
-    def sees(hfov_deg: float) -> bool:
-        return bool(_pixels(lens, turn, Intrinsics.from_hfov(hfov_deg, *size), u, v)[1].all())
-
-    least, most = _NARROWEST_DEG, _WIDEST_DEG
-    if not sees(least):
-        raise ConfigError(f"the left lens sees less than {least:g} degree around the axis of the rectified pair")
-    while most - least > 1e-3:
-        middle = (least + most) / 2
-        least, most = (middle, most) if sees(middle) else (least, middle)
-    return least
 
 
 def _rectifying_turns(right_from_left: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -311,13 +228,6 @@ def _matcher(disparities: int, camera: Intrinsics) -> cv2.StereoSGBM:
         speckleRange=2,
         mode=cv2.STEREO_SGBM_MODE_SGBM,
     )
-
-
-def _aside(baseline_m: float) -> NDArray[np.float64]:
-    """right_from_left of a rectified pair."""
-    transform = np.eye(4)
-    transform[0, 3] = -baseline_m
-    return transform
 
 
 def _checked_baseline(right_from_left: NDArray[np.float64]) -> float:

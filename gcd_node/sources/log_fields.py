@@ -3,30 +3,29 @@
 What is damaged in a way that is not looked for raises whatever the library does that found it.
 """
 
-import io
 import logging
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
 from statistics import median
 from typing import Any
 
 import cv2
-import imagesize
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_node.calibration import CameraInfo, LensModel, lens_of
+from gcd_node.calibration import LensModel, lens_of
 from gcd_node.errors import ConfigError, SourceError, TooShortError
 from gcd_node.frame import MAX_FPS, MAX_PIXELS, Image
+from gcd_node.sources.files import decode_picture
 from gcd_node.sources.log_reader import CAMERAS, CODED_IMAGES, TRANSFORMS, VIDEOS, LogMessage
 
 _LOG = logging.getLogger(__name__)
 _COLOUR = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 _CODECS = ("jpeg", "png", "webp")
 _DEPTH = ("16UC", "32FC", "64FC", "16SC", "32SC")
-_MOST_CAMERAS, _MOST_COEFFICIENTS = 1000, 64
 _AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # body_from_camera by REP 103
 _LOWEST_FPS = 0.05
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -121,25 +120,10 @@ class ImageDecoder:
 def _decoded(format_: str, coded: bytes) -> tuple[Image, str]:
     if format_.startswith(_DEPTH) or "compressedDepth" in format_:
         raise SourceError(f"{format_[:40]!r} is a map of depths, not a picture")
-    picture, kind = _checked_decode(coded, format_, _COLOUR)
+    picture, codec = decode_picture(coded, _COLOUR), next((each for each in _CODECS if each in format_.lower()), "jpeg")
     # image_transport names the order it handed to the coder, which takes all for BGR
     swapped = "compressed rgb" in format_
-    return np.ascontiguousarray(picture if swapped else cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8), kind
-
-
-def _checked_decode(coded: bytes, format_: str, flags: int) -> tuple[NDArray[Any], str]:
-    codec = next((each for each in _CODECS if each in format_.lower()), "jpeg")
-    try:
-        width, height = imagesize.get(
-            io.BytesIO(coded), exif_rotation=False
-        )  # a small message can claim a huge picture
-    except (ValueError, struct.error, SyntaxError) as error:
-        raise SourceError(f"a picture of format {format_[:40]!r} is damaged ({error})") from error
-    _check_size(width, height)
-    found = cv2.imdecode(np.frombuffer(coded, np.uint8), flags)
-    if found is None or found.shape[:2] != (height, width):  # pyright: ignore[reportUnnecessaryComparison]  stub hides None
-        raise SourceError(f"a {codec} picture is damaged")
-    return found, codec
+    return np.ascontiguousarray(picture if swapped else cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8), codec
 
 
 def _unpacked(fields: Any) -> Image:
@@ -186,7 +170,7 @@ def _decoded_depth(format_: str, coded: bytes) -> NDArray[Any]:
     start = coded.find(_PNG, 0, 64)
     if start < 0:
         raise SourceError(f"depth in {format_[:40]!r} is not read; known are 16-bit PNG and compressedDepth")
-    levels, _ = _checked_decode(coded[start:], format_, cv2.IMREAD_UNCHANGED)
+    levels = decode_picture(coded[start:], cv2.IMREAD_UNCHANGED)
     if levels.dtype != np.uint16 or levels.ndim != 2:
         raise SourceError(f"depth must be one channel of 16 bits, got {levels.dtype} {list(levels.shape)}")
     if not format_.startswith("32FC1"):
@@ -202,16 +186,16 @@ class Cameras:
     """What a log says of the robot's cameras: their lenses, and where they are by /tf_static."""
 
     def __init__(self) -> None:
-        self._infos: dict[str, tuple[str, CameraInfo]] = {}  # by topic: frame_id and calibration
+        self._infos: dict[str, tuple[str, Callable[..., LensModel | None]]] = {}  # by topic: frame_id and calibration
         self._parents: dict[str, tuple[str, NDArray[np.float64]]] = {}  # of a frame: parent, parent_from_frame
 
     def add(self, message: LogMessage) -> None:
-        """Keep what a message says. Raises SourceError: it has more numbers than any camera."""
-        if message.kind in CAMERAS and message.topic not in self._infos and len(self._infos) < _MOST_CAMERAS:
+        """Keep what a message says."""
+        if message.kind in CAMERAS and message.topic not in self._infos:
             fields = message.decode()
-            self._infos[message.topic] = head_of(fields)[1], _camera_info(fields)
+            self._infos[message.topic] = head_of(fields)[1], _calibration(fields)
         elif message.kind == TRANSFORMS and message.topic.endswith("tf_static"):
-            for each in message.decode().transforms[:_MOST_CAMERAS]:
+            for each in message.decode().transforms:
                 pose = pose_of(each.transform.translation, each.transform.rotation)
                 self._parents[each.child_frame_id] = each.header.frame_id, pose
 
@@ -227,7 +211,7 @@ class Cameras:
         # by the conventions of image_pipeline, pictures on image_rect... are undistorted already
         rectified = any(part.startswith("image_rect") for part in place)
         try:
-            lens = lens_of(self._infos[name][1], rectified=rectified)
+            lens = self._infos[name][1](rectified=rectified)
             return None if lens is None else lens.resized(*size)
         except ConfigError as error:
             remedy = "state calibration or hfov_deg in [source]"
@@ -252,15 +236,15 @@ class Cameras:
         return frame, pose
 
 
-def _camera_info(fields: Any) -> CameraInfo:
+def _calibration(fields: Any) -> Callable[..., LensModel | None]:
+    """lens_of() for the pictures of a message, but for whether they are rectified."""
     roi = getattr(fields, "roi", None)
-    return CameraInfo(
+    return partial(
+        lens_of,
         width=fields.width,
         height=fields.height,
-        distortion_model=fields.distortion_model,
-        d=_numbers(fields, "d"),
-        k=_numbers(fields, "k"),
-        p=_numbers(fields, "p"),
+        model=fields.distortion_model,
+        **{name: _numbers(fields, name) for name in "dkp"},
         binning=(getattr(fields, "binning_x", 1), getattr(fields, "binning_y", 1)),
         roi=(0, 0, 0, 0) if roi is None else (roi.x_offset, roi.y_offset, roi.width, roi.height),
     )
@@ -268,8 +252,6 @@ def _camera_info(fields: Any) -> CameraInfo:
 
 def _numbers(fields: Any, name: str) -> tuple[float, ...]:
     values = getattr(fields, name) if hasattr(fields, name) else getattr(fields, name.upper())  # as ROS 1 and Foxglove
-    if len(values) > _MOST_COEFFICIENTS:
-        raise SourceError(f"a calibration states {len(values)} numbers in {name}: it is damaged")
     return tuple(map(float, values))
 
 

@@ -5,21 +5,17 @@ into gigabytes. ROS messages are read by the definitions that ship with rosbags,
 """
 
 import functools
-import io
 import logging
 import re
 import time
-import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, TypeVar, cast
+from typing import IO, Any, cast
 
-import lz4.frame
-import zstandard
 from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader
+from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap_protobuf.decoder import DecoderFactory
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader as Ros2Reader
@@ -41,32 +37,12 @@ ODOMETRY, TRANSFORMS = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
 _READABLE = IMAGES | CAMERAS | {ODOMETRY, TRANSFORMS}
 
 _MAX_BYTES = 96 * 2**20  # of a record, and of an unfolded chunk
-_MAX_KEPT = 16 * 2**20  # of all topics and definitions together
-_Record = TypeVar("_Record", Schema, Channel, Metadata)
 _PACKED_MESSAGES = re.compile(r"compression_mode:\s*[\"']?message", re.IGNORECASE)
 _ROS1_TYPE = re.compile(r"^(\w+)/(\w+)$")
 
 
 class LogLimitError(SourceError):
     """A log takes more time or memory than it may, or nobody waits for it any more."""
-
-
-class Deadline:
-    """Time to find something in a log; `renew` it with every find."""
-
-    def __init__(self, seconds: float, stopped: Callable[[], bool] = lambda: False) -> None:
-        """stopped: whether to give up at once."""
-        self._seconds, self._stopped = seconds, stopped
-        self.renew()
-
-    def renew(self) -> None:
-        """Begin again, now."""
-        self._end_s = time.monotonic() + self._seconds
-
-    def check(self) -> None:
-        """Raises LogLimitError when the time is over."""
-        if time.monotonic() > self._end_s or self._stopped():
-            raise LogLimitError(f"nothing was found in {self._seconds:g} s of reading")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -87,17 +63,31 @@ class LogMessage:
 class LogReader:
     """One reading of a log. `messages` gives those of the types in this file."""
 
-    def __init__(self, path: Path, deadline: Deadline) -> None:
-        """Look at what is there. Raises SourceError: it is missing, empty or no log."""
-        self._path, self._deadline = path, deadline
+    def __init__(self, path: Path, search_s: float, stopped: Callable[[], bool] = lambda: False) -> None:
+        """Look at what is there.
+
+        Args:
+            search_s: time to find something in it; `renew` it with every find. stopped: whether to give up at once.
+        Raises:
+            SourceError: it is missing, empty or no log.
+        """
+        self._path, self._search_s, self._stopped = path, search_s, stopped
         self._files = log_files(path)
-        self._kept_bytes = 0
+        self.renew()
         self.damaged = 0
         """Chunks left out so far."""
         self.topics: dict[str, str] = {}
         """Every topic so far, and the type of its messages."""
         self.metadata: dict[str, dict[str, str]] = {}
         """What a recording of this node says of itself, by name."""
+
+    def renew(self) -> None:
+        """Begin to search anew, now."""
+        self._end_s = time.monotonic() + self._search_s
+
+    def _check(self) -> None:
+        if time.monotonic() > self._end_s or self._stopped():
+            raise LogLimitError(f"nothing was found in {self._search_s:g} s of reading")
 
     def messages(self) -> Iterator[LogMessage]:
         """Messages of one file after the other.
@@ -128,15 +118,15 @@ class LogReader:
                         decode=functools.partial(decode, record.data),
                     )
             elif isinstance(record, Schema) and schemas.get(record.id) != record:  # many writers repeat them
-                schemas[record.id] = self._kept(record)
+                schemas[record.id] = record
             elif isinstance(record, Channel) and channels.get(record.id) != record:
-                channels[record.id] = self._kept(record)
+                channels[record.id] = record
                 kind, decode = _reader_of(record, schemas.get(record.schema_id, schemas[0]))
                 self.topics[record.topic] = kind
                 if decode is not None:
                     readable[record.id] = kind, decode
             elif isinstance(record, Metadata) and record.name.startswith("gcd-node"):
-                self.metadata[record.name] = self._kept(record).metadata
+                self.metadata[record.name] = record.metadata
 
     def _mcap_records(self, file: Path) -> Iterator[McapRecord]:
         """Everything before the index, chunks unfolded; of a file that was cut, what is whole."""
@@ -156,7 +146,7 @@ class LogReader:
 
     def _chunk_records(self, chunk: Chunk) -> Iterator[McapRecord]:
         try:
-            yield from self._records(io.BytesIO(_unfolded(chunk)), in_chunk=True)
+            yield from self._records(_unfolded(chunk), in_chunk=True)
         except EndOfFile:
             return  # of the chunk
         except LogLimitError:
@@ -167,17 +157,8 @@ class LogReader:
             self.damaged += 1
 
     def _records(self, stream: IO[bytes], *, in_chunk: bool) -> Iterator[McapRecord]:
-        limited = cast(IO[bytes], _LimitedStream(stream, self._deadline))
+        limited = cast(IO[bytes], _LimitedStream(stream, self._check))
         return StreamReader(limited, skip_magic=in_chunk, emit_chunks=True, record_size_limit=_MAX_BYTES).records
-
-    def _kept(self, record: _Record) -> _Record:
-        """The same, its bytes counted. Raises LogLimitError."""
-        for value in vars(record).values():
-            parts = (*value, *value.values()) if isinstance(value, dict) else (value,)
-            self._kept_bytes += sum(len(part) for part in parts if isinstance(part, str | bytes))
-        if self._kept_bytes > _MAX_KEPT:
-            raise LogLimitError(f"topics and definitions alone are more than {_MAX_KEPT} bytes")
-        return record
 
     def _bag(self, path: Path) -> Iterator[LogMessage]:
         is_ros1 = kind_of_log(path) == ".bag"
@@ -187,7 +168,7 @@ class LogReader:
                 self.topics |= {each.topic: each.msgtype for each in reader.connections}
                 wanted = [each for each in reader.connections if each.msgtype in _READABLE]
                 for connection, at_ns, data in reader.messages(connections=wanted) if wanted else ():
-                    self._deadline.check()
+                    self._check()
                     yield LogMessage(
                         topic=connection.topic,
                         kind=connection.msgtype,
@@ -205,36 +186,27 @@ class LogReader:
 
 
 class _LimitedStream:
-    """What `mcap` reads from: only before the deadline, and never very much at once."""
+    """What `mcap` reads from: only while `check` raises nothing, and never very much at once."""
 
-    def __init__(self, stream: IO[bytes], deadline: Deadline) -> None:
-        self._stream, self._deadline = stream, deadline
+    def __init__(self, stream: IO[bytes], check: Callable[[], None]) -> None:
+        self._stream, self._check = stream, check
 
     def read(self, size: int) -> bytes:
         """As of a file. Raises LogLimitError; EndOfFile for a length that cannot be."""
-        self._deadline.check()
+        self._check()
         if size > _MAX_BYTES:
             raise EndOfFile(f"{size} bytes at once, more than {_MAX_BYTES}")
         return self._stream.read(size)
 
 
-def _unfolded(chunk: Chunk) -> bytes:
-    """Its records. The library itself would let a decompressor write more than the chunk states."""
-    size = chunk.uncompressed_size
-    if size > _MAX_BYTES:
-        raise SourceError(f"a chunk states {size} bytes, more than {_MAX_BYTES}")
-    if chunk.compression == "zstd":
-        with zstandard.ZstdDecompressor().stream_reader(chunk.data, read_across_frames=True) as unfolding:
-            records = io.BufferedReader(cast(io.RawIOBase, unfolding)).read(size)
-    elif chunk.compression == "lz4":
-        records = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size)
-    else:
-        records = chunk.data
-    if len(records) != size:
-        raise SourceError(f"a chunk states {size} bytes and holds {len(records)}: it is damaged")
-    if chunk.uncompressed_crc and zlib.crc32(records) != chunk.uncompressed_crc:
-        raise SourceError("the checksum of a chunk is wrong: it is damaged")
-    return records
+def _unfolded(chunk: Chunk) -> IO[bytes]:
+    """Its records."""
+    if chunk.uncompressed_size > _MAX_BYTES:
+        raise SourceError(f"a chunk states {chunk.uncompressed_size} bytes, more than {_MAX_BYTES}")
+    records, size = get_chunk_data_stream(chunk, validate_crc=True)
+    if size != chunk.uncompressed_size:
+        raise SourceError(f"a chunk states {chunk.uncompressed_size} bytes and holds {size}: it is damaged")
+    return cast(IO[bytes], records)
 
 
 def _reader_of(channel: Channel, schema: Schema) -> tuple[str, Callable[[bytes], Any] | None]:
@@ -295,7 +267,10 @@ def _files_in(folder: Path) -> tuple[Path, ...]:
     metadata = folder / "metadata.yaml"
     is_bag = metadata.is_file()
     if is_bag:
-        is_packed = _PACKED_MESSAGES.search(_metadata(metadata)) is not None
+        try:
+            is_packed = _PACKED_MESSAGES.search(read_small(metadata)) is not None
+        except FileError as error:
+            raise SourceError(f"{metadata} {error}; run ros2 bag reindex") from error
         if is_packed or not any(folder.glob("*.mcap")):
             return (folder,)
     found = list(folder.glob("*.mcap")) or list(folder.glob("*.db3"))
@@ -306,13 +281,6 @@ def _files_in(folder: Path) -> tuple[Path, ...]:
         names = ", ".join(file.name for file in found[:3])
         raise SourceError(f"{folder} is a folder of several logs; give one of them, such as {names}")
     return tuple(found)
-
-
-def _metadata(path: Path) -> str:
-    try:
-        return read_small(path)
-    except FileError as error:
-        raise SourceError(f"{path} {error}; run ros2 bag reindex") from error
 
 
 def line_of(error: Exception) -> str:

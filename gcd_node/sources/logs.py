@@ -13,23 +13,22 @@ import numpy as np
 from gcd_node.errors import SourceError
 from gcd_node.frame import Frame, SourceInfo
 from gcd_node.sources.depth import clean_depth
+from gcd_node.sources.files import Pace, Recording
 from gcd_node.sources.log_fields import Cameras, ImageDecoder, are_filled_in, depth_of, head_of, pose_of, rate_of
-from gcd_node.sources.log_reader import IMAGES, ODOMETRY, Deadline, LogLimitError, LogMessage, LogReader, line_of
-from gcd_node.sources.pace import Pace, Pacer
+from gcd_node.sources.log_reader import IMAGES, ODOMETRY, LogLimitError, LogMessage, LogReader, line_of
 
 _LOG = logging.getLogger(__name__)
 _SEARCH_S = 15.0  # of reading, for what is needed to begin, and from one picture to the next
 _SURVEYED_NS = 5_000_000_000
-_MOST_STAMPS, _MOST_TOPICS = 500, 1000
+_MOST_STAMPS = 500
 _LISTED, _SHOWN = 8, 100
-_LONGEST_STEP_NS = 10_000_000_000
 _LATEST_NS = 2**63  # in the year 2262
 _HEADER_UNCERTAINTY_US = 10_000  # drivers stamp anything from the begin of the exposure to the picture's arrival
 _WAIT_NS, _MOST_WAITING = 500_000_000, 30  # of the log's time, for what was recorded after the picture it belongs to
 _OWN, _OWN_SOURCE = "gcd-node", "gcd-node/source"  # metadata of this node's recordings
 
 
-class LogSource:
+class LogSource(Recording):
     """One topic of a log as a FrameSource: ROS or Foxglove pictures, compressed, raw or video.
 
     Stamps are those of the pictures' headers, on the clock of the robot; where nobody filled these in, when they were
@@ -62,86 +61,36 @@ class LogSource:
             SourceError: no log; no such topic; no pictures, or on several topics; none of them can be decoded, or none
                 was found in 15 s of reading. TooShortError: one picture.
         """
-        self._path, self._loop, self._pacer = path.absolute(), loop, Pacer(pace)
+        super().__init__(str(path), fps=None, pace=pace, loop=loop)
+        self._path = path.absolute()
         self._found = _Survey(self._path, topic, depth_topic, odometry_topic)
-        self._matcher: _Matcher | None = None  # of the pass under way
-        self._corrupt = 0  # of the passes before
-
-    @property
-    def info(self) -> SourceInfo:
-        """Size of the first picture, rate by the first seconds' stamps, lens if the log states one."""
-        return self._found.info
-
-    @property
-    def topic(self) -> str:
-        """Where the pictures are."""
-        return self._found.topic
-
-    @property
-    def corrupt(self) -> int:
-        """Pictures, and damaged parts of the log, left out so far."""
-        return self._corrupt + (0 if self._matcher is None else self._matcher.corrupt + self._matcher.reader.damaged)
-
-    def frames(self) -> Iterator[Frame]:
-        """Every picture that can be decoded. See FrameSource.frames.
-
-        Raises:
-            SourceError: none can any more; or the next one does not come in 15 s of reading.
-        """
-        offset_ns, newest_ns = 0, None
-        for frame in self._played():
-            step_ns = None if newest_ns is None else frame.stamp_ns - newest_ns
-            if step_ns is None or not 0 <= step_ns <= _LONGEST_STEP_NS:
-                offset_ns = self._pacer.start(frame.stamp_ns)
-            newest_ns = frame.stamp_ns
-            if not self._pacer.wait(frame.stamp_ns, offset_ns):
-                return
-            yield frame
-
-    def close(self) -> None:
-        """End `frames` soon, from any thread."""
-        self._pacer.stop()
-
-    def _played(self) -> Iterator[Frame]:
-        """One pass, or pass after pass, each going on where the last one ended."""
-        begin_ns, begin_seq, period_ns = 0, 0, round(1e9 / self.info.fps_nominal)
-        while not self._pacer.stopped:
-            first = newest = None
-            for frame in self._one_pass():
-                first = frame if first is None else first
-                newest = replace(frame, stamp_ns=frame.stamp_ns + begin_ns, seq=frame.seq + begin_seq)
-                yield newest
-            if self._pacer.stopped or (newest is not None and not self._loop):
-                return
-            if first is None or newest is None:
-                raise SourceError(f"{self._path} gives no pictures any more; was it replaced while it was playing?")
-            begin_ns = newest.stamp_ns + period_ns - first.stamp_ns
-            begin_seq = newest.seq + 1 - first.seq
+        self.info, self.topic = self._found.info, self._found.topic
 
     def _one_pass(self) -> Iterator[Frame]:
-        deadline = Deadline(_SEARCH_S, stopped=lambda: self._pacer.stopped)
-        matcher, count = _Matcher(self._found, LogReader(self._path, deadline)), 0
-        self._corrupt, self._matcher = self.corrupt, matcher
+        reader = LogReader(self._path, _SEARCH_S, self._stopped.is_set)
+        matcher, count, before = _Matcher(self._found), 0, self.corrupt
         try:
-            for message in matcher.reader.messages():
+            for message in reader.messages():
                 for frame in matcher.take(message):
                     count += 1
                     yield frame
-                    deadline.renew()  # what was done with it took its own time
+                    reader.renew()  # what was done with it took its own time
+                self.corrupt = before + matcher.corrupt + reader.damaged
             yield from matcher.rest()
         except LogLimitError as error:
-            if not self._pacer.stopped:
+            if not self._stopped.is_set():
                 raise SourceError(
                     f"{self._path}: {error} after {count} pictures on {self.topic}, and the log goes on; cut it to the "
                     f"pictures: mcap filter LOG -y {self.topic} -o NEW"
                 ) from None
+        self.corrupt = before + matcher.corrupt + reader.damaged
 
 
 class _Matcher:
     """Puts the frames of one pass together: a picture waits until its depth and odometry have come."""
 
-    def __init__(self, found: "_Survey", reader: LogReader) -> None:
-        self._found, self.reader, self._decoder = found, reader, ImageDecoder()
+    def __init__(self, found: "_Survey") -> None:
+        self._found, self._decoder = found, ImageDecoder()
         self._waiting: deque[tuple[int, Frame]] = deque()  # and when each was recorded
         self._depth = _Nearest(found.depth_topic, found.info.fps_nominal, 32)
         self._odometry = _Nearest(found.odometry_topic, found.info.fps_nominal, 2048)
@@ -262,7 +211,7 @@ class _Survey:
     def __init__(self, path: Path, topic: str | None, depth_topic: str | None, odometry_topic: str | None) -> None:
         """See LogSource."""
         self._path, self._wanted, self.depth_topic, self.odometry_topic = path, topic, depth_topic, odometry_topic
-        self._reader = LogReader(path, Deadline(_SEARCH_S))
+        self._reader = LogReader(path, _SEARCH_S)
         self._topics: dict[str, _Topic] = {}
         self._cameras, self._body, self._limit = Cameras(), "", ""
         first_ns = None
@@ -289,8 +238,7 @@ class _Survey:
     def _add(self, message: LogMessage) -> None:
         try:
             if message.kind in IMAGES and message.topic != self.depth_topic:
-                if message.topic in self._topics or len(self._topics) < _MOST_TOPICS:
-                    self._topics.setdefault(message.topic, _Topic(message.topic)).add(message)
+                self._topics.setdefault(message.topic, _Topic(message.topic)).add(message)
             elif message.kind == ODOMETRY and message.topic == self.odometry_topic:
                 self._body = self._body or message.decode().child_frame_id
             else:

@@ -4,6 +4,7 @@ The node binds, whoever has frames connects (gcd_client.FramePusher; docs/camera
 """
 
 import logging
+import math
 import time
 
 import zmq
@@ -13,8 +14,9 @@ from gcd_client.protocol import MAX_HEADER, MAX_PAYLOAD, PREFIX, ClientError, Me
 from gcd_node.auth import Context, EventSink, ServerSecurity, SocketGuard, own_endpoint, unbind
 from gcd_node.errors import DepthError, SourceError, SourceLostError
 from gcd_node.frame import Frame, SourceInfo
-from gcd_node.sources.depth import DepthPicture, clean_depth
-from gcd_node.sources.live_camera import LiveCamera, SparingLog
+from gcd_node.source_config import PushSource
+from gcd_node.sources.depth import clean_depth
+from gcd_node.sources.live import LiveCamera
 
 _LOG = logging.getLogger(__name__)
 _WAIT_MS = 100
@@ -22,30 +24,25 @@ _QUEUED = 2
 _FARTHEST_NS = 10_000_000_000  # a stamp that is farther from now is of another clock
 _UNCERTAINTY_US = 10_000
 _SILENT_S = 0.5  # a pusher that is silent for so long has made way for another one
+_WARN_EVERY_S = 10.0
 _HINT = "start who pushes them, or correct endpoint in [source]; state fps there if they come slowly"
 
 
 def open_push(
-    endpoint: str,
-    *,
-    fps: float | None,
-    open_timeout_s: float,
-    security: ServerSecurity | None = None,
-    on_event: EventSink | None = None,
+    config: PushSource, security: ServerSecurity | None = None, on_event: EventSink | None = None
 ) -> LiveCamera:
     """The first who pushes frames, as a camera.
 
     Args:
-        endpoint: to bind, "ipc" for the runtime folder. fps: None to measure it.
         security: keys and clients of a tcp endpoint; only operators may push. on_event: gets AUTH_DENIED.
     Raises:
         SourceAbsentError: nobody pushed a frame in time. EndpointError, ConfigError: see SocketGuard.bind().
         SetupError: no endpoint.
     """
     return LiveCamera(
-        f"the push source at {endpoint}",
-        lambda: _PushDriver(endpoint, fps, security, on_event),
-        open_timeout_s=open_timeout_s,
+        f"the push source at {config.endpoint}",
+        lambda: _PushDriver(config, security, on_event),
+        open_timeout_s=config.open_timeout_s,
         hint=_HINT,
     )
 
@@ -53,27 +50,24 @@ def open_push(
 class _PushDriver:
     """A bound socket as a Driver. Stamps arrive in UTC; the node's are of its monotonic clock."""
 
-    def __init__(
-        self, endpoint: str, fps: float | None, security: ServerSecurity | None, on_event: EventSink | None
-    ) -> None:
+    def __init__(self, config: PushSource, security: ServerSecurity | None, on_event: EventSink | None) -> None:
         """Raises EndpointError, ConfigError, SetupError: see SocketGuard.bind()."""
-        self.fps, self.corrupt = fps, 0
+        self.fps, self.corrupt = config.fps, 0
         self._pusher, self._heard_s = "", 0.0
-        self._refusals, self._depths = SparingLog(_LOG), SparingLog(_LOG)
+        self._warned_s = -math.inf
         context: Context = zmq.Context()
         self._context, self._guard = context, SocketGuard(context, security, on_event)
         try:
             self._socket = context.socket(zmq.PULL)
             self._socket.set(zmq.RCVHWM, _QUEUED)
             self._socket.set(zmq.MAXMSGSIZE, PREFIX.size + MAX_HEADER + MAX_PAYLOAD)
-            self._endpoint = self._guard.bind(self._socket, own_endpoint(endpoint, "frames"), "frames")
+            self._endpoint = self._guard.bind(self._socket, own_endpoint(config.endpoint, "frames"), "frames")
         except BaseException:
             self._guard.close()
             context.destroy(linger=0)
             raise
 
     def read(self) -> Frame | None:
-        """See Driver."""
         self._guard.report_failures()
         if not self._socket.poll(_WAIT_MS):
             return None
@@ -86,11 +80,10 @@ class _PushDriver:
             raise
         except (ClientError, SourceError) as error:
             self.corrupt += 1
-            self._refusals.warn(f"a pushed frame is refused: {error}")
+            self._warn(f"a pushed frame is refused: {error}")
             return None
 
     def describe(self, first: Frame, fps: float) -> SourceInfo:
-        """See Driver."""
         return SourceInfo(
             kind="push",
             id=self._endpoint.rpartition("/")[2],
@@ -102,10 +95,15 @@ class _PushDriver:
         )
 
     def close(self) -> None:
-        """See Driver."""
         unbind(self._socket, self._endpoint, 0)
         self._guard.close()
         self._context.destroy(linger=0)
+
+    def _warn(self, text: str) -> None:
+        """Of what may happen with every frame, only once in a while."""
+        if time.monotonic() - self._warned_s > _WARN_EVERY_S:
+            _LOG.warning("%s (the next such line in %g s at the earliest)", text, _WARN_EVERY_S)
+            self._warned_s = time.monotonic()
 
     def _frame(self, pushed: PushedFrame) -> Frame:
         """Raises SourceError, MessageError: it is refused; SourceLostError: another camera takes over."""
@@ -122,11 +120,11 @@ class _PushDriver:
                 raise SourceLostError("somebody else pushes frames from now on")
             self._pusher = pushed.pusher
         self._heard_s = now_s
-        depth: DepthPicture | None = None
+        depth = None
         try:
             if pushed.depth is not None:
                 depth = clean_depth(pushed.depth, pushed.image.shape[:2])
         except DepthError as error:
-            self._depths.warn(f"frame {pushed.seq} goes without its depth: {error}")
+            self._warn(f"frame {pushed.seq} goes without its depth: {error}")
         stamp_ns = time.monotonic_ns() - late_ns
         return Frame(image=pushed.image, stamp_ns=stamp_ns, seq=pushed.seq, depth=depth, odometry=pushed.odometry)

@@ -3,27 +3,29 @@
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 
-from gcd_node.errors import SourceAbsentError, SourceError
+from gcd_node.errors import SourceAbsentError, SourceLostError
 from gcd_node.frame import Frame, Image, SourceInfo
+from gcd_node.sources.live import LiveCamera
 
 FPS = 24.0
 
 
-class Camera:
-    """Gives what `feed` and `shoot` put in; silent otherwise. deaf: does not even end when it is closed."""
+class Camera(LiveCamera):
+    """Gives what `feed` and `shoot` put in; silent otherwise. Open at once, without a thread."""
 
-    def __init__(self, *, size: tuple[int, int] = (96, 64), fps: float = FPS, deaf: bool = False) -> None:
+    corrupt = 0
+
+    def __init__(self, *, size: tuple[int, int] = (96, 64), fps: float = FPS) -> None:
         self.info = SourceInfo(
             kind="v4l2", id="bench", width=size[0], height=size[1], fps_nominal=fps, clock="realtime"
         )
-        self.corrupt = 0
         self.last_s = 0.0
         self.closed = threading.Event()
-        self._deaf, self._seq = deaf, 0
+        self._seq = 0
         self._items: queue.Queue[Frame | Exception | None] = queue.Queue()
 
     def feed(self, item: Frame | Exception | None) -> None:
@@ -46,22 +48,24 @@ class Camera:
             self.shoot(stamp_ns=start_ns + round(i * 1e9 * period_s))
             time.sleep(period_s if pause_s is None else pause_s)
 
-    def frames(self) -> Iterator[Frame]:
-        while self._deaf or not self.closed.is_set():
+    def take(self, timeout_s: float | None = None) -> Frame | None:
+        end_s = None if timeout_s is None else time.monotonic() + timeout_s
+        while not self.closed.is_set():
             try:
                 item = self._items.get(timeout=0.01)
             except queue.Empty:
+                if end_s is not None and time.monotonic() > end_s:
+                    return None
                 continue
             if item is None:
-                return
+                raise SourceLostError("the stream ended")
             if isinstance(item, Exception):
                 raise item
-            yield item
+            return item
+        return None
 
     def close(self) -> None:
         self.closed.set()
-        if self._deaf:
-            time.sleep(30)
 
 
 class Bench:
@@ -95,6 +99,3 @@ def until(condition: Callable[[], bool], timeout_s: float = 60.0) -> None:
     while not condition():
         assert time.monotonic() < deadline_s, "it did not come about in time"
         time.sleep(0.005)
-
-
-__all__ = ["FPS", "Bench", "Camera", "SourceError", "until"]

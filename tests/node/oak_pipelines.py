@@ -4,7 +4,6 @@ import threading
 import time
 from collections.abc import Callable
 from datetime import timedelta
-from pathlib import Path
 from typing import cast
 
 import cv2
@@ -13,8 +12,7 @@ from media import HEIGHT, WIDTH
 
 from gcd_node.calibration import LensModel
 from gcd_node.frame import Image
-from gcd_node.sources.oak_camera import OakStream, load_depthai
-from gcd_node.sources.oak_device import Guard
+from gcd_node.sources.oak import OakStream, load_depthai
 
 load_depthai()
 
@@ -62,19 +60,15 @@ def no_lens(width: int, height: int) -> LensModel | None:
 class Scripted:
     """A pipeline factory: a host-only pipeline with one camera that does what the script says."""
 
-    def __init__(
-        self, script: Script, *, guarded: bool = True, lens: Callable[[int, int], LensModel | None] | None = None
-    ) -> None:
+    def __init__(self, script: Script, *, lens: Callable[[int, int], LensModel | None] | None = None) -> None:
         self._script = script
-        self._guarded = guarded
         self._lens = lens or no_lens
         self.pipeline: WatchedPipeline | None = None
 
-    def __call__(self, guard: Guard) -> OakStream:
+    def __call__(self) -> OakStream:
         self.pipeline = WatchedPipeline()
         camera = self.pipeline.create(HostCamera)
-        body = lambda: self._script(camera)  # noqa: E731
-        camera.body = guard(body) if self._guarded else body
+        camera.body = lambda: self._script(camera)
         return OakStream(pipeline=self.pipeline, output=camera.out, id=NAME, fps=FPS, lens=self._lens)
 
     def device_turns(self, state: dai.DeviceState) -> None:
@@ -134,18 +128,3 @@ class Handed:
             if self._handed.acquire(timeout=0.05):
                 camera.out.send(waiting.pop(0))
         camera.idle()
-
-
-def replay(path: Path, fps: float = 30.0) -> Callable[[Guard], OakStream]:
-    """A pipeline factory: DepthAI's own replay of a video file, once."""
-
-    def build(_: Guard) -> OakStream:
-        pipeline = dai.Pipeline(createImplicitDevice=False)
-        video = pipeline.create(dai.node.ReplayVideo)
-        video.setReplayVideoFile(path)
-        video.setOutFrameType(dai.ImgFrame.Type.NV12)
-        video.setFps(fps)
-        video.setLoop(False)
-        return OakStream(pipeline=pipeline, output=video.out, id=path.name, fps=fps)
-
-    return build

@@ -19,8 +19,9 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Bag2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from gcd_node.frame import Image
+from gcd_node.frame import Frame, Image
 from gcd_node.sources.log_reader import ros1_types
+from gcd_node.sources.logs import LogSource
 
 START_NS = 1_750_000_000_123_456_789
 PERIOD_NS = 100_000_000
@@ -196,3 +197,22 @@ def write_foxglove(
 def stamped(message: Any, stamp_ns: int) -> Any:
     message.timestamp.seconds, message.timestamp.nanos = stamp_ns // 10**9, stamp_ns % 10**9
     return message
+
+
+def at(i: float) -> int:
+    """When the i-th message of a log is."""
+    return START_NS + round(i * PERIOD_NS)
+
+
+def stamps(frames: Sequence[Frame]) -> list[int]:
+    return [frame.stamp_ns for frame in frames]
+
+
+def of_pictures(
+    path: Path, pictures: Sequence[Fields], kind: str = COMPRESSED, topic: str = "/front/image"
+) -> LogSource:
+    """A log of these, open."""
+    with ros_log(path) as log:
+        for fields in pictures:
+            log.say("/front/image", kind, fields)
+    return LogSource(path)

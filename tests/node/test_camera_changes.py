@@ -34,7 +34,7 @@ class Steady(Camera):
         super().__init__(size=size, fps=fps)
         self._size, self._stamp_ns, self._level = size, time.monotonic_ns(), 0
 
-    def take(self, size: tuple[int, int] | None = None) -> None:
+    def step(self, size: tuple[int, int] | None = None) -> None:
         """A picture, of this size from here on."""
         width, height = self._size = size or self._size
         self._level = 40 + (self._level + 7) % 150
@@ -60,7 +60,7 @@ def view_of(rig: Rig, camera: Steady, epoch: int, size: tuple[int, int] | None =
     """
     deadline_s = time.monotonic() + GUARD_S
     while not (seen := [view for view in rig.of() if view.header.src.epoch == epoch + len(rig.events("CLOCK_STEP"))]):
-        camera.take(size)
+        camera.step(size)
         assert time.monotonic() < deadline_s, "no view came in time"
     return seen[0]
 
@@ -113,7 +113,7 @@ def test_pictures_the_model_cannot_be_given_are_refused_until_they_change_and_th
         rig.await_state("active")
         view_of(rig, camera, 0)
         for _ in range(15):
-            camera.take(size)
+            camera.step(size)
         told = rig.await_event("SRC_REFUSED")
         status = rig.await_status(lambda status: "SRC_REFUSED" in status["reasons"])
         assert rig.ask("state").result["state"] == "active"
@@ -167,7 +167,7 @@ def test_a_camera_that_returns_too_slow_for_the_stated_rate_is_refused_and_the_n
         lose(rig, camera)
         slow = bench.plug(Steady(fps=10.0))
         for _ in range(15):
-            slow.take()
+            slow.step()
         assert "fps 24 is more than the 10 the source gives" in rig.await_event("SRC_REFUSED")["message"]
         lose(rig, slow, 2)
         right = bench.plug(Steady())

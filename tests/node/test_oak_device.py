@@ -1,9 +1,11 @@
-"""Which OAK is meant, and what is known of its lens, without one."""
+"""Which OAK is meant, what is known of its lens, and how DepthAI comes into a process; without a camera."""
 
-import logging
+import os
+import subprocess
 import sys
 import time
 from contextlib import closing
+from pathlib import Path
 from threading import Event
 from unittest.mock import create_autospec
 
@@ -14,8 +16,7 @@ from gcd_node.calibration import LensModel
 from gcd_node.config import parse_config
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError
 from gcd_node.source_config import OakSource
-from gcd_node.sources.oak_camera import camera_pipeline, lens_in_memory, load_depthai, open_oak, open_pipeline
-from gcd_node.sources.oak_device import Guard, find_device
+from gcd_node.sources.oak import camera_pipeline, find_device, lens_in_memory, open_oak, open_pipeline
 
 try:
     import oak_pipelines as pipelines
@@ -56,20 +57,14 @@ def test_an_address_that_the_search_did_not_find_is_to_be_tried() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wanted", "available", "connected", "said"),
-    [
-        (None, [], [], "wanted an OAK camera, found none"),
-        (None, [], [ONE], f"{ONE.deviceId} .* in use by another process"),
-        (None, [ONE, TWO], [ONE, TWO], f"{ONE.deviceId} .*{TWO.deviceId}.*say which with device"),
-        ("14442C", [ONE], [ONE, TWO], f"OAK 14442C, found {ONE.deviceId} .*{TWO.deviceId} .* in use"),
-    ],
-    ids=["none", "busy", "several", "another"],
+    ("wanted", "available", "connected"), [(None, [], [ONE]), (None, [ONE, TWO], [ONE, TWO]), ("14442C", [ONE], [ONE])]
 )
 def test_a_device_that_cannot_be_told_is_absent_and_the_others_are_listed(
-    wanted: str | None, available: list[dai.DeviceInfo], connected: list[dai.DeviceInfo], said: str
+    wanted: str | None, available: list[dai.DeviceInfo], connected: list[dai.DeviceInfo]
 ) -> None:
-    with pytest.raises(SourceAbsentError, match=said):
+    with pytest.raises(SourceAbsentError) as caught:
         find_device(wanted, lambda: available, lambda: connected)
+    assert all(each.deviceId in str(caught.value) for each in connected)
 
 
 @pytest.fixture
@@ -81,7 +76,7 @@ def no_device() -> None:
 @pytest.mark.usefixtures("no_device")
 def test_no_device_is_said_within_three_seconds() -> None:
     begin = time.monotonic()
-    with pytest.raises(SourceAbsentError, match="wanted an OAK camera, found none") as caught:
+    with pytest.raises(SourceAbsentError) as caught:
         open_oak(OakSource(open_timeout_s=PATIENT_S))
     assert caught.value.exit_code == 69
     assert time.monotonic() - begin < 6  # 1.1 s on a machine that is not busy
@@ -90,7 +85,7 @@ def test_no_device_is_said_within_three_seconds() -> None:
 @pytest.mark.usefixtures("no_device")
 def test_an_address_where_nobody_answers_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DEPTHAI_SEARCH_TIMEOUT", "300")
-    with pytest.raises(SourceAbsentError, match=r"no OAK camera answers at 127\.0\.0\.1"):
+    with pytest.raises(SourceAbsentError):
         open_oak(OakSource(device="127.0.0.1", open_timeout_s=PATIENT_S))
 
 
@@ -107,7 +102,7 @@ def test_a_real_camera_is_wired_by_depthais_own_names(monkeypatch: pytest.Monkey
     monkeypatch.setattr(dai, "Device", devices)
     monkeypatch.setattr(dai, "Pipeline", lambda device: pipeline if device is opened else None)
     config = OakSource(fps=15.0, socket="CAM_B", focus=130, exposure_us=8000, iso=400, anti_banding="50hz")
-    stream = camera_pipeline(config)(lambda body: body)
+    stream = camera_pipeline(config)
     lens = stream.lens(1280, 720)
     devices.assert_called_once_with(ONE)
     opened.setMaxReconnectionAttempts.assert_called_once_with(0)
@@ -125,31 +120,25 @@ def test_a_real_camera_is_wired_by_depthais_own_names(monkeypatch: pytest.Monkey
 
 def test_a_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "depthai", None)
-    with pytest.raises(SourceError, match=r"pip install 'gcd-node\[oak\]'"):
+    with pytest.raises(SourceError):
         open_oak(OakSource())
-
-
-def test_an_older_depthai_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delattr(dai.Pipeline, "setDeviceStateCallback")
-    with pytest.raises(SourceError, match=r"3\.12 or newer"):
-        load_depthai()
 
 
 def test_an_attempt_that_was_given_up_ends_before_the_next_one_begins() -> None:
     first, second, answer = pipelines.Scripted(pipelines.steady()), pipelines.Scripted(pipelines.steady()), Event()
     running: list[bool] = []
 
-    def slow(guard: Guard) -> pipelines.OakStream:
+    def slow() -> pipelines.OakStream:
         answer.wait(PATIENT_S)
-        return first(guard)
+        return first()
 
-    def next_one(guard: Guard) -> pipelines.OakStream:
+    def next_one() -> pipelines.OakStream:
         running.append(first.pipeline is None or first.pipeline.isRunning())
-        return second(guard)
+        return second()
 
-    with pytest.raises(SourceAbsentError, match="no picture within"):
+    with pytest.raises(SourceAbsentError):
         open_pipeline(slow, open_timeout_s=0.2)
-    with pytest.raises(SourceAbsentError, match="still busy"):
+    with pytest.raises(SourceAbsentError):
         open_pipeline(next_one, open_timeout_s=0.2)
     answer.set()
     open_pipeline(next_one, open_timeout_s=PATIENT_S).close()
@@ -209,44 +198,75 @@ def test_distortion_has_our_names(coefficients: list[float], model: str, wanted:
     assert (lens.distortion, lens.coefficients) == wanted
 
 
-def test_a_memory_without_this_sensor_is_no_lens(caplog: pytest.LogCaptureFixture) -> None:
-    assert lens_in_memory(dai.CalibrationHandler(dai.EepromData()), SOCKET, 640, 480) is None
-    assert "no calibration for CAM_A" in caplog.text
+def test_a_lens_that_makes_no_sense_is_no_lens() -> None:
+    broken = memory(coefficients=RATIONAL, model="Perspective", width=1000)
+    for stored in (
+        dai.CalibrationHandler(dai.EepromData()),
+        broken,
+        memory(coefficients=RATIONAL, model="RadialDivision"),
+    ):
+        assert lens_in_memory(stored, SOCKET, 500, 500) is None
 
 
-@pytest.mark.parametrize("broken", ["model", "axis"])
-def test_a_lens_that_makes_no_sense_is_no_lens(broken: str, caplog: pytest.LogCaptureFixture) -> None:
-    stored = memory(
-        coefficients=RATIONAL,
-        model="RadialDivision" if broken == "model" else "Perspective",
-        width=4056 if broken == "model" else 1000,
-    )
-    assert lens_in_memory(stored, SOCKET, 500, 500) is None
-    assert "uncalibrated" in caplog.text
-
-
-def test_the_lens_of_the_picture_itself_comes_before_the_memory(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_lens_of_the_picture_itself_comes_before_the_memory() -> None:
     first = pipelines.picture(0)
     matrix = [[80.0, 0.0, 32.0], [0.0, 81.0, 24.0], [0.0, 0.0, 1.0]]
     first.transformation = dai.ImgTransformation(WIDTH, HEIGHT, matrix, dai.CameraModel.Perspective, RATIONAL)
     stored = LensModel(width=WIDTH, height=HEIGHT, fx=50.0, fy=50.0, cx=32.0, cy=24.0)
     factory = pipelines.Scripted(pipelines.Handed(first), lens=lambda width, height: stored)
-    with caplog.at_level(logging.WARNING), closing(open_pipeline(factory, open_timeout_s=PATIENT_S)) as camera:
+    with closing(open_pipeline(factory, open_timeout_s=PATIENT_S)) as camera:
         lens = camera.info.lens
     assert lens is not None
     assert (lens.fx, lens.fy, lens.cx, lens.cy) == (80.0, 81.0, 32.0, 24.0)
     assert lens.coefficients == tuple(RATIONAL)
-    assert "focal length is 80.0 pixels by its pictures, 50.0 by its memory" in caplog.text
 
 
-def test_the_memory_is_asked_for_the_size_of_the_picture_if_that_knows_no_lens() -> None:
-    asked: list[tuple[int, int]] = []
+# What only a process of its own can show.
 
-    def lens(width: int, height: int) -> LensModel:
-        asked.append((width, height))
-        return LensModel(width=width, height=height, fx=50.0, fy=50.0, cx=32.0, cy=24.0)
+HERE = Path(__file__).parent
 
-    factory = pipelines.Scripted(pipelines.steady(), lens=lens)
-    with closing(open_pipeline(factory, open_timeout_s=PATIENT_S)) as camera:
-        assert camera.info.lens == lens(WIDTH, HEIGHT)
-    assert asked[0] == (WIDTH, HEIGHT)
+
+def in_a_process(script: str) -> subprocess.CompletedProcess[str]:
+    path = os.pathsep.join([str(HERE), *sys.path])
+    return subprocess.run(
+        [sys.executable, "-c", script],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
+
+
+SIGNALS = """
+import os, signal, sys, time
+import gcd_node.sources
+from gcd_node.sources import oak
+assert "depthai" not in sys.modules, "imported before a camera was wanted"
+got = []
+for number in (signal.SIGTERM, signal.SIGINT):
+    signal.signal(number, lambda number, _: got.append(number))
+
+def ours():
+    lines = open("/proc/self/status").read().splitlines()
+    masks = {line.split(":")[0]: int(line.split()[1], 16) for line in lines if line.startswith(("SigCgt", "SigIgn"))}
+    return masks["SigCgt"] & 0x7FFFFFFF, masks["SigIgn"]  # real-time signals are the C library's
+
+before = ours()
+import oak_pipelines as pipelines
+from contextlib import closing
+from pathlib import Path
+with closing(oak.open_pipeline(pipelines.Scripted(pipelines.steady()), open_timeout_s=30)) as camera:
+    next(camera.frames())
+    assert ours() == before, (ours(), before)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        os.kill(os.getpid(), number)
+    time.sleep(0.1)
+assert got == [signal.SIGTERM, signal.SIGINT], got
+"""
+
+
+def test_depthai_comes_late_leaves_our_signal_handlers_alone_and_standard_output_clean() -> None:
+    ended = in_a_process(SIGNALS)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout == ""

