@@ -43,7 +43,7 @@ from gcd_node.cli.watch import StatusBoard
 from gcd_node.config import parse_config
 from gcd_node.config_dump import to_toml
 from gcd_node.errors import ConfigError, NodeError, SourceError
-from gcd_node.sources import read_picture
+from gcd_node.sources.files import read_picture
 from gcd_node.verbs import VERBS, Command, RequestError, parse_command, parse_request
 
 SETTINGS = settings(

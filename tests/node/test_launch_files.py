@@ -90,7 +90,9 @@ def _nothing(*_: object) -> None:
 
 def test_every_file_of_the_folder_is_in_its_table() -> None:
     table = (LAUNCH / "README.md").read_text()
+    package = LAUNCH / "ros2" / "gcd_views"  # has a row as a whole
     files = [path for path in LAUNCH.rglob("*") if path.is_file() and "__pycache__" not in path.parts]
+    files = [path for path in files if package not in path.parents]
     assert [str(path) for path in files if f"`{path.relative_to(LAUNCH)}`" not in table] == [str(LAUNCH / "README.md")]
     named = re.findall(r"`([\w.@/-]+/[\w.@-]+|[\w-]+\.toml)`", table)
     assert [name for name in named if not (LAUNCH / name).exists()] == ["/etc/gcd"]

@@ -1,0 +1,1 @@
+"""Views of a gcd node as ROS 2 topics."""

@@ -1,0 +1,354 @@
+"""A ROS 2 node beside a gcd node: its views as topics, its status as diagnostics, its lifecycle as services.
+
+    ros2 run gcd_views gcd_views --ros-args -r __node:=gcd -p data:=ipc:///run/gcd/topdown/data \\
+        -p status:=ipc:///run/gcd/topdown/status -p control:=ipc:///run/gcd/topdown/control
+
+docs/deploy.md has the table of topics. Every pixel is generated: never evidence of free space. Each view has threads of
+its own that read and publish; those of rclpy never wait for the node, but for the one that serves a lifecycle request.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from lifecycle_msgs.srv import ChangeState, GetAvailableStates, GetAvailableTransitions, GetState
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import Header, String
+from tf2_msgs.msg import TFMessage
+
+from gcd_client import (
+    ClientError,
+    ClientKeys,
+    ControlClient,
+    ReceivedView,
+    StatusMessage,
+    StatusSubscriber,
+    ViewSubscriber,
+    read_key_pair,
+    read_public_key,
+)
+from gcd_client.endpoints import resolve_endpoint
+from gcd_client.protocol import ViewKind, view_topic
+from gcd_views import messages
+
+SILENT_AFTER_S = 3.0  # a node speaks once a second
+_POLL_MS = 200.0  # how long a reader waits before it looks whether it is to stop
+_RETRY_S = 1.0
+_TRANSITION_S = 300.0  # loading a model from a slow disk takes minutes
+_SETTLE_S = 0.1
+_MAPS: Mapping[ViewKind, str] = {"cls": "classes", "depth": "depth", "vis": "visibility"}
+_NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)  # reaches best-effort subscribers, too
+_LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_STREAM = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """The parameters of this node.
+
+    data, status, control: the gcd node's endpoints; "ipc" finds those of a node of the same user.
+    keys: for a node that asks for them.
+    source_frame: TF frame of the source camera on this robot (x right, y down, z ahead).
+    max_age_ms: older pictures are not published; None: no limit but the node's own `valid_for_ms`.
+    metres_per_unit: of the scene units of models that know no metres; 0: their views get no TF.
+    """
+
+    data: str
+    status: str
+    control: str
+    keys: ClientKeys | None
+    source_frame: str
+    max_age_ms: float | None
+    metres_per_unit: float
+
+
+class Reader(threading.Thread):
+    """Reads from the gcd node until stopped; connects anew after whatever goes wrong. trouble: what did last."""
+
+    def __init__(self, name: str, stop: threading.Event) -> None:
+        super().__init__(name=name, daemon=True)
+        self.trouble, self._stop_event = "", stop
+
+    def run(self) -> None:
+        """What the thread does."""
+        while not self._stop_event.is_set():
+            try:
+                self._read()
+            except Exception as error:  # such as AuthError; the other readers go on
+                self.trouble = f"{type(error).__name__}: {error}"
+                self._stop_event.wait(_RETRY_S)
+
+    def _read(self) -> None:
+        """Connect and read until stopped."""
+        raise NotImplementedError
+
+
+class ViewReader(Reader):
+    """Reads one kind of one view; gives `publish` the newest frame that may still be used, and counts the others."""
+
+    def __init__(
+        self,
+        view_id: str,
+        kind: ViewKind,
+        settings: Settings,
+        publish: Callable[[ReceivedView, int], None],
+        stop: threading.Event,
+    ) -> None:
+        super().__init__(f"{view_id} {kind}", stop)
+        self.kind, self.published, self.expired = kind, 0, 0
+        self._view_id, self._settings, self._publish = view_id, settings, publish
+        self._views: ViewSubscriber | None = None
+
+    def counts(self) -> dict[str, int]:
+        """What became of the messages; all but the first two since the last connection."""
+        counts, views = {"published": self.published, "expired": self.expired}, self._views
+        if views is None:
+            return counts
+        return counts | {name: getattr(views, name) for name in ("stale", "damaged", "skipped", "restarts")}
+
+    def _read(self) -> None:
+        settings = self._settings
+        with ViewSubscriber(
+            settings.data, self._view_id, self.kind, max_age_ms=settings.max_age_ms, keys=settings.keys
+        ) as self._views:
+            while not self._stop_event.is_set():
+                damaged = self._views.damaged
+                view = self._views.receive(_POLL_MS)
+                if self._views.damaged > damaged:
+                    self.trouble = self._views.last_error
+                if view is not None:
+                    self._pass_on(view)
+
+    def _pass_on(self, view: ReceivedView) -> None:
+        index = messages.newest_at_goal(view.header)
+        if view.expired:
+            self.expired += 1
+        elif index is None:
+            self.trouble = "no frame of this view has arrived at its goal pose"
+        else:
+            try:
+                self._publish(view, index)
+            except ClientError as error:  # damaged JPEG, or no cv2 to decode it
+                self.trouble = str(error)
+            else:
+                self.published, self.trouble = self.published + 1, ""
+
+
+class StatusReader(Reader):
+    """Keeps the last status and the ids of the views of the gcd node."""
+
+    def __init__(self, settings: Settings, stop: threading.Event) -> None:
+        super().__init__("status", stop)
+        self.status: StatusMessage | None = None
+        self.views: tuple[str, ...] = ()
+        self._settings, self._heard_s = settings, 0.0
+
+    @property
+    def silent(self) -> bool:
+        """Whether the gcd node has said nothing for too long."""
+        return time.monotonic() - self._heard_s > SILENT_AFTER_S
+
+    def _read(self) -> None:
+        settings = self._settings
+        with StatusSubscriber(settings.status, ("status", "meta"), settings.keys) as notes:
+            while not self._stop_event.is_set():
+                note = notes.receive(_POLL_MS)
+                if note is None:
+                    continue
+                self.trouble = ""
+                if note.topic == "meta":
+                    views = tuple(note.fields.get("views", ()))
+                    for each in views:
+                        view_topic(each, "win")  # raises MessageError: no id of a view
+                    self.views = views
+                else:  # the last one is repeated to whoever subscribes: it may be old
+                    kept_s = max(0.0, (time.time_ns() - note.header.t_publish_ns) / 1e9)
+                    self.status, self._heard_s = note, time.monotonic() - kept_s
+
+
+class ViewTopics:
+    """The topics of one view, and the readers that fill them."""
+
+    def __init__(self, node: Node, view_id: str, settings: Settings, stop: threading.Event) -> None:
+        folder = f"~/view_{view_id}" if view_id[0].isdigit() else f"~/{view_id}"  # ROS: no name begins with a digit
+
+        def topic(kind: type, name: str, qos: QoSProfile = _NEWEST) -> Any:
+            return node.create_publisher(kind, f"{folder}/{name}", qos)
+
+        self._settings = settings
+        self._name = node.get_fully_qualified_name().strip("/")
+        self._frame_id = f"{self._name}/{view_id}_optical"
+        self._transforms = node.create_publisher(TFMessage, "/tf", _STREAM)
+        self._image, self._compressed = topic(Image, "image"), topic(CompressedImage, "image/compressed")
+        self._camera_info = topic(CameraInfo, "camera_info")
+        self._class_names, self._last_names = topic(String, "class_names", _LATCHED), ""
+        self._maps = {kind: topic(Image, name) for kind, name in _MAPS.items()}
+        kinds: Mapping[ViewKind, Callable[[ReceivedView, int], None]] = {
+            "win": self._publish_picture, **dict.fromkeys(_MAPS, self._publish_map)
+        }  # fmt: skip
+        self.readers = [ViewReader(view_id, kind, settings, publish, stop) for kind, publish in kinds.items()]
+        for reader in self.readers:
+            reader.start()
+
+    def _publish_picture(self, view: ReceivedView, index: int) -> None:
+        header, settings = view.header, self._settings
+        source_frame = settings.source_frame or f"{self._name}/{header.src_frame_id}"
+        transform = messages.to_transform(header, index, source_frame, self._frame_id, settings.metres_per_unit)
+        if transform is not None:  # before the picture: who looks up its frame then finds it
+            self._transforms.publish(TFMessage(transforms=[transform]))
+        self._camera_info.publish(messages.to_camera_info(header, index, self._frame_id))
+        if header.encoding == "jpeg":
+            self._compressed.publish(messages.to_compressed_image(view.message, index, self._frame_id))
+        if header.encoding != "jpeg" or self._image.get_subscription_count():  # decoded only for somebody
+            self._image.publish(messages.to_image(view.message, index, self._frame_id))
+
+    def _publish_map(self, view: ReceivedView, index: int) -> None:
+        kind = view.message.topic.rpartition("/")[2]
+        if kind == "cls":
+            names = messages.to_class_names(view.header)
+            if names.data != self._last_names:
+                self._last_names = names.data
+                self._class_names.publish(names)
+        self._maps[kind].publish(messages.to_image(view.message, index, self._frame_id))
+
+
+class GcdViews(Node):
+    """The ROS 2 node. Raises ClientError: a parameter is wrong."""
+
+    def __init__(self) -> None:
+        super().__init__("gcd")
+        self._settings, self._stop_event = self._read_parameters(), threading.Event()
+        self._topics: dict[str, ViewTopics] = {}
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", _STREAM)
+        self._status = StatusReader(self._settings, self._stop_event)
+        self._status.start()
+        self.create_timer(1.0, self._on_second)
+        asking, changing = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()  # both wait for the node
+        for kind, name, answer, group in (
+            (GetState, "get_state", self._get_state, asking),
+            (GetAvailableStates, "get_available_states", self._get_available_states, asking),
+            (GetAvailableTransitions, "get_available_transitions", self._get_available_transitions, asking),
+            (ChangeState, "change_state", self._change_state, changing),
+        ):
+            self.create_service(kind, f"~/{name}", answer, callback_group=group)
+
+    def stop(self) -> None:
+        """End all readers."""
+        self._stop_event.set()
+        for reader in [self._status, *(reader for view in self._topics.values() for reader in view.readers)]:
+            reader.join()
+
+    def _read_parameters(self) -> Settings:
+        def number(name: str) -> float:  # an integer will do: `max_age_ms:=500`
+            return float(self.declare_parameter(name, 0.0, ParameterDescriptor(dynamic_typing=True)).value)
+
+        def text(name: str, default: str = "") -> str:
+            return self.declare_parameter(name, default).value
+
+        own, server = text("keys"), text("node_key")
+        keys = ClientKeys(own=read_key_pair(Path(own)), server=read_public_key(server)) if own or server else None
+        return Settings(
+            data=resolve_endpoint(text("data", "ipc"), "data"),
+            status=resolve_endpoint(text("status", "ipc"), "status"),
+            control=resolve_endpoint(text("control", "ipc"), "control"),
+            keys=keys,
+            source_frame=text("source_frame"),
+            max_age_ms=number("max_age_ms") or None,
+            metres_per_unit=number("metres_per_unit"),
+        )
+
+    def _on_second(self) -> None:
+        for view_id in self._status.views:
+            if view_id not in self._topics:
+                self._topics[view_id] = ViewTopics(self, view_id, self._settings, self._stop_event)
+        header = Header(stamp=messages.to_time(time.time_ns()))
+        self._diagnostics.publish(DiagnosticArray(header=header, status=self._all_diagnostics()))
+
+    def _all_diagnostics(self) -> list[DiagnosticStatus]:
+        status, name = self._status, self.get_fully_qualified_name().strip("/")
+        silent = status.silent
+        about_node = messages.to_node_diagnostic(f"{name}: node", status.status, silent=silent)
+        if silent and status.trouble:
+            about_node.message = status.trouble
+        told = [about_node]
+        for view_id, topics in self._topics.items():
+            trouble = "; ".join(f"{reader.kind}: {reader.trouble}" for reader in topics.readers if reader.trouble)
+            counts = {reader.kind: reader.counts() for reader in topics.readers}
+            level = messages.WARN if trouble else messages.OK
+            told.append(messages.to_diagnostic(f"{name}: {view_id}", level, trouble or "OK", counts))
+        return told
+
+    # --- lifecycle services ---
+
+    def _client(self) -> ControlClient:
+        return ControlClient(self._settings.control, keys=self._settings.keys)
+
+    def _node_state(self) -> str:
+        try:
+            with self._client() as control:
+                return control.request("state").state
+        except ClientError as error:
+            self.get_logger().warning(str(error))
+            return "unknown"
+
+    def _get_state(self, _: Any, response: Any) -> Any:
+        response.current_state = messages.to_state(self._node_state())
+        return response
+
+    def _get_available_states(self, _: Any, response: Any) -> Any:
+        response.available_states = [messages.to_state(label) for label in messages.STATES]
+        return response
+
+    def _get_available_transitions(self, _: Any, response: Any) -> Any:
+        response.available_transitions = messages.available_transitions(self._node_state())
+        return response
+
+    def _change_state(self, request: Any, response: Any) -> Any:
+        asked = messages.to_verb(request.transition)
+        try:
+            response.success = asked is not None and self._transition(*asked)
+        except ClientError as error:
+            self.get_logger().warning(str(error))
+            response.success = False
+        return response
+
+    def _transition(self, verb: str, goal: str) -> bool:
+        """Whether the gcd node did it. Waits until it has; not for one that shuts down: it is gone then."""
+        deadline_s = time.monotonic() + _TRANSITION_S
+        with self._client() as control:
+            control.call(verb)
+            if verb == "shutdown":
+                return True
+            while (state := control.request("state").state) not in messages.SETTLED:
+                if time.monotonic() > deadline_s or self._stop_event.wait(_SETTLE_S):
+                    return False
+            return state == goal
+
+
+def main() -> None:
+    """Run until ROS shuts down."""
+    rclpy.init()
+    executor, node = MultiThreadedExecutor(num_threads=3), None
+    try:
+        node = GcdViews()
+        executor.add_node(node)
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except ClientError as error:
+        raise SystemExit(f"gcd_views: {error}") from error
+    finally:
+        if node is not None:
+            node.stop()
+        executor.shutdown()
+        rclpy.try_shutdown()
