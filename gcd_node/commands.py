@@ -12,7 +12,8 @@ from gcd_client.protocol import PROTO
 from gcd_model import ASSUMED_SOURCE, DeltaFit, ModelError, Traits, ViewFixedError, ViewRangeError, nearest_delta
 from gcd_node.auth import Role
 from gcd_node.config import ViewConfig, pose_matrix
-from gcd_node.config_dump import config_digest, without_secrets
+from gcd_node.config_digest import config_digest
+from gcd_node.config_dump import without_secrets
 from gcd_node.control import Outcome
 from gcd_node.health import Level
 from gcd_node.lifecycle import Verb

@@ -9,7 +9,7 @@ from pathlib import Path
 from gcd_model import LIVE_LENS_DEG, CameraMount, Intrinsics, OptionError, Traits
 from gcd_node.calibration import LensModel, load_lens
 from gcd_node.config import NodeConfig
-from gcd_node.config_dump import config_digest
+from gcd_node.config_digest import config_digest
 from gcd_node.errors import ConfigError
 from gcd_node.frame import SourceInfo
 from gcd_node.preprocess import Fit, Rectifier, assumed_hfov_deg, require_usable, stated_mount

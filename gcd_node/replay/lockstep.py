@@ -17,7 +17,8 @@ from msgspec.structs import replace
 from gcd_client.protocol import ClassRecord, EndMessage, OriginHeader, StatusTopic, ViewMessage, kind_of
 from gcd_model import Traits
 from gcd_node.config import LifeConfig, NodeConfig
-from gcd_node.config_dump import config_digest, to_toml
+from gcd_node.config_digest import config_digest
+from gcd_node.config_dump import to_toml
 from gcd_node.errors import ConfigError, DamagedRunError, ModelFailedError, OutputError, SourceError
 from gcd_node.frame import FrameSource, SourceInfo
 from gcd_node.image_io import video_writer

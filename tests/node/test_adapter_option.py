@@ -13,7 +13,7 @@ from gcd_model.own_format import Card
 from gcd_model.weights_export import write_adapter
 from gcd_node.check import check_launch
 from gcd_node.config import NodeConfig, parse_config
-from gcd_node.config_dump import config_digest
+from gcd_node.config_digest import config_digest
 from gcd_node.session import load_model
 
 _RANK = 2

@@ -7,7 +7,7 @@ from fakes import traits
 
 from gcd_node.cli.main import run_app
 from gcd_node.config import parse_config
-from gcd_node.config_dump import config_digest
+from gcd_node.config_digest import config_digest
 from gcd_node.errors import ConfigError
 from gcd_node.session import load_model
 

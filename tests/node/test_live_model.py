@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from gcd_model import CameraMount, OptionError, load_synthesizer
 from gcd_node.cli.main import run_app
 from gcd_node.config import NodeConfig, ViewConfig, parse_config
-from gcd_node.config_dump import config_digest
+from gcd_node.config_digest import config_digest
 from gcd_node.errors import ConfigError
 from gcd_node.frame import SourceInfo
 from gcd_node.preprocess import assumed_hfov_deg, stated_mount

@@ -26,7 +26,7 @@ from gcd_model import (
     ViewRangeError,
 )
 from gcd_node.config import NodeConfig, ViewConfig, parse_config
-from gcd_node.config_dump import config_digest
+from gcd_node.config_digest import config_digest
 from gcd_node.errors import (
     EndpointError,
     ModelFailedError,

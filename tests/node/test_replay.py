@@ -16,7 +16,7 @@ from runs import FRAMES, WINDOWS, LevelModel, copied, launch, made_run, nan_mode
 
 from gcd_node.cli.main import run_app
 from gcd_node.config import parse_config
-from gcd_node.config_dump import config_digest
+from gcd_node.config_digest import config_digest
 from gcd_node.encoded_frames import window_seed
 from gcd_node.errors import (
     ConfigError,
