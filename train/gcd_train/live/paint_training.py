@@ -18,13 +18,15 @@ from gcd_train.live.inputs import read_inputs
 from gcd_train.live.look import picture, write_rows
 from gcd_train.live.target_views import VIEW_ARRAYS, ViewBatches, Views, carry, halved, mirrored, views_of
 from gcd_train.loop import Progress, StepLoss
-from gcd_train.picture_losses import gradient_l1
+from gcd_train.picture_losses import gradient_l1, ssim
 from gcd_train.schedule import ParameterGroup
 
 _CLASS_POWER = -0.45
 _NEVER_WEIGHT = 0.5
 """Of a never-seen pixel beside a seen one: nobody can know it."""
-_SQUARE, _ABSOLUTE, _GRADIENT, _SPREAD, _CLASS, _DEPTH, _SEEN = 40.0, 4.0, 2.0, 2.0, 0.3, 0.2, 0.15
+_SEEN_SQUARE, _SEEN_ABSOLUTE = 0.25, 2.0
+"""Of a seen pixel beside others in these two: squares alone make it a blur of all places where it could be."""
+_SQUARE, _ABSOLUTE, _STRUCTURE, _GRADIENT, _SPREAD, _CLASS, _DEPTH, _SEEN = 40.0, 4.0, 4.0, 2.0, 2.0, 0.3, 0.2, 0.15
 _MEAN_ALONE = 0.5
 """Share of the training in which nothing but the mean of single frames is learned, which is what takes longest."""
 _DENOISING_SHARE = 0.3
@@ -116,7 +118,7 @@ class PaintTask:
         """Weighted parts of the loss. some: the pixels from which all but the colours' are computed."""
         seen = (views.visibility > 0).float()
         error = made.mean - views.target
-        weight = seen + (1 - seen) * _NEVER_WEIGHT
+        never = (1 - seen) * _NEVER_WEIGHT
         square = error.square().mean(dim=1)
         mask = seen[:, None]
         gradient = gradient_l1(made.mean * mask, views.target * mask)
@@ -125,8 +127,9 @@ class PaintTask:
         variance = log_variance.exp()
         spread = variance.detach() * (fixed * (-log_variance).exp() + log_variance)
         return {
-            "square": _SQUARE * (square * weight).mean(),
-            "absolute": _ABSOLUTE * (error.abs().mean(dim=1) * weight).mean(),
+            "square": _SQUARE * (square * (seen * _SEEN_SQUARE + never)).mean(),
+            "absolute": _ABSOLUTE * (error.abs().mean(dim=1) * (seen * _SEEN_ABSOLUTE + never)).mean(),
+            "structure": _STRUCTURE * (1 - ssim(views.target + error * mask, views.target)),
             "gradient": _GRADIENT * gradient,
             "spread": _SPREAD * spread.mean(),
             "class": _CLASS * F.cross_entropy(made.classes[some], views.labels[some], self.class_weights),
