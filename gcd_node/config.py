@@ -9,7 +9,7 @@ import msgspec
 from msgspec import Meta
 
 from gcd_node.errors import ConfigError
-from gcd_node.source_config import Count, Positive, SourceConfig, prepare_source
+from gcd_node.source_config import Count, Positive, Rate, SourceConfig, prepare_source
 
 NotNegative: TypeAlias = Annotated[float, Meta(ge=0)]
 _LEAST_ROTATE_MB, _LEAST_ROTATE_S = 0.1, 1.0
@@ -29,7 +29,7 @@ class WindowConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     max_skew: how far, in frame periods, a frame may lie from its place in time.
     """
 
-    fps: Positive | None = None
+    fps: Rate | None = None
     stride: Count | None = None
     max_skew: Annotated[float, Meta(gt=0, le=0.5)] = 0.5
 

@@ -28,9 +28,6 @@ from gcd_node.source_config import SourcePose
 Resize: TypeAlias = Literal["released", "area"]
 """released: bilinear, as in training; it aliases when it shrinks a lot. area: averages, and does not."""
 
-ResizePath: TypeAlias = Literal[Resize, "remap2x_area"]
-"""What is published as `src.resize`; remap2x_area: undistorted at twice the size, then averaged."""
-
 _LEVELS = np.arange(256, dtype=np.float32) / np.float32(127.5) - np.float32(1.0)
 
 

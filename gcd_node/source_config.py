@@ -9,6 +9,7 @@ from msgspec import Meta
 from gcd_node.errors import ConfigError
 
 Positive: TypeAlias = Annotated[float, Meta(gt=0)]
+Rate: TypeAlias = Annotated[float, Meta(gt=0, le=1000)]
 Count: TypeAlias = Annotated[int, Meta(ge=1)]
 SourceKind: TypeAlias = Literal["file", "folder", "synthetic", "mcap", "v4l2", "rtsp", "oak", "push"]
 
@@ -86,14 +87,14 @@ class FileSource(RecordedSource, frozen=True, kw_only=True, forbid_unknown_field
     """path: of a video; `package:drive.mp4` and `package:workbench.mp4` ship. fps: instead of its stamps."""
 
     path: str
-    fps: Positive | None = None
+    fps: Rate | None = None
 
 
 class FolderSource(RecordedSource, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="folder"):
     """path: of a folder of pictures. fps: at which they were taken; they cannot say."""
 
     path: str
-    fps: Positive
+    fps: Rate
 
 
 class McapSource(RecordedSource, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="mcap"):
@@ -111,7 +112,7 @@ class McapSource(RecordedSource, frozen=True, kw_only=True, forbid_unknown_field
 class SyntheticSource(RecordedSource, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="synthetic"):
     """A moving pattern. frames: end after so many."""
 
-    fps: Positive = 10.0
+    fps: Rate = 10.0
     frames: Count | None = None
 
 
@@ -130,7 +131,7 @@ class LiveSource(_Source, frozen=True, kw_only=True, forbid_unknown_fields=True)
     open_timeout_s: Positive = 5.0
     stall_ms: Positive | None = None
     max_reconnects: Annotated[int, Meta(ge=0)] | None = None
-    fps: Positive | None = None
+    fps: Rate | None = None
 
     def __post_init__(self) -> None:
         if self.pace == "lockstep" or self.loop:

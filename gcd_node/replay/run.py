@@ -28,7 +28,7 @@ from gcd_node.image_io import make_folder
 from gcd_node.sources.opencv import quiet_opencv
 
 MANIFEST = "manifest.json"
-_MAX_MANIFEST = 64 * 2**20  # bytes: a day of windows
+_MAX_MANIFEST, _MAX_WINDOW = 64 * 2**20, 2**28  # bytes: a day of windows; 6 times the largest model's pixels
 _MATROSKA = b"\x1a\x45\xdf\xa3"
 
 Pixels = NDArray[np.uint8]
@@ -49,6 +49,12 @@ class SizeEntry(_Entry, frozen=True, kw_only=True):
     frames: Count
     height: Count
     width: Count
+
+    def __post_init__(self) -> None:
+        if 3 * self.frames * self.height * self.width > _MAX_WINDOW:
+            raise ValueError(
+                f"a window of {self.frames} x {self.height} x {self.width} takes more than {_MAX_WINDOW} bytes"
+            )
 
 
 class TroubleEntry(_Entry, frozen=True, kw_only=True):
@@ -162,11 +168,14 @@ def open_run(path: Path) -> RunFolder:
     if not file.exists():
         raise DamagedRunError(f"{path} has no {MANIFEST}: it is no run, or one that did not finish; replay again")
     try:
-        return RunFolder(path=path, manifest=read_json(file, Manifest, _MAX_MANIFEST))
+        manifest = read_json(file, Manifest, _MAX_MANIFEST)
     except FileError as error:
         raise DamagedRunError(
             f"{file} is no manifest of a run as this version writes it: it {error}; replay the recording again"
         ) from error
+    if any("win" not in view.sha256 for window in manifest.windows for view in window.views.values()):
+        raise DamagedRunError(f"{file} has a view without a digest of its pixels; replay the recording again")
+    return RunFolder(path=path, manifest=manifest)
 
 
 # Pixels.

@@ -5,17 +5,21 @@ into gigabytes. ROS messages are read by the definitions that ship with rosbags,
 """
 
 import functools
+import io
 import logging
 import re
 import time
+import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import IO, Any, TypeVar, cast
 
+import lz4.frame
+import zstandard
 from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader, get_chunk_data_stream
+from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader as Ros2Reader
@@ -26,6 +30,7 @@ from gcd_model import FileError, printable, read_small
 from gcd_node.errors import SourceError
 
 _LOG = logging.getLogger(__name__)
+_Record = TypeVar("_Record", Schema, Channel, Metadata)
 
 _HEADS = {b"\x89MCAP0\r\n": ".mcap", b"#ROSBAG V": ".bag", b"SQLite format 3\0": ".db3"}
 RAW_IMAGES = frozenset({"sensor_msgs/msg/Image", "foxglove.RawImage"})
@@ -37,6 +42,7 @@ ODOMETRY, TRANSFORMS = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
 _READABLE = IMAGES | CAMERAS | {ODOMETRY, TRANSFORMS}
 
 _MAX_BYTES = 96 * 2**20  # of a record, and of an unfolded chunk
+_MAX_KEPT = 16 * 2**20  # of all topics and definitions together
 _PACKED_MESSAGES = re.compile(r"compression_mode:\s*[\"']?message", re.IGNORECASE)
 _ROS1_TYPE = re.compile(r"^(\w+)/(\w+)$")
 
@@ -74,6 +80,7 @@ class LogReader:
         self._path, self._search_s, self._stopped = path, search_s, stopped
         self._files = log_files(path)
         self.renew()
+        self._kept_bytes = 0
         self.damaged = 0
         """Chunks left out so far."""
         self.topics: dict[str, str] = {}
@@ -118,15 +125,15 @@ class LogReader:
                         decode=functools.partial(decode, record.data),
                     )
             elif isinstance(record, Schema) and schemas.get(record.id) != record:  # many writers repeat them
-                schemas[record.id] = record
+                schemas[record.id] = self._kept(record)
             elif isinstance(record, Channel) and channels.get(record.id) != record:
-                channels[record.id] = record
+                channels[record.id] = self._kept(record)
                 kind, decode = _reader_of(record, schemas.get(record.schema_id, schemas[0]))
                 self.topics[record.topic] = kind
                 if decode is not None:
                     readable[record.id] = kind, decode
             elif isinstance(record, Metadata) and record.name.startswith("gcd-node"):
-                self.metadata[record.name] = record.metadata
+                self.metadata[record.name] = self._kept(record).metadata
 
     def _mcap_records(self, file: Path) -> Iterator[McapRecord]:
         """Everything before the index, chunks unfolded; of a file that was cut, what is whole."""
@@ -146,7 +153,7 @@ class LogReader:
 
     def _chunk_records(self, chunk: Chunk) -> Iterator[McapRecord]:
         try:
-            yield from self._records(_unfolded(chunk), in_chunk=True)
+            yield from self._records(io.BytesIO(_unfolded(chunk)), in_chunk=True)
         except EndOfFile:
             return  # of the chunk
         except LogLimitError:
@@ -159,6 +166,15 @@ class LogReader:
     def _records(self, stream: IO[bytes], *, in_chunk: bool) -> Iterator[McapRecord]:
         limited = cast(IO[bytes], _LimitedStream(stream, self._check))
         return StreamReader(limited, skip_magic=in_chunk, emit_chunks=True, record_size_limit=_MAX_BYTES).records
+
+    def _kept(self, record: _Record) -> _Record:
+        """The same, its bytes counted. Raises LogLimitError."""
+        for value in vars(record).values():
+            parts = (*value, *value.values()) if isinstance(value, dict) else (value,)
+            self._kept_bytes += sum(len(part) for part in parts if isinstance(part, str | bytes))
+        if self._kept_bytes > _MAX_KEPT:
+            raise LogLimitError(f"topics and definitions alone are more than {_MAX_KEPT} bytes")
+        return record
 
     def _bag(self, path: Path) -> Iterator[LogMessage]:
         is_ros1 = kind_of_log(path) == ".bag"
@@ -199,14 +215,23 @@ class _LimitedStream:
         return self._stream.read(size)
 
 
-def _unfolded(chunk: Chunk) -> IO[bytes]:
-    """Its records."""
-    if chunk.uncompressed_size > _MAX_BYTES:
-        raise SourceError(f"a chunk states {chunk.uncompressed_size} bytes, more than {_MAX_BYTES}")
-    records, size = get_chunk_data_stream(chunk, validate_crc=True)
-    if size != chunk.uncompressed_size:
-        raise SourceError(f"a chunk states {chunk.uncompressed_size} bytes and holds {size}: it is damaged")
-    return cast(IO[bytes], records)
+def _unfolded(chunk: Chunk) -> bytes:
+    """Its records. The library itself would let a decompressor write more than the chunk states."""
+    size = chunk.uncompressed_size
+    if size > _MAX_BYTES:
+        raise SourceError(f"a chunk states {size} bytes, more than {_MAX_BYTES}")
+    if chunk.compression == "zstd":
+        with zstandard.ZstdDecompressor().stream_reader(chunk.data, read_across_frames=True) as unfolding:
+            records = io.BufferedReader(cast(io.RawIOBase, unfolding)).read(size)
+    elif chunk.compression == "lz4":
+        records = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size)
+    else:
+        records = chunk.data
+    if len(records) != size:
+        raise SourceError(f"a chunk states {size} bytes and holds {len(records)}: it is damaged")
+    if chunk.uncompressed_crc and zlib.crc32(records) != chunk.uncompressed_crc:
+        raise SourceError("the checksum of a chunk is wrong: it is damaged")
+    return records
 
 
 def _reader_of(channel: Channel, schema: Schema) -> tuple[str, Callable[[bytes], Any] | None]:

@@ -4,6 +4,7 @@ OpenCV's and FFmpeg's own messages are no use to a user, and may hold an address
 quiet.
 """
 
+import contextlib
 import logging
 import math
 import os
@@ -172,8 +173,10 @@ def list_v4l2() -> list[str]:
     numbers = [path.name.removeprefix("video") for path in _DEVICES.glob("video*")]
     found: list[str] = []
     for number in sorted(int(each) for each in numbers if each.isdigit()):
-        name = _NAMES / f"video{number}" / "name"
-        found.append(f"{_DEVICES}/video{number}" + (f" ({name.read_text().strip()})" if name.is_file() else ""))
+        name = ""
+        with contextlib.suppress(OSError):  # it may just be pulled out
+            name = f" ({(_NAMES / f'video{number}' / 'name').read_text().strip()})"
+        found.append(f"{_DEVICES}/video{number}{name}")
     return found
 
 

@@ -335,6 +335,7 @@ class NodeLink:
                     received = await views.receive_async()
                     while received is not None:
                         newest[received.message.topic] = received
+                        await asyncio.sleep(0)  # a node that is faster than this must not keep the others waiting
                         received = await views.receive_async(0)
                     for each in newest.values():
                         with contextlib.suppress(MessageError):  # its pixels: the page leaves it out

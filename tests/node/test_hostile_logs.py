@@ -53,13 +53,20 @@ IMAGES = record(3, struct.pack("<H", 1) + text("sensor_msgs/msg/CompressedImage"
 HOSTILE: dict[str, Callable[[], bytes]] = {
     "a billion tiny records": lambda: chunk(record(200, b"") * (BIG // 9)) * 45,
     "a million empty messages": lambda: channel() + chunk(message() * 1_000_000) * 9,
+    "a million empty pictures": lambda: IMAGES + channel("/x", 1, "cdr", 1) + chunk(message() * 1_000_000),
     "a chunk that is larger than it states": lambda: chunk(bytes(2**30), states=1000) * 9,
+    "a chunk that is larger than it states, in lz4": lambda: chunk(bytes(2**28), "lz4", states=1000) * 9,
     "a chunk that states a gigabyte": lambda: chunk(bytes(2**30)) * 9,
     "an index without end": lambda: chunk(record(7, struct.pack("<HI", 0, 0xFFFFFFF0)) + bytes(BIG)) * 9,
+    "names that unfold to gigabytes": lambda: (
+        chunk(b"".join(channel("n" * 60_000 + str(i), i) for i in range(4000))) * 9
+    ),
     "notes about itself that unfold to gigabytes": lambda: (
         chunk(record(12, text("gcd-node") + struct.pack("<I", 8 + BIG) + text("") + text("v" * BIG))) * 20
     ),
     "a length of gigabytes": lambda: struct.pack("<BQ", 12, 20) + struct.pack("<I", 0xFFFFFFF0) + bytes(1000),
+    "records without end that were never sent": lambda: record(200, b"") * 3_000_000,
+    "a summary that points backwards": lambda: channel() + message() + record(2, struct.pack("<QQI", 8, 8, 0)),
 }
 
 
@@ -131,7 +138,7 @@ def test_what_a_strange_run_states_takes_neither_time_nor_memory(tmp_path: Path)
     golden = made_run(tmp_path / "golden")
     lies: dict[str, tuple[str, object, str]] = {
         "a name of a million parts": ("config", "a" + ".a" * 20_000 + "=1", "more than 200 dots"),
-        "a window of terabytes": ("size", {"frames": 14, "height": 10**6, "width": 10**6}, "pictures of"),
+        "a window of terabytes": ("size", {"frames": 14, "height": 10**6, "width": 10**6}, "takes more than"),
     }
     for key, value, reason in lies.values():
         run = copied(golden, tmp_path / key)

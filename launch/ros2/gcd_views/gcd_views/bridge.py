@@ -31,6 +31,7 @@ from gcd_client import (
     ClientKeys,
     ControlClient,
     ReceivedView,
+    SetupError,
     StatusMessage,
     StatusSubscriber,
     ViewSubscriber,
@@ -250,7 +251,11 @@ class GcdViews(Node):
 
     def _read_parameters(self) -> Settings:
         def number(name: str) -> float:  # an integer will do: `max_age_ms:=500`
-            return float(self.declare_parameter(name, 0.0, ParameterDescriptor(dynamic_typing=True)).value)
+            value = self.declare_parameter(name, 0.0, ParameterDescriptor(dynamic_typing=True)).value
+            try:
+                return float(value)
+            except (TypeError, ValueError) as error:
+                raise SetupError(f"{name} must be a number, got {value!r}") from error
 
         def text(name: str, default: str = "") -> str:
             return self.declare_parameter(name, default).value
