@@ -149,18 +149,16 @@ def _evaluate(asked: Asked, out: Path, *, views: KeptViews, workers: int, ray: s
     plan = planned(asked)
     for line in plan.opened.notes:
         _say(line)
-    note = note_of(plan, _command_line())
-    RunKeeper(out).begin(note)
-    plan = plan.with_means(progress_bar)
-    work = ClipWork(
-        folder=out.resolve(),
-        clips=plan.clips,
-        makers={method.name: method.make for method in plan.methods},
-        lpips=None if asked.lpips is None else asked.lpips.resolve(),
-        views=views,
-    )
-    account = _measured(work, workers, ray, asked.tested.device)
-    RunKeeper(out).begin(note)  # anew: a line that ran beside this one saw no records yet, and dropped the methods
+    with RunKeeper(out).in_use(note_of(plan, _command_line())):
+        plan = plan.with_means(progress_bar)
+        work = ClipWork(
+            folder=out.resolve(),
+            clips=plan.clips,
+            makers={method.name: method.make for method in plan.methods},
+            lpips=None if asked.lpips is None else asked.lpips.resolve(),
+            views=views,
+        )
+        account = _measured(work, workers, ray, asked.tested.device)
     for line in account.lines():
         _say(line)
     typer.echo(write_outcome(plan, work, sheet_clips))
