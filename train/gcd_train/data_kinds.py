@@ -11,6 +11,7 @@ from gcd_train.batches import BatchMaker, BatchSource
 from gcd_train.datasets.clip_frames import DRIVING_FRAMES, KUBRIC_FRAMES, FrameSampling
 from gcd_train.datasets.dataset4d import Dataset4D
 from gcd_train.datasets.kubric4d import Kubric4D
+from gcd_train.datasets.ontology import Ontology
 from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
 from gcd_train.datasets.sample_clips import SampleClips
 from gcd_train.datasets.skips import Skips
@@ -154,7 +155,9 @@ class _Opening:
             )
         return present(read_split(Path(data.split_file), part), scenes, Skips(), data.split_file)
 
-    def _pairs(self, data: Kubric4D | ParallelDomain4D, sampling: Sampling, seed: int, repeats: int) -> ViewPairs:
+    def _pairs(
+        self, data: Kubric4D | ParallelDomain4D, sampling: Sampling, seed: int, repeats: int, *, class_ids: bool = False
+    ) -> ViewPairs:
         told = self._data
         return ViewPairs(
             data,
@@ -163,6 +166,7 @@ class _Opening:
             (self.config.width, self.config.height),
             repeats=repeats,
             modality="classes" if told.modality == "semantic" else "rgb",
+            class_ids=class_ids,
             exact=told.exact,
             published=told.published,
         )
@@ -174,14 +178,15 @@ class _Opening:
         if fps / stride != wanted:
             raise RecipeError(f"unet.fps is {wanted:g}, and no stride makes that of the set's {fps:g}")
         sampling = sampling_of(self.recipe, self.config.frames, stride=stride)
-        pairs = self._pairs(data, sampling, _FIXED_SEED, repeats)
-        return self._clips(pairs, len(pairs), wanted)
+        painted = self._data.modality == "semantic"
+        pairs = self._pairs(data, sampling, _FIXED_SEED, repeats, class_ids=painted)
+        return self._clips(pairs, len(pairs), wanted, data.ontology if painted else None)
 
-    def _clips(self, samples: Samples, count: int, fps: float) -> SampleClips:
+    def _clips(self, samples: Samples, count: int, fps: float, ontology: Ontology | None = None) -> SampleClips:
         origin = digest_of(self._data, str(self.places.data))
         if self._data.task == "image-to-video":
             samples, count = VideoSamples(samples), 2 * count
-        return SampleClips(samples, count, camera=self.config.camera, fps=fps, origin=origin)
+        return SampleClips(samples, count, camera=self.config.camera, fps=fps, origin=origin, ontology=ontology)
 
     def _sampled(self, samples: Samples) -> BatchMaker:
         recipe = self.recipe
