@@ -80,9 +80,17 @@ def test_the_last_scenes_are_held_out_where_the_recipe_says_so(kubric: Path) -> 
 
 
 def test_a_folder_of_its_own_leaves_all_of_the_data_to_learn_from(kubric: Path, tmp_path: Path) -> None:
-    shutil.copytree(kubric / "scn02801", tmp_path / "scn02801")
+    other = Path(shutil.copytree(kubric / "scn02801", tmp_path / "scn02802"))
+    for file in other.glob("*.json"):
+        file.rename(other / file.name.replace("scn02801", other.name))
     assert lengths(opened(recipe(KUBRIC), kubric, tmp_path)) == (3, 1)
-    with pytest.raises(DataError, match="to learn from, too"):
+
+
+def test_a_scene_that_is_learned_from_is_never_measured_on(kubric: Path, tmp_path: Path) -> None:
+    shutil.copytree(kubric / "scn02801", tmp_path / "scn02801")
+    with pytest.raises(DataError, match="scn02801"):
+        opened(recipe(KUBRIC), kubric, tmp_path)
+    with pytest.raises(DataError, match="scn00003, scn00007, scn02801"):
         opened(recipe(KUBRIC), kubric, kubric)
 
 
@@ -105,7 +113,7 @@ def test_a_cache_is_read_with_the_encoders_that_made_it(driving: Path, tmp_path:
     job = CacheJob(folder=tmp_path, pictures=pictures, choice=CHOICE, identity=tiny_identity())
     with only_writer(tmp_path):
         assert len(list(cache_scenes(job, pictures.scenes))) == 3
-    data = msgspec.structs.replace(DRIVING, kind="cache")
+    data = msgspec.structs.replace(DRIVING, kind="cache", split="last", held_out=1)
     own = recipe(data, fps=10.0, source="cache", image_share=0.0, augmentation=0.02, loss=LossRecipe())
     model = msgspec.structs.replace(own.model, weights=CHOICE.weights)
     told = msgspec.structs.replace(own, model=model, vae=None, latents=None)
@@ -118,6 +126,9 @@ def test_a_cache_is_read_with_the_encoders_that_made_it(driving: Path, tmp_path:
     assert batch.target.shape[0] == 2 * CLIP
     assert len(batch.ids) == 2
     assert batch.wait_s is not None
+    both = msgspec.structs.replace(told, data=msgspec.structs.replace(data, held_out=2))
+    with pytest.raises(DataError, match="scene_000002"):
+        open_data(both, config, FAMILIES["driving"], DataPlaces(data=tmp_path, valid=driving))
     with pytest.raises(RecipeError, match="made with other encoders"):
         run.batches(random_networks(networks.config, seed=9), precision)
     for change, name in (

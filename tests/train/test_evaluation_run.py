@@ -125,6 +125,16 @@ def test_what_never_measured_anything_binds_nobody(tmp_path: Path) -> None:
         keeper.begin(note(methods={"b": {"digest": "3"}}))
 
 
+def test_lines_beside_each_other_keep_each_others_methods_before_there_is_a_record(tmp_path: Path) -> None:
+    first, second = RunKeeper(tmp_path), RunKeeper(tmp_path)
+    with first.in_use(note(methods={"a": {}})):
+        with second.in_use(note(methods={"b": {}})), pytest.raises(RunError, match="data_identity"):
+            first.in_use(note(methods={"c": {}}, data_identity="another")).__enter__()
+        first.keep(record("a", "k"))
+    second.keep(record("b", "k"))
+    assert list(read_run(tmp_path)[0].methods) == ["a", "b"]
+
+
 def test_frames_are_known_again_by_what_they_are_and_not_by_their_place(tmp_path: Path) -> None:
     keeper = RunKeeper(tmp_path)
     keeper.begin(note(methods={"flat": {"frames in": "p/flat", "digest": "1"}}))

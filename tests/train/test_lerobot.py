@@ -7,18 +7,23 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from headless import needs_egl
+from tiny_world import tiny_recipe
 from typer.testing import CliRunner
 
+from gcd_model import FAMILIES, ModelConfig
 from gcd_train.cli.main import app
+from gcd_train.data_kinds import DataPlaces, RunData, open_data
 from gcd_train.datasets.skips import FileFault
 from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.lerobot.cameras import CAMERA_FILE, CameraCalibration
 from gcd_train.lerobot.pairs import LeRobotOptions, LeRobotPairs
 from gcd_train.lerobot.tabletop_export import TabletopExport, export_tabletop
 from gcd_train.lerobot.writer import ExportOptions, LeRobotWriter, LoggedEpisode
+from gcd_train.recipe import DataRecipe
 
 pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra `lerobot`: pip install 'gcd-node[lerobot]'")
 av = pytest.importorskip("av", reason="needs the extra `lerobot`: pip install 'gcd-node[lerobot]'")
@@ -101,6 +106,22 @@ def test_pictures_come_back_within_the_error_of_the_codec_and_from_the_right_row
             wanted = np.stack([_picture(episode, row, camera) for row in sample.frame_numbers]).astype(int)
             assert np.abs(pictures - wanted).mean() < 3.0
     assert pairs.skips.total == 0
+
+
+def test_an_episode_that_is_learned_from_is_never_measured_on(made: Path, copied: Path, tmp_path: Path) -> None:
+    data = DataRecipe(kind="lerobot", held_out=1)
+    recipe = tiny_recipe(data=data, unet=msgspec.structs.replace(tiny_recipe().unet, fps=FPS))
+    config = ModelConfig(frames=6, height=HEIGHT, width=WIDTH)
+
+    def opened(valid: Path | None) -> RunData:
+        return open_data(recipe, config, FAMILIES["driving"], DataPlaces(data=made, valid=valid))
+
+    assert len(opened(None).valid) == 1
+    for same in (made, copied):
+        with pytest.raises(DataError, match="episode_000000, episode_000001, episode_000002"):
+            opened(same)
+    other = _write(tmp_path / "other", episodes=1)
+    assert (len(opened(other).clips), len(opened(other).valid)) == (3 * data.repeats, 1)
 
 
 def test_poses_of_standing_cameras_are_exact(made: Path) -> None:

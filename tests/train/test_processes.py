@@ -47,6 +47,14 @@ def test_two_processes_end_with_the_weights_of_one_with_twice_the_batch(found: d
     assert found["ddp against two batches"] < 1e-7
 
 
+def test_the_first_of_two_processes_measures_alone(found: dict[str, Any]) -> None:
+    assert found["ddp measured"] == 0.5  # once in one, never in the other
+
+
+def test_means_over_processes_keep_what_one_of_them_alone_gives(found: dict[str, Any]) -> None:
+    assert found["ddp rank 0"] == found["ddp rank 1"] == 1.0
+
+
 @pytest.mark.timeout(300)
 def test_a_process_that_ends_ends_the_others_with_an_error(found: dict[str, Any]) -> None:
     assert "lost another process of this run" in found["lost"]
@@ -63,6 +71,7 @@ def test_two_processes_that_share_the_weights_out_do_so_too(more: dict[str, Any]
     assert more["fsdp moved"] > 1e-5
     assert more["fsdp against twice the batch"] < _SHARED_OUT
     assert more["fsdp share of the way"] < 0.1
+    assert more["fsdp measured"] == 0.5
 
 
 @pytest.mark.slow

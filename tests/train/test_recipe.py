@@ -1,14 +1,18 @@
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import pytest
-from tiny_world import RECIPE
+from tiny_world import RECIPE, tiny_recipe
 
 from gcd_train.data_kinds import sampling_of
 from gcd_train.datasets.trajectories import DRIVING, MAX90, MAX180
 from gcd_train.errors import RecipeError
+from gcd_train.live.recipe import LiveRecipe, live_recipes, load_live_recipe
 from gcd_train.model_setup import family_of, model_config, require_exportable
 from gcd_train.recipe import load_recipe, packaged_recipes, parse_recipe
+from gcd_train.run_folder import RunFolder
 
 
 @pytest.mark.parametrize("name", packaged_recipes())
@@ -152,3 +156,30 @@ def test_the_small_scale_drops_the_published_layout_that_a_recipe_asks_for(tmp_p
     own.write_text('base = "package:kubric-gradual-max90"\n[export]\nlayouts = ["gcd-node", "gcd-ckpt"]\n')
     assert load_recipe(own).export.layouts == ("gcd-node", "gcd-ckpt")
     assert load_recipe(own, small=True).export.layouts == ("gcd-node",)
+
+
+def test_a_run_folder_keeps_recipe_and_commands_and_says_what_another_recipe_changes(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder, first = RunFolder(tmp_path), tiny_recipe()
+    other = msgspec.structs.replace(
+        first, seed=first.seed + 1, model=msgspec.structs.replace(first.model, weights="start.ckpt")
+    )
+    for recipe, command in ((first, "gcd-train train tiny.toml"), (first, "again"), (other, "with another seed")):
+        caplog.clear()
+        folder.begin(recipe, command)
+    assert parse_recipe((tmp_path / "recipe.toml").read_bytes(), "kept") == other
+    lines = (tmp_path / "commands.txt").read_text().splitlines()
+    assert lines[1::2] == ["gcd-train train tiny.toml", "again", "with another seed"]
+    said = "".join(each.getMessage() for each in caplog.records)
+    assert f"seed was {first.seed}, is {other.seed}" in said
+    assert "model.weights was not given, is start.ckpt" in said
+    caplog.clear()
+    folder.begin(other, "once more")
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("recipe", [load_live_recipe(f"package:{live_recipes()[0]}")])
+def test_a_live_recipe_is_kept_too(tmp_path: Path, recipe: LiveRecipe) -> None:
+    RunFolder(tmp_path).begin(recipe, "gcd-train train")
+    assert msgspec.convert(tomllib.loads((tmp_path / "recipe.toml").read_text()), LiveRecipe) == recipe

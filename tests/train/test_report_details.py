@@ -56,9 +56,9 @@ def kept(folder: Path, **told: object) -> Path:
 @pytest.mark.parametrize("kind", ["kubric", "driving"])
 def test_methods_outside_the_papers_rows_stand_below_in_the_last_frame_too(kind: str) -> None:
     of = measured(two("copy_source"), two("hexplane_1"), kind=kind, protocol="paper")
-    main, last = main_tables(of)
-    assert (main.rows[-1].label, main.rows[-1].method) == ("not in the paper", "copy_source")
-    assert [(row.label, row.method) for row in last.rows[-2:]] == [
+    last, main = main_tables(of)
+    assert (main.below[0].label, main.below[0].method) == ("not in the paper", "copy_source")
+    assert [(row.label, row.method) for row in last.below] == [
         ("not in the paper", "copy_source"),
         ("HexPlane, not in this table", "hexplane_1"),
     ]
@@ -67,7 +67,7 @@ def test_methods_outside_the_papers_rows_stand_below_in_the_last_frame_too(kind:
 @pytest.mark.parametrize(
     ("kind", "protocol", "hint"),
     [
-        ("kubric", "paper", "--row mine: no row is called 'anything'; there are HexPlane; 4D-GS;"),
+        ("kubric", "paper", "--row mine: no row is called 'anything'; there are GCD (direct, max 90, scratch);"),
         ("orbit", "pairs", "none of them is for these clips"),
     ],
 )

@@ -129,7 +129,7 @@ def lines(text: str) -> list[dict[str, str]]:
 
 def test_a_table_of_the_paper_has_its_rows_and_nobody_is_given_a_printed_figure() -> None:
     of = measured(records("gradual-max90"), kind="kubric", protocol="paper")
-    main, ablation = main_tables(of)
+    ablation, main = main_tables(of)
     text = to_markdown(main)
     (ours,) = [line for line in text.splitlines() if "gradual-max90" in line]
     assert "20.6" in ours  # measured
@@ -137,7 +137,7 @@ def test_a_table_of_the_paper_has_its_rows_and_nobody_is_given_a_printed_figure(
     for name in ("HexPlane", "4D-GS", "DynIBaR", "Vanilla SVD", "ZeroNVS", "Reproject RGB-D"):
         (line,) = [line for line in text.splitlines() if line.startswith(f"| {name} |")]
         assert line.count("not run") == 5
-    assert len(ablation.rows) == 8
+    assert len(ablation.rows) == 8 + 3
     direct = next(row for row in lines(to_csv(ablation)) if row["row"] == "GCD (direct, max 90, finetuned)")
     assert (direct["method"], direct["PSNR all"], direct["PSNR all paper"]) == ("not run", "", "17.23")
 
@@ -170,7 +170,7 @@ def test_clips_of_our_own_with_classes_have_columns_for_both() -> None:
 
 
 def test_pixels_that_nobody_knows_are_unknown_in_a_table_of_the_paper() -> None:
-    main, _ = main_tables(measured(records("gradual-90", occluded=None), kind="kubric", protocol="released"))
+    _, main = main_tables(measured(records("gradual-90", occluded=None), kind="kubric", protocol="released"))
     (row,) = [row for row in main.rows if row.method]
     assert [str(cell) for cell in row.cells[3:]] == ["unknown", "unknown"]
     assert "Unknown" in main.notes[1]
@@ -186,16 +186,16 @@ def test_a_released_run_also_has_its_own_figures_over_all_frames(tmp_path: Path)
     choices = Choices(drawn=False, worst=0)
     text = make_report([tmp_path / "released"], tmp_path / "out", choices).read_text()
     assert f"all {FRAMES} frames" in text
-    assert text.index("all_frames.csv") < text.index("table1.csv")
-    every, table1 = (
+    assert text.index("all_frames.csv") < text.index("table4.csv")
+    every, table4 = (
         next(
             row
             for row in lines((tmp_path / "out" / "tables" / f"{name}.csv").read_text())
             if "gradual" in row["method"]
         )
-        for name in ("all_frames", "table1")
+        for name in ("all_frames", "table4")
     )
-    assert float(every["PSNR all"]) == pytest.approx((99.0 + 3 * float(table1["PSNR all"])) / 4, rel=1e-5)
+    assert float(every["PSNR all"]) == pytest.approx((99.0 + 3 * float(table4["PSNR all"])) / 4, rel=1e-5)
     compared = {row["frames"] for row in lines((tmp_path / "out" / "tables" / "differences.csv").read_text())}
     assert compared == {"all", "2-last", "last"}
     make_report([tmp_path / "paper"], tmp_path / "other", choices)
@@ -213,18 +213,18 @@ def test_a_table_with_regions_says_that_lpips_has_none() -> None:
 @pytest.mark.parametrize(
     ("method", "details", "table", "label"),
     [
-        ("hexplane_4", {}, 0, "HexPlane"),
-        ("4D-GS", {}, 2, "4D-GS"),
-        ("Zero-NVS", {}, 0, "ZeroNVS"),
-        ("vanilla_svd", {}, 0, "Vanilla SVD"),
-        ("reproject_rgbd", {}, 2, "Reproject RGB-D"),
-        ("reproject_semd", {}, 4, "Reproject Sem-D"),
-        ("kubric_direct_max180", WEIGHTS, 1, "GCD (direct, max 180, finetuned)"),
-        ("mine", {"weights": "ab", "family": "kubric90"}, 0, "GCD (gradual, max 90, finetuned)"),
-        ("mine", {"weights": "sha 1902", "steps": "25"}, 0, None),
-        ("study-direct-scratch", WEIGHTS, 3, "GCD (direct, scratch)"),
-        ("pardom_gradual_semantic", WEIGHTS, 5, "GCD (gradual, finetuned)"),
-        ("copy_source", {}, 2, None),
+        ("hexplane_4", {}, 3, "HexPlane"),
+        ("4D-GS", {}, 3, "4D-GS"),
+        ("Zero-NVS", {}, 3, "ZeroNVS"),
+        ("vanilla_svd", {}, 3, "Vanilla SVD"),
+        ("reproject_rgbd", {}, 4, "Reproject RGB-D"),
+        ("reproject_semd", {}, 5, "Reproject Sem-D"),
+        ("kubric_direct_max180", WEIGHTS, 0, "GCD (direct, max 180, finetuned)"),
+        ("mine", {"weights": "ab", "family": "kubric90"}, 3, "GCD (gradual, max 90, finetuned)"),
+        ("mine", {"weights": "sha 1902", "steps": "25"}, 3, None),
+        ("study-direct-scratch", WEIGHTS, 1, "GCD (direct, scratch)"),
+        ("pardom_gradual_semantic", WEIGHTS, 2, "GCD (gradual, finetuned)"),
+        ("copy_source", {}, 4, None),
     ],
 )
 def test_a_method_finds_its_row(method: str, details: Mapping[str, str], table: int, label: str | None) -> None:
@@ -236,13 +236,40 @@ def test_a_method_finds_its_row(method: str, details: Mapping[str, str], table: 
 def test_a_user_may_say_where_a_method_stands() -> None:
     of = measured(records("mine"), kind="kubric", protocol="paper")
     placed = Measured(of=of.of, rows={"mine": "DynIBaR"})
-    table = main_tables(placed)[0]
+    table = main_tables(placed)[1]
     assert [row.method for row in table.rows if row.label == "DynIBaR"] == ["mine"]
 
 
 def test_what_the_paper_does_not_have_stands_below() -> None:
     table = main_tables(measured(records("copy_source"), kind="driving", protocol="released"))[0]
-    assert (table.rows[-1].label, table.rows[-1].method) == ("not in the paper", "copy_source")
+    assert [(row.label, row.method) for row in table.below] == [("not in the paper", "copy_source")]
+    assert not any(row.method for row in table.rows)
+    line = to_markdown(table).splitlines().index(f"| {' | '.join(['———'] * 9)} |")
+    assert "copy_source" in to_markdown(table).splitlines()[line + 1]
+
+
+def test_the_papers_tables_hold_all_it_prints() -> None:
+    printed = [[value for row in table.rows for value in row.printed if value is not None] for table in PAPER_TABLES]
+    assert [len(values) for values in printed] == [40, 20, 8, 33, 18, 3]
+    assert [table.name for table in PAPER_TABLES] == [f"table{number}" for number in range(1, 7)]
+    assert [table.frames for table in PAPER_TABLES] == ["last"] * 3 + ["2-last"] * 3
+    # sums over each table's rows, from the paper
+    assert [sum(values) for values in printed] == pytest.approx([277.162, 191.311, 2.751, 203.069, 138.253, 1.189])
+
+
+def test_the_means_that_the_papers_text_tells_follow_from_its_rows_and_are_measured_where_all_variants_are() -> None:
+    table = PAPER_TABLES[0]
+    first = {row.label: row.printed[0] or 0.0 for row in table.rows}
+    for gain in table.gains:
+        better = [label for label in first if gain.better in label]
+        apart = [first[label] - first[label.replace(gain.better, gain.worse)] for label in better]
+        assert sum(apart) / len(apart) == pytest.approx(gain.printed, abs=0.0051)
+    names = [label[5:-1].replace(", ", "-").replace(" ", "") for label in first]
+    every = [records(name, float(number)) for number, name in enumerate(names)]
+    ablation, _ = main_tables(measured(*every, kind="kubric", protocol="paper"))
+    assert [str(row.cells[0]) for row in ablation.rows[-3:]] == ["2.00", "-1.00", "4.00"]
+    some, _ = main_tables(measured(*every[:7], kind="kubric", protocol="paper"))
+    assert str(some.rows[-1].cells[0]) == "not run"
 
 
 def test_a_bar_in_a_name_breaks_no_table() -> None:

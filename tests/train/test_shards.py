@@ -200,7 +200,7 @@ def test_sets_that_share_scenes_are_refused(tmp_path: Path) -> None:
         list(generate(tmp_path / name, TINY, seeds, workers=1))
     first, second, third = (PairedClips.open(tmp_path / name) for name in "abc")
     require_apart(first, third)
-    with pytest.raises(DataError, match="share 1 scenes, first: seed 2"):
+    with pytest.raises(DataError, match="driving 2"):
         require_apart(first, second)
 
 

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 import torch
+from tiny_scenes4d import DRIVING_POSES, write_driving
 from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips, TinyOrbits, tiny_recipe
 from torch import Tensor
 
@@ -19,6 +20,7 @@ from gcd_model.networks import random_networks
 from gcd_train.batches import EncodedBatches, PixelBatches
 from gcd_train.checkpoint import load_state
 from gcd_train.conditioner import Conditioner, mirrored_path
+from gcd_train.data_kinds import DataPlaces, open_data
 from gcd_train.datasets.clip_source import ClipSource, PaintedClips, SomeClips, to_network
 from gcd_train.datasets.latents import LatentClips, LatentRows
 from gcd_train.draws import Draws
@@ -26,7 +28,7 @@ from gcd_train.errors import DataError, Interrupted
 from gcd_train.losses import COLOUR_WEIGHTS, class_emphasis
 from gcd_train.model_setup import model_config, sampled_as_trained
 from gcd_train.precision import Precision
-from gcd_train.recipe import Budget, ClassWeightsName, NoiseRecipe, Recipe
+from gcd_train.recipe import Budget, ClassWeightsName, DataRecipe, FramesRecipe, NoiseRecipe, Recipe
 from gcd_train.run_folder import RunFolder
 from gcd_train.stages.latents import LatentsJob, encode_clips
 from gcd_train.start import start_networks
@@ -131,6 +133,31 @@ def test_a_run_on_painted_clips_ends_in_a_file_that_makes_class_maps(painted_run
     assert view.classes.shape == (1, FRAMES, HEIGHT, WIDTH)
     assert synthesizer.traits.classes == DRIVING_CLASSES
     assert all(0 <= measured(painted_run)[stage]["miou_full"] <= 1 for stage in ("vae", "unet", "export"))
+
+
+def test_the_classes_of_a_driving_set_are_measured_and_end_in_the_weight_file(tmp_path: Path) -> None:
+    for number in (1, 2):
+        write_driving(tmp_path / "set", number, frames=FRAMES + 1)
+    data = DataRecipe(
+        kind="parallel_domain4d",
+        modality="semantic",
+        cameras=tuple(DRIVING_POSES),
+        frames=FramesRecipe(strides=(1,), reach_last=True),
+        split="last",
+        held_out=1,
+        repeats=2,
+    )
+    recipe = msgspec.structs.replace(painted_recipe(), data=data)
+    places = DataPlaces(data=tmp_path / "set")
+    opened = open_data(recipe, model_config(recipe.model), FAMILIES["driving-semantic"], places)
+    truth = opened.valid.target_classes(0)
+    assert [kind.name for kind in opened.valid.classes] == ["Car", "Road", "Sky", "Void"]
+    assert set(np.unique(truth).tolist()) == {0, 1, 2, 3}
+    trainer(tmp_path / "run", recipe, opened.clips, opened.valid).run()
+    synthesizer = load_synthesizer(tmp_path / "run" / "tiny-painted.safetensors", device="cpu")
+    assert synthesizer.traits.classes == opened.valid.classes
+    found = measured(tmp_path / "run")
+    assert all(0 <= found[stage]["miou_full"] <= 1 for stage in ("vae", "unet", "export"))
 
 
 def test_the_target_of_a_painted_clip_is_what_the_latents_hold(painted_run: Path) -> None:

@@ -1,5 +1,6 @@
 """Laws of single stages that a whole run does not show."""
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -137,6 +138,17 @@ def test_the_gradient_of_an_update_is_the_mean_over_its_parts(tmp_path: Path) ->
     task = Distances([0.0, 3.0, 9.0])
     Loop(task, RunFolder(tmp_path), replace(options(Budget(updates=1), Clock()), parts=3)).run()
     assert task.gradients == [pytest.approx(2 * (1 - (0 + 3 + 9) / 3))]
+
+
+def test_a_part_of_the_loss_that_the_last_batch_lacks_stays_in_the_log(tmp_path: Path) -> None:
+    class Changing(Distances):
+        def step_loss(self, progress: Progress) -> StepLoss:
+            loss = super().step_loss(progress)
+            return loss if progress.part else replace(loss, parts={"early": loss.total})
+
+    Loop(Changing([0.0, 3.0]), RunFolder(tmp_path), replace(options(Budget(updates=1), Clock()), parts=2)).run()
+    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert (lines[0]["early"], lines[0]["distance"]) == (1.0, 4.0)
 
 
 def test_a_linear_path_starts_as_the_best_linear_code() -> None:

@@ -1,5 +1,6 @@
 """Training pairs out of scenes in the published layouts: what they show, and what happens to bad data."""
 
+import json
 import pickle
 import shutil
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from tiny_scenes4d import (
     DRIVING_POSES,
     GROUND,
     KUBRIC_LENS,
+    SKY,
     draw,
     driving_pose,
     write_driving,
@@ -28,6 +30,7 @@ from gcd_train.datasets.clip_frames import FrameSampling
 from gcd_train.datasets.clip_source import ClipSource
 from gcd_train.datasets.controls import Control
 from gcd_train.datasets.kubric4d import Kubric4D
+from gcd_train.datasets.ontology import VOID
 from gcd_train.datasets.pair_clips import DrivingClips
 from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
 from gcd_train.datasets.pictures_of_draws import trained_lens, trained_picture
@@ -145,6 +148,17 @@ def test_classes_come_as_colours_and_as_ids(driving_root: Path) -> None:
     assert similar(painted.target, coloured.target) < 25
     truth = draw(driving_pose("yaw-0"), render_lens(DRIVING_LENS, *SIZE), box_x=9.0).ids
     assert np.mean(painted.target_classes[0] == truth) > 0.9
+
+
+def test_no_edge_is_of_a_third_class_whose_colour_lies_between_and_holes_are_of_none(two_scenes: Path) -> None:
+    between = [(one + other) // 2 for one, other in zip(COLOURS[BOX], COLOURS[GROUND], strict=True)]
+    for path in two_scenes.glob("*/ontology/*.json"):
+        told = json.loads(path.read_text())
+        told["items"] = [{"id": 7, "name": "Rider", "color": dict(zip("rgb", between, strict=True))}, *told["items"]]
+        path.write_text(json.dumps(told))
+    ids = driving_pairs(two_scenes, class_ids=True).sample(1).target_classes
+    assert ids is not None
+    assert set(np.unique(ids).tolist()) == {BOX, GROUND, SKY, VOID}
 
 
 def test_what_the_source_saw_is_all_at_first_and_less_later(kubric: Kubric4D, driving_root: Path) -> None:

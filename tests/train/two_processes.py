@@ -83,7 +83,7 @@ class Task(UNetTask):
     def __init__(self, recipe: Recipe, dies_at: int | None = None) -> None:
         networks = random_networks(model_config(recipe.model), seed=1)
         super().__init__(networks, Noise(), None, recipe.unet, None, PRECISION, recipe.seed)  # pyright: ignore
-        self._dies_at = dies_at
+        self._dies_at, self.measured = dies_at, 0
 
     def step_loss(self, progress: Progress) -> StepLoss:
         if progress.updates == self._dies_at:
@@ -91,7 +91,9 @@ class Task(UNetTask):
         return super().step_loss(progress)
 
     def measure(self, picture: Path) -> dict[str, float]:
-        return {"weight": float(whole(self.module.unet.conv_out.weight).sum())}  # pyright: ignore
+        self.measured += 1
+        self.gather()
+        return {"weight": 0.0}
 
 
 class BothDraws:
@@ -197,7 +199,10 @@ class Together:
         """How far the weights of two are from those of one."""
         found: dict[str, object] = {}
         for parallel in kinds:
-            weights = self.run(parallel, parallel=parallel)
+            task = Task(recipe_of())
+            weights = trained(self.folder / parallel, task, options(self.processes, Never(), LOG, parallel=parallel))
+            both = self.processes.averaged({"measured": task.measured, f"rank {self.processes.rank}": 1.0})
+            found |= {f"{parallel} {name}": value for name, value in both.items()}
             found[f"{parallel} against two batches"] = furthest(weights, self.single["two batches"])
             found[f"{parallel} against twice the batch"] = furthest(weights, self.single["twice the batch"])
             found[f"{parallel} moved"] = furthest(weights, self.single["start"])

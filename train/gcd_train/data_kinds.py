@@ -1,6 +1,7 @@
 """From a recipe's [data] and the folders a user names to what a run learns from and is measured on."""
 
 from dataclasses import dataclass
+from filecmp import cmp
 from pathlib import Path
 from typing import TypeVar
 
@@ -8,17 +9,20 @@ from gcd_model import Family, ModelConfig
 from gcd_model.networks import Networks
 from gcd_train.batches import BatchMaker, BatchSource
 from gcd_train.datasets.clip_frames import DRIVING_FRAMES, KUBRIC_FRAMES, FrameSampling
+from gcd_train.datasets.dataset4d import Dataset4D
 from gcd_train.datasets.kubric4d import Kubric4D
+from gcd_train.datasets.ontology import Ontology
 from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
 from gcd_train.datasets.sample_clips import SampleClips
 from gcd_train.datasets.skips import Skips
-from gcd_train.datasets.splits import Part, kubric_split, present, read_split
+from gcd_train.datasets.splits import Part, kubric_split, present, read_split, require_none_shared
 from gcd_train.datasets.trajectories import DrivingSampling, OrbitSampling, Sampling
 from gcd_train.datasets.videos import VideoSamples
 from gcd_train.datasets.view_pairs import ViewPairs
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.latent_cache import CachedLatents
 from gcd_train.latent_cache.batches import CachedBatches
+from gcd_train.layouts.manifest import MANIFEST, read_manifest
 from gcd_train.lerobot.pairs import LeRobotOptions, LeRobotPairs
 from gcd_train.model_setup import digest_of
 from gcd_train.pair_batches import PairBatches
@@ -36,7 +40,7 @@ def open_data(recipe: Recipe, config: ModelConfig, family: Family, places: DataP
     """Open what a recipe's [data] says the folders hold.
 
     Raises:
-        DataError: no such data there, nothing is left to measure on, or both parts share scenes.
+        DataError: no such data there, nothing is left to measure on, or both parts share scenes or episodes.
         RecipeError: an option does not fit the data or the family.
     """
     if recipe.data.task == "image-to-video":
@@ -78,6 +82,7 @@ class _Opening:
         held_out = 0 if self.places.valid else self._data.held_out
         learned = self._episodes(self.places.data, (0, -held_out or None))
         held = self._episodes(self.places.valid or self.places.data, (-held_out, None))
+        require_none_shared(_shared_episodes(learned, held))
         return RunData(
             clips=self._clips(learned, len(learned), learned.fps),
             valid=self._clips(held, len(held.episodes), held.fps),
@@ -90,6 +95,9 @@ class _Opening:
         cache, valid = CachedLatents.open(self.places.data), self._valid_folder("a latent cache holds no pictures")
         self._require_drawn_as_cached(cache)
         held = self._driving(valid)
+        if self._data.split == "last" or self._data.split_file is not None:
+            held = held.only(self._part(held, "val"))
+        require_none_shared(set(cache.scenes) & set(held.scenes))
         clips = self._one_rate(held, held.fps)
 
         def batches(networks: Networks, precision: Precision, /) -> BatchSource:
@@ -100,6 +108,7 @@ class _Opening:
         return RunData(clips=clips, valid=clips, batches=batches)
 
     def _views(self, learned: Kubric4D | ParallelDomain4D, held: Kubric4D | ParallelDomain4D) -> RunData:
+        require_none_shared(_shared_scenes(learned, held))
         sampling = sampling_of(self.recipe, self.config.frames)
         return RunData(
             clips=self._one_rate(learned, learned.fps, repeats=self._data.repeats),
@@ -123,10 +132,6 @@ class _Opening:
         """What to learn from, and what to measure on."""
         if self.places.valid is not None:
             held = self._kubric(self.places.valid) if isinstance(whole, Kubric4D) else self._driving(self.places.valid)
-            if self.places.valid.resolve() == self.places.data.resolve():
-                raise DataError(
-                    f"{self.places.valid} is to learn from, too; leave out --valid to hold out a part of it"
-                )
             return whole, held  # pyright: ignore[reportReturnType]  # opened as the other one was
         learned, held_out = (self._part(whole, part) for part in ("train", "val"))
         if not learned or not held_out:
@@ -150,7 +155,9 @@ class _Opening:
             )
         return present(read_split(Path(data.split_file), part), scenes, Skips(), data.split_file)
 
-    def _pairs(self, data: Kubric4D | ParallelDomain4D, sampling: Sampling, seed: int, repeats: int) -> ViewPairs:
+    def _pairs(
+        self, data: Kubric4D | ParallelDomain4D, sampling: Sampling, seed: int, repeats: int, *, class_ids: bool = False
+    ) -> ViewPairs:
         told = self._data
         return ViewPairs(
             data,
@@ -159,6 +166,7 @@ class _Opening:
             (self.config.width, self.config.height),
             repeats=repeats,
             modality="classes" if told.modality == "semantic" else "rgb",
+            class_ids=class_ids,
             exact=told.exact,
             published=told.published,
         )
@@ -170,14 +178,15 @@ class _Opening:
         if fps / stride != wanted:
             raise RecipeError(f"unet.fps is {wanted:g}, and no stride makes that of the set's {fps:g}")
         sampling = sampling_of(self.recipe, self.config.frames, stride=stride)
-        pairs = self._pairs(data, sampling, _FIXED_SEED, repeats)
-        return self._clips(pairs, len(pairs), wanted)
+        painted = self._data.modality == "semantic"
+        pairs = self._pairs(data, sampling, _FIXED_SEED, repeats, class_ids=painted)
+        return self._clips(pairs, len(pairs), wanted, data.ontology if painted else None)
 
-    def _clips(self, samples: Samples, count: int, fps: float) -> SampleClips:
+    def _clips(self, samples: Samples, count: int, fps: float, ontology: Ontology | None = None) -> SampleClips:
         origin = digest_of(self._data, str(self.places.data))
         if self._data.task == "image-to-video":
             samples, count = VideoSamples(samples), 2 * count
-        return SampleClips(samples, count, camera=self.config.camera, fps=fps, origin=origin)
+        return SampleClips(samples, count, camera=self.config.camera, fps=fps, origin=origin, ontology=ontology)
 
     def _sampled(self, samples: Samples) -> BatchMaker:
         recipe = self.recipe
@@ -240,6 +249,26 @@ class _Opening:
                 f"data.orbit goes to {largest} (azimuth, elevation, radius), family {self.family.name} to {allowed}: "
                 "nobody could ask for the views beyond; change model.family or data.orbit"
             )
+
+
+def _shared_scenes(learned: Dataset4D, held: Dataset4D) -> list[str]:
+    """Scenes of one name, and of one world where they are ours."""
+
+    def world(folder: Path) -> str | None:
+        return read_manifest(folder).world if (folder / MANIFEST).exists() else None
+
+    both = sorted(set(learned.scenes) & set(held.scenes))
+    return [scene for scene in both if world(learned.folder(scene)) == world(held.folder(scene))]
+
+
+def _shared_episodes(learned: LeRobotPairs, held: LeRobotPairs) -> list[str]:
+    """Episodes of one number whose rows lie in the same file, or in one with the same content."""
+    places = {episode.number: episode.data for episode in learned.episodes}
+
+    def same(one: Path, other: Path) -> bool:
+        return one.is_file() and other.is_file() and cmp(one, other, shallow=False)
+
+    return [each.name for each in held.episodes if each.number in places and same(places[each.number], each.data)]
 
 
 def sampling_of(recipe: Recipe, frames: int, *, stride: int | None = None) -> Sampling:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from threading import Event
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -69,7 +69,7 @@ class Task(Protocol):
         ...
 
     def measure(self, picture: Path) -> dict[str, float]:
-        """Metrics with the weights as they are; writes a sample picture there."""
+        """Metrics with the weights as they are; writes a sample picture there. Called in the first process alone."""
         ...
 
 
@@ -79,6 +79,15 @@ class SharedTask(Task, Protocol):
 
     def compute_through(self, network: nn.Module) -> None:
         """Compute losses through this from now on: the task's module, as the engine wraps it."""
+        ...
+
+
+@runtime_checkable
+class ShardedTask(SharedTask, Protocol):
+    """One whose weights the processes may hold in parts."""
+
+    def gather(self) -> None:
+        """Take part where the first process gathers the weights to measure them."""
         ...
 
 
@@ -110,7 +119,7 @@ class _Window:
 
     def values(self) -> dict[str, float]:
         """Mean of the loss, of its parts and of the gradient's norm, and frames per second."""
-        names = self.losses[-1].parts
+        names = {name: None for loss in self.losses for name in loss.parts}
         parts = {name: [loss.parts[name] for loss in self.losses if name in loss.parts] for name in names}
         means = {name: float(torch.stack(values).float().mean()) for name, values in parts.items()}
         total = float(torch.stack([loss.total for loss in self.losses]).float().mean())
@@ -257,16 +266,17 @@ class Loop:
         self._folder.record(self._options.stage, "loss", {**self._when(), **values})
 
     def _measure(self) -> None:
+        """Save, then measure in the first process; the others hand over what they hold of the weights, and wait."""
         self._save()
+        with torch.no_grad(), nullcontext() if self._ema is None else self._ema.applied():
+            if not self._processes.first and isinstance(self._task, ShardedTask):
+                self._task.gather()
+            self._processes.by_the_first(self._measured, Event())  # a stop is agreed on after this
+
+    def _measured(self) -> None:
         picture = self._folder.sample(self._options.stage, self._updates)
-        with torch.no_grad(), TemporaryDirectory() as scratch:
-            if not self._processes.first:  # takes part where weights are shared out, but writes nothing
-                picture = Path(scratch) / picture.name
-            picture.parent.mkdir(parents=True, exist_ok=True)
-            with nullcontext() if self._ema is None else self._ema.applied():
-                values = self._task.measure(picture)
-        if not self._processes.first:
-            return
+        picture.parent.mkdir(parents=True, exist_ok=True)
+        values = self._task.measure(picture)
         shown = "  ".join(f"{name} {value:.4g}" for name, value in values.items())
         _log.info("%s update %d measured: %s", self._options.stage, self._updates, shown)
         self._folder.record(self._options.stage, "measured", {**self._when(), **values}, picture)

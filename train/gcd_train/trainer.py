@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
+import msgspec
 import torch
 
 from gcd_model import ModelConfig
@@ -70,8 +71,11 @@ class Trainer:
     def __init__(self, inputs: RunInputs) -> None:
         """Raises RecipeError if the recipe's model cannot be built or exported, or its device is not there."""
         self._inputs, self._recipe, self._folder = inputs, inputs.recipe, inputs.folder
-        self._config: ModelConfig = sampled_as_trained(model_config(inputs.recipe.model), inputs.recipe.unet)
         self._family = family_of(inputs.recipe.model)
+        config = model_config(inputs.recipe.model)
+        if self._family.output == "semantic" and inputs.valid.classes:
+            config = msgspec.structs.replace(config, semantic_classes=tuple(inputs.valid.classes))
+        self._config: ModelConfig = sampled_as_trained(config, inputs.recipe.unet)
         require_exportable(inputs.recipe, self._config)
         self._precision = Precision.of(inputs.recipe.compute)
         self._engine = Engine(processes=inputs.processes, compute=inputs.recipe.compute)

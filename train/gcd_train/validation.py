@@ -9,7 +9,7 @@ from gcd_model import Clip, Family, Synthesizer, Traits
 from gcd_model.colours import palette
 from gcd_model.networks import Networks
 from gcd_train.datasets.clip_source import ClipSource, to_network
-from gcd_train.metrics import confusion_matrix, mean_iou, psnr
+from gcd_train.metrics import NO_CLASS, mean_iou, named_confusion, psnr
 from gcd_train.model_setup import copy_of
 from gcd_train.pictures import write_sheet
 
@@ -40,7 +40,7 @@ class Validation:
             rows = [source, view.video * 2 - 1, target]
             if view.classes is not None:
                 truth = torch.from_numpy(self._clips.target_classes(number).copy())
-                met = confusion_matrix(view.classes[0, 1:], truth[1:], len(self._clips.classes))
+                met = named_confusion(view.classes[0, 1:], truth[1:], [kind.name for kind in self._clips.classes])
                 counts = met if counts is None else counts + met
                 rows += [self._painted(view.classes[0]), self._painted(truth)]
             if number < _SHOWN_CLIPS:
@@ -67,8 +67,9 @@ class Validation:
         return Synthesizer(copy.to(device), traits)
 
     def _painted(self, ids: Tensor) -> Tensor:
-        """Class ids [T, H, W] as pictures [T, 3, H, W] in [-1, 1]."""
-        colours = palette(tuple(self._clips.classes)).float() / 127.5 - 1
+        """Class ids [T, H, W] as pictures [T, 3, H, W] in [-1, 1], black where no class is."""
+        named = palette(tuple(self._clips.classes)).float() / 127.5 - 1
+        colours = torch.cat([named, torch.full((NO_CLASS + 1 - len(named), 3), -1.0)])
         return colours[ids.long().cpu()].permute(0, 3, 1, 2)
 
 

@@ -14,6 +14,7 @@ from gcd_train.cli.training_run import (
     Out,
     Threads,
     Valid,
+    command_line,
     prepare_process,
     stage_named,
     stop_when_asked,
@@ -70,15 +71,18 @@ def _run(
 
     stop = stop_when_asked()
     teacher = teacher_of(recipe)
+    folder = RunFolder(out, TensorBoard(out / "tensorboard") if recipe.log.tensorboard else None)
     inputs = DistillInputs(
         recipe=recipe,
         teacher=teacher,
         data=open_data(as_training(recipe, teacher), teacher.config, teacher.family, places),
-        folder=RunFolder(out, TensorBoard(out / "tensorboard") if recipe.log.tensorboard else None),
+        folder=folder,
         stop=stop,
         latents=latents,
     )
-    Distiller(inputs).run(stage)
+    distiller = Distiller(inputs)
+    folder.begin(recipe, command_line())
+    distiller.run(stage)
 
 
 def _require_one_process() -> None:

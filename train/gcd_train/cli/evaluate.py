@@ -1,8 +1,6 @@
 """`gcd-train evaluate`: weights and what they have to beat, on held-out clips."""
 
-import shlex
 import signal
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -15,6 +13,7 @@ from typer import Option
 from gcd_model import Quality, RenderOptions, SolverName
 from gcd_train.cli.errors import errors_shown
 from gcd_train.cli.progress_bar import progress_bar
+from gcd_train.cli.training_run import command_line
 from gcd_train.errors import RecipeError
 from gcd_train.evaluation import ClipWork, RunKeeper, measure_all
 from gcd_train.evaluation.asked import Asked, Candidate, Looks, Rivals, SceneWishes, declared_mount
@@ -149,18 +148,16 @@ def _evaluate(asked: Asked, out: Path, *, views: KeptViews, workers: int, ray: s
     plan = planned(asked)
     for line in plan.opened.notes:
         _say(line)
-    note = note_of(plan, _command_line())
-    RunKeeper(out).begin(note)
-    plan = plan.with_means(progress_bar)
-    work = ClipWork(
-        folder=out.resolve(),
-        clips=plan.clips,
-        makers={method.name: method.make for method in plan.methods},
-        lpips=None if asked.lpips is None else asked.lpips.resolve(),
-        views=views,
-    )
-    account = _measured(work, workers, ray, asked.tested.device)
-    RunKeeper(out).begin(note)  # anew: a line that ran beside this one saw no records yet, and dropped the methods
+    with RunKeeper(out).in_use(note_of(plan, command_line())):
+        plan = plan.with_means(progress_bar)
+        work = ClipWork(
+            folder=out.resolve(),
+            clips=plan.clips,
+            makers={method.name: method.make for method in plan.methods},
+            lpips=None if asked.lpips is None else asked.lpips.resolve(),
+            views=views,
+        )
+        account = _measured(work, workers, ray, asked.tested.device)
     for line in account.lines():
         _say(line)
     typer.echo(write_outcome(plan, work, sheet_clips))
@@ -181,10 +178,6 @@ def _measured(work: ClipWork, workers: int, ray: str | None, device: str) -> Acc
         ):
             show(account.done)
     return account
-
-
-def _command_line() -> str:
-    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
 def _say(line: str) -> None:

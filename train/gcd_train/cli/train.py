@@ -18,6 +18,7 @@ from gcd_train.cli.training_run import (
     Out,
     Threads,
     Valid,
+    command_line,
     prepare_process,
     stage_named,
     stop_when_asked,
@@ -70,6 +71,7 @@ def train(
 def _train_live(recipe: str, data: Path, valid: Path | None, out: Path) -> None:
     from gcd_train.engine.processes import processes_of
     from gcd_train.live.training import LivePlaces, train_live
+    from gcd_train.run_folder import RunFolder
 
     if valid is None:
         raise RecipeError("a live model is measured on clips of their own: give --valid, see `gcd-train generate live`")
@@ -77,6 +79,8 @@ def _train_live(recipe: str, data: Path, valid: Path | None, out: Path) -> None:
     with processes_of(ComputeRecipe(device=loaded.device, parallel="ddp")) as processes:
         if not processes.first:
             logging.getLogger().setLevel(logging.WARNING)
+        else:
+            RunFolder(out).begin(loaded, command_line())
         train_live(loaded, places, stop_when_asked(), processes)
 
 
@@ -144,6 +148,7 @@ def _run(
     stop = stop_when_asked()
     board = TensorBoard(out / "tensorboard") if recipe.log.tensorboard and processes.first else None
     opened = open_data(recipe, model_config(recipe.model), family_of(recipe.model), places)
+    folder = RunFolder(out, board)
     inputs = RunInputs(
         recipe=recipe,
         clips=opened.clips,
@@ -151,8 +156,11 @@ def _run(
         batches=opened.batches,
         parts=opened.parts,
         latents=latents,
-        folder=RunFolder(out, board),
+        folder=folder,
         stop=stop,
         processes=processes,
     )
-    Trainer(inputs).run(stage)
+    trainer = Trainer(inputs)
+    if processes.first:
+        folder.begin(recipe, command_line())
+    trainer.run(stage)

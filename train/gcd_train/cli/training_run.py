@@ -1,7 +1,9 @@
 """What the commands that train have in common: options, how they log, and how they are stopped."""
 
 import logging
+import shlex
 import signal
+import sys
 import threading
 import warnings
 from collections.abc import Sequence
@@ -37,6 +39,11 @@ def prepare_process(threads: int | None) -> None:
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     if threads is not None:
         torch.set_num_threads(threads)
+
+
+def command_line() -> str:
+    """As it could be typed again."""
+    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
 def stop_when_asked() -> threading.Event:

@@ -75,19 +75,24 @@ class Ontology:
 
     @cached_property
     def classes(self) -> tuple[SemanticClass, ...]:
-        """The ids without gaps: class k of it is `items[k]`; see `places`."""
-        return tuple(SemanticClass(name=item.name, colour=item.colour) for item in self.items)
+        """The ids without gaps, those that share a colour as the lowest of them alone; see `places`."""
+        return tuple(SemanticClass(name=item.name, colour=item.colour) for item in self._told_apart)
 
     @cached_property
     def places(self) -> Bytes:
         """u8 [256]: the place in `classes` of each id; of an unlisted one that of void, or 255 without void."""
         places = np.full(_IDS, VOID, np.uint8)
-        for place, item in enumerate(self.items):
+        for place, item in enumerate(self._told_apart):
             places[item.id] = place
+        places = places[self._representatives]
         listed = {item.id for item in self.items}
         if VOID in listed:
             places[[i for i in range(_IDS) if i not in listed]] = places[VOID]
         return places
+
+    @property
+    def _told_apart(self) -> list[OntologyItem]:
+        return [item for item in self.items if self._representatives[item.id] == item.id]
 
     @cached_property
     def _representatives(self) -> Bytes:

@@ -25,6 +25,7 @@ from gcd_model.geometry import (
 )
 from gcd_model.small_files import decode_json
 from gcd_train.array_files import ZIP_FAULTS, read_member
+from gcd_train.datasets.splits import require_none_shared
 from gcd_train.errors import DataError
 from gcd_train.scenes.pair_world import DEPTH_UNIT_M, Orbit, World, read_world
 
@@ -231,13 +232,9 @@ class PairedClips:
 
 
 def require_apart(training: PairedClips, held_out: PairedClips) -> None:
-    """Raises DataError if two sets share scenes: what was learned from them says nothing about others."""
+    """Raises DataError naming the scenes that two sets share."""
     shared = {training.scene(i) for i in range(len(training))} & {held_out.scene(i) for i in range(len(held_out))}
-    if shared:
-        raise DataError(
-            f"training and held-out clips share {len(shared)} scenes, first: seed {min(seed for _, seed in shared)}; "
-            "generate the held-out ones with --first-seed 1000000"
-        )
+    require_none_shared([f"{world} {seed}" for world, seed in shared])
 
 
 def data_folders(folder: Path | str | Sequence[Path | str]) -> list[Path]:

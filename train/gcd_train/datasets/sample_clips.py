@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from gcd_model.config import CameraControl, SemanticClass
 from gcd_model.geometry import CameraMount, Trajectory, pose_trajectory
 from gcd_train.datasets.dataset4d import PairSample
+from gcd_train.datasets.ontology import Ontology
 from gcd_train.sample_loader import Samples
 
 Bytes = NDArray[np.uint8]
@@ -18,10 +19,20 @@ class SampleClips:
     """A `ClipSource` of the first `count` samples.
 
     camera: how the network is told where the target camera goes. fps: of all clips. origin: names set and options.
+    ontology: of samples with class ids; None for others.
     """
 
-    def __init__(self, samples: Samples, count: int, *, camera: CameraControl, fps: float, origin: str) -> None:
-        self._samples, self._count = samples, count
+    def __init__(
+        self,
+        samples: Samples,
+        count: int,
+        *,
+        camera: CameraControl,
+        fps: float,
+        origin: str,
+        ontology: Ontology | None = None,
+    ) -> None:
+        self._samples, self._count, self._ontology = samples, count, ontology
         self._camera: CameraControl = camera
         self._fps, self._origin = fps, origin
         self._last: tuple[int, PairSample] | None = None
@@ -31,8 +42,8 @@ class SampleClips:
 
     @property
     def classes(self) -> tuple[SemanticClass, ...]:
-        """None: a semantic model of the paper paints its view."""
-        return ()
+        """Of the class ids, none where the samples have none."""
+        return () if self._ontology is None else self._ontology.classes
 
     @property
     def fps(self) -> float:
@@ -72,8 +83,11 @@ class SampleClips:
         return sample.source, sample.target
 
     def target_classes(self, number: int, /) -> Bytes:
-        """Zeros: there are no classes here. u8 [T, H, W]."""
-        return np.zeros(self._sample(number).target.shape[:3], np.uint8)
+        """Places in `classes`, u8 [T, H, W]; zeros where the samples have no class ids."""
+        sample = self._sample(number)
+        if self._ontology is None or sample.target_classes is None:
+            return np.zeros(sample.target.shape[:3], np.uint8)
+        return self._ontology.places[sample.target_classes]
 
     def _sample(self, number: int) -> PairSample:
         """The last one is kept: pictures and path of a clip are asked for one after the other."""

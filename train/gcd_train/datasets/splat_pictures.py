@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.datasets.dataset4d import Dataset4D
-from gcd_train.datasets.ontology import Ontology
+from gcd_train.datasets.ontology import VOID, Ontology
 from gcd_train.datasets.pictures_of_draws import Bytes, Modality, PairPictures, stacked, trained_picture
 from gcd_train.datasets.trajectories import Draw
 from gcd_train.errors import DataError
@@ -82,33 +82,42 @@ class SplatPictures:
         world_from_target: NDArray[np.float64],
         lens: Intrinsics,
     ) -> _Frame:
-        painted = self._painted(views)
-        colours = [view.rgb for view in views]
-        values = painted if self._modality == "classes" and painted is not None else colours
-        if self._modality == "rgb" and painted is not None:  # both in one go
-            values = [np.concatenate(both, axis=-1) for both in zip(colours, painted, strict=True)]
-        target = self._picture(views, world_from_target, lens, values)
+        values = self._painted(views) if self._modality == "classes" else None
         visible = None
         if self._visible and seen is not None:
             visible = visibility(
                 seen, world_from_target, lens, width=self._width, height=self._height, options=self._options
             )
-        return _Frame(source, np.ascontiguousarray(target[..., :3]), self._class_ids_of(target), visible)
+        return _Frame(
+            source=source,
+            target=self._picture(views, world_from_target, lens, values),
+            target_classes=self._target_ids(views, world_from_target, lens) if self._class_ids else None,
+            visible=visible,
+        )
 
-    def _class_ids_of(self, target: Bytes) -> Bytes | None:
-        """From the painted picture, which is the last three channels."""
-        if not self._class_ids or self._ontology is None:
-            return None
-        return self._ontology.decode(np.ascontiguousarray(target[..., -3:]))
+    def _target_ids(
+        self, views: Sequence[SceneView], world_from_target: NDArray[np.float64], lens: Intrinsics
+    ) -> Bytes:
+        """The class of the point that shows most in each pixel, `VOID` where none does: colours of edges are mixed, and
+        read back as a third class."""
+        smaller = render_lens(lens, self._width, self._height)
+        labels = self._ids(views)
+        drawn = splat(views, world_from_target, smaller, labels=labels, options=self._options, device=self._device)
+        assert drawn.labels is not None
+        return drawn.labels.masked_fill(~drawn.covered, VOID).byte().cpu().numpy()
 
-    def _painted(self, views: Sequence[SceneView]) -> list[Bytes] | None:
-        """Views in colours of their classes, None where nobody asked."""
-        if self._ontology is None:
-            return None
+    def _painted(self, views: Sequence[SceneView]) -> list[Bytes]:
+        """Views in colours of their classes."""
+        assert self._ontology is not None
+        return [self._ontology.encode(ids) for ids in self._ids(views)]
+
+    def _ids(self, views: Sequence[SceneView]) -> list[Bytes]:
+        """Class ids of the views; of several in one colour, which pictures cannot tell apart, the lowest."""
+        assert self._ontology is not None
         classes = [view.classes for view in views if view.classes is not None]
         if len(classes) < len(views):
             raise DataError("classes were asked for, but the scene lacks its layer semantic_segmentation_2d")
-        return [self._ontology.encode(ids) for ids in classes]
+        return [self._ontology.merge(ids) for ids in classes]
 
     def _picture(
         self,

@@ -1,7 +1,7 @@
 """Which scenes are for training, validation and test: by number, by split file, by list."""
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -17,6 +17,7 @@ from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
 Part = Literal["train", "val", "test"]
 
 _KUBRIC_RANGES: dict[Part, range] = {"train": range(2800), "val": range(2800, 2900), "test": range(2900, 3000)}
+_NAMED = 5  # scenes in a message
 _LIST_MARK = re.compile(r"\binvalid\b", re.IGNORECASE)
 
 
@@ -99,6 +100,17 @@ def present(wanted: Sequence[str], available: Sequence[str], skips: Skips, origi
         if scene not in known:
             skips.add(scene, str(origin), "names a scene that is not in the data folder")
     return tuple(scene for scene in wanted if scene in known)
+
+
+def require_none_shared(scenes: Collection[str]) -> None:
+    """Raises DataError naming the scenes or episodes that are to learn from and held out, if there are any: what was
+    learned from them says nothing about others."""
+    if scenes:
+        named = ", ".join(sorted(scenes)[:_NAMED]) + ", ..." * (len(scenes) > _NAMED)
+        raise DataError(
+            f"training and held-out data share {len(scenes)} scenes or episodes, {named}; hold out others, or leave "
+            "out --valid where a part of --data can be held out"
+        )
 
 
 def _require_part(part: Part) -> Part:

@@ -32,7 +32,7 @@ class ViewPairs:
 
     dataset: where pictures come from. sampling: frames and paths, for one `trajectories.MAX90` or `DRIVING`.
     size: width and height of the samples, pixels. repeats: the set counts as so many times its scenes; scene of index i
-    is i mod the number of scenes. modality: the target in colour, or painted by class. class_ids: also decode the
+    is i mod the number of scenes. modality: the target in colour, or painted by class. class_ids: also the
     target's classes. visible: also say what of the target the source camera saw. exact: draw the target from the
     geometry our own scenes keep, instead of from points. published: points as released, with its approximations; open
     Kubric-4D with `published` too then.

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager, nullcontext
 from datetime import timedelta
+from statistics import fmean as mean
 
 import torch
 import torch.distributed as dist
@@ -73,13 +74,14 @@ class Processes:
         return float(said[0]), float(said[1]), bool(said[2])
 
     def averaged(self, values: dict[str, float]) -> dict[str, float]:
-        """The mean of every value over the processes, which all give the same names. Raises TrainError as `agreed`."""
+        """The mean of every value over the processes that give it. Raises TrainError as `agreed`."""
         if self.control is None:
             return values
-        total = torch.tensor(list(values.values()), dtype=torch.float64)
+        given = [dict[str, float]() for _ in range(self.count)]
         with self.others_gone():
-            dist.all_reduce(total, group=self.control)
-        return dict(zip(values, (total / self.count).tolist(), strict=True))
+            dist.all_gather_object(given, values, group=self.control)
+        names = {name: None for each in given for name in each}
+        return {name: mean(each[name] for each in given if name in each) for name in names}
 
     def told(self, value: object) -> object:
         """What the first process gives here, in every process. Raises TrainError as `agreed`."""

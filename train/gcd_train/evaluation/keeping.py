@@ -9,11 +9,14 @@
 Files appear whole or not at all, so a run that was killed goes on where it stopped.
 """
 
+import fcntl
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TextIO
 
 import msgspec
 
@@ -42,11 +45,22 @@ class RunKeeper:
 
     folder: Path
 
-    def begin(self, note: RunNote) -> RunNote:
+    @contextmanager
+    def in_use(self, note: RunNote) -> Generator[None]:
+        """`begin`, one line at a time; lines that begin before the block is left keep its methods. Raises as it."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with (self.folder / ".in_use").open("a") as measuring:
+            with (self.folder / ".begin").open("a") as turn:
+                fcntl.flock(turn, fcntl.LOCK_EX)
+                self.begin(note, alone=_nobody_else(measuring))
+                fcntl.flock(measuring, fcntl.LOCK_SH)
+            yield
+
+    def begin(self, note: RunNote, *, alone: bool = True) -> RunNote:
         """Write `run.json`, or add this note's methods to the one that is there, whose command and time stay.
 
-        What has no record binds nobody: a note of which nothing was measured is written anew, and a method without
-        records is corrected, or dropped where this note does not name it.
+        What has no record binds nobody, if no other line measures now (alone): a note of which nothing was measured is
+        written anew, and a method without records is corrected, or dropped where this note does not name it.
 
         Returns: what now stands there.
         Raises:
@@ -55,7 +69,8 @@ class RunKeeper:
         """
         path = self.folder / RUN_FILE
         if path.exists():
-            found = self._with_records(_read_note(path))
+            found = _read_note(path)
+            found = self._with_records(found) if alone else found
             note = _joined(self.folder, found, note) if found.methods else note
         _require_own_folders(note.methods)
         write_whole(path, msgspec.json.format(msgspec.json.encode(note), indent=1))
@@ -113,6 +128,14 @@ def write_whole(path: Path, data: bytes) -> None:
         partial.replace(path)
     except OSError as error:
         raise RunError(f"cannot write {path}: {error.strerror}; free some space, or choose another --out") from error
+
+
+def _nobody_else(measuring: TextIO) -> bool:
+    try:
+        fcntl.flock(measuring, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def _read_note(path: Path) -> RunNote:

@@ -87,6 +87,14 @@ def frame_confusions(predicted: Tensor, target: Tensor, count: int, mask: Tensor
     return torch.bincount(cells, minlength=frames * count * columns).view(frames, count, columns)
 
 
+def named_confusion(predicted: Tensor, target: Tensor, names: Sequence[str]) -> Tensor:
+    """`frame_confusions` of all frames together, int64 [K, K + 1], for the K classes of these names: those that stand
+    for no class do not count where they are true."""
+    void = void_ids(names)
+    said, true = (without_classes(labels.cpu(), void) for labels in (predicted, target))
+    return frame_confusions(said, true, len(names)).sum(dim=0)
+
+
 def class_iou(confusion: Tensor) -> Tensor:
     """Intersection over union of each class, float64 [K]; NaN for one that is neither predicted nor there.
 

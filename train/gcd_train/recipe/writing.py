@@ -1,30 +1,18 @@
 """A recipe as the TOML file that would say all of it, defaults included."""
 
-import json
-from collections.abc import Mapping
 from typing import cast
 
 import msgspec
+import tomli_w
 
-from gcd_train.recipe.schema import Recipe
 
-
-def to_toml(recipe: Recipe) -> str:
+def to_toml(recipe: msgspec.Struct) -> str:
     """The whole recipe; reading it gives the same one."""
-    return "\n".join(_lines(msgspec.to_builtins(recipe), ())) + "\n"
+    return tomli_w.dumps(cast(dict[str, object], _said(msgspec.to_builtins(recipe))))
 
 
-def _lines(table: Mapping[str, object], place: tuple[str, ...]) -> list[str]:
-    """Plain values first, then the tables below; None cannot be said in TOML and is the same as left out."""
-    given = {key: value for key, value in table.items() if value is not None}
-    plain = [f"{key} = {_value(value)}" for key, value in given.items() if not isinstance(value, dict)]
-    tables = {key: cast(Mapping[str, object], value) for key, value in given.items() if isinstance(value, dict)}
-    head = ["", f"[{'.'.join(place)}]"] if place else []
-    below = [line for key, value in tables.items() for line in _lines(value, (*place, key))]
-    return [*head, *plain, *below]
-
-
-def _value(value: object) -> str:
-    if isinstance(value, (list, tuple)):
-        return f"[{', '.join(_value(each) for each in cast(list[object], list(value)))}]"  # pyright: ignore[reportUnknownArgumentType]
-    return json.dumps(value, ensure_ascii=False)
+def _said(value: object) -> object:
+    """None cannot be said in TOML and is the same as left out."""
+    if isinstance(value, dict):
+        return {key: _said(each) for key, each in cast(dict[str, object], value).items() if each is not None}
+    return [_said(each) for each in cast(list[object], value)] if isinstance(value, list | tuple) else value

@@ -2,13 +2,24 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from math import nan
+from statistics import fmean
 
 from gcd_train.evaluation.class_counts import ClassCounts, class_counts
 from gcd_train.evaluation.record import Region
 from gcd_train.evaluation.tallies import FIGURE_NAMES, Selection, Span
 from gcd_train.reports.intervals import Drawn, Interval, drawn
 from gcd_train.reports.material import EvaluatedSet, Method
-from gcd_train.reports.paper import CLASS_COLUMNS, PICTURE_COLUMNS, Column, PaperRow, PaperTable, row_label, tables_for
+from gcd_train.reports.paper import (
+    CLASS_COLUMNS,
+    PICTURE_COLUMNS,
+    Column,
+    Gain,
+    PaperRow,
+    PaperTable,
+    row_label,
+    tables_for,
+)
 from gcd_train.reports.table import NO_WEIGHTS, NOT_RUN, NOTHING, Cell, Row, Table, csv_text
 
 _SPANS: tuple[Span, ...] = ("2-last", "last", "all")
@@ -60,10 +71,8 @@ def main_tables(measured: Measured, spans: Sequence[Span] = ("2-last", "last")) 
         spans: only tables over these frames. The paper has none over all frames, so that one is always our own.
     """
     columns, papers = _columns(measured.of), {each.frames: each for each in tables_for(measured.of.note)}
-    return tuple(
-        _paper_table(measured, papers[frames]) if frames in papers else _own_table(measured, columns, frames)
-        for frames in spans
-    )
+    ours = tuple(_own_table(measured, columns, frames) for frames in spans if frames not in papers)
+    return (*ours, *(_paper_table(measured, each) for frames, each in papers.items() if frames in spans))
 
 
 def all_figures(measured: Measured) -> str:
@@ -109,7 +118,7 @@ def _paper_table(measured: Measured, table: PaperTable) -> Table:
         found = placed.pop(row.label, [])
         rows += [measured_row(measured, each, table.columns, table.frames, row) for each in found]
         rows += [] if found else [_not_run(row, table.columns)]
-    rows += [
+    below = [
         measured_row(measured, each, table.columns, table.frames, PaperRow(label=_below(label)))
         for label, methods in placed.items()
         for each in methods
@@ -118,8 +127,24 @@ def _paper_table(measured: Measured, table: PaperTable) -> Table:
         name=table.name,
         title=f"{table.title} ({measured.of.title})",
         headings=tuple(column.heading for column in table.columns),
-        rows=tuple(rows),
+        rows=(*rows, *(_gain(rows, each, table.columns) for each in table.gains)),
+        below=tuple(below),
         notes=table_notes(measured, table.columns, table.frames),
+    )
+
+
+def _gain(rows: Sequence[Row], gain: Gain, columns: Sequence[Column]) -> Row:
+    """The mean difference of the first column, where every variant was measured; of several in a row the first."""
+    known = {row.label: row.cells[0].figure for row in reversed(rows)}
+    pairs = [(known[label], known[label.replace(gain.better, gain.worse)]) for label in known if gain.better in label]
+    apart = [one.value - other.value for one, other in pairs if one is not None and other is not None]
+    figure = None
+    if len(apart) == len(pairs):
+        figure = Interval(value=fmean(apart), low=nan, high=nan)
+    first = Cell(figure=figure, digits=columns[0].digits, note=NOT_RUN, paper=gain.printed)
+    return Row(
+        label=f"{gain.better} over {gain.worse}, mean of variants",
+        cells=(first, *(Cell(note=NOTHING) for _ in columns[1:])),
     )
 
 

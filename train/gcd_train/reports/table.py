@@ -41,6 +41,9 @@ class Cell:
         return value, low, high
 
 
+_LINE = "———"
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Row:
     """label: of the row. method: whose figures these are, empty for nobody's. clips: how many it was measured on."""
@@ -53,12 +56,13 @@ class Row:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Table:
-    """name: of its file. title, notes: above and below it. headings: of the cells' columns."""
+    """name: of its file. title, notes: above and below it. headings: of the cells' columns. below: under a line."""
 
     name: str
     title: str
     headings: tuple[str, ...]
     rows: tuple[Row, ...]
+    below: tuple[Row, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
@@ -72,8 +76,10 @@ def to_markdown(table: Table) -> str:
     heads = ["", "method", "clips", *table.headings, *(["paper (its own data)"] if table.has_paper else [])]
     rows = [
         [row.label, row.method, row.clips, *map(str, row.cells), *([_printed(row)] if table.has_paper else [])]
-        for row in table.rows
+        for row in (*table.rows, *table.below)
     ]
+    if table.below:
+        rows.insert(len(table.rows), [_LINE] * len(heads))
     lines = [f"### {table.title}", "", *markdown_rows(heads, rows)]
     return "\n".join([*lines, *(f"\n{note}" for note in table.notes)]) + "\n"
 
@@ -84,7 +90,7 @@ def to_csv(table: Table) -> str:
     for heading in table.headings:
         heads += [heading, f"{heading} low", f"{heading} high", f"{heading} paper"]
     rows: list[list[str]] = []
-    for row in table.rows:
+    for row in (*table.rows, *table.below):
         cells = [part for cell in row.cells for part in (*cell.numbers(), _number(cell.paper))]
         rows.append([row.label, row.method or NOT_RUN, row.clips, *cells])
     return csv_text(heads, rows)

@@ -9,6 +9,7 @@ from gcd_model.networks import Networks
 from gcd_train.batches import BatchSource
 from gcd_train.draws import Draws
 from gcd_train.loop import Progress, StepLoss
+from gcd_train.lora import plain_weights
 from gcd_train.objective import denoiser_of, diffusion_loss
 from gcd_train.precision import Precision
 from gcd_train.recipe import UNetRecipe
@@ -76,3 +77,7 @@ class UNetTask:
     def measure(self, picture: Path) -> dict[str, float]:
         """Held-out clips through the shipped synthesizer."""
         return self._validation.measure(self._networks, picture)
+
+    def gather(self) -> None:
+        """See `ShardedTask`."""
+        plain_weights(self._networks)

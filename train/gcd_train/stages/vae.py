@@ -16,7 +16,7 @@ from gcd_train.datasets.clip_source import Bytes, ClipSource, KeptClips, to_netw
 from gcd_train.draws import Draws
 from gcd_train.errors import RecipeError
 from gcd_train.loop import Progress, StepLoss
-from gcd_train.metrics import confusion_matrix, mean_iou, psnr
+from gcd_train.metrics import mean_iou, named_confusion, psnr
 from gcd_train.picture_losses import gradient_l1, kl_to_normal, ssim
 from gcd_train.pictures import write_sheet
 from gcd_train.precision import Precision
@@ -104,7 +104,7 @@ class VAETask:
             means.append(latents)
             if self._painted:
                 truth = torch.from_numpy(self._valid.target_classes(number).copy())
-                counts.append(confusion_matrix(self._classes(decoded), truth, len(self._painted)))
+                counts.append(named_confusion(self._classes(decoded), truth, [kind.name for kind in self._painted]))
             shown += [[decoded[0], decoded[-1]], [frames[0], frames[-1]]]
         write_sheet(picture, shown)
         spread = torch.cat(means).transpose(0, 1).flatten(1).std(1)
