@@ -132,13 +132,6 @@ def test_frames_are_known_again_by_what_they_are_and_not_by_their_place(tmp_path
     assert keeper.begin(note(methods={"flat": {"frames in": "q", "digest": "1"}})).methods["flat"]["frames in"] == "q"
 
 
-def test_a_run_whose_baselines_once_told_more_than_they_use_goes_on(tmp_path: Path) -> None:
-    keeper = RunKeeper(tmp_path)
-    keeper.begin(note(methods={"a": {"baseline": "a", "samples": "4", "seed": "0", "means of": "nothing"}}))
-    keeper.keep(record("a", "k"))
-    assert keeper.begin(note(methods={"a": {"baseline": "a"}})).methods == {"a": {"baseline": "a"}}
-
-
 @pytest.mark.parametrize(
     ("other", "said"),
     [

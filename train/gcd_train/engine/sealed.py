@@ -2,14 +2,12 @@
 
 import hashlib
 import os
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
 _MARK = b"gcd-train sha256 "
 _COMMENT = len(_MARK) + 64
-_END = 22  # bytes of a zip archive's last record when it has no comment
 _CHUNK = 1 << 22
 
 
@@ -39,20 +37,17 @@ def write_sealed(path: Path, write: Callable[[Any], None]) -> None:
 
 
 def damage(path: Path) -> str | None:
-    """What is wrong with a sealed file, or None. One without a digest (of older versions) is checked by its CRCs."""
+    """What is wrong with a sealed file, or None."""
     if not path.is_file():
         return "it is no regular file"
     size = path.stat().st_size
     with path.open("rb") as file:
-        file.seek(max(0, size - _END - _COMMENT))
-        tail = file.read()
-        if tail[-_COMMENT:].startswith(_MARK):
-            said = tail[-_COMMENT - 2 : -_COMMENT], tail[len(_MARK) - _COMMENT :].decode("ascii", "replace")
-            right = said == (_COMMENT.to_bytes(2, "little"), _digest(file, size - _COMMENT - 2))
-            return None if right else "its bytes are not those that were written"
-    if tail[-_END : 4 - _END] != b"PK\x05\x06":
-        return "it is no state, or only half of one"
-    return _damage_by_crc(path)
+        file.seek(max(0, size - _COMMENT - 2))
+        length, comment = file.read(2), file.read()
+        if length != _COMMENT.to_bytes(2, "little") or not comment.startswith(_MARK):
+            return "it is no state, or only half of one"
+        right = comment.removeprefix(_MARK).decode("ascii", "replace") == _digest(file, size - _COMMENT - 2)
+        return None if right else "its bytes are not those that were written"
 
 
 def _digest(file: IO[bytes], size: int) -> str:
@@ -66,12 +61,3 @@ def _digest(file: IO[bytes], size: int) -> str:
         left -= len(chunk)
     total.update(b"\0\0")
     return total.hexdigest()
-
-
-def _damage_by_crc(path: Path) -> str | None:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            wrong = archive.testzip()
-    except (zipfile.BadZipFile, OSError, NotImplementedError, EOFError) as error:
-        return f"it cannot be read ({error})"
-    return None if wrong is None else f"its part {wrong} is damaged"
