@@ -23,11 +23,11 @@ from gcd_train.baselines import (
     fit_statistics,
     to_pictures,
 )
+from gcd_train.cli.evaluate import gpu_seats
 from gcd_train.cli.main import app
 from gcd_train.datasets.paired import PairedClips
 from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.evaluation import ClipWork, HeldOutClip, PairedSet, RunKeeper, folder_name, measure_all, read_run
-from gcd_train.evaluation.gpu_seats import gpu_seats
 from gcd_train.evaluation.kept_frames import KeptViews, png
 from gcd_train.evaluation.methods import of_baselines
 from gcd_train.evaluation.paired_set import chosen, identity_of

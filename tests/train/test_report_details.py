@@ -17,8 +17,8 @@ from gcd_train.reports import Choices, Measured, Run, all_plots, differences, ga
 from gcd_train.reports.comparison import to_markdown as differences_told
 from gcd_train.reports.drawing import draw
 from gcd_train.reports.failures import worst_clips
+from gcd_train.reports.figure_tables import frames_csv, region_table
 from gcd_train.reports.galleries import Strip, caption, write_sheet
-from gcd_train.reports.region_tables import frames_csv, region_table
 from gcd_train.reports.table import to_markdown
 
 COUNTS = [(0, 0, 9), (1, 0, 1)]

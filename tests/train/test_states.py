@@ -16,8 +16,8 @@ from torch import nn
 from torch.distributed.checkpoint.filesystem import FileSystemWriter
 from torch.distributed.checkpoint.state_dict_saver import save
 
+from gcd_train import checkpoint
 from gcd_train.checkpoint import DamagedStateError, load_state
-from gcd_train.engine import sealed
 from gcd_train.engine.sharded import FolderNote, checked_note, close_folder, read_weights
 from gcd_train.engine.states import newest_weights
 from gcd_train.errors import RunError
@@ -132,7 +132,7 @@ def test_no_byte_of_a_state_can_change_unnoticed(tmp_path: Path) -> None:
     data = path.read_bytes()
     for place in (*range(0, len(data), 97), *range(len(data) - 110, len(data))):
         path.write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
-        assert sealed.damage(path) is not None, place
+        assert checkpoint.damage(path) is not None, place
 
 
 class Killed(BaseException):
@@ -146,7 +146,7 @@ class Assassin:
         self._left = at
         for owner, name in ((Path, "replace"), (Path, "rename"), (Path, "unlink"), (Path, "mkdir"), (os, "fsync")):
             patch.setattr(owner, name, self._watched(getattr(owner, name)))
-        write: Any = sealed._Hashing.write  # pyright: ignore[reportPrivateUsage]
+        write: Any = checkpoint._Hashing.write  # pyright: ignore[reportPrivateUsage]
 
         def cut(hashing: Any, data: Any) -> int:
             if self._strikes():
@@ -156,7 +156,7 @@ class Assassin:
             self._stay_dead()
             return write(hashing, data)
 
-        patch.setattr(sealed._Hashing, "write", cut)  # pyright: ignore[reportPrivateUsage]
+        patch.setattr(checkpoint._Hashing, "write", cut)  # pyright: ignore[reportPrivateUsage]
 
     @property
     def struck(self) -> bool:

@@ -7,8 +7,7 @@ from gcd_model import Family, ModelConfig
 from gcd_model.networks import Networks, weights_digest
 from gcd_train.conditioner import Conditioner
 from gcd_train.datasets.clip_source import ClipSource
-from gcd_train.datasets.latent_videos import LatentVideos
-from gcd_train.datasets.latents import EncodedClips, LatentClips
+from gcd_train.datasets.latents import EncodedClips, LatentClips, LatentVideos
 from gcd_train.errors import RunError
 from gcd_train.losses import COLOUR_WEIGHTS
 from gcd_train.model_setup import digest_of
