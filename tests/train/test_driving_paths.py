@@ -58,14 +58,13 @@ def test_clips_and_methods_follow_the_path_that_the_world_tells(path: CameraWay,
     np.testing.assert_allclose(declared, driving_trajectory(frames=3, move_time=goal, mount=lower).source_from_target)
 
 
-def test_the_path_is_told_where_it_is_direct_and_folders_without_a_word_are_gradual(tmp_path: Path) -> None:
+def test_a_folder_says_which_path_its_target_camera_takes(tmp_path: Path) -> None:
     for path in ("gradual", "direct"):
         agree_in = tmp_path / path
         agree_in.mkdir()
         agree(agree_in, world(path))
         assert read_world(agree_in) == world(path)
-    assert "path" not in json.loads((tmp_path / "gradual" / "world.json").read_text())
-    assert json.loads((tmp_path / "direct" / "world.json").read_text())["path"] == "direct"
+        assert json.loads((agree_in / "world.json").read_text())["path"] == path
 
 
 # examples
