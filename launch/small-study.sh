@@ -71,5 +71,5 @@ done
 gcd_train evaluate --methods "$METHODS" --svd "$PRETRAINED" --train "$DATA/train/gradual" --train-limit 400 \
   --data "$DATA/test/gradual" --out "$ROOT/evaluated/baselines" "${BUDGET[@]}" "${MEASURE[@]}"
 
-gcd_train findings "$ROOT"/evaluated/* --out "$ROOT/findings" ${SMALL:+--small}
+"$PYTHON" tools/study_findings.py "$ROOT"/evaluated/* --out "$ROOT/findings" ${SMALL:+--small}
 gcd_train report "$ROOT"/evaluated/* --out "$ROOT/report"

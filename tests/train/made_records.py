@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from gcd_train.evaluation.record import ClipRecord, Counted, Region, RegionRecord, RunNote
 
 FRAMES = 4
+FPS = 10.0
 
 
 def region(
@@ -60,6 +61,7 @@ def record(
         scene=key.partition(".")[0] if scene is None else scene,
         change=change,
         frames=FRAMES,
+        fps=FPS,
         draws=draws,
         seconds=seconds,
         regions=made,

@@ -110,10 +110,11 @@ def test_an_account_adds_up_bytes_of_parameters() -> None:
     assert account(SMALL, plan, KEPT, cached=True).encoders == 0
 
 
-def test_full_fine_tunes_and_adapters_need_no_more_than_was_set(rows: tuple[MemoryRow, ...]) -> None:
-    bounded = [row for row in rows if row.wanted is not None]
-    assert {row.wanted for row in bounded} == {20.0, 14.0, 8.0}
-    assert all(row.total <= (row.wanted or 0) for row in bounded)
+def test_full_fine_tunes_and_adapters_fit_common_gpus(rows: tuple[MemoryRow, ...]) -> None:
+    totals = {row.name: row.total for row in rows if not row.cached}
+    assert totals["8-bit Adam, float32 weights"] <= 20
+    assert totals["8-bit Adam, bfloat16 weights"] <= 14
+    assert totals["LoRA, rank 32, bfloat16 base"] <= 8
 
 
 def test_adapters_are_about_one_and_a_half_percent_of_the_full_model(rows: tuple[MemoryRow, ...]) -> None:
@@ -152,16 +153,7 @@ def test_a_report_is_shown_with_units_and_says_what_was_not_measured(rows: tuple
         speed=(fast, slow),
     )
     told = shown(memory_table(report), speed_table(report))
-    for part in (
-        "<= 20",
-        "<= 14",
-        "<= 8",
-        "41%",
-        "17.2",
-        "21.5 (wanted <= 24)",
-        "full model on a GPU only",
-        "not known",
-    ):
+    for part in ("41%", "17.2", "21.5", "full model on a GPU only", "not known"):
         assert part in told
     assert msgspec.json.decode(msgspec.json.encode(report), type=TrainReport) == report
 

@@ -11,8 +11,7 @@ from stage_world import LIGHT
 from gcd_train.scenes.compile import Vertices, runs_of, vertices_of
 from gcd_train.scenes.culling import Groups, grouped
 from gcd_train.scenes.description import STREET, Part, Pattern, Scene, Sheet, upright
-from gcd_train.scenes.projections import clip_from_camera, sunlight_from_world
-from gcd_train.scenes.renderer import Renderer, Rendering
+from gcd_train.scenes.renderer import Renderer, Rendering, clip_from_camera, sunlight_from_world
 
 SUN_TO = (0.6, 0.0, 0.8)
 

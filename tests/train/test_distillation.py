@@ -20,6 +20,7 @@ from gcd_train.batches import PixelBatches
 from gcd_train.checkpoint import load_state
 from gcd_train.datasets.clip_source import to_network
 from gcd_train.distillation.distiller import Distiller, DistillInputs
+from gcd_train.distillation.paired import sampled, schedule_of
 from gcd_train.distillation.recipe import (
     DistillRecipe,
     SampleLossRecipe,
@@ -28,7 +29,6 @@ from gcd_train.distillation.recipe import (
     packaged_distillations,
 )
 from gcd_train.distillation.sample_losses import SampleLoss, colour_loss
-from gcd_train.distillation.student import sampled, schedule_of
 from gcd_train.distillation.teacher import student_config, teacher_of
 from gcd_train.draws import Draws
 from gcd_train.errors import Interrupted, RecipeError

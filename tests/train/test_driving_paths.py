@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from gcd_model.geometry import CameraMount, driving_trajectory
+from gcd_train.data_kinds import open_pairs
 from gcd_train.datasets.paired import PairedClips
 from gcd_train.errors import DataError
 from gcd_train.evaluation.held_out import cameras_of
 from gcd_train.model_setup import model_config
-from gcd_train.pair_data import open_pairs
 from gcd_train.recipe import load_recipe
 from gcd_train.scenes.driving.pair_scene import driving_scene
 from gcd_train.scenes.pair_world import CameraWay, PairForm, World, agree, driving_world, read_world
@@ -58,14 +58,13 @@ def test_clips_and_methods_follow_the_path_that_the_world_tells(path: CameraWay,
     np.testing.assert_allclose(declared, driving_trajectory(frames=3, move_time=goal, mount=lower).source_from_target)
 
 
-def test_the_path_is_told_where_it_is_direct_and_folders_without_a_word_are_gradual(tmp_path: Path) -> None:
+def test_a_folder_says_which_path_its_target_camera_takes(tmp_path: Path) -> None:
     for path in ("gradual", "direct"):
         agree_in = tmp_path / path
         agree_in.mkdir()
         agree(agree_in, world(path))
         assert read_world(agree_in) == world(path)
-    assert "path" not in json.loads((tmp_path / "gradual" / "world.json").read_text())
-    assert json.loads((tmp_path / "direct" / "world.json").read_text())["path"] == "direct"
+        assert json.loads((agree_in / "world.json").read_text())["path"] == path
 
 
 # examples

@@ -23,11 +23,11 @@ from gcd_train.baselines import (
     fit_statistics,
     to_pictures,
 )
+from gcd_train.cli.evaluate import gpu_seats
 from gcd_train.cli.main import app
 from gcd_train.datasets.paired import PairedClips
 from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.evaluation import ClipWork, HeldOutClip, PairedSet, RunKeeper, folder_name, measure_all, read_run
-from gcd_train.evaluation.gpu_seats import gpu_seats
 from gcd_train.evaluation.kept_frames import KeptViews, png
 from gcd_train.evaluation.methods import of_baselines
 from gcd_train.evaluation.paired_set import chosen, identity_of
@@ -140,13 +140,6 @@ def test_frames_are_known_again_by_what_they_are_and_not_by_their_place(tmp_path
     keeper.begin(note(methods={"flat": {"frames in": "p/flat", "digest": "1"}}))
     keeper.keep(record("flat", "k"))
     assert keeper.begin(note(methods={"flat": {"frames in": "q", "digest": "1"}})).methods["flat"]["frames in"] == "q"
-
-
-def test_a_run_whose_baselines_once_told_more_than_they_use_goes_on(tmp_path: Path) -> None:
-    keeper = RunKeeper(tmp_path)
-    keeper.begin(note(methods={"a": {"baseline": "a", "samples": "4", "seed": "0", "means of": "nothing"}}))
-    keeper.keep(record("a", "k"))
-    assert keeper.begin(note(methods={"a": {"baseline": "a"}})).methods == {"a": {"baseline": "a"}}
 
 
 @pytest.mark.parametrize(

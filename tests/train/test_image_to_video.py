@@ -11,15 +11,14 @@ from tiny_world import FRAMES, Never, TinyClips, TinyOrbits
 from gcd_model import FAMILIES, load_synthesizer
 from gcd_model.networks import Networks, random_networks
 from gcd_train.conditioner import Conditioner
+from gcd_train.data_kinds import open_pairs, require_image_to_video
 from gcd_train.datasets.clip_source import ClipSource
 from gcd_train.datasets.dataset4d import PairSample
-from gcd_train.datasets.latent_videos import LatentVideos
-from gcd_train.datasets.latents import LatentClips
+from gcd_train.datasets.latents import LatentClips, LatentVideos
 from gcd_train.datasets.skips import Skips
 from gcd_train.datasets.videos import VideoClips, VideoSamples
 from gcd_train.errors import RecipeError
 from gcd_train.model_setup import model_config
-from gcd_train.pair_data import open_pairs, require_image_to_video
 from gcd_train.precision import Precision
 from gcd_train.recipe import Recipe, load_recipe
 from gcd_train.run_folder import RunFolder

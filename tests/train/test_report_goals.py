@@ -10,8 +10,7 @@ from made_records import FRAMES, note, record, region
 from gcd_train.evaluation.keeping import RunKeeper
 from gcd_train.evaluation.record import ClipRecord, RegionRecord
 from gcd_train.reports import Choices, EvaluatedSet, Run, gather, make_report
-from gcd_train.reports.findings import Claim, findings, to_markdown
-from gcd_train.reports.goals import on_the_same_goals, shared_clips
+from gcd_train.reports.goals import Goal, on_the_same_goals
 
 Change = tuple[float, float, float]
 AHEAD: Change = (30.0, 5.0, 0.0)
@@ -91,14 +90,14 @@ def test_class_maps_alone_tell_whether_the_goal_is_the_same() -> None:
         ]
         for of in (seen, same, other)
     ]
-    assert shared_clips(bare[0], bare[1], "last").left_out == {}
-    assert list(shared_clips(bare[0], bare[2], "last").left_out) == ["s.0"]
+    assert Goal.of(bare[0]).apart_from(Goal.of(bare[1])) == ""
+    assert Goal.of(bare[0]).apart_from(Goal.of(bare[2]))
 
 
 def test_where_nobody_knows_the_goal_nothing_is_compared() -> None:
     bare = msgspec.structs.replace(sharp((2.0,) * FRAMES), gradient_target=None)
     ours, theirs = ([record(name, "s.0", regions={"all": bare})] for name in ("a", "b"))
-    assert "nobody knows" in shared_clips(ours, theirs, "last").left_out["s.0"]
+    assert "nobody knows" in Goal.of(ours).apart_from(Goal.of(theirs))
 
 
 def test_methods_stand_in_the_order_of_the_first_run_and_then_as_they_come() -> None:
@@ -126,17 +125,3 @@ def test_a_report_of_other_goals_makes_no_claim_and_says_so(tmp_path: Path) -> N
     assert "The last frame together" not in text
     assert "## What is not compared" in text
     assert "do not end at the same goal" in text
-
-
-def test_findings_pair_only_clips_of_the_same_target_in_the_frames_of_the_claim() -> None:
-    ours, direct = run("k0", clips("a", AHEAD, ASIDE)), clips("b", AHEAD, AHEAD, target=(2.0, 5.0, 5.0, 2.0))
-    last, whole = findings(
-        [ours, run("k1", direct)],
-        [Claim(text="x", first="a", other="b", frames=frames) for frames in ("last", "2-last")],
-    )
-    assert {each.clips for each in last.apart} == {1}
-    assert whole.apart == ()
-    table = to_markdown([last, whole])
-    assert "no clips in common" in table
-    assert "a and b, frames last: of 2 clips of the same names 1 do not show the same" in table
-    assert "a and b, frames 2-last: of 2 clips of the same names 2 do not show the same" in table

@@ -16,14 +16,12 @@ from gcd_model.geometry import Spherical
 from gcd_train.baselines import CopySource
 from gcd_train.cli.main import app
 from gcd_train.datasets.clip_frames import FrameSampling
-from gcd_train.datasets.public_splits import public_split, public_split_names
 from gcd_train.datasets.trajectories import OrbitSampling
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation import EvaluationSet, read_run
 from gcd_train.evaluation.asked import Asked, Rivals, SceneWishes
-from gcd_train.evaluation.choosing import Choice
-from gcd_train.evaluation.fingerprint import fingerprint
-from gcd_train.evaluation.opening import SceneCuts, data_kind, open_scenes, usual_samples
+from gcd_train.evaluation.choosing import Choice, public_split, public_split_names
+from gcd_train.evaluation.opening import SceneCuts, data_kind, fingerprint, open_scenes, usual_samples
 from gcd_train.evaluation.plan import planned
 from gcd_train.evaluation.protocols import PAPER_SOURCE, RELEASED_SOURCE, DrawnControls, FrameBounds, ReleasedControl
 from gcd_train.evaluation.run import predicted_and_measured

@@ -16,8 +16,8 @@ from torch import nn
 from torch.distributed.checkpoint.filesystem import FileSystemWriter
 from torch.distributed.checkpoint.state_dict_saver import save
 
+from gcd_train import checkpoint
 from gcd_train.checkpoint import DamagedStateError, load_state
-from gcd_train.engine import sealed
 from gcd_train.engine.sharded import FolderNote, checked_note, close_folder, read_weights
 from gcd_train.engine.states import newest_weights
 from gcd_train.errors import RunError
@@ -132,25 +132,7 @@ def test_no_byte_of_a_state_can_change_unnoticed(tmp_path: Path) -> None:
     data = path.read_bytes()
     for place in (*range(0, len(data), 97), *range(len(data) - 110, len(data))):
         path.write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
-        assert sealed.damage(path) is not None, place
-
-
-def test_a_state_that_an_older_version_wrote_is_read_and_checked_by_its_own_sums(tmp_path: Path) -> None:
-    whole = run(tmp_path / "whole", 4)
-    run(tmp_path / "old", 2)
-    path = tmp_path / "old" / "unet" / "state.pt"
-    content = torch.load(path, weights_only=True)
-    assert content["format"] == 1
-    torch.save(content, path)  # as it was written before states had digests
-    assert not path.read_bytes()[-81:].startswith(b"gcd-train")
-    kept = path.read_bytes()
-    assert run(tmp_path / "old", 4).losses == {update: whole.losses[update] for update in (2, 3)}
-    path.write_bytes(kept)
-    weights = next(value for name, value in content["module"].items() if name == "weight").numpy().tobytes()
-    place = kept.index(weights)
-    path.write_bytes(kept[:place] + bytes([kept[place] ^ 1]) + kept[place + 1 :])
-    with pytest.raises(DamagedStateError, match="damaged"):
-        load_state(path, "unet")
+        assert checkpoint.damage(path) is not None, place
 
 
 class Killed(BaseException):
@@ -164,7 +146,7 @@ class Assassin:
         self._left = at
         for owner, name in ((Path, "replace"), (Path, "rename"), (Path, "unlink"), (Path, "mkdir"), (os, "fsync")):
             patch.setattr(owner, name, self._watched(getattr(owner, name)))
-        write: Any = sealed._Hashing.write  # pyright: ignore[reportPrivateUsage]
+        write: Any = checkpoint._Hashing.write  # pyright: ignore[reportPrivateUsage]
 
         def cut(hashing: Any, data: Any) -> int:
             if self._strikes():
@@ -174,7 +156,7 @@ class Assassin:
             self._stay_dead()
             return write(hashing, data)
 
-        patch.setattr(sealed._Hashing, "write", cut)  # pyright: ignore[reportPrivateUsage]
+        patch.setattr(checkpoint._Hashing, "write", cut)  # pyright: ignore[reportPrivateUsage]
 
     @property
     def struck(self) -> bool:

@@ -1,7 +1,5 @@
 """The tabletop world: what holds in every scene, and that grasps hold by friction alone."""
 
-import importlib.util
-import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -10,16 +8,15 @@ import numpy as np
 import pytest
 from headless import needs_egl
 
-from gcd_train.errors import DataError, RecipeError, RenderError
+from gcd_train.errors import RenderError
 from gcd_train.scenes.compile import vertices_of
 from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.renderer import Renderer
 from gcd_train.scenes.tabletop import CLASS_NAMES, Episode, TabletopClass, tabletop_episode, tabletop_scene
-from gcd_train.scenes.tabletop.arm import primitive_arm
+from gcd_train.scenes.tabletop.arm import random_arm
 from gcd_train.scenes.tabletop.furniture import random_table
 from gcd_train.scenes.tabletop.layout import random_things
 from gcd_train.scenes.tabletop.model import build_model
-from gcd_train.scenes.tabletop.panda import panda_arm
 from gcd_train.scenes.tabletop.simulation import Simulation
 
 pytest.importorskip("mujoco", reason="needs the extra `scenes`: pip install 'gcd-node[scenes]'")
@@ -136,7 +133,7 @@ def test_a_grasped_thing_is_lifted_follows_the_gripper_and_stays_where_it_is_put
 
 def test_nothing_is_welded_an_arm_without_grip_lifts_nothing() -> None:
     random = np.random.default_rng(3)
-    arm = primitive_arm(random)
+    arm = random_arm(random)
     things = random_things(random, arm, [])
     model = build_model(arm, random_table(random), [], things)
     assert model.model.neq == 1  # the two fingers move alike; nothing else is tied to anything
@@ -149,7 +146,7 @@ def test_nothing_is_welded_an_arm_without_grip_lifts_nothing() -> None:
 def test_physics_that_diverges_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log where it runs
     random = np.random.default_rng(3)
-    arm = primitive_arm(random)
+    arm = random_arm(random)
     things = random_things(random, arm, [])
     model = build_model(arm, random_table(random), [], things)
     model.model.opt.gravity[2] = np.nan
@@ -175,34 +172,3 @@ def test_arm_and_gripper_and_things_are_seen() -> None:
     assert seen >= wanted
     assert len(np.unique(np.stack([view.instances for view in views]))) > 10
     assert all((view.depth[view.classes != TabletopClass.SKY] > 0).all() for view in views)
-
-
-def test_an_arm_that_is_not_there_is_refused() -> None:
-    with pytest.raises(RecipeError, match="choose one of primitive, panda"):
-        tabletop_scene(0, frames=2, arm="tentacle")
-
-
-def test_a_panda_without_its_package_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(RenderError, match="pip install gymnasium-robotics"):
-        panda_arm()
-
-
-def test_a_panda_is_read_from_the_installed_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    package = tmp_path / "gymnasium_robotics"
-    package.mkdir()
-    (package / "__init__.py").write_text("")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "gymnasium_robotics", raising=False)
-    with pytest.raises(DataError, match=r"chain\.xml"):
-        panda_arm()
-
-
-@pytest.mark.skipif(
-    importlib.util.find_spec("gymnasium_robotics") is None,
-    reason="needs the package gymnasium-robotics with its Franka model: pip install gymnasium-robotics",
-)
-def test_the_real_panda_grasps_too() -> None:
-    done = tabletop_episode(0, frames=LONG, arm="panda", skipped_s=0.0)
-    assert done.motion.grasps[0].held
-    assert "Apache-2.0" in str(done.scene.facts["arm_licence"])

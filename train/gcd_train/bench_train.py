@@ -40,7 +40,7 @@ from gcd_train.trained_part import halve_frozen, let_train
 
 KUBRIC_CLIPS = 10_000 * 56
 """Clips of the published Kubric-4D recipe: iterations times batch."""
-_WANTED_LORA_GB, _LORA_RANK = 8.0, 32
+_LORA_RANK = 32
 _PEAK_FLOPS = {"H100": 989e12, "H200": 989e12, "A100": 312e12, "L40S": 362e12, "L40": 181e12}
 """Dense bfloat16 arithmetic of whole devices, as their makers state it; the first name that fits counts."""
 
@@ -56,7 +56,6 @@ class MemoryRow(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     activations: float
     encoders: float
     total: float
-    wanted: float | None
 
 
 class SpeedRow(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -134,7 +133,6 @@ def memory_rows(kept: Kept) -> tuple[MemoryRow, ...]:
         gradient=4,
         state=8,
         adapter=lora_parameters(SVD_14, LoraRecipe(rank=_LORA_RANK)),
-        wanted_gb=_WANTED_LORA_GB,
     )
     return tuple(
         _memory_row(account(SVD_14, plan, kept, cached=cached), cached)
@@ -161,7 +159,6 @@ def _memory_row(counted: Account, cached: bool) -> MemoryRow:
         activations=counted.activations,
         encoders=counted.encoders,
         total=counted.total,
-        wanted=counted.plan.wanted_gb,
     )
 
 

@@ -9,15 +9,17 @@ from gcd_model import Family, ModelConfig
 from gcd_model.networks import Networks
 from gcd_train.batches import BatchMaker, BatchSource
 from gcd_train.datasets.clip_frames import DRIVING_FRAMES, KUBRIC_FRAMES, FrameSampling
+from gcd_train.datasets.clip_source import PaintedClips
 from gcd_train.datasets.dataset4d import Dataset4D
 from gcd_train.datasets.kubric4d import Kubric4D
 from gcd_train.datasets.ontology import Ontology
+from gcd_train.datasets.paired import PairedClips, data_folders, require_apart
 from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
 from gcd_train.datasets.sample_clips import SampleClips
 from gcd_train.datasets.skips import Skips
 from gcd_train.datasets.splits import Part, kubric_split, present, read_split, require_none_shared
 from gcd_train.datasets.trajectories import DrivingSampling, OrbitSampling, Sampling
-from gcd_train.datasets.videos import VideoSamples
+from gcd_train.datasets.videos import VideoClips, VideoSamples
 from gcd_train.datasets.view_pairs import ViewPairs
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.latent_cache import CachedLatents
@@ -26,7 +28,6 @@ from gcd_train.layouts.manifest import MANIFEST, read_manifest
 from gcd_train.lerobot.pairs import LeRobotOptions, LeRobotPairs
 from gcd_train.model_setup import digest_of
 from gcd_train.pair_batches import PairBatches
-from gcd_train.pair_data import open_pairs, require_image_to_video
 from gcd_train.precision import Precision
 from gcd_train.recipe import DataRecipe, Recipe
 from gcd_train.run_data import DataPlaces, RunData
@@ -301,3 +302,65 @@ def sampling_of(recipe: Recipe, frames: int, *, stride: int | None = None) -> Sa
         move_time=move_time,
         frames=chosen,
     )
+
+
+_VIDEO_FAMILY = "svd"
+
+
+def open_pairs(recipe: Recipe, config: ModelConfig, data: Path, valid: Path) -> RunData:
+    """The pairs of two folders, or of the folders in them.
+
+    Raises:
+        DataError: no such data there, both share scenes, or their cameras go another way than the recipe says.
+        RecipeError: the recipe's task does not go together with its model or its latents.
+    """
+    if recipe.data.task == "image-to-video":
+        return _videos(recipe, config, data, valid)
+    clips, held_out = PairedClips.open(data), PairedClips.open(valid)
+    require_apart(clips, held_out)
+    for each, folder in ((clips, data), (held_out, valid)):
+        _require_path(each, folder, recipe)
+    if recipe.data.modality == "semantic":
+        return RunData(clips=PaintedClips(clips), valid=PaintedClips(held_out))
+    return RunData(clips=clips, valid=held_out)
+
+
+def require_image_to_video(recipe: Recipe, config: ModelConfig) -> None:
+    """Raises RecipeError if the recipe's model is made for something else than a video out of its first frame."""
+    model = recipe.model
+    if model.family != _VIDEO_FAMILY:
+        raise RecipeError(
+            f'data.task "image-to-video" makes a model without views, model.family is {model.family!r}: give '
+            f'model.family "{_VIDEO_FAMILY}"'
+        )
+
+
+def _videos(recipe: Recipe, config: ModelConfig, data: Path, valid: Path) -> RunData:
+    """Both sides of all pairs; the folders in one need not go the same way."""
+    _require_plain_latents(recipe, config)
+    learned, held_out = (tuple(map(PairedClips.open, data_folders(place))) for place in (data, valid))
+    for one in learned:
+        for other in held_out:
+            require_apart(one, other)
+    return RunData(clips=VideoClips(learned), valid=VideoClips(held_out), parts=learned)
+
+
+def _require_plain_latents(recipe: Recipe, config: ModelConfig) -> None:
+    """Encoded pairs serve as videos where both sides were encoded alike."""
+    latents = recipe.latents
+    if recipe.unet.source != "latents" or latents is None:
+        return
+    if latents.augmentation or latents.sample or not config.vae.shared:
+        raise RecipeError(
+            'data.task "image-to-video" takes both sides of the encoded pairs as videos: it wants one shared '
+            'autoencoder, latents.augmentation 0 and latents.sample false; or give unet.source "pixels"'
+        )
+
+
+def _require_path(clips: PairedClips, folder: Path, recipe: Recipe) -> None:
+    goal, reached = recipe.data.goal_frame(clips.frames), clips.trajectory(0).at_goal.index(True)
+    if goal != reached:
+        raise DataError(
+            f"the cameras in {folder} are at their goal in frame {reached}, the recipe's data.path says frame {goal}; "
+            "change data.path, or make the clips with `gcd-train generate driving --path direct` or gradual"
+        )

@@ -7,8 +7,7 @@ from gcd_model import Family, ModelConfig
 from gcd_model.networks import Networks, weights_digest
 from gcd_train.conditioner import Conditioner
 from gcd_train.datasets.clip_source import ClipSource
-from gcd_train.datasets.latent_videos import LatentVideos
-from gcd_train.datasets.latents import EncodedClips, LatentClips
+from gcd_train.datasets.latents import EncodedClips, LatentClips, LatentVideos
 from gcd_train.errors import RunError
 from gcd_train.losses import COLOUR_WEIGHTS
 from gcd_train.model_setup import digest_of
@@ -85,8 +84,10 @@ class Encodings:
         return self.folder if len(self.sets) == 1 else self.folder / identity
 
     def _identity(self, networks: Networks, clips: ClipSource) -> str:
-        recipe, config = self.recipe, self.config
-        steered = (config.camera, _told_motion(self.family), recipe.unet.motion_bucket)
+        recipe, config, family = self.recipe, self.config, self.family
+        told_by_path = family.motion_bucket is None and family.limits is not None
+        motion = family.name if told_by_path else None  # families told the recipe's number write the same latents
+        steered = (config.camera, motion, recipe.unet.motion_bucket)
         told = digest_of(self._latents, recipe.seed, clips.origin, steered, recipe.unet.loss.class_weights)
         return f"{autoencoder_digest(networks)}-{told}"
 
@@ -102,9 +103,3 @@ def autoencoder_digest(networks: Networks) -> str:
     return weights_digest(
         {f"{i}.{name}": value for i, part in enumerate(parts) for name, value in part.state_dict().items()}
     )
-
-
-def _told_motion(family: Family) -> str:
-    """Families that tell every clip the recipe's motion number write the same latents: they count as one."""
-    told_by_path = family.motion_bucket is None and family.limits is not None
-    return family.name if told_by_path else "driving"  # whose latents have always been called so

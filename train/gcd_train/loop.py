@@ -1,6 +1,8 @@
 """The training loop of every stage: updates, moving average, log, state, measurements; resumable to the update."""
 
 import logging
+import resource
+import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -19,7 +21,6 @@ from gcd_train.engine.parallel import whole
 from gcd_train.engine.trained import Mark, Trained
 from gcd_train.errors import Interrupted
 from gcd_train.monitor.finite import FiniteGuard
-from gcd_train.monitor.memory import peak_memory_gb
 from gcd_train.recipe import AnyStageName, Budget, EmaRecipe, LogRecipe, OptimiserRecipe
 from gcd_train.run_folder import RunFolder
 from gcd_train.schedule import ParameterGroup
@@ -294,3 +295,13 @@ def _duration(seconds: float) -> str:
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{seconds:02d}"
+
+
+_KIB = 1 if sys.platform == "darwin" else 1024  # what getrusage counts in
+
+
+def peak_memory_gb(device: torch.device) -> float:
+    """Largest so far, 1e9 bytes: of the device's allocator on CUDA, else of the whole process."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 1e9
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _KIB / 1e9

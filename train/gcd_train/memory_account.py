@@ -33,7 +33,7 @@ class Plan:
 
     weights: bytes of each parameter of the U-Net. gradient, state: bytes of each trained one. adapter: parameters that
     are trained instead of the U-Net's, in float32, beside it. copies: autocast computes with bfloat16 copies of a
-    block's float32 weights. wanted_gb: at most this, for one clip an update.
+    block's float32 weights.
     """
 
     name: str
@@ -42,7 +42,6 @@ class Plan:
     state: float
     adapter: int = 0
     copies: bool = False
-    wanted_gb: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -82,8 +81,8 @@ class Account:
 
 PLANS = (
     Plan(name="Adam, float32 weights", weights=4, gradient=4, state=8, copies=True),
-    Plan(name="8-bit Adam, float32 weights", weights=4, gradient=4, state=2, copies=True, wanted_gb=20.0),
-    Plan(name="8-bit Adam, bfloat16 weights", weights=2, gradient=2, state=2, wanted_gb=14.0),
+    Plan(name="8-bit Adam, float32 weights", weights=4, gradient=4, state=2, copies=True),
+    Plan(name="8-bit Adam, bfloat16 weights", weights=2, gradient=2, state=2),
 )
 """Full fine-tunes."""
 

@@ -13,13 +13,12 @@ from gcd_model.adapter import Adapter, base_digest
 from gcd_model.networks import Networks
 from gcd_model.own_format import Card
 from gcd_train.batches import BatchMaker, BatchSource, EncodedBatches, PixelBatches
-from gcd_train.clip_fit import require_fit
 from gcd_train.datasets.clip_source import ClipSource
 from gcd_train.datasets.latents import EncodedClips
 from gcd_train.encodings import Encodings, autoencoder_digest
 from gcd_train.engine.engine import Engine
 from gcd_train.engine.processes import ALONE, Processes
-from gcd_train.errors import RecipeError
+from gcd_train.errors import DataError, RecipeError
 from gcd_train.loop import Loop, LoopOptions, Task
 from gcd_train.lora import adapter_of, merge_lora
 from gcd_train.model_setup import (
@@ -230,3 +229,16 @@ class Trainer:
 def _present(table: Table | None) -> Table:
     assert table is not None, "a stage runs only if the recipe has its table"
     return table
+
+
+def require_fit(clips: ClipSource, config: ModelConfig, fps: float) -> None:
+    """Raises DataError if the clips are not what the model and its recipe take them for."""
+    if clips.fps != fps:
+        raise DataError(f"the recipe's unet.fps is {fps:g}, the clips have {clips.fps:g}; change one of them")
+    if config.camera == "spherical" and clips.camera != "spherical":
+        raise DataError("the model is steered by angles and radius, and these clips have no orbits; take drop clips")
+    if config.camera == "none" and clips.camera != "none":
+        raise DataError("the model has one fixed view, and each of these clips has its own; take driving clips")
+    classes = config.semantic_classes
+    if classes and [kind.name for kind in classes] != [kind.name for kind in clips.classes]:
+        raise DataError("the clips' classes are not the model's; generate them with this version")

@@ -1,6 +1,8 @@
 """`gcd-train evaluate`: weights and what they have to beat, on held-out clips."""
 
+import os
 import signal
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -18,7 +20,6 @@ from gcd_train.errors import RecipeError
 from gcd_train.evaluation import ClipWork, RunKeeper, measure_all
 from gcd_train.evaluation.asked import Asked, Candidate, Looks, Rivals, SceneWishes, declared_mount
 from gcd_train.evaluation.choosing import Choice
-from gcd_train.evaluation.gpu_seats import gpu_seats
 from gcd_train.evaluation.kept_frames import KeptViews
 from gcd_train.evaluation.opening import usual_samples
 from gcd_train.evaluation.outcome import write_outcome
@@ -182,3 +183,23 @@ def _measured(work: ClipWork, workers: int, ray: str | None, device: str) -> Acc
 
 def _say(line: str) -> None:
     _LOG.print(line, markup=False, soft_wrap=True)
+
+
+_VISIBLE = "CUDA_VISIBLE_DEVICES"
+
+
+def gpu_seats(device: str, count: int) -> tuple[Mapping[str, str], ...]:
+    """What the environment of worker k says: it sees GPU k alone, and whatever asks for CUDA finds that one.
+
+    Workers beyond the last GPU begin again with the first; see `environments` of `map_items`.
+
+    Args:
+        device: as asked for; one that is named, as `cuda:1` or `cpu`, is everybody's. count: of GPUs of this process.
+    Returns:
+        One environment for each GPU; nothing where there is no choice.
+    """
+    if device not in ("auto", "cuda") or count < 2:
+        return ()
+    told = [name.strip() for name in os.environ.get(_VISIBLE, "").split(",") if name.strip()]
+    names = told[:count] if len(told) >= count else [str(number) for number in range(count)]
+    return tuple({_VISIBLE: name} for name in names)

@@ -20,7 +20,7 @@ from gcd_train.live.draws import LIVE_SCENES, LiveWorld, TargetPath, worlds_of
 from gcd_train.scenes.contact_sheet import write_contact_sheet
 from gcd_train.scenes.film import write_film
 from gcd_train.scenes.pair_world import CameraWay, PairForm, World, driving_world, orbit_world
-from gcd_train.scenes.worlds import SCENE_WORLDS, SceneWorld, WorldOptions, tabletop_world
+from gcd_train.scenes.worlds import SCENE_WORLDS, SceneWorld, WorldOptions
 from gcd_train.scenes.writer import generate
 
 app = typer.Typer(no_args_is_help=True, help="Make training data with a procedural world (extra `scenes`).")
@@ -35,7 +35,6 @@ Oversample = Annotated[int, typer.Option(min=1, max=4, help="Anti-aliasing: pixe
 Frames = Annotated[int | None, typer.Option(min=2, help="Time steps; by default as published.")]
 Width = Annotated[int | None, typer.Option(min=16, help="Pixels; by default as published.")]
 Height = Annotated[int | None, typer.Option(min=16, help="Pixels; by default as published.")]
-Arm = Annotated[str, typer.Option(help="primitive, or panda (needs the package gymnasium-robotics).")]
 Pairs = Annotated[bool, typer.Option("--pairs", help="Pairs of clips in shards, not whole scenes.")]
 Clips = Annotated[int | None, typer.Option(min=1, help="How many pairs: implies --pairs; by default 100.")]
 ClipsPerScene = Annotated[int, typer.Option(min=1, help="Pairs: how many are cut from one simulation.")]
@@ -84,7 +83,6 @@ def drop(
 @app.command()
 def tabletop(
     out: Folder,
-    arm: Arm = "primitive",
     scenes: Scenes = None,
     pairs: Pairs = False,
     clips: Clips = None,
@@ -105,7 +103,7 @@ def tabletop(
     With --pairs or --clips: a camera that stands, and one that goes round, 192x128 and 14 frames at 12 Hz by default.
     """
     with errors_shown():
-        world = tabletop_world(arm)
+        world = SCENE_WORLDS["tabletop"]
         if _wants_pairs(pairs, clips, scenes, compact):
             form = PairForm.of(width, height, frames, oversample, clips_per_shard)
             made = orbit_world(world, form, clips_per_scene=clips_per_scene)

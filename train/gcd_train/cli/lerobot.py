@@ -31,7 +31,6 @@ def lerobot(
     cameras: Annotated[
         str, typer.Option(help="Two or more of view0 to view15 and wrist, with commas.")
     ] = "view0,view4,view9,wrist",
-    arm: Annotated[str, typer.Option(help="primitive, or panda (needs the package gymnasium-robotics).")] = "primitive",
     oversample: Annotated[int, typer.Option(min=1, max=4, help="Anti-aliasing: pixels drawn per pixel and side.")] = 2,
 ) -> None:
     """Tabletop episodes as a LeRobot data set (v3.0) with calibrated cameras (extras `scenes` and `lerobot`)."""
@@ -43,7 +42,6 @@ def lerobot(
         cameras=tuple(name.strip() for name in cameras.split(",")),
         width=width,
         height=height,
-        arm=arm,
         oversample=oversample,
     )
     with errors_shown(), progress_bar("episodes", episodes, keep=True) as show:

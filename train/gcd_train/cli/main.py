@@ -13,7 +13,6 @@ from gcd_train.cli.cache import cache
 from gcd_train.cli.calibrate import calibrate_command
 from gcd_train.cli.distill import distill
 from gcd_train.cli.evaluate import evaluate_command
-from gcd_train.cli.findings import findings_command
 from gcd_train.cli.gallery import gallery_command
 from gcd_train.cli.report import report_command
 from gcd_train.cli.show import show
@@ -35,7 +34,6 @@ app.command()(cache)
 app.command("calibrate")(calibrate_command)
 app.command()(distill)
 app.command("evaluate")(evaluate_command)
-app.command("findings")(findings_command)
 app.command("gallery")(gallery_command)
 app.command("lerobot")(lerobot.lerobot_command)
 app.command("report")(report_command)

@@ -1,16 +1,74 @@
 """Which scenes of a folder are measured: of a split, of a list, or the first few."""
 
+import difflib
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import get_args
 
-from gcd_train.datasets.public_splits import PublicSplit, public_split
+import msgspec
+
 from gcd_train.datasets.skips import Skips
 from gcd_train.datasets.splits import Part, present, read_scene_list, read_split
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
 from gcd_train.layouts.manifest import MANIFEST, read_manifest
+
+
+class _World(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One file of `splits_public`. parts: name to runs of scenes, each the first seed and how many."""
+
+    about: str
+    world: str
+    parts: dict[str, tuple[tuple[int, int], ...]]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PublicSplit:
+    """One part of a world's scenes. runs: of seeds, or of Kubric-4D's scene numbers, that follow each other."""
+
+    name: str
+    world: str
+    runs: tuple[range, ...]
+
+    def __contains__(self, seed: int) -> bool:
+        return any(seed in run for run in self.runs)
+
+    def __len__(self) -> int:
+        return sum(map(len, self.runs))
+
+
+def public_split_names() -> tuple[str, ...]:
+    """All there are, by name."""
+    worlds = {
+        file.name.removesuffix(".json"): _read(file) for file in _folder().iterdir() if file.name.endswith(".json")
+    }
+    return tuple(sorted(f"{stem}-{part}" for stem, world in worlds.items() for part in world.parts))
+
+
+def public_split(name: str) -> PublicSplit:
+    """The part of that name. Raises RecipeError for another."""
+    if name not in public_split_names():
+        near = difflib.get_close_matches(name, public_split_names(), n=1)
+        meant = f"did you mean {near[0]}? " if near else ""
+        raise RecipeError(
+            f"no split is called {name!r}, and it is no file; {meant}there are {', '.join(public_split_names())}"
+        )
+    stem, _, part = name.rpartition("-")
+    world = _read(_folder() / f"{stem}.json")
+    runs = tuple(range(first, first + count) for first, count in world.parts[part])
+    return PublicSplit(name=name, world=world.world, runs=runs)
+
+
+def _folder() -> Traversable:
+    return files("gcd_train") / "splits_public"
+
+
+def _read(file: Traversable) -> _World:
+    return msgspec.json.decode(file.read_bytes(), type=_World)
+
 
 _PARTS: dict[str, Part] = {part: part for part in get_args(Part)}
 

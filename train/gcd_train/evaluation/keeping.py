@@ -29,8 +29,6 @@ RUN_FILE = "run.json"
 _MOST_RECORD = 1 << 24
 _SAME = ("data_identity", "kind", "modality", "protocol", "frames", "height", "width", "seed", "classes")
 _PACKAGE = "gcd-node"
-_INFORMS = (FRAMES_IN,)  # the digest says whether frames are the same, wherever they lie
-_ONCE_TOLD = ("samples", "seed", "means of", "published rounding")  # earlier, also of methods that use none of them
 _SHOWN = 48  # letters of a value in a message
 
 
@@ -167,9 +165,10 @@ def _joined(folder: Path, found: RunNote, new: RunNote) -> RunNote:
 
 
 def _differences(method: str, was: Mapping[str, str], now: Mapping[str, str]) -> dict[str, tuple[str, str]]:
-    names = dict.fromkeys([*was, *now])
-    counting = [name for name in names if name not in _INFORMS and (name in now or name not in _ONCE_TOLD)]
-    return {f"{name} of {method}": (was.get(name, "not told"), now.get(name, "not told")) for name in counting}
+    names = [
+        name for name in dict.fromkeys([*was, *now]) if name != FRAMES_IN
+    ]  # the digest says if frames are the same
+    return {f"{name} of {method}": (was.get(name, "not told"), now.get(name, "not told")) for name in names}
 
 
 def _short(value: object) -> str:

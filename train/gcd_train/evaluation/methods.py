@@ -190,12 +190,12 @@ def _of_weights(weights: Weights, clips: ClipFacts, options: RenderOptions) -> M
         "weights": traits.sha256_12,
         "family": "unknown" if traits.family is None else traits.family.name,
         "steps": str(used.steps),
+        "solver": used.solver,
         "guidance": "{:g} to {:g}".format(*used.guidance),
         "samples": str(options.samples),
         "seed": str(options.seed),
         "precision": traits.precision,
     }
-    told |= {} if used.solver == "euler" else {"solver": used.solver}  # left out, earlier runs can be gone on with
     if used.guidance_interval is not None:
         told["guided from"] = "{:g} to {:g}".format(*used.guidance_interval)
     return Method(name=made.name, make=partial(_synthesized, weights, Form.of(clips), options), told=told)

@@ -190,7 +190,7 @@ def _keys(clips: HeldOutClips) -> list[str]:
 
 def identity_of(clips: PairedClips, declared: CameraMount | None = None) -> str:
     """Digest of the worlds, of every file of every clip by its checksum, and of what is declared. Raises DataError."""
-    digest = hashlib.sha256(msgspec.json.encode([world.told() for world in clips.worlds]))
+    digest = hashlib.sha256(msgspec.json.encode(clips.worlds))
     digest.update(repr(declared).encode())
     sums: dict[Path, dict[str, list[int]]] = {}
     for path, name in clips.places:

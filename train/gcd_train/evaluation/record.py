@@ -41,9 +41,8 @@ class ClipRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     method: its name. privileged: whether it is given the exact depth, or further cameras. key: of the clip in its set.
     scene: the clip's; errors are over scenes. change: azimuth and elevation in degrees and radius in metres from source
-    to goal; None for the fixed path of driving. fps: of the clip; None in records that were made before it was kept.
-    seconds: that the method took.
-    regions: by name; "visible" and "occluded" are missing where nobody knows what the source camera saw.
+    to goal; None for the fixed path of driving. fps: of the clip. seconds: that the method took. regions: by name;
+    "visible" and "occluded" are missing where nobody knows what the source camera saw.
     lpips: [S][T], None where no weights were given. step, step_target: [S][T-1] and T-1, mean change from frame to
     frame. grid_confusion: as in a region, at the class grid. Where the method makes no pictures all else is None.
     """
@@ -54,7 +53,7 @@ class ClipRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     scene: str
     change: tuple[float, float, float] | None
     frames: int
-    fps: float | None = None
+    fps: float
     draws: int
     seconds: float
     regions: dict[Region, RegionRecord]

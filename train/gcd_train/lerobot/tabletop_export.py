@@ -35,7 +35,7 @@ class TabletopExport:
 
     seeds: one an episode. frames: of an episode, at 24 Hz. cameras: of view0..view15 and wrist, which moves with the
     hand; the others stand where Kubric-4D has them, turned so that they look at every episode's robot alike.
-    width, height: pixels. arm: as in `tabletop_scene`. oversample: as in `Renderer`.
+    width, height: pixels. oversample: as in `Renderer`.
     """
 
     seeds: range
@@ -43,7 +43,6 @@ class TabletopExport:
     cameras: tuple[str, ...] = ("view0", "view4", "view9", WRIST)
     width: int = 320
     height: int = 240
-    arm: str = "primitive"
     oversample: int = 2
 
 
@@ -63,7 +62,7 @@ def export_tabletop(out: Path, export: TabletopExport) -> Iterator[int]:
         LeRobotWriter(folder, _calibrations(export, poses), _options(export)) as writer,
     ):
         for done, seed in enumerate(export.seeds, start=1):
-            episode = tabletop_episode(seed, frames=export.frames, arm=export.arm, skipped_s=0.0)
+            episode = tabletop_episode(seed, frames=export.frames, skipped_s=0.0)
             writer.add(_logged(episode, export), _pictures(renderer, episode, poses, export))
             yield done
 
@@ -100,7 +99,7 @@ def _calibrations(export: TabletopExport, poses: Mapping[str, Floats]) -> dict[s
 
 def _options(export: TabletopExport) -> ExportOptions:
     names = {_POSE_FEATURE: [f"base_from_camera_{row}{column}" for row in range(4) for column in range(4)]}
-    return ExportOptions(robot=f"tabletop {export.arm}", fps=round(FPS), names=names)
+    return ExportOptions(robot="tabletop primitive", fps=round(FPS), names=names)
 
 
 def _logged(episode: Episode, export: TabletopExport) -> LoggedEpisode:

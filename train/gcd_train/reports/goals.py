@@ -8,7 +8,6 @@ import msgspec
 
 from gcd_train.evaluation.record import ClipRecord, Counted, Frames
 from gcd_train.evaluation.tallies import Selection, Span
-from gcd_train.reports.intervals import common_clips
 from gcd_train.reports.material import COMPARABLE, EvaluatedSet, Method
 
 _SAME_CHANGE = 0.01  # degrees and metres
@@ -43,30 +42,6 @@ class Goal:
             return "nobody knows whether the targets are the same"
         same = all(_alike(self.target[name][chosen], other.target[name][chosen]) for name in known)
         return "" if same else "the target's pictures differ: other moments, or another path"
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SharedClips:
-    """Two methods' records of the clips that both have and that show the same, in one order.
-
-    left_out: why others of the same name do not, by key.
-    """
-
-    first: tuple[ClipRecord, ...]
-    other: tuple[ClipRecord, ...]
-    left_out: Mapping[str, str]
-
-
-def shared_clips(first: Sequence[ClipRecord], other: Sequence[ClipRecord], frames: Span) -> SharedClips:
-    """Clips of one name whose targets are the same in these frames."""
-    pairs = list(zip(*common_clips(first, other), strict=True))
-    why = {one.key: Goal.of([one]).apart_from(Goal.of([two]), frames) for one, two in pairs}
-    same = [pair for pair in pairs if not why[pair[0].key]]
-    return SharedClips(
-        first=tuple(one for one, _ in same),
-        other=tuple(two for _, two in same),
-        left_out={key: reason for key, reason in why.items() if reason},
-    )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -108,9 +108,8 @@ class EvaluatedSet:
         return tuple(region for region in REGIONS if any(region in record.regions for record in records))
 
     def fps(self, key: str) -> float:
-        """Frames per second of a clip; the run's, where the record does not say."""
-        told = (record.fps for method in self.methods for record in method.records if record.key == key)
-        return next((fps for fps in told if fps is not None), self.note.fps)
+        """Frames per second of a clip."""
+        return next(record.fps for method in self.methods for record in method.records if record.key == key)
 
     def method(self, name: str) -> Method:
         """Raises RunError where there is none of the name."""

@@ -12,12 +12,19 @@ from gcd_train.reports import comparison, failures
 from gcd_train.reports.comparison import Difference
 from gcd_train.reports.curves import all_plots, curves_csv
 from gcd_train.reports.drawing import draw
-from gcd_train.reports.figure_tables import STAR_OF_FIGURE, Measured, all_figures, frames_told, main_tables
+from gcd_train.reports.figure_tables import (
+    STAR_OF_FIGURE,
+    Measured,
+    all_figures,
+    frames_csv,
+    frames_told,
+    main_tables,
+    region_table,
+)
 from gcd_train.reports.galleries import shown_clips, strips, write_sheet, write_video
 from gcd_train.reports.goals import on_the_same_goals
 from gcd_train.reports.material import EvaluatedSet, Method, Run, gather
 from gcd_train.reports.paper import is_model, tables_for
-from gcd_train.reports.region_tables import frames_csv, region_table
 from gcd_train.reports.table import Table, markdown_rows, to_csv, to_markdown
 from gcd_train.show.matplotlib_door import require_matplotlib
 

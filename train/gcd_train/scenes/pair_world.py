@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias
 
 import msgspec
 from msgspec import Meta
@@ -21,8 +21,6 @@ DEPTH_UNIT_M = 1 / 256
 """Depth is stored in these, as 16 bit."""
 STAGE_HFOV_DEG = math.degrees(2 * math.atan(0.5))
 """Kubric-4D's lens, as the worlds on its stage have it."""
-_LATER = ("camera", "clips_per_scene", "edition", "stride", "path")
-"""Fields that came later: they are told only where they say something, so that what was told before stays."""
 
 Numbers = tuple[float, float, float]
 CameraWay: TypeAlias = Literal["gradual", "direct"]
@@ -82,12 +80,6 @@ class World(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         """Numbers of so many clips, from the first one of a scene on."""
         first = first_scene * self.clips_per_scene
         return range(first, first + clips)
-
-    def told(self) -> dict[str, Any]:
-        """What is written down: later fields are left out where they say what went without saying before."""
-        usual = {name: default for name, default in _defaults().items() if name in _LATER}
-        every: dict[str, Any] = msgspec.to_builtins(self)
-        return {name: value for name, value in every.items() if usual.get(name) != value}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -185,11 +177,7 @@ def agree(folder: Path, world: World) -> None:
     path = folder / "world.json"
     if not path.exists():
         partial = path.with_suffix(".partial")
-        partial.write_bytes(msgspec.json.format(msgspec.json.encode(world.told())))
+        partial.write_bytes(msgspec.json.format(msgspec.json.encode(world)))
         partial.replace(path)
     elif read_world(folder) != world:
         raise DataError(f"{folder} holds clips of another world or size (see its world.json); choose another folder")
-
-
-def _defaults() -> dict[str, Any]:
-    return {field.name: field.default for field in msgspec.structs.fields(World)}

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Literal
 
 import msgspec
@@ -15,7 +14,6 @@ from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
 from gcd_train.scenes.description import Scene
 from gcd_train.scenes.driving import ONTOLOGY, OntologyItem, driving_drive, vehicle_from_camera
 
-_TABLETOP = "tabletop-"
 Layout = Literal["kubric4d", "parallel_domain4d"]
 
 
@@ -58,10 +56,10 @@ def _drop(seed: int, frames: int) -> Scene:
     return drop_scene(seed, frames=frames)
 
 
-def _tabletop(arm: str, seed: int, frames: int) -> Scene:
+def _tabletop(seed: int, frames: int) -> Scene:
     from gcd_train.scenes.tabletop import tabletop_scene  # its physics is an extra
 
-    return tabletop_scene(seed, frames=frames, arm=arm)
+    return tabletop_scene(seed, frames=frames)
 
 
 def _drive(seed: int, frames: int) -> Scene:
@@ -82,27 +80,9 @@ def _on_a_stage(name: str, make: Callable[[int, int], Scene], edition: int) -> S
     )
 
 
-def tabletop_world(arm: str = "primitive") -> SceneWorld:
-    """The tabletop world with one of its arms; another arm than the usual is told in the world's name.
-
-    Raises:
-        RecipeError: no such arm.
-        RenderError: the package with the arm is not installed, which is known here before a scene is begun.
-    """
-    from gcd_train.scenes.tabletop import ARMS  # its physics is an extra
-    from gcd_train.scenes.tabletop.panda import panda_arm
-
-    if arm not in ARMS:
-        raise RecipeError(f"there is no arm {arm!r}; choose one of {', '.join(ARMS)}")
-    if arm == "panda":
-        panda_arm()
-    name = "tabletop" if arm == "primitive" else f"{_TABLETOP}{arm}"
-    return _on_a_stage(name, partial(_tabletop, arm), edition=1)
-
-
 SCENE_WORLDS: dict[str, SceneWorld] = {
     "drop": _on_a_stage("drop", _drop, edition=1),
-    "tabletop": _on_a_stage("tabletop", partial(_tabletop, "primitive"), edition=1),
+    "tabletop": _on_a_stage("tabletop", _tabletop, edition=1),
     "driving": SceneWorld(
         name="driving",
         layout="parallel_domain4d",
@@ -120,14 +100,7 @@ SCENE_WORLDS: dict[str, SceneWorld] = {
 
 
 def scene_world(name: str) -> SceneWorld:
-    """A world by its name, `tabletop-panda` too.
-
-    Raises:
-        RecipeError: no such world.
-        RenderError: see `tabletop_world`.
-    """
-    if name in SCENE_WORLDS:
-        return SCENE_WORLDS[name]
-    if name.startswith(_TABLETOP):
-        return tabletop_world(name.removeprefix(_TABLETOP))
-    raise RecipeError(f"there is no world {name!r}; choose one of {', '.join(SCENE_WORLDS)}")
+    """A world by its name. Raises RecipeError: no such world."""
+    if name not in SCENE_WORLDS:
+        raise RecipeError(f"there is no world {name!r}; choose one of {', '.join(SCENE_WORLDS)}")
+    return SCENE_WORLDS[name]

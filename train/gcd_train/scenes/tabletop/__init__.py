@@ -2,7 +2,6 @@
 
 from gcd_train.scenes.tabletop.classes import CLASS_NAMES, TabletopClass
 from gcd_train.scenes.tabletop.scene import (
-    ARMS,
     UNITS_A_METRE,
     Episode,
     tabletop_episode,
@@ -12,7 +11,6 @@ from gcd_train.scenes.tabletop.scene import (
 from gcd_train.scenes.tabletop.simulation import FPS
 
 __all__ = [
-    "ARMS",
     "CLASS_NAMES",
     "FPS",
     "UNITS_A_METRE",

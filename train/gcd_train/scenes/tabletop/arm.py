@@ -1,29 +1,24 @@
-"""The default arm: six hinges and a parallel gripper, made of boxes, cylinders and capsules, as MuJoCo wants it."""
+"""The arm: six hinges and a parallel gripper, made of boxes, cylinders and capsules, as MuJoCo wants it."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from gcd_train.scenes.description import Colour
-from gcd_train.scenes.tabletop.things import Solid
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Arm:
     """An arm as pieces of MJCF, and what the controller must know of it.
 
-    name, licence: for the facts of a scene. assets, defaults, body, equality, actuators: the XML inside the elements of
-    those names; the body stands at the origin, x ahead, metres. joints, fingers: names, as in the model; every joint
-    has the position actuator of its name. home: [J] radians, a pose above the table with the tool down. open_m: how far
-    a finger goes from the middle. reach_m: nearest and farthest distance from the base at which it grasps from above.
-    site: the point between the fingertips, z out of the hand, y from finger to finger. links: body name -> spoken name,
-    gripper last; the last `gripper_links` of them are the gripper. shells: what is drawn in place of a body's
-    meshes.
+    body, equality, actuators: the XML inside the elements of those names; the body stands at the origin, x ahead,
+    metres, and its site "tool" is the point between the fingertips, z out of the hand, y from finger to finger.
+    joints, fingers: names, as in the model; every joint has the position actuator of its name. home: [J] radians, a
+    pose above the table with the tool down. open_m: how far a finger goes from the middle. reach_m: nearest and
+    farthest distance from the base at which it grasps from above. links: body name -> spoken name, gripper last; the
+    last `gripper_links` of them are the gripper.
     """
 
-    name: str
-    licence: str
     body: str
     actuators: str
     equality: str
@@ -34,10 +29,6 @@ class Arm:
     reach_m: tuple[float, float]
     links: dict[str, str]
     gripper_links: int
-    shells: Mapping[str, tuple[Solid, ...]] = field(default_factory=dict[str, tuple[Solid, ...]])
-    assets: str = ""
-    defaults: str = ""
-    site: str = "tool"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -72,8 +63,8 @@ _LINKS = {
 _JOINTS = ("yaw", "shoulder", "elbow", "forearm_roll", "wrist_pitch", "tool_roll")
 
 
-def primitive_arm(random: np.random.Generator) -> Arm:
-    """An arm of this project's own, in one of several liveries and slightly varied in length and girth."""
+def random_arm(random: np.random.Generator) -> Arm:
+    """An arm in one of several liveries and slightly varied in length and girth."""
     shell, joint = _STYLES[int(random.integers(len(_STYLES)))]
     style = _Style(
         shell=shell,
@@ -83,8 +74,6 @@ def primitive_arm(random: np.random.Generator) -> Arm:
         thick=float(random.uniform(0.9, 1.15)),
     )
     return Arm(
-        name="primitive",
-        licence="Apache-2.0 (part of gcd-node)",
         body=_body(style),
         actuators=_actuators(),
         equality='<joint joint1="slide_right" joint2="slide_left" polycoef="0 1 0 0 0" solref="0.005 1"/>',

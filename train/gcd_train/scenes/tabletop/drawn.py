@@ -44,7 +44,7 @@ def parts_of(solid: Solid, scale: float, *, label: int, instance: int, body: int
 
 
 def solids_of_body(mujoco: Any, model: Any, body: int) -> list[Solid]:
-    """The geoms of one body of a compiled model, as they are seen; meshes are left out, see `Arm.shells`."""
+    """The geoms of one body of a compiled model, as they are seen."""
     kinds = {
         int(mujoco.mjtGeom.mjGEOM_BOX): "box",
         int(mujoco.mjtGeom.mjGEOM_SPHERE): "sphere",
@@ -54,9 +54,7 @@ def solids_of_body(mujoco: Any, model: Any, body: int) -> list[Solid]:
     first = int(model.body_geomadr[body])
     found: list[Solid] = []
     for geom in range(first, first + int(model.body_geomnum[body])):
-        kind = kinds.get(int(model.geom_type[geom]))
-        if kind is None:
-            continue
+        kind = kinds[int(model.geom_type[geom])]
         numbers = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2}[kind]
         found.append(
             Solid(
@@ -77,8 +75,6 @@ def bounding_box(solids: list[Solid]) -> tuple[Point, Point]:
     for solid in solids:
         half = np.abs(rotations(np.asarray(solid.turn))) @ (np.asarray(_full_size(solid)) / 2)
         corners += [np.asarray(solid.centre) - half, np.asarray(solid.centre) + half]
-    if not corners:
-        return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     low, high = np.min(corners, axis=0), np.max(corners, axis=0)
     return _point((low + high) / 2), _point(high - low)
 

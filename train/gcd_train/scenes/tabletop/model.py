@@ -92,7 +92,7 @@ def build_model(arm: Arm, table: tuple[Solid, ...], clutter: list[Placed], thing
         grips=ids(mujoco.mjtObj.mjOBJ_ACTUATOR, arm.fingers),
         things=tuple(ids(mujoco.mjtObj.mjOBJ_BODY, tuple(f"thing_{i}" for i in range(len(things)))).tolist()),
         links=tuple(ids(mujoco.mjtObj.mjOBJ_BODY, tuple(arm.links)).tolist()),
-        site=int(ids(mujoco.mjtObj.mjOBJ_SITE, (arm.site,))[0]),
+        site=int(ids(mujoco.mjtObj.mjOBJ_SITE, ("tool",))[0]),
     )
 
 
@@ -103,8 +103,7 @@ def _xml(arm: Arm, table: tuple[Solid, ...], clutter: list[Placed], things: list
     loose = "\n".join(_body(placed, index) for index, placed in enumerate(things))
     base = f'<body name="mount" pos="{BASE[0]} {BASE[1]} {BASE[2]}">{arm.body}</body>'
     return f"""<mujoco>{_OPTIONS}
-<default>{_DEFAULTS}{arm.defaults}</default>
-<asset>{arm.assets}</asset>
+<default>{_DEFAULTS}</default>
 <worldbody>{still}{base}{loose}</worldbody>
 <equality>{arm.equality}</equality>
 <actuator>{arm.actuators}</actuator>

@@ -57,10 +57,9 @@ def _numbered(model: Model, setting: Setting) -> Iterator[tuple[Thing, int, int]
 def _links(model: Model, things: int) -> Iterator[tuple[list[Solid], int, int, TabletopClass]]:
     """Links with their instance (after the things), body and class."""
     gripper = len(model.links) - model.arm.gripper_links
-    for index, (name, body) in enumerate(zip(model.arm.links, model.links, strict=True)):
+    for index, body in enumerate(model.links):
         label = TabletopClass.GRIPPER if index >= gripper else TabletopClass.ROBOT_ARM
-        solids = [*solids_of_body(model.mujoco, model.model, body), *model.arm.shells.get(name, ())]
-        yield solids, 1 + things + index, _TABLE + body, label
+        yield solids_of_body(model.mujoco, model.model, body), 1 + things + index, _TABLE + body, label
 
 
 def objects(model: Model, motion: Motion, world: Floats, setting: Setting) -> Iterator[SceneObject]:

@@ -11,19 +11,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_train.errors import RecipeError
 from gcd_train.scenes.description import Extent, Scene, rotations
 from gcd_train.scenes.drop import HFOV_DEG, orbit_cameras
-from gcd_train.scenes.tabletop.arm import Arm, primitive_arm
+from gcd_train.scenes.tabletop.arm import random_arm
 from gcd_train.scenes.tabletop.furniture import random_clutter, random_light, random_table, room
 from gcd_train.scenes.tabletop.layout import random_things
 from gcd_train.scenes.tabletop.model import BASE, Model, build_model
 from gcd_train.scenes.tabletop.objects import UNITS_A_METRE, Setting, moved, objects, parts
-from gcd_train.scenes.tabletop.panda import panda_arm
 from gcd_train.scenes.tabletop.simulation import Motion, Simulation
 from gcd_train.scenes.tabletop.things import Placed
 
-ARMS = ("primitive", "panda")
 TABLE_M = -0.12
 """Height of the table's surface in the world, metres: arm and things are then in the middle of the pictures."""
 _EXTENT = Extent(near_m=0.2, far_m=150.0, shadow_radius_m=12.0, shadow_depth_m=40.0, shadow_pixels=2048)
@@ -50,27 +47,25 @@ class Episode:
     motion: Motion
 
 
-def tabletop_scene(seed: int, *, frames: int = 60, arm: str = "primitive") -> Scene:
+def tabletop_scene(seed: int, *, frames: int = 60) -> Scene:
     """A scene that depends on nothing but its arguments.
 
     Args:
         seed: 0 or more.
         frames: time steps at 24 Hz.
-        arm: "primitive", or "panda" with the package gymnasium-robotics installed.
     Raises:
-        RecipeError: no such arm.
-        RenderError: MuJoCo, or the package with the arm, is not installed.
+        RenderError: MuJoCo is not installed.
     """
-    return tabletop_episode(seed, frames=frames, arm=arm).scene
+    return tabletop_episode(seed, frames=frames).scene
 
 
-def tabletop_episode(seed: int, *, frames: int = 60, arm: str = "primitive", skipped_s: float | None = None) -> Episode:
+def tabletop_episode(seed: int, *, frames: int = 60, skipped_s: float | None = None) -> Episode:
     """As `tabletop_scene`, with the robot's log.
 
     skipped_s: how much of the work has passed when the clip begins; by default up to 1.4 s, drawn from the seed.
     """
     random = np.random.default_rng([seed, 0x7AB])
-    robot = _arm(arm, random)
+    robot = random_arm(random)
     table, clutter = random_table(random), random_clutter(random)
     things = random_things(random, robot, clutter)
     model = build_model(robot, table, clutter, things)
@@ -88,14 +83,6 @@ def tabletop_episode(seed: int, *, frames: int = 60, arm: str = "primitive", ski
         task=_in_words(motion, things),
         motion=motion,
     )
-
-
-def _arm(name: str, random: np.random.Generator) -> Arm:
-    if name == "primitive":
-        return primitive_arm(random)
-    if name == "panda":
-        return panda_arm()
-    raise RecipeError(f"there is no arm {name!r}; choose one of {', '.join(ARMS)}")
 
 
 def _scene(
@@ -167,8 +154,8 @@ def _hand_from_camera() -> Floats:
 def _facts(seed: int, model: Model, motion: Motion, setting: Setting) -> dict[str, float | str]:
     return {
         "seed": seed,
-        "arm": model.arm.name,
-        "arm_licence": model.arm.licence,
+        "arm": "primitive",
+        "arm_licence": "Apache-2.0 (part of gcd-node)",
         "metres_a_unit": 1 / UNITS_A_METRE,
         "objects": len(setting.things),
         "clutter": len(setting.clutter),

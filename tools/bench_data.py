@@ -1,0 +1,96 @@
+"""What data costs on this machine: making scenes, reading them, drawing targets from their points, bytes per sample.
+
+    python tools/bench_data.py                  # half an hour and 3 GB of disk
+    python tools/bench_data.py --frames 6       # shorter scenes: minutes
+
+CPU seconds of one thread: what else the machine does hardly shows in them. Prints one Markdown row a figure.
+"""
+
+import argparse
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+import torch
+
+from gcd_train.datasets.kubric4d import Kubric4D
+from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
+from gcd_train.datasets.picture_files import bytes_read
+from gcd_train.datasets.trajectories import DRIVING, MAX90
+from gcd_train.datasets.view_pairs import ViewPairs
+from gcd_train.layouts.scene_writer import SceneFormat, write_scene
+from gcd_train.map_items import one_thread_each
+from gcd_train.pointcloud import published_picture
+from gcd_train.scenes.worlds import SCENE_WORLDS
+
+FIRST_SEED = 3_000_000  # in no data set
+CLIP_FRAMES, TARGETS, TIME_STEPS = 14, 7, 6
+WORLDS = {"drop": (Kubric4D.open, MAX90), "driving": (ParallelDomain4D.open, DRIVING)}
+EDITIONS = {"compact": {"compact": True, "oversample": 1}, "published": {"compact": False, "oversample": 2}}
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--world", choices=WORLDS, nargs="+", default=list(WORLDS))
+    parser.add_argument("--scenes", type=int, default=1, help="of each world and edition")
+    parser.add_argument("--samples", type=int, default=2, help="training samples read whole")
+    parser.add_argument("--frames", type=int, help="time steps of a scene; in shorter ones no training sample is read")
+    parser.add_argument("--folder", help="where to make the scenes; removed afterwards")
+    options = parser.parse_args()
+    one_thread_each()
+    torch.set_num_threads(1)
+    print("| what | unit | median (lowest to highest) | count |\n| --- | --- | --- | --- |")
+    with tempfile.TemporaryDirectory(prefix="gcd-bench-", dir=options.folder) as place:
+        for name in options.world:
+            world = SCENE_WORLDS[name]
+            warm = replace(SceneFormat.of(world, **EDITIONS["compact"]), frames=1)
+            write_scene(Path(place) / "unmeasured", world, warm, FIRST_SEED)
+            for edition in EDITIONS:
+                measure(Path(place) / f"{name}-{edition}", name, edition, options)
+
+
+def measure(place, name, edition, options):
+    """All figures of a world in one edition."""
+    world, (open_set, sampling) = SCENE_WORLDS[name], WORLDS[name]
+    form = SceneFormat.of(world, **EDITIONS[edition])
+    form = replace(form, frames=options.frames or world.frames)
+    made = [write_scene(place, world, form, FIRST_SEED + number) for number in range(options.scenes)]
+    what = f"{name}, {edition}"
+    show(f"{what}: a scene of {form.frames} frames", "CPU s", [each.cpu_s for each in made])
+    show(f"{what}: a scene of {form.frames} frames", "MB", [each.size / 1e6 for each in made])
+    data = open_set(place)
+    scene = data.scenes[0]
+    views = data.views(scene, 0)  # metadata is read once a scene
+    steps = range(0, form.frames, max(1, form.frames // TIME_STEPS))
+    show(f"{what}: reading a time step", "CPU s", [cpu_s(data.views, scene, step) for step in steps])
+    if edition == "compact":
+        draw = sampling.draw(np.random.default_rng(0), world.frames, world.fps)
+        lens, poses = data.lens(scene), draw.world_from_target[:: CLIP_FRAMES // TARGETS]
+        published_picture(views, poses[0], lens)
+        drawn = [cpu_s(published_picture, views, pose, lens) for pose in poses]
+        show(f"{name}: drawing a 384x256 target from {len(views)} views", "CPU s", drawn)
+    if form.frames == world.frames:
+        pairs, read = ViewPairs(data, sampling), []
+        for number in range(options.samples):
+            before = bytes_read(), time.process_time()
+            pairs.sample(number)
+            read.append(((bytes_read() - before[0]) / 1e6, time.process_time() - before[1]))
+        show(f"{what}: a training sample, read", "MB", [each for each, _ in read])
+        show(f"{what}: a training sample, read and drawn", "CPU s", [each for _, each in read])
+
+
+def cpu_s(work, *args):
+    started = time.process_time()
+    work(*args)
+    return time.process_time() - started
+
+
+def show(what, unit, values):
+    print(f"| {what} | {unit} | {median(values):.3g} ({min(values):.3g} to {max(values):.3g}) | {len(values)} |")
+
+
+if __name__ == "__main__":
+    main()
