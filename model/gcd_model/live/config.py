@@ -51,6 +51,7 @@ class LiveConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     height, width: of the training; any multiples of 32 work. frames: of a window. memory: remembered surfels at most.
     memory_frames: for how long. steps, sigma_max, sigma_min: of the paint sampler; one step paints the mean.
+    carry_painted: what was painted is seen again in the next frame, as painted, so that it stays put.
     ood_threshold: a source whose `View.ood` is above it shows another world than the training's.
     """
 
@@ -67,6 +68,7 @@ class LiveConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     sigma_max: Annotated[float, Meta(gt=0)] = 80.0
     sigma_start: Annotated[float, Meta(gt=0)] = 2.0
     sigma_min: Annotated[float, Meta(gt=0)] = 0.05
+    carry_painted: bool = True
     spread_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ood_threshold: Annotated[float, Meta(ge=0, le=1)] = 0.35
 

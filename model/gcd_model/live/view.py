@@ -243,9 +243,10 @@ class LiveView:
         visibility = torch.where(covered, _likeliest(chances), PAINTED).to(torch.uint8)
         metres = painted.log_depth[0].exp()
         picture = self._drawn(painted, seen, base)[0].clamp(-1, 1)
-        self._carry(
-            index, metres, picture, labels, (visibility == PAINTED) & ~self._movable[labels.long()], target, lens
-        )
+        if self._config.carry_painted:
+            self._carry(
+                index, metres, picture, labels, (visibility == PAINTED) & ~self._movable[labels.long()], target, lens
+            )
         shift = torch.tensor(self._config.spread_shift, device=self._device)[visibility.long()]
         return ViewFrame(
             picture=picture,
