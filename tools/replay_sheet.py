@@ -1,6 +1,6 @@
 """Frames of a replay in one picture: the recording above, each view below.
 
-    python tools/replay_sheet.py RUN VIDEO --picture sheet.png --frames 6
+python tools/replay_sheet.py RUN VIDEO --picture sheet.png --frames 6
 """
 
 import argparse
