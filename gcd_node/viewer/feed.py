@@ -35,6 +35,7 @@ _STEERING: Final = frozenset({"set_view", "set_param", "get_config"})
 _KINDS: tuple[ViewKind, ...] = tuple(kind for kind in get_args(ViewKind) if kind != "frm")
 _QUALITY = 85
 _RETRY_S, _REPLY_S = 2.0, 2.0
+_MOST_AT_ONCE = 64
 _EVENTS, _HISTORY = 50, 300
 _LENGTH = struct.Struct("<I")
 _LOG = logging.getLogger(__name__)
@@ -332,11 +333,11 @@ class NodeLink:
             with _logged_errors(view), ViewSubscriber(endpoint, view, kinds, conflate=False, keys=keys) as views:
                 while True:
                     newest: dict[str, ReceivedView] = {}
-                    received = await views.receive_async()
+                    received, count = await views.receive_async(), 0
                     while received is not None:
                         newest[received.message.topic] = received
-                        await asyncio.sleep(0)  # a node that is faster than this must not keep the others waiting
-                        received = await views.receive_async(0)
+                        count += 1  # a node that is faster than this must not keep everybody waiting
+                        received = await views.receive_async(0) if count < _MOST_AT_ONCE else None
                     for each in newest.values():
                         with contextlib.suppress(MessageError):  # its pixels: the page leaves it out
                             self._take_picture(await asyncio.to_thread(picture, each))
