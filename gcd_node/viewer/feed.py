@@ -35,7 +35,7 @@ _STEERING: Final = frozenset({"set_view", "set_param", "get_config"})
 _KINDS: tuple[ViewKind, ...] = tuple(kind for kind in get_args(ViewKind) if kind != "frm")
 _QUALITY = 85
 _RETRY_S, _REPLY_S = 2.0, 2.0
-_MOST_AT_ONCE = 64
+_MOST_AT_ONCE, _SETTLE_S = 64, 0.05
 _EVENTS, _HISTORY = 50, 300
 _LENGTH = struct.Struct("<I")
 _LOG = logging.getLogger(__name__)
@@ -329,6 +329,7 @@ class NodeLink:
         """Until it is cancelled. Of the views that have come, the newest of each topic: nobody must see old ones."""
         endpoint, keys = self._node.data, self._node.keys_for(self._node.data)
         kinds = ("frm",) if view == PREVIEW_ID else _KINDS
+        await asyncio.sleep(_SETTLE_S)  # a reader that was just cancelled still lets go of a file that this one may get
         while True:
             with _logged_errors(view), ViewSubscriber(endpoint, view, kinds, conflate=False, keys=keys) as views:
                 while True:
