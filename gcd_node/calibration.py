@@ -1,13 +1,14 @@
 """What is known of a lens, and where it comes from: ROS camera_info files, CameraInfo messages, a camera's memory."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
 
 import msgspec
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from gcd_model import FileError, read_json, read_small
@@ -33,9 +34,8 @@ _NAMES: dict[str, Distortion] = {
 }
 _SHAPE_TOLERANCE = 0.01
 _LARGEST_FILE = 16384
-_DEPTHAI_MODELS = {"Perspective": 14, "Fisheye": 4}  # and how many coefficients they have
+_DEPTHAI_MODELS = {"Perspective": "rational_polynomial", "Fisheye": "equidistant"}
 _CAMERA_TYPES = {0: "Perspective", 1: "Fisheye"}
-_RATIONAL = 8  # coefficients without prism and tilt
 _ROTATION_TOLERANCE = 1e-3
 HALF_PIXEL = 0.5
 """OpenCV and ROS count pixels from the centre of the first, this project from its corner."""
@@ -154,11 +154,13 @@ def lens_of(
 
 
 def _distortion(model: str, d: tuple[float, ...]) -> tuple[Distortion, tuple[float, ...]]:
+    """No coefficients, or zeros, are no distortion under any name: so ROS's image_geometry reads them, and so DepthAI
+    marks pictures that it has undistorted, fish-eyes' too."""
     kind = _NAMES.get(model.strip().lower())
     if kind is None:
         raise ConfigError(f"unknown distortion_model {model[:40]!r}; known are {', '.join(_COUNTS)}")
-    if not any(d):  # drivers of ideal cameras send no coefficients, or zeros, under any name but the fish-eye's
-        return (kind, (0.0,) * 4) if kind == "equidistant" else ("none", ())
+    if not any(d):
+        return "none", ()
     if kind == "plumb_bob" and len(d) in _COUNTS["rational_polynomial"]:
         kind = "rational_polynomial"  # the same formula, longer
     return kind, d
@@ -186,20 +188,10 @@ def load_lens(path: Path) -> LensModel:
         ConfigError: missing, not YAML, something in it is missing or no camera has it.
     """
     try:
-        return parse_lens(read_small(path, _LARGEST_FILE), str(path))
-    except FileError as error:
-        raise ConfigError(
-            f"cannot read the calibration {path}: it {error}; give a ROS camera_info YAML file"
-        ) from error
-
-
-def parse_lens(text: str | bytes, name: str) -> LensModel:
-    """The same of a file's content; `name` is for messages. Raises ConfigError as `load_lens`."""
-    try:
-        stated = msgspec.convert(_parse_yaml(text, name), _File, strict=False)  # YAML takes 1e-05 for a word
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"{name} is not a ROS camera_info file: {error}") from error
-    try:
+        content = yaml.safe_load(
+            read_small(path, _LARGEST_FILE)
+        )  # the loader in C would end the process on deep nesting
+        stated = msgspec.convert(content, _File, strict=False)  # YAML takes 1e-05 for a word
         lens = lens_of(
             width=stated.image_width,
             height=stated.image_height,
@@ -207,23 +199,14 @@ def parse_lens(text: str | bytes, name: str) -> LensModel:
             d=stated.distortion_coefficients.data,
             k=stated.camera_matrix.data,
         )
-    except ConfigError as error:
-        raise ConfigError(f"{name}: {error}") from error
-    if lens is None:
-        raise ConfigError(f"{name} holds no calibration: its camera matrix is zero; calibrate the camera")
-    return lens
-
-
-def _parse_yaml(text: str | bytes, name: str) -> object:
-    try:
-        import yaml
-    except ImportError as error:
-        raise ConfigError("to read a calibration file, PyYAML is needed: pip install pyyaml") from error
-    try:
-        return yaml.safe_load(text)  # the loader in C would end the process on deep nesting
-    except (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError) as error:
+    except (FileError, ConfigError) as error:
+        raise ConfigError(f"{path}: {error}; give a ROS camera_info YAML file") from error
+    except (msgspec.ValidationError, yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError) as error:
         reason = " ".join(str(error).split())[:200]
-        raise ConfigError(f"{name} is not valid YAML: {reason}; give a ROS camera_info YAML file") from error
+        raise ConfigError(f"{path} is not a ROS camera_info YAML file: {reason}") from error
+    if lens is None:
+        raise ConfigError(f"{path} holds no calibration: its camera matrix is zero; calibrate the camera")
+    return lens
 
 
 def depthai_lens(
@@ -240,53 +223,28 @@ def depthai_lens(
     """
     if model not in _DEPTHAI_MODELS or len(matrix) != 3:
         raise ConfigError(f"a lens of model {model} with {len(matrix)} rows of intrinsics is not known here")
-    count = _DEPTHAI_MODELS[model]
-    full = (*coefficients, *[0.0] * count)[:count]
-    distortion: Distortion = "equidistant"
-    if model == "Perspective":
-        distortion = "rational_polynomial" if any(full) else "none"
-        full = full if any(full[_RATIONAL:]) else full[:_RATIONAL] if any(full) else ()
+    count = 4 if model == "Fisheye" else 14 if any(coefficients[8:14]) else 8  # without prism and tilt
+    kind, d = _distortion(_DEPTHAI_MODELS[model], (*coefficients, *[0.0] * count)[:count])
     (fx, _, cx), (_, fy, cy), _ = matrix
-    return LensModel(
-        width=size[0], height=size[1], fx=fx, fy=fy, cx=cx, cy=cy, distortion=distortion, coefficients=full
-    )
-
-
-def read_depthai(path: Path) -> "DepthaiBoard":
-    """What DepthAI's `eepromToJsonFile` wrote: the memory of an OAK.
-
-    Raises:
-        ConfigError: missing, or not such a file.
-    """
-    try:
-        return read_json(path, DepthaiBoard)
-    except FileError as error:
-        raise ConfigError(f"it {error}; give the JSON file of DepthAI's eepromToJsonFile") from error
-
-
-class _Offset(msgspec.Struct, frozen=True, kw_only=True):
-    x: float
-    y: float
-    z: float
+    return LensModel(width=size[0], height=size[1], fx=fx, fy=fy, cx=cx, cy=cy, distortion=kind, coefficients=d)
 
 
 class _Extrinsics(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
-    """From this camera's axes to those of another on the board; -1 is no other."""
+    """From this camera's axes to those of another on the board, centimetres; -1 is no other."""
 
     rotation_matrix: tuple[tuple[float, float, float], ...]
-    translation: _Offset  # centimetres
+    translation: dict[str, float]
     to_camera_socket: int
 
     @property
     def transform(self) -> NDArray[np.float64] | None:
-        """[4, 4], metres; None if the rotation is none."""
+        """[4, 4], metres; None if the rotation is none: DepthAI fills what was never calibrated with zeros."""
         rotation, transform = np.array(self.rotation_matrix), np.eye(4)
-        if rotation.shape != (3, 3):
+        if rotation.shape != (3, 3) or np.linalg.det(rotation) < 0:
             return None
         transform[:3, :3] = rotation
-        transform[:3, 3] = np.array([self.translation.x, self.translation.y, self.translation.z]) / 100
-        proper = np.abs(rotation @ rotation.T - np.eye(3)).max() < _ROTATION_TOLERANCE and np.linalg.det(rotation) > 0
-        return transform if proper else None
+        transform[:3, 3] = [self.translation.get(axis, math.nan) / 100 for axis in "xyz"]
+        return transform if np.abs(rotation @ rotation.T - np.eye(3)).max() < _ROTATION_TOLERANCE else None
 
 
 class _Camera(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
@@ -298,46 +256,44 @@ class _Camera(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
     extrinsics: _Extrinsics
 
 
-class DepthaiBoard(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
-    """A DepthAI calibration file; other keys of it are of no interest here."""
-
+class _Board(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
     camera_data: tuple[tuple[int, _Camera], ...]
 
-    def _camera(self, socket: int) -> _Camera:
-        cameras = dict(self.camera_data)
-        if socket not in cameras:
-            there = ", ".join(map(str, sorted(cameras))) or "none"
-            raise ConfigError(f"there is no camera at socket {socket}, only at {there}")
-        return cameras[socket]
 
-    def lens(self, socket: int) -> LensModel:
-        """Raises ConfigError: no such camera, or it was never calibrated."""
-        camera = self._camera(socket)
-        model, size = _CAMERA_TYPES.get(camera.camera_type, str(camera.camera_type)), (camera.width, camera.height)
-        try:
-            return depthai_lens(camera.intrinsic_matrix, camera.distortion_coeff, model, size)
-        except ConfigError as error:
-            raise ConfigError(f"the camera at socket {socket}: {error}; calibrate the device") from error
+def load_stereo(path: Path, left: int, right: int) -> tuple[LensModel, LensModel, NDArray[np.float64]]:
+    """The lenses of two sockets, and right_from_left, [4, 4], metres, out of what DepthAI's `eepromToJsonFile` wrote:
+    the memory of an OAK.
 
-    def transform(self, left: int, right: int) -> NDArray[np.float64]:
-        """right_from_left, [4, 4], metres. Raises ConfigError if the file does not connect the two."""
-        left_chain, right_chain = self._chain(left), self._chain(right)
-        common = next((socket for socket in left_chain if socket in right_chain), None)
-        if common is None:
-            raise ConfigError(
-                f"the file does not say how the cameras at sockets {left} and {right} stand to each other: "
-                "calibrate the pair"
-            )
-        return np.linalg.inv(right_chain[common]) @ left_chain[common]
+    Raises:
+        ConfigError: missing, or not such a file; no such camera, or the pair was never calibrated.
+    """
+    try:
+        cameras = dict(read_json(path, _Board).camera_data)
+    except FileError as error:
+        raise ConfigError(f"it {error}; give the JSON file of DepthAI's eepromToJsonFile") from error
+    if not {left, right} <= cameras.keys():
+        raise ConfigError(f"there must be cameras at sockets {left} and {right}, there are at {sorted(cameras)}")
+    found = (cameras[left], cameras[right])
+    models = [_CAMERA_TYPES.get(each.camera_type, str(each.camera_type)) for each in found]
+    lenses = [
+        depthai_lens(each.intrinsic_matrix, each.distortion_coeff, model, (each.width, each.height))
+        for each, model in zip(found, models, strict=True)
+    ]
+    left_chain, right_chain = _chain(cameras, left), _chain(cameras, right)
+    common = next((socket for socket in left_chain if socket in right_chain), None)
+    if common is None:
+        raise ConfigError(f"how the cameras at sockets {left} and {right} stand to each other is not in it: calibrate")
+    return lenses[0], lenses[1], np.linalg.inv(right_chain[common]) @ left_chain[common]
 
-    def _chain(self, socket: int) -> dict[int, NDArray[np.float64]]:
-        """other_from_socket, for each camera that the file leads to from this one; a step without a rotation ends it:
-        DepthAI fills what was never calibrated with zeros."""
-        chain, here = {socket: np.eye(4)}, socket
-        while True:
-            extrinsics = self._camera(here).extrinsics
-            onward, step = extrinsics.to_camera_socket, extrinsics.transform
-            if onward < 0 or onward in chain or step is None:
-                return chain
-            chain[onward] = step @ chain[here]
-            here = onward
+
+def _chain(cameras: Mapping[int, _Camera], socket: int) -> dict[int, NDArray[np.float64]]:
+    """other_from_socket, for each camera that the file leads to from this one."""
+    chain, here = {socket: np.eye(4)}, socket
+    while here in cameras:
+        extrinsics = cameras[here].extrinsics
+        onward, step = extrinsics.to_camera_socket, extrinsics.transform
+        if onward < 0 or onward in chain or step is None:
+            break
+        chain[onward] = step @ chain[here]
+        here = onward
+    return chain

@@ -24,7 +24,7 @@ from gcd_model import (
 )
 from gcd_node.errors import DepthError
 from gcd_node.preprocess import to_image
-from gcd_node.sources.depth import DepthSource, require_known
+from gcd_node.sources.depth import DepthSource
 from gcd_node.window import PartialWindow
 
 _Key: TypeAlias = tuple[int, int]  # epoch and stamp: a builder never gives the same twice
@@ -129,7 +129,9 @@ class EncodedFrames:
         try:
             if measured is None and network is not None:
                 _, measured = network(to_image(frames.clip[place]))
-            depth = None if measured is None else require_known(measured)
+            if measured is not None and not measured.any():
+                raise DepthError(f"a depth of {measured.shape[::-1]} is all holes: look at what measures it")
+            depth = measured
         except DepthError as error:
             self._on_bad_depth(error)
         guessed = {_keys(frames)[place]} if depth is None else set[_Key]()

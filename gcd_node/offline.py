@@ -36,8 +36,7 @@ from gcd_node.image_io import (
 )
 from gcd_node.preprocess import Fit, assumed_hfov_deg, stated_mount, stated_sphere, to_clip_tensor
 from gcd_node.source_config import SourcePose
-from gcd_node.sources.depth import DepthPicture, OnnxDepth, clean_depth
-from gcd_node.sources.depth_stereo import StereoDepth
+from gcd_node.sources.depth import DepthPicture, OnnxDepth, StereoDepth, clean_depth
 from gcd_node.sources.files import PICTURES, ImageFolder, VideoFile, list_pictures, read_depth, read_picture
 
 _LOG = logging.getLogger(__name__)

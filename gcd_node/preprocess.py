@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any, Literal, TypeAlias
 
 import cv2
@@ -128,24 +128,24 @@ class Rectifier:
     """Published as `src.resize`."""
 
     def __init__(
-        self, lens: LensModel, *, width: int, height: int, hfov_deg: float | None, allow_upscale: bool = False
+        self,
+        lens: LensModel,
+        camera: Intrinsics,
+        *,
+        turn: NDArray[np.float64] | None = None,
+        allow_upscale: bool = False,
     ) -> None:
-        """Work out which camera the fitted pictures are of.
+        """Make the maps for pictures of the size the lens is calibrated for.
 
         Args:
-            lens: of the source's pictures.
-            width, height: of the fitted picture.
-            hfov_deg: wanted horizontal field of view, None for as much as the lens sees (at most 120 degrees).
+            camera: of the fitted picture: square pixels, no distortion; see widest_camera(). turn: see seen_pixels().
             allow_upscale: enlarge pictures that are too coarse instead of refusing them.
         Raises:
-            ConfigError: the lens sees next to nothing around its axis, or its picture would have to be enlarged.
+            ConfigError: the picture would have to be enlarged.
         """
-        self._lens, self._allow_upscale = lens, allow_upscale
-        self.camera = widest_camera(lens, width, height, hfov_deg)
-        """Of the fitted picture: looks along the lens's axis, square pixels, no distortion. Its field of view is the
-        wanted one, or the largest of that shape which the lens sees all of."""
-        self._sampling: _Sampling | None = None  # for pictures of the latest size
-        self._sampling_for(lens.width, lens.height)
+        self.camera = camera
+        self._lens, self._turn, self._allow_upscale = lens, turn, allow_upscale
+        self._prepare(lens.width, lens.height)
 
     def image(self, image: Image) -> Image:
         """One picture, u8 [H, W, 3] to [height, width, 3].
@@ -153,16 +153,28 @@ class Rectifier:
         Raises:
             ConfigError: of another shape than the lens was calibrated for, or too coarse.
         """
-        return self._sampling_for(image.shape[1], image.shape[0]).image(image)
+        self._prepare(image.shape[1], image.shape[0])
+        if self._shrunk != self._size:
+            image = np.asarray(cv2.resize(image, self._shrunk, interpolation=cv2.INTER_AREA), np.uint8)
+        fine = cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        size = (self.camera.width, self.camera.height)
+        return np.asarray(cv2.resize(fine, size, interpolation=cv2.INTER_AREA), np.uint8)
 
     def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
         """The same of a depth picture, [H, W]; no depth between two surfaces is made up. Raises as `image`."""
-        return self._sampling_for(depth.shape[1], depth.shape[0]).depth(depth)
+        self._prepare(depth.shape[1], depth.shape[0])
+        if (
+            self._depth_maps is None
+        ):  # straight: nearest neighbours of fixed-point maps would be those to the upper left
+            self._depth_maps = self._maps_to(self.camera, cv2.CV_32FC1)
+        small = cv2.resize(depth, self._shrunk, interpolation=cv2.INTER_NEAREST_EXACT)
+        return np.asarray(cv2.remap(small, *self._depth_maps, cv2.INTER_NEAREST), np.float32)  # 0, a hole, beyond it
 
-    def _sampling_for(self, width: int, height: int) -> "_Sampling":
-        sampling = self._sampling
-        if sampling is not None and (width, height) == (sampling.lens.width, sampling.lens.height):
-            return sampling
+    _size = (0, 0)  # of the pictures that the maps are for
+
+    def _prepare(self, width: int, height: int) -> None:
+        if (width, height) == self._size:
+            return
         lens, camera = self._lens.resized(width, height), self.camera
         enlarged = max(camera.fx / lens.fx, camera.fy / lens.fy)
         if enlarged > _ENLARGED and not self._allow_upscale:
@@ -171,8 +183,22 @@ class Rectifier:
                 f"{camera.width} x {camera.height} the model takes at {camera.hfov_deg:.0f} degrees; "
                 "use a larger one or set allow_upscale"
             )
-        self._sampling = _Sampling(lens, camera)
-        return self._sampling
+        halvings = max(0, math.ceil(-math.log2(enlarged * _MOST_SHRINK)))
+        self._size, self._shrunk = (width, height), (max(1, width >> halvings), max(1, height >> halvings))
+        self._maps = self._maps_to(
+            camera.resized(_SUPERSAMPLED * camera.width, _SUPERSAMPLED * camera.height), cv2.CV_16SC2
+        )
+        self._depth_maps: tuple[NDArray[Any], NDArray[Any]] | None = None
+
+    def _maps_to(self, camera: Intrinsics, kind: int) -> tuple[NDArray[Any], NDArray[Any]]:
+        """For `cv2.remap`, from the shrunk picture."""
+        small, turn = self._lens.resized(*self._shrunk), np.eye(3) if self._turn is None else self._turn
+        centre = (camera.cx - HALF_PIXEL, camera.cy - HALF_PIXEL)
+        target = np.array([[camera.fx, 0.0, centre[0]], [0.0, camera.fy, centre[1]], [0.0, 0.0, 1.0]])
+        equidistant = self._lens.distortion == "equidistant"
+        undistort = cv2.fisheye.initUndistortRectifyMap if equidistant else cv2.initUndistortRectifyMap
+        size = (camera.width, camera.height)
+        return undistort(small.matrix, np.array(small.coefficients), turn, target, size, kind)
 
 
 def widest_camera(
@@ -251,42 +277,6 @@ def project(lens: LensModel, rays: NDArray[np.float64]) -> NDArray[np.float64]:
         ahead = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
         pixels, _ = cv2.projectPoints(ahead, np.zeros(3), np.zeros(3), lens.matrix, coefficients)
     return np.asarray(pixels, np.float64).reshape(-1, 2)
-
-
-class _Sampling:
-    """Where each pixel of the camera's picture, at twice its size, lies in pictures of one size."""
-
-    def __init__(self, lens: LensModel, camera: Intrinsics) -> None:
-        self.lens, self._camera, self._size = lens, camera, (camera.width, camera.height)
-        finer = min(lens.fx / camera.fx, lens.fy / camera.fy)
-        halvings = max(0, math.ceil(math.log2(finer / _MOST_SHRINK)))
-        self._shrunk = max(1, lens.width >> halvings), max(1, lens.height >> halvings)
-        self._maps = self._maps_to(camera.resized(*(_SUPERSAMPLED * side for side in self._size)), cv2.CV_16SC2)
-
-    def _maps_to(self, camera: Intrinsics, kind: int) -> tuple[NDArray[Any], NDArray[Any]]:
-        """For `cv2.remap`, from the shrunk picture."""
-        small = self.lens.resized(*self._shrunk)
-        centre = (camera.cx - HALF_PIXEL, camera.cy - HALF_PIXEL)
-        target = np.array([[camera.fx, 0.0, centre[0]], [0.0, camera.fy, centre[1]], [0.0, 0.0, 1.0]])
-        equidistant = self.lens.distortion == "equidistant"
-        undistort = cv2.fisheye.initUndistortRectifyMap if equidistant else cv2.initUndistortRectifyMap
-        coefficients = np.array(self.lens.coefficients)
-        return undistort(small.matrix, coefficients, np.eye(3), target, (camera.width, camera.height), kind)
-
-    @cached_property
-    def _depth_maps(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Straight to the camera's pixels: nearest neighbours of fixed-point maps would be those to the upper left."""
-        return self._maps_to(self._camera, cv2.CV_32FC1)
-
-    def image(self, image: Image) -> Image:
-        if self._shrunk != (self.lens.width, self.lens.height):
-            image = np.asarray(cv2.resize(image, self._shrunk, interpolation=cv2.INTER_AREA), np.uint8)
-        fine = cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(cv2.resize(fine, self._size, interpolation=cv2.INTER_AREA), np.uint8)
-
-    def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
-        small = cv2.resize(depth, self._shrunk, interpolation=cv2.INTER_NEAREST_EXACT)
-        return np.asarray(cv2.remap(small, *self._depth_maps, cv2.INTER_NEAREST), np.float32)  # 0, a hole, beyond it
 
 
 def require_usable(pose: SourcePose | None, traits: Traits) -> None:

@@ -12,7 +12,7 @@ from gcd_node.config import NodeConfig
 from gcd_node.config_digest import config_digest
 from gcd_node.errors import ConfigError
 from gcd_node.frame import SourceInfo
-from gcd_node.preprocess import Fit, Rectifier, assumed_hfov_deg, require_usable, stated_mount
+from gcd_node.preprocess import Fit, Rectifier, assumed_hfov_deg, require_usable, stated_mount, widest_camera
 from gcd_node.sources.depth import DepthSource, OnnxDepth
 from gcd_node.window import RATE_TOLERANCE, choose_fps
 
@@ -142,13 +142,9 @@ def _fit(config: NodeConfig, traits: Traits, source: SourceInfo, lens: LensModel
     and to its field of view if the source's is known and wider. Raises ConfigError."""
     if lens is None:
         return _crop(config, traits, source)
-    return Rectifier(
-        lens.resized(source.width, source.height),
-        width=traits.config.width,
-        height=traits.config.height,
-        hfov_deg=_trained_hfov_deg(traits),
-        allow_upscale=config.source.allow_upscale,
-    )
+    lens, model = lens.resized(source.width, source.height), traits.config
+    camera = widest_camera(lens, model.width, model.height, _trained_hfov_deg(traits))
+    return Rectifier(lens, camera, allow_upscale=config.source.allow_upscale)
 
 
 def _crop(config: NodeConfig, traits: Traits, source: SourceInfo) -> Fit:

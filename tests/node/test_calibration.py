@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gcd_node.calibration import LensModel, lens_of, load_lens, parse_lens
+from gcd_node.calibration import LensModel, depthai_lens, lens_of, load_lens
 from gcd_node.errors import ConfigError
 
 FILE = b"""# as cameracalibrator writes it
@@ -50,14 +50,18 @@ LENS = LensModel(
 # --- files -------------------------------------------------------------------------------------------------------
 
 
+def read(folder: Path, content: bytes) -> LensModel:
+    (folder / "camera.yaml").write_bytes(content)
+    return load_lens(folder / "camera.yaml")
+
+
 def test_a_ros_file_and_the_message_of_the_same_camera_say_the_same(tmp_path: Path) -> None:
-    (tmp_path / "camera.yaml").write_bytes(FILE)
-    assert load_lens(tmp_path / "camera.yaml") == lens_of(**INFO) == LENS
+    assert read(tmp_path, FILE) == lens_of(**INFO) == LENS
 
 
-def test_an_old_file_without_a_distortion_model_is_a_plumb_bob() -> None:
-    old = FILE.replace(b"distortion_model: plumb_bob", b"camera_model: pinhole")
-    assert parse_lens(old, "x") == parse_lens(FILE.replace(b"distortion_model: plumb_bob\n", b""), "x") == LENS
+def test_an_old_file_without_a_distortion_model_is_a_plumb_bob(tmp_path: Path) -> None:
+    for model in (b"camera_model: pinhole\n", b""):
+        assert read(tmp_path, FILE.replace(b"distortion_model: plumb_bob\n", model)) == LENS
 
 
 @pytest.mark.parametrize(
@@ -77,12 +81,9 @@ def test_an_old_file_without_a_distortion_model_is_a_plumb_bob() -> None:
         (b"# as", b"!!python/object/apply:os.system ['true']\n# as"),
     ],
 )
-def test_a_bad_file_is_refused_in_one_line(find: bytes, put: bytes) -> None:
-    text = FILE.replace(find, put, 1)
-    assert text != FILE
+def test_a_bad_file_is_refused_in_one_line(find: bytes, put: bytes, tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as caught:
-        parse_lens(text, "camera.yaml")
-    assert str(caught.value).startswith("camera.yaml")
+        read(tmp_path, FILE.replace(find, put, 1))
     assert "\n" not in str(caught.value)
 
 
@@ -93,7 +94,7 @@ def test_missing_and_huge_files_are_refused(tmp_path: Path) -> None:
             load_lens(path)
 
 
-def test_aliases_that_multiply_and_deep_nesting_end_in_an_error() -> None:
+def test_aliases_that_multiply_and_deep_nesting_end_in_an_error(tmp_path: Path) -> None:
     laughs = b"a: &a [x, x, x, x, x, x, x, x]\n"
     for here, there in zip("bcdefghijkl", "abcdefghijk", strict=True):
         laughs += f"{here}: &{here} [{', '.join(['*' + there] * 8)}]\n".encode()
@@ -106,7 +107,7 @@ def test_aliases_that_multiply_and_deep_nesting_end_in_an_error() -> None:
         b"\xff\xfe\0",
     ):
         with pytest.raises(ConfigError):
-            parse_lens(text, "x")
+            read(tmp_path, text)
 
 
 # --- messages ----------------------------------------------------------------------------------------------------
@@ -132,13 +133,22 @@ def test_rectified_pictures_are_described_by_the_projection_matrix() -> None:
         ("rational_polynomial", (0.1,) * 8, ("rational_polynomial", 8)),
         ("rational_polynomial", (0.1,) * 14, ("rational_polynomial", 14)),
         ("equidistant", (0.1,) * 4, ("equidistant", 4)),
-        ("fisheye", (), ("equidistant", 4)),
+        ("fisheye", (0.1,) * 4, ("equidistant", 4)),
+        ("fisheye", (0.0,) * 4, ("none", 0)),  # undistorted already
+        ("equidistant", (), ("none", 0)),
     ],
 )
 def test_names_of_distortion_become_ours(model: str, d: tuple[float, ...], wanted: tuple[str, int]) -> None:
     lens = lens_of(**INFO | {"model": model, "d": d})
     assert lens is not None
     assert (lens.distortion, len(lens.coefficients)) == wanted
+
+
+def test_a_fish_eye_picture_that_depthai_has_undistorted_is_not_undistorted_again() -> None:
+    """DepthAI leaves the model's name, and no coefficients."""
+    matrix = [[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]]
+    lens = depthai_lens(matrix, [], "Fisheye", (640, 480))
+    assert (lens.distortion, lens.coefficients) == ("none", ())
 
 
 @pytest.mark.parametrize(
@@ -154,11 +164,6 @@ def test_a_part_of_the_picture_and_joined_pixels_move_the_axis() -> None:
     assert lens is not None
     assert (lens.width, lens.height, lens.fx, lens.fy) == (200, 150, 433.5 / 2, 432.75 / 2)
     assert (lens.cx, lens.cy) == ((322.25 - 100 + 0.5) / 2 - 0.5, (241.5 - 40 + 0.5) / 2 - 0.5)
-
-
-def test_more_joined_pixels_than_there_are_is_refused() -> None:
-    with pytest.raises(ConfigError):
-        lens_of(**INFO | {"binning": (1, 500)})
 
 
 # --- sizes -------------------------------------------------------------------------------------------------------

@@ -16,8 +16,7 @@ from gcd_node.calibration import LensModel
 from gcd_node.errors import ConfigError, DepthError
 from gcd_node.frame import Image
 from gcd_node.preprocess import project
-from gcd_node.sources.depth import clean_depth
-from gcd_node.sources.depth_stereo import StereoDepth
+from gcd_node.sources.depth import StereoDepth, clean_depth
 
 REAL = Path(__file__).parents[2].parent / "shared" / "real" / "oak-stereo"
 SIZE = (320, 192)
@@ -27,25 +26,12 @@ IDEAL = LensModel(width=320, height=192, fx=260.0, fy=260.0, cx=159.5, cy=95.5)
 # --- the door --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
-def test_what_is_no_distance_becomes_a_hole(dtype: type) -> None:
-    depth = np.array([[1.5, np.nan, np.inf], [-np.inf, -2.0, 0.0]], dtype)
-    cleaned = clean_depth(depth, (2, 3))
-    assert cleaned.dtype == np.float32
-    assert cleaned.tolist() == [[1.5, 0.0, 0.0], [0.0, 0.0, 0.0]]
-
-
-def test_uint16_is_millimetres_and_its_last_number_is_too_far() -> None:
+def test_millimetres_become_metres_and_what_is_no_distance_a_hole_in_the_pictures_size() -> None:
     cleaned = clean_depth(np.array([[1250, 0, 65535]], np.uint16), (1, 3))
     assert cleaned == pytest.approx(np.array([[1.25, 0.0, 0.0]]))
-
-
-def test_another_size_takes_the_nearest_pixel_so_that_no_depth_is_invented() -> None:
-    depth = np.array([[1.0, 5.0], [1.0, np.nan]], np.float32)
-    cleaned = clean_depth(depth, (4, 4))
-    assert cleaned.shape == (4, 4)
-    assert set(np.unique(cleaned)) == {0.0, 1.0, 5.0}
-    assert cleaned[:2, 2:].tolist() == [[5.0, 5.0], [5.0, 5.0]]
+    depth = np.array([[1.5, np.nan, np.inf], [-np.inf, -2.0, 5.0]], np.float16)
+    cleaned = clean_depth(depth, (4, 6))
+    assert (cleaned.dtype, cleaned.shape, set(np.unique(cleaned))) == (np.float32, (4, 6), {0.0, 1.5, 5.0})
 
 
 @pytest.mark.parametrize(
@@ -287,11 +273,9 @@ LEFT = ("cameraData", 1, 1)
         change(board(), *LEFT, "extrinsics", "translation", to={"x": 0.0, "y": -9.0, "z": 0.0}),
         change(board(), *LEFT, "extrinsics", "translation", to={"x": -9000.0, "y": 0.0, "z": 0.0}),
         change(board(), *LEFT, "intrinsicMatrix", to=[[405.0, 0, 9999.0], [0, 405, 200], [0, 0, 1]]),
-        change(board(), *LEFT, "intrinsicMatrix", to=[]),
         change(board(), *LEFT, "cameraType", to=7),
         change(board(), *LEFT, "width", to="wide"),
         {"cameraData": []},
-        [],
     ],
     ids=lambda _: "",
 )
@@ -301,21 +285,6 @@ def test_a_calibration_of_no_such_pair_is_refused_with_one_line(tmp_path: Path, 
         StereoDepth.from_depthai(path, size=SIZE)
     assert str(path) in str(raised.value)
     assert "\n" not in str(raised.value)
-
-
-def test_a_file_that_is_no_calibration_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "calib.json").write_bytes(b'{"cameraData": [[1, {"width": NaN}]]}')
-    for path in (tmp_path / "calib.json", tmp_path / "missing.json", tmp_path):
-        with pytest.raises(ConfigError):
-            StereoDepth.from_depthai(path, size=SIZE)
-
-
-def test_options_that_cannot_be_matched_are_refused(tmp_path: Path) -> None:
-    path = written(tmp_path / "calib.json", board())
-    with pytest.raises(ConfigError):
-        StereoDepth.from_depthai(path, size=SIZE, hfov_deg=170.0)
-    with pytest.raises(ConfigError):
-        StereoDepth((IDEAL, IDEAL), moved(-0.7), size=SIZE)
 
 
 def test_pictures_the_calibration_is_not_for_are_refused_and_the_next_ones_taken() -> None:

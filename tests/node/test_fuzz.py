@@ -38,7 +38,7 @@ from gcd_client.protocol import (
     view_topic,
 )
 from gcd_node.auth import load_clients
-from gcd_node.calibration import parse_lens
+from gcd_node.calibration import load_lens
 from gcd_node.cli.watch import StatusBoard
 from gcd_node.config import parse_config
 from gcd_node.config_dump import to_toml
@@ -317,18 +317,24 @@ def test_what_nests_too_deep_is_refused(depth: int, tmp_path: Path) -> None:
     clients = tmp_path / "clients.toml"
     clients.touch(mode=0o600)
     clients.write_bytes(b"client = " + deep)
+    lens = tmp_path / "lens.yaml"
+    lens.write_bytes(b"image_width: " + deep)
     for read in (
         lambda: parse_config(b"node_id = " + deep, "launch.toml"),
         lambda: parse_config(CONFIG, "launch.toml", [f"node_id={deep.decode()}"]),
         lambda: load_clients(clients),
-        lambda: parse_lens(b"image_width: " + deep, "lens"),
+        lambda: load_lens(lens),
     ):
         with pytest.raises(ConfigError):
             read()
 
 
-def test_mutated_calibrations_end_as_lenses_or_config_errors() -> None:
-    ended = outcomes(lambda part: parse_lens(part, "lens").distortion, Mutator(6, [LENS], TEXT_PIECES), ConfigError)
+def test_mutated_calibrations_end_as_lenses_or_config_errors(tmp_path: Path) -> None:
+    def read(part: bytes) -> str:
+        (tmp_path / "lens.yaml").write_bytes(part)
+        return load_lens(tmp_path / "lens.yaml").distortion
+
+    ended = outcomes(read, Mutator(6, [LENS], TEXT_PIECES), ConfigError)
     assert ended["refused"] > ROUNDS // 4
     assert ended["plumb_bob"] > 0
 
