@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import msgspec
 import numpy as np
@@ -151,6 +151,26 @@ def lens_of(
         coefficients=coefficients,
     )
     return whole if (across, along) == (1, 1) else whole.resized(whole.width // across, whole.height // along)
+
+
+def lens_of_message(message: Any, *, rectified: bool = False) -> LensModel | None:
+    """lens_of() for the fields of a CameraInfo, of ROS 1 or 2, or a CameraCalibration. Raises ConfigError."""
+
+    def numbers(name: str) -> tuple[float, ...]:
+        return tuple(map(float, getattr(message, name if hasattr(message, name) else name.upper())))
+
+    roi = getattr(message, "roi", None)
+    return lens_of(
+        width=message.width,
+        height=message.height,
+        model=message.distortion_model,
+        d=numbers("d"),
+        k=numbers("k"),
+        p=numbers("p"),
+        binning=(getattr(message, "binning_x", 1), getattr(message, "binning_y", 1)),
+        roi=(0, 0, 0, 0) if roi is None else (roi.x_offset, roi.y_offset, roi.width, roi.height),
+        rectified=rectified,
+    )
 
 
 def _distortion(model: str, d: tuple[float, ...]) -> tuple[Distortion, tuple[float, ...]]:

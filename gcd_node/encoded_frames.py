@@ -128,7 +128,7 @@ class EncodedFrames:
             return None
         try:
             if measured is None and network is not None:
-                _, measured = network(to_image(frames.clip[place]))
+                measured = network(to_image(frames.clip[place]))
             if measured is not None and not measured.any():
                 raise DepthError(f"a depth of {measured.shape[::-1]} is all holes: look at what measures it")
             depth = measured

@@ -123,7 +123,7 @@ def read_clip(path: Path, request: ClipRequest, traits: Traits, pose: SourcePose
     if request.network is not None:
         scale = mount if request.depth_kind == "inverse" else None
         network = OnnxDepth(request.network, kind=request.depth_kind, scale=scale)
-        depth = _stacked([network(picture)[1] for picture in source.pictures])
+        depth = _stacked([network(picture) for picture in source.pictures])
     depth = None if depth is None else depth / request.unit_m
     return replace(source, clip=replace(source.clip, mount=mount, depth=depth))
 

@@ -20,8 +20,8 @@ from gcd_node.preprocess import Rectifier, seen_pixels, widest_camera
 DepthPicture: TypeAlias = NDArray[np.float32]
 """[H, W], metres along the camera's axis; 0 is unknown, a hole."""
 
-DepthSource: TypeAlias = Callable[[Image], tuple[Image, DepthPicture]]
-"""Depth of a picture, u8 [H, W, 3]; gives both. Raises DepthError: this picture cannot be used, the next may be."""
+DepthSource: TypeAlias = Callable[[Image], DepthPicture]
+"""Of a picture, u8 [H, W, 3]. Raises DepthError: this picture cannot be used, the next may be."""
 
 _SHAPE_TOLERANCE = 0.01
 _MM = np.float32(1e-3)
@@ -114,7 +114,7 @@ class OnnxDepth:
                 f"{path} does not: {_first_line(error)}"
             ) from error
 
-    def __call__(self, picture: Image) -> tuple[Image, DepthPicture]:
+    def __call__(self, picture: Image) -> DepthPicture:
         """See DepthSource: the depth of a picture of any size, in the same size.
 
         Raises:
@@ -125,8 +125,7 @@ class OnnxDepth:
             scale, shift = fit_ground(scaled, self._scale)
             scaled = scale * scaled + shift
         known = np.isfinite(scaled) & (scaled > 1 / _FARTHEST_M)
-        depth = np.divide(1, scaled, out=np.zeros(scaled.shape, np.float32), where=known, casting="same_kind")
-        return picture, depth
+        return np.divide(1, scaled, out=np.zeros(scaled.shape, np.float32), where=known, casting="same_kind")
 
     def _run(self, picture: Image) -> NDArray[np.float32]:
         """The network's output, [h, w]."""

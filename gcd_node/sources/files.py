@@ -39,6 +39,28 @@ _NO_VIDEO = ("ansi", None)  # FFmpeg plays a text as pictures of its letters
 _MAX_BYTES = 2**29  # of a picture's file
 _COLOURS = ((200, 60, 40), (60, 160, 60), (40, 80, 200), (220, 220, 210))
 
+_LAYOUTS: dict[str, tuple[int, int | None]] = {
+    "rgb8": (3, None),
+    "bgr8": (3, cv2.COLOR_BGR2RGB),
+    "8UC3": (3, cv2.COLOR_BGR2RGB),
+    "rgba8": (4, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, cv2.COLOR_BGRA2RGB),
+    "8UC4": (4, cv2.COLOR_BGRA2RGB),
+    "mono8": (1, cv2.COLOR_GRAY2RGB),
+    "8UC1": (1, cv2.COLOR_GRAY2RGB),
+    "bayer_rggb8": (1, cv2.COLOR_BayerRGGB2RGB),
+    "bayer_bggr8": (1, cv2.COLOR_BayerBGGR2RGB),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2RGB),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2RGB),
+    "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY),
+    "uyvy": (2, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
+    "yuyv": (2, cv2.COLOR_YUV2RGB_YUY2),
+    "nv12": (1, cv2.COLOR_YUV2RGB_NV12),
+    "nv21": (1, cv2.COLOR_YUV2RGB_NV21),
+}
+"""Bytes a pixel, and OpenCV's way from there to RGB; None: it is RGB."""
+
 
 class Recording:
     """What recordings have in common as FrameSources: their pace, their end, and that they may begin again.
@@ -293,6 +315,29 @@ def decode_picture(coded: bytes, flags: int) -> NDArray[Any]:
     if picture is None:
         raise SourceError(f"cannot be decoded: damaged, or no {', '.join(PICTURES)}")
     return picture
+
+
+def raw_picture(fields: Any) -> Image:
+    """A picture without a coder, as messages of ROS and Foxglove hold it. Raises SourceError."""
+    if fields.encoding not in _LAYOUTS:
+        known = ", ".join(_LAYOUTS)
+        raise SourceError(f"pictures in {str(fields.encoding)[:40]!r} are not read; known are {known}")
+    width, (channels, code) = fields.width, _LAYOUTS[fields.encoding]
+    rows = fields.height * 3 // 2 if fields.encoding in ("nv12", "nv21") else fields.height  # then half as much colour
+    pixels = np.ascontiguousarray(raw_rows(fields, channels, rows).reshape(rows, width, channels))
+    return np.asarray(pixels if code is None else cv2.cvtColor(pixels, code), np.uint8)
+
+
+def raw_rows(fields: Any, pixel_bytes: int, rows: int) -> NDArray[np.uint8]:
+    """[rows, bytes], without the padding of each row."""
+    used, step = fields.width * pixel_bytes, fields.step
+    fits = fields.width > 0 and fields.height > 0 and fields.width * fields.height <= MAX_PIXELS
+    if not fits or not used <= step or step * rows > len(fields.data):
+        raise SourceError(
+            f"a {fields.width} x {fields.height} picture in {fields.encoding} has rows of {step} bytes and "
+            f"{len(fields.data)} in all, wanted are {used} and {used * rows} or more: it is damaged"
+        )
+    return np.frombuffer(fields.data, np.uint8, count=step * rows).reshape(rows, step)[:, :used]
 
 
 class MovingPattern(Recording):

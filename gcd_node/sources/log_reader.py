@@ -1,13 +1,16 @@
-"""Messages of robot logs, front to back: MCAP files, ROS 2 bags (folders and .db3 files) and ROS 1 bags.
+"""Messages of robot logs, front to back: MCAP files, ROS 2 bags (folders and .db3 files) and ROS 1 bags; and the
+pictures and depth in them.
 
 `mcap` and `rosbags` read what is there; how much and how long is limited here, because a log of a few kB can unfold
-into gigabytes. ROS messages are read by the definitions that ship with rosbags, whatever the log says of them.
+into gigabytes. ROS messages are read by the definitions that ship with rosbags, whatever the log says of them. What is
+damaged in a way that is not looked for raises whatever the library does that found it.
 """
 
 import functools
 import io
 import logging
 import re
+import struct
 import time
 import zlib
 from collections.abc import Callable, Iterator
@@ -15,12 +18,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, TypeVar, cast
 
+import cv2
 import lz4.frame
+import msgspec
+import numpy as np
 import zstandard
 from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
+from numpy.typing import NDArray
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader as Ros2Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -28,15 +35,16 @@ from rosbags.typesys.store import Typestore
 
 from gcd_model import FileError, printable, read_small
 from gcd_node.errors import SourceError
+from gcd_node.frame import MAX_PIXELS, Image
+from gcd_node.sources.files import decode_picture, raw_picture, raw_rows
 
 _LOG = logging.getLogger(__name__)
 _Record = TypeVar("_Record", Schema, Channel, Metadata)
 
 _HEADS = {b"\x89MCAP0\r\n": ".mcap", b"#ROSBAG V": ".bag", b"SQLite format 3\0": ".db3"}
-RAW_IMAGES = frozenset({"sensor_msgs/msg/Image", "foxglove.RawImage"})
 CODED_IMAGES = frozenset({"sensor_msgs/msg/CompressedImage", "foxglove.CompressedImage"})
 VIDEOS = frozenset({"foxglove.CompressedVideo", "foxglove_msgs/msg/CompressedVideo"})
-IMAGES = RAW_IMAGES | CODED_IMAGES | VIDEOS
+IMAGES = CODED_IMAGES | VIDEOS | {"sensor_msgs/msg/Image", "foxglove.RawImage"}
 CAMERAS = frozenset({"sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration"})
 ODOMETRY, TRANSFORMS = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
 _READABLE = IMAGES | CAMERAS | {ODOMETRY, TRANSFORMS}
@@ -45,6 +53,11 @@ _MAX_BYTES = 96 * 2**20  # of a record, and of an unfolded chunk
 _MAX_KEPT = 16 * 2**20  # of all topics and definitions together
 _PACKED_MESSAGES = re.compile(r"compression_mode:\s*[\"']?message", re.IGNORECASE)
 _ROS1_TYPE = re.compile(r"^(\w+)/(\w+)$")
+_COLOUR = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+_CODECS = ("jpeg", "png", "webp")
+_DEPTH = ("16UC", "32FC", "64FC", "16SC", "32SC")
+_PNG = b"\x89PNG\r\n\x1a\n"
+_VIDEO_DECODERS = {"h264": "h264", "h265": "hevc", "vp9": "vp9", "av1": "libdav1d"}
 
 
 class LogLimitError(SourceError):
@@ -67,7 +80,11 @@ class LogMessage:
 
 
 class LogReader:
-    """One reading of a log. `messages` gives those of the types in this file."""
+    """One reading of a log. `messages` gives those of the types in this file.
+
+    damaged: chunks left out so far. topics: every one so far, and the type of its messages. metadata: what a recording
+    of this node says of itself, by name.
+    """
 
     def __init__(self, path: Path, search_s: float, stopped: Callable[[], bool] = lambda: False) -> None:
         """Look at what is there.
@@ -78,23 +95,21 @@ class LogReader:
             SourceError: it is missing, empty or no log.
         """
         self._path, self._search_s, self._stopped = path, search_s, stopped
-        self._files = log_files(path)
+        try:
+            self._files = _files_in(path) if path.is_dir() else (path,)
+            if _kind_of_log(path) is None:
+                raise SourceError(f"{path} is no log, or empty; give an MCAP file, a ROS bag or the folder of one")
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise SourceError(f"cannot read the log {path}: {reason}; check path and permissions") from error
         self.renew()
-        self._kept_bytes = 0
-        self.damaged = 0
-        """Chunks left out so far."""
+        self.damaged = self._kept_bytes = 0
         self.topics: dict[str, str] = {}
-        """Every topic so far, and the type of its messages."""
         self.metadata: dict[str, dict[str, str]] = {}
-        """What a recording of this node says of itself, by name."""
 
     def renew(self) -> None:
         """Begin to search anew, now."""
         self._end_s = time.monotonic() + self._search_s
-
-    def _check(self) -> None:
-        if time.monotonic() > self._end_s or self._stopped():
-            raise LogLimitError(f"nothing was found in {self._search_s:g} s of reading")
 
     def messages(self) -> Iterator[LogMessage]:
         """Messages of one file after the other.
@@ -104,15 +119,19 @@ class LogReader:
         """
         for file in self._files:
             try:
-                yield from self._bag(file) if kind_of_log(file) in (".bag", ".db3") else self._mcap(file)
+                yield from self._bag(file) if _kind_of_log(file) in (".bag", ".db3") else self._mcap(file)
             except OSError as error:
                 raise SourceError(f"cannot read {file}: {error.strerror or error}; check the disk") from error
+
+    def _check(self) -> None:
+        if time.monotonic() > self._end_s or self._stopped():
+            raise LogLimitError(f"nothing was found in {self._search_s:g} s of reading")
 
     def _mcap(self, file: Path) -> Iterator[LogMessage]:
         schemas: dict[int, Schema] = {0: Schema(id=0, data=b"", encoding="", name="")}
         channels: dict[int, Channel] = {}
         readable: dict[int, tuple[str, Callable[[bytes], Any]]] = {}
-        for record in self._mcap_records(file):
+        for record in self._records(functools.partial(file.open, "rb")):
             if isinstance(record, Message):
                 if record.channel_id in readable:
                     kind, decode = readable[record.channel_id]
@@ -128,56 +147,44 @@ class LogReader:
                 schemas[record.id] = self._kept(record)
             elif isinstance(record, Channel) and channels.get(record.id) != record:
                 channels[record.id] = self._kept(record)
-                kind, decode = _reader_of(record, schemas.get(record.schema_id, schemas[0]))
+                kind, decode = _decoder_of(record, schemas.get(record.schema_id, schemas[0]))
                 self.topics[record.topic] = kind
                 if decode is not None:
                     readable[record.id] = kind, decode
             elif isinstance(record, Metadata) and record.name.startswith("gcd-node"):
                 self.metadata[record.name] = self._kept(record).metadata
 
-    def _mcap_records(self, file: Path) -> Iterator[McapRecord]:
-        """Everything before the index, chunks unfolded; of a file that was cut, what is whole."""
-        with file.open("rb") as stream:
-            try:
-                for record in self._records(stream, in_chunk=False):
+    def _records(self, open_stream: Callable[[], IO[bytes]], *, in_chunk: bool = False) -> Iterator[McapRecord]:
+        """Everything before the index, chunks unfolded; of what was cut or is damaged, what is whole."""
+        try:
+            with open_stream() as stream:
+                limited = cast(IO[bytes], _LimitedStream(stream, self._check))
+                reader = StreamReader(limited, skip_magic=in_chunk, emit_chunks=True, record_size_limit=_MAX_BYTES)
+                for record in reader.records:
                     if isinstance(record, DataEnd):
                         return
-                    if isinstance(record, Chunk):
-                        yield from self._chunk_records(record)
+                    if isinstance(record, Chunk) and not in_chunk:
+                        yield from self._records(functools.partial(_unfolded, record), in_chunk=True)
                     else:
                         yield record
-            except (LogLimitError, OSError):
-                raise
-            except Exception as error:  # whatever the library says of a file that was cut
-                _LOG.warning("%s was not finished, or is damaged: it was read up to there (%s)", file, line_of(error))
-
-    def _chunk_records(self, chunk: Chunk) -> Iterator[McapRecord]:
-        try:
-            yield from self._records(io.BytesIO(_unfolded(chunk)), in_chunk=True)
-        except EndOfFile:
-            return  # of the chunk
-        except LogLimitError:
+        except (LogLimitError, OSError):
             raise
         except Exception as error:  # of the library, or of its decompressors
-            level = logging.DEBUG if self.damaged else logging.WARNING  # once is enough
-            _LOG.log(level, "%s: a part of the log is left out: %s", self._path, line_of(error))
-            self.damaged += 1
-
-    def _records(self, stream: IO[bytes], *, in_chunk: bool) -> Iterator[McapRecord]:
-        limited = cast(IO[bytes], _LimitedStream(stream, self._check))
-        return StreamReader(limited, skip_magic=in_chunk, emit_chunks=True, record_size_limit=_MAX_BYTES).records
+            if in_chunk and isinstance(error, EndOfFile):
+                return  # of the chunk
+            what = "a part is left out" if in_chunk else "it was not finished, or is damaged, and is read up to there"
+            _LOG.log(logging.DEBUG if self.damaged else logging.WARNING, "%s: %s: %s", self._path, what, line_of(error))
+            self.damaged += in_chunk
 
     def _kept(self, record: _Record) -> _Record:
         """The same, its bytes counted. Raises LogLimitError."""
-        for value in vars(record).values():
-            parts = (*value, *value.values()) if isinstance(value, dict) else (value,)
-            self._kept_bytes += sum(len(part) for part in parts if isinstance(part, str | bytes))
+        self._kept_bytes += len(msgspec.json.encode(vars(record)))
         if self._kept_bytes > _MAX_KEPT:
             raise LogLimitError(f"topics and definitions alone are more than {_MAX_KEPT} bytes")
         return record
 
     def _bag(self, path: Path) -> Iterator[LogMessage]:
-        is_ros1 = kind_of_log(path) == ".bag"
+        is_ros1 = _kind_of_log(path) == ".bag"
         decode = ros1_types().deserialize_ros1 if is_ros1 else ros2_types().deserialize_cdr
         try:
             with Ros1Reader(path) if is_ros1 else Ros2Reader(path) as reader:
@@ -215,7 +222,7 @@ class _LimitedStream:
         return self._stream.read(size)
 
 
-def _unfolded(chunk: Chunk) -> bytes:
+def _unfolded(chunk: Chunk) -> IO[bytes]:
     """Its records. The library itself would let a decompressor write more than the chunk states."""
     size = chunk.uncompressed_size
     if size > _MAX_BYTES:
@@ -231,19 +238,18 @@ def _unfolded(chunk: Chunk) -> bytes:
         raise SourceError(f"a chunk states {size} bytes and holds {len(records)}: it is damaged")
     if chunk.uncompressed_crc and zlib.crc32(records) != chunk.uncompressed_crc:
         raise SourceError("the checksum of a chunk is wrong: it is damaged")
-    return records
+    return io.BytesIO(records)
 
 
-def _reader_of(channel: Channel, schema: Schema) -> tuple[str, Callable[[bytes], Any] | None]:
+def _decoder_of(channel: Channel, schema: Schema) -> tuple[str, Callable[[bytes], Any] | None]:
     """The type of a channel's messages, and what reads them; None if nothing does, or nobody needs them."""
     encoding = channel.message_encoding
     kind = _ROS1_TYPE.sub(r"\1/msg/\2", schema.name) if encoding == "ros1" else schema.name
     if kind not in _READABLE:
         return kind, None
-    if encoding == "cdr":
-        return kind, lambda data: ros2_types().deserialize_cdr(data, kind)
-    if encoding == "ros1":
-        return kind, lambda data: ros1_types().deserialize_ros1(data, kind)
+    if encoding in ("cdr", "ros1"):
+        decode = ros2_types().deserialize_cdr if encoding == "cdr" else ros1_types().deserialize_ros1
+        return kind, lambda data: decode(data, kind)
     try:
         return kind, DecoderFactory().decoder_for(encoding, schema)
     except Exception as error:  # of protobuf: the definition is damaged
@@ -268,44 +274,33 @@ def ros1_types() -> Typestore:
     return store
 
 
-def log_files(path: Path) -> tuple[Path, ...]:
-    """What is read one after another: a file; the files of one recording in a folder, in the order of their numbers; or
-    the folder itself, if rosbags is to make sense of its metadata.yaml.
-
-    Raises:
-        SourceError: no log, or a folder with several.
-    """
-    try:
-        if path.is_dir():
-            return _files_in(path)
-        if not path.exists():
-            raise SourceError(f"no such log: {path}; check the path")
-        if kind_of_log(path) is None:
-            raise SourceError(f"{path} is no log, or empty; give an MCAP file, a ROS bag or the folder of one")
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise SourceError(f"cannot read {path}: {reason}; check path and permissions") from error
-    return (path,)
-
-
 def _files_in(folder: Path) -> tuple[Path, ...]:
-    metadata = folder / "metadata.yaml"
-    is_bag = metadata.is_file()
-    if is_bag:
+    """What is read one after another: the files of one recording, in the order of their numbers; or the folder itself,
+    if rosbags is to make sense of its metadata.yaml. Raises SourceError: there are several logs."""
+    metadata, found = (
+        folder / "metadata.yaml",
+        sorted(folder.glob("*.mcap"), key=lambda file: (len(file.name), file.name)),
+    )
+    if metadata.is_file():
         try:
             is_packed = _PACKED_MESSAGES.search(read_small(metadata)) is not None
         except FileError as error:
             raise SourceError(f"{metadata} {error}; run ros2 bag reindex") from error
-        if is_packed or not any(folder.glob("*.mcap")):
-            return (folder,)
-    found = list(folder.glob("*.mcap")) or list(folder.glob("*.db3"))
-    found.sort(key=lambda file: (len(file.name), file.name))
-    if not found:
-        raise SourceError(f"{folder} is a folder without a log; give an MCAP file, a ROS bag or the folder of one")
-    if not is_bag and len({re.sub(r"_?\d*$", "", file.stem) for file in found}) > 1:
-        names = ", ".join(file.name for file in found[:3])
-        raise SourceError(f"{folder} is a folder of several logs; give one of them, such as {names}")
+        return (folder,) if is_packed or not found else tuple(found)
+    found = found or sorted(folder.glob("*.db3"), key=lambda file: (len(file.name), file.name))
+    if len({re.sub(r"_?\d*$", "", file.stem) for file in found}) > 1:
+        raise SourceError(f"{folder} is a folder of several logs; give one of them, such as {found[0].name}")
     return tuple(found)
+
+
+def _kind_of_log(path: Path) -> str | None:
+    """By its first bytes: ".mcap", ".bag" of ROS 1, ".db3" of ROS 2 or the folder of a bag; None if it is none."""
+    if path.is_dir():
+        named = (path / "metadata.yaml").is_file() or any(path.glob("*.mcap")) or any(path.glob("*.db3"))
+        return ".db3" if named else None
+    with path.open("rb") as file:
+        head = file.read(max(map(len, _HEADS)))
+    return next((kind for begin, kind in _HEADS.items() if head.startswith(begin)), None)
 
 
 def line_of(error: Exception) -> str:
@@ -313,14 +308,78 @@ def line_of(error: Exception) -> str:
     return printable(" ".join(str(error)[:2000].split()), 200) or type(error).__name__
 
 
-def kind_of_log(path: Path) -> str | None:
-    """Which kind of robot log it is, by its first bytes: ".mcap", ".bag" of ROS 1, ".db3" of ROS 2 or the folder of a
-    bag; None if it is none."""
-    if path.is_dir():
-        named = (path / "metadata.yaml").is_file() or any(path.glob("*.mcap")) or any(path.glob("*.db3"))
-        return ".db3" if named else None
-    if not path.is_file():
-        return None
-    with path.open("rb") as file:
-        head = file.read(max(map(len, _HEADS)))
-    return next((kind for begin, kind in _HEADS.items() if head.startswith(begin)), None)
+# Pictures.
+
+
+class ImageDecoder:
+    """Pictures of one topic. Of a video it must be given every message, in order."""
+
+    def __init__(self) -> None:
+        self._video: Any = None
+
+    def decode(self, kind: str, fields: Any) -> tuple[Image, str] | None:
+        """The picture, u8 [H, W, 3] RGB, and what it was coded as; None while a video waits for its key frame.
+
+        Args:
+            kind: of IMAGES. fields: of the message.
+        Raises:
+            SourceError: damaged, too large, in a layout that is not read, or PyAV is not installed.
+        """
+        if kind in VIDEOS:
+            return self._decode_video(str(fields.format).lower(), bytes(fields.data))
+        if kind not in CODED_IMAGES:
+            return raw_picture(fields), str(fields.encoding)
+        format_ = str(fields.format)
+        if format_.startswith(_DEPTH) or "compressedDepth" in format_:
+            raise SourceError(f"{format_[:40]!r} is a map of depths, not a picture")
+        picture = decode_picture(bytes(fields.data), _COLOUR)
+        if "compressed rgb" not in format_:  # the order image_transport handed to the coder, which takes all for BGR
+            picture = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+        codec = next((each for each in _CODECS if each in format_.lower()), "jpeg")
+        return np.ascontiguousarray(picture, np.uint8), codec
+
+    def _decode_video(self, codec: str, data: bytes) -> tuple[Image, str] | None:
+        try:
+            import av
+        except ImportError as error:
+            raise SourceError(f"to read {codec[:20]} video, PyAV is needed: pip install 'gcd-node[video]'") from error
+        if codec not in _VIDEO_DECODERS:
+            raise SourceError(f"video in {codec[:20]!r} is not read; known are {', '.join(_VIDEO_DECODERS)}")
+        if self._video is None:
+            self._video = av.CodecContext.create(_VIDEO_DECODERS[codec], "r")
+            self._video.thread_count = 1  # more would keep frames back
+            self._video.options = {"max_pixels": str(MAX_PIXELS)}
+        frames = self._video.decode(av.Packet(data))
+        return (frames[-1].to_ndarray(format="rgb24"), codec) if frames else None
+
+
+def depth_of(kind: str, fields: Any) -> NDArray[Any]:
+    """A depth picture as it was sent, [H, W]: uint16 millimetres or float32 metres.
+
+    Raises:
+        SourceError: damaged, or no depth.
+    """
+    if kind in CODED_IMAGES:
+        return _decoded_depth(str(fields.format), bytes(fields.data))
+    types = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+    if kind in VIDEOS or fields.encoding not in types:
+        raise SourceError(f"depth is read from 16UC1, mono16 and 32FC1, got {getattr(fields, 'encoding', kind)!r}")
+    order = ">" if getattr(fields, "is_bigendian", 0) else "<"
+    stored = np.dtype(order + types[fields.encoding])
+    rows = np.ascontiguousarray(raw_rows(fields, stored.itemsize, fields.height))
+    return rows.view(stored).astype(stored.newbyteorder("="))
+
+
+def _decoded_depth(format_: str, coded: bytes) -> NDArray[Any]:
+    """A 16-bit PNG of millimetres; behind the 12 bytes of image_transport's compressedDepth also of inverse depth."""
+    start = coded.find(_PNG, 0, 64)
+    levels = decode_picture(coded[max(start, 0) :], cv2.IMREAD_UNCHANGED)
+    if start < 0 or levels.dtype != np.uint16 or levels.ndim != 2:
+        raise SourceError(f"depth in {format_[:40]!r} must be a PNG of one channel of 16 bits")
+    if not format_.startswith("32FC1"):
+        return levels
+    if start < 12:
+        raise SourceError("depth in 32FC1 lacks the numbers that scale it: it is damaged")
+    a, b = struct.unpack_from("<ff", coded, 4)  # level = a / metres + b
+    with np.errstate(all="ignore"):
+        return np.where(levels > 0, a / (levels - np.float32(b)), 0).astype(np.float32)

@@ -2,20 +2,37 @@
 
 import contextlib
 import logging
+import math
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
+from statistics import median
 from typing import Any
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from gcd_node.errors import SourceError
-from gcd_node.frame import Frame, SourceInfo
+from gcd_model import printable
+from gcd_node.calibration import LensModel, lens_of_message
+from gcd_node.errors import ConfigError, SourceError, TooShortError
+from gcd_node.frame import MAX_FPS, Frame, SourceInfo
 from gcd_node.sources.depth import clean_depth
 from gcd_node.sources.files import Pace, Recording
-from gcd_node.sources.log_fields import Cameras, ImageDecoder, are_filled_in, depth_of, head_of, pose_of, rate_of
-from gcd_node.sources.log_reader import IMAGES, ODOMETRY, LogLimitError, LogMessage, LogReader, line_of
+from gcd_node.sources.log_reader import (
+    CAMERAS,
+    IMAGES,
+    ODOMETRY,
+    TRANSFORMS,
+    ImageDecoder,
+    LogLimitError,
+    LogMessage,
+    LogReader,
+    depth_of,
+    line_of,
+)
 
 _LOG = logging.getLogger(__name__)
 _SEARCH_S = 15.0  # of reading, for what is needed to begin, and from one picture to the next
@@ -25,14 +42,15 @@ _LISTED, _SHOWN = 8, 100
 _LATEST_NS = 2**63  # in the year 2262
 _HEADER_UNCERTAINTY_US = 10_000  # drivers stamp anything from the begin of the exposure to the picture's arrival
 _WAIT_NS, _MOST_WAITING = 500_000_000, 30  # of the log's time, for what was recorded after the picture it belongs to
+_LOWEST_FPS = 0.05
+_AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # body_from_camera by REP 103
 _OWN, _OWN_SOURCE = "gcd-node", "gcd-node/source"  # metadata of this node's recordings
 
 
 class LogSource(Recording):
     """One topic of a log as a FrameSource: ROS or Foxglove pictures, compressed, raw or video.
 
-    Stamps are those of the pictures' headers, on the clock of the robot; where nobody filled these in, when they were
-    sent. They may repeat or step back if the robot's did.
+    Stamps are those of the pictures' headers, on the robot's clock; where nobody filled these in, when they were sent.
     """
 
     def __init__(
@@ -45,18 +63,9 @@ class LogSource(Recording):
         pace: Pace = "lockstep",
         loop: bool = False,
     ) -> None:
-        """Find the pictures and decode the first.
+        """Find the pictures and decode the first, by the settings of McapSource. A folder may be a recording of this
+        node, whose pictures are its input's. A file that was never finished plays up to its last whole chunk.
 
-        Args:
-            path: an MCAP file, a ROS bag, or the folder of a ROS 2 bag or of a recording of this node. A file that was
-                never finished plays up to its last whole chunk.
-            topic: where the pictures are; may be left out if just one topic has some, or in this node's recordings,
-                whose input it is.
-            depth_topic, odometry_topic: what frames carry along, each with the stamp nearest to the picture's, within
-                half a frame period.
-            pace: "realtime" yields every frame at its time (holes over 10 s are skipped), "lockstep" as soon as it is
-                asked for.
-            loop: begin again at the end; stamps and sequence numbers keep rising.
         Raises:
             SourceError: no log; no such topic; no pictures, or on several topics; none of them can be decoded, or none
                 was found in 15 s of reading. TooShortError: one picture.
@@ -76,7 +85,6 @@ class LogSource(Recording):
                     yield frame
                     reader.renew()  # what was done with it took its own time
                 self.corrupt = before + matcher.corrupt + reader.damaged
-            yield from matcher.rest()
         except LogLimitError as error:
             if not self._stopped.is_set():
                 raise SourceError(
@@ -84,6 +92,7 @@ class LogSource(Recording):
                     f"pictures: mcap filter LOG -y {self.topic} -o NEW"
                 ) from None
         self.corrupt = before + matcher.corrupt + reader.damaged
+        yield from matcher.rest()
 
 
 class _Matcher:
@@ -103,7 +112,8 @@ class _Matcher:
         try:
             if companion is not None:
                 fields = message.decode()
-                companion.add(self._stamp_ns(message, fields), message.kind, fields)
+                companion.newest_ns = self._stamp_ns(message, fields)
+                companion.kept.append((companion.newest_ns, message.kind, fields))
             elif message.topic == self._found.topic and message.kind in IMAGES:
                 self._add_picture(message)
         except Exception as error:  # of a library, or SourceError: the message is damaged
@@ -126,7 +136,7 @@ class _Matcher:
             self._waiting.append((message.log_ns, Frame(image=decoded[0], stamp_ns=stamp_ns, seq=self._seq)))
 
     def _stamp_ns(self, message: LogMessage, fields: Any) -> int:
-        stamp_ns = head_of(fields)[0] if self._found.header_stamps else message.sent_ns
+        stamp_ns = _head_of(fields)[0] if self._found.header_stamps else message.sent_ns
         if stamp_ns >= _LATEST_NS:
             raise SourceError(f"a message states {stamp_ns} ns since 1970 as its time: it is damaged")
         return stamp_ns
@@ -157,18 +167,13 @@ class _Nearest:
     def __init__(self, topic: str | None, fps: float, most: int) -> None:
         self.topic, self.newest_ns = topic, -1
         self._half_ns = 0.5e9 / fps
-        self._kept: deque[tuple[int, str, Any]] = deque(maxlen=most)
-
-    def add(self, stamp_ns: int, kind: str, fields: Any) -> None:
-        """Keep one."""
-        self.newest_ns = stamp_ns
-        self._kept.append((stamp_ns, kind, fields))
+        self.kept: deque[tuple[int, str, Any]] = deque(maxlen=most)  # stamp, type and fields
 
     def take(self, stamp_ns: int) -> tuple[str, Any] | None:
         """Type and fields of the nearest, None if it is farther than half a frame period."""
-        while self._kept and self._kept[0][0] < stamp_ns - self._half_ns:
-            self._kept.popleft()
-        nearest = min(self._kept, key=lambda each: abs(each[0] - stamp_ns), default=None)
+        while self.kept and self.kept[0][0] < stamp_ns - self._half_ns:
+            self.kept.popleft()
+        nearest = min(self.kept, key=lambda each: abs(each[0] - stamp_ns), default=None)
         return None if nearest is None or abs(nearest[0] - stamp_ns) > self._half_ns else nearest[1:]
 
 
@@ -176,7 +181,6 @@ class _Nearest:
 class _Topic:
     """What was seen of one picture topic. Stamps in nanoseconds; reason: why a picture cannot be read."""
 
-    name: str
     decoder: ImageDecoder = field(default_factory=ImageDecoder)
     header_ns: list[int] = field(default_factory=list[int])
     sent_ns: list[int] = field(default_factory=list[int])
@@ -186,19 +190,19 @@ class _Topic:
     reason: str = "none is whole"
 
     def add(self, message: LogMessage) -> None:
-        """Count a message; pictures are decoded until one could be. Damaged ones do not count."""
-        if len(self.sent_ns) >= _MOST_STAMPS:
-            return
-        try:
-            fields = message.decode()
-            stamp_ns, self.frame_id = head_of(fields)
-            if not self.codec and (decoded := self.decoder.decode(message.kind, fields)) is not None:
-                self.size, self.codec = decoded[0].shape[1::-1], decoded[1]
-        except Exception as error:  # of a library, or SourceError: the message is damaged
-            self.reason = line_of(error)
-            return
+        """Count a message; pictures are decoded until one could be. Raises as a library does if it is damaged."""
+        fields = message.decode()
+        stamp_ns, self.frame_id = _head_of(fields)
+        if not self.codec and (decoded := self.decoder.decode(message.kind, fields)) is not None:
+            self.size, self.codec = decoded[0].shape[1::-1], decoded[1]
         self.header_ns.append(stamp_ns)
         self.sent_ns.append(message.sent_ns)
+
+    @property
+    def has_header_stamps(self) -> bool:
+        """Whether they are there at all, and go on from most messages to the next."""
+        rising = [later > earlier for earlier, later in pairwise(self.header_ns)]
+        return all(self.header_ns) and 2 * sum(rising) > len(rising)
 
 
 class _Survey:
@@ -213,53 +217,82 @@ class _Survey:
         self._path, self._wanted, self.depth_topic, self.odometry_topic = path, topic, depth_topic, odometry_topic
         self._reader = LogReader(path, _SEARCH_S)
         self._topics: dict[str, _Topic] = {}
-        self._cameras, self._body, self._limit = Cameras(), "", ""
-        first_ns = None
+        self._cameras, self._body, limit, end_ns = Cameras(), "", "", None
         try:
             for message in self._reader.messages():
                 self._add(message)
-                first_ns = message.log_ns if first_ns is None else first_ns
-                if message.log_ns - first_ns > _SURVEYED_NS and self._is_enough():
+                end_ns = end_ns or message.log_ns + _SURVEYED_NS
+                if message.log_ns > end_ns and self._is_enough():
                     break
         except LogLimitError as error:
-            self._limit = f"; {error}: cut it to the pictures: mcap filter LOG -y TOPIC -o NEW"
+            limit = f"; {error}: cut it to the pictures: mcap filter LOG -y TOPIC -o NEW"
         for name in (depth_topic, odometry_topic):
             if name is not None and name not in self._reader.topics:
-                raise SourceError(f"{path} has no topic {name!r}; it has {_shown(self._reader.topics)}{self._limit}")
-        chosen = self._chosen()
-        self.topic = chosen.name
-        is_own = self._own("recording") is not None  # whose stamps may begin at 0
-        self.header_stamps = is_own or are_filled_in(chosen.header_ns)
+                raise SourceError(f"{path} has no topic {name!r}; it has {_shown(self._reader.topics)}{limit}")
+        self._wanted = self._wanted or self._own("input_topic")
+        usable = self._usable()
+        if len(usable) != 1:
+            raise SourceError(f"{path} {self._trouble(usable)}{limit}")
+        self.topic = usable[0]
+        chosen = self._topics[self.topic]
+        # stamps of this node's recordings may begin at 0
+        self.header_stamps = self._own("recording") is not None or chosen.has_header_stamps
         self.info = self._describe(chosen)
         self.body_from_camera = np.eye(4)
         if odometry_topic is not None:
             self.body_from_camera = self._cameras.body_from_camera(self._body, chosen.frame_id)
 
     def _add(self, message: LogMessage) -> None:
+        topic = None
+        if message.kind in IMAGES and message.topic != self.depth_topic:
+            topic = self._topics.setdefault(message.topic, _Topic())
         try:
-            if message.kind in IMAGES and message.topic != self.depth_topic:
-                self._topics.setdefault(message.topic, _Topic(message.topic)).add(message)
+            if topic is not None:
+                if len(topic.sent_ns) < _MOST_STAMPS:
+                    topic.add(message)
             elif message.kind == ODOMETRY and message.topic == self.odometry_topic:
                 self._body = self._body or message.decode().child_frame_id
             else:
                 self._cameras.add(message)
         except Exception as error:  # of a library, or SourceError: the message is damaged
-            _LOG.warning("a message on %s is left out: %s", message.topic, line_of(error))
+            if topic is None:
+                _LOG.warning("a message on %s is left out: %s", message.topic, line_of(error))
+            else:
+                topic.reason = line_of(error)
 
     def _own(self, key: str, name: str = _OWN) -> str | None:
         """What a recording of this node says of itself."""
         return self._reader.metadata.get(name, {}).get(key)
 
-    def _usable(self) -> list[_Topic]:
+    def _usable(self) -> list[str]:
         wanted = self._wanted or self._own("input_topic")
-        return [topic for name, topic in self._topics.items() if topic.codec and wanted in (None, name)]
+        return [name for name, topic in self._topics.items() if topic.codec and wanted in (None, name)]
 
     def _is_enough(self) -> bool:
         companions = all(each in (None, *self._reader.topics) for each in (self.depth_topic, self.odometry_topic))
-        return companions and any(len(topic.sent_ns) > 1 for topic in self._usable())
+        return companions and any(len(self._topics[name].sent_ns) > 1 for name in self._usable())
+
+    def _trouble(self, usable: list[str]) -> str:
+        """Why it cannot be played, to be read after its name."""
+        if usable:
+            return f"has pictures on {len(usable)} topics, {_shown(usable)}: say which with topic in [source]"
+        for name, topic in self._topics.items():
+            if self._wanted in (None, name):
+                return f"has no picture on {name} that can be decoded: {topic.reason}"
+        kinds = [f"{name} ({kind})" for name, kind in self._reader.topics.items()]
+        has = f"it has pictures on {_shown(self._topics)}" if self._topics else f"its topics are {_shown(kinds)}"
+        return f"has no pictures{'' if self._wanted is None else f' on the topic {self._wanted!r}'}; {has}"
 
     def _describe(self, chosen: _Topic) -> SourceInfo:
-        fps = rate_of(chosen.header_ns if self.header_stamps else chosen.sent_ns, f"{chosen.name} of {self._path}")
+        stamps = chosen.header_ns if self.header_stamps else chosen.sent_ns
+        steps = [later - earlier for earlier, later in pairwise(stamps) if later > earlier]
+        if not steps:
+            raise TooShortError(f"TOO_SHORT n={len(stamps)}: pictures on {self.topic} of {self._path} make no video")
+        fps = 1e9 / median(steps)
+        if not _LOWEST_FPS <= fps <= MAX_FPS:
+            raise SourceError(
+                f"pictures on {self.topic} of {self._path} come {fps:g} times a second: is its clock right?"
+            )
         info = SourceInfo(
             kind="mcap",
             id=self._path.name,
@@ -268,10 +301,10 @@ class _Survey:
             fps_nominal=fps,
             clock="replay",
             codec=chosen.codec,
-            lens=self._cameras.lens(chosen.name, chosen.frame_id, chosen.size),
+            lens=self._cameras.lens(self.topic, chosen.frame_id, chosen.size),
             stamp_uncertainty_us=_HEADER_UNCERTAINTY_US if self.header_stamps else round(1e6 / fps),
         )
-        return self._as_recorded(info) if chosen.name == self._own("input_topic") else info
+        return self._as_recorded(info) if self.topic == self._own("input_topic") else info
 
     def _as_recorded(self, info: SourceInfo) -> SourceInfo:
         """With what was known of the source when it was recorded. A field of view is not made a lens of: that would be
@@ -285,26 +318,83 @@ class _Survey:
             return replace(info, lens=None, hfov_deg=hfov_deg if 0 < hfov_deg < 180 else None)
         return replace(info, lens=None)
 
-    def _chosen(self) -> _Topic:
-        usable, wanted = self._usable(), self._wanted or self._own("input_topic")
-        if len(usable) == 1:
-            return usable[0]
-        if usable:
-            names = _shown(topic.name for topic in usable)
-            raise SourceError(
-                f"{self._path} has pictures on {len(usable)} topics, {names}: say which with topic in [source]"
-            )
-        for topic in self._topics.values():
-            if wanted in (None, topic.name):
-                raise SourceError(
-                    f"{self._path}: no picture on {topic.name} can be decoded: {topic.reason}{self._limit}"
-                )
-        kinds = [f"{name} ({kind})" for name, kind in self._reader.topics.items()]
-        has = f"it has pictures on {_shown(self._topics)}" if self._topics else f"its topics are {_shown(kinds)}"
-        where = "" if wanted is None else f" on the topic {wanted!r}"
-        raise SourceError(f"{self._path} has no pictures{where}; {has}{self._limit}")
-
 
 def _shown(names: Iterable[str]) -> str:
     """A few names, as a terminal can show them."""
-    return ", ".join(ascii(name[:_SHOWN])[1:-1] for name in sorted(names)[:_LISTED]) or "none"
+    return ", ".join(printable(name, _SHOWN) for name in sorted(names)[:_LISTED]) or "none"
+
+
+# What messages say.
+
+
+def _head_of(fields: Any) -> tuple[int, str]:
+    """A message's stamp in nanoseconds, 0 if nobody filled it in, and its frame_id."""
+    head = getattr(fields, "header", fields)
+    time = head.stamp if hasattr(head, "stamp") else head.timestamp
+    seconds, nanoseconds = (time.sec, time.nanosec) if hasattr(time, "sec") else (time.seconds, time.nanos)
+    return max(0, int(seconds) * 1_000_000_000 + int(nanoseconds)), str(head.frame_id)
+
+
+class Cameras:
+    """What a log says of the robot's cameras: their lenses, and where they are by /tf_static."""
+
+    def __init__(self) -> None:
+        self._infos: dict[str, tuple[str, Any]] = {}  # by topic: frame_id and fields
+        self._parents: dict[str, tuple[str, NDArray[np.float64]]] = {}  # of a frame: parent, parent_from_frame
+
+    def add(self, message: LogMessage) -> None:
+        """Keep what a message says."""
+        if message.kind in CAMERAS and message.topic not in self._infos:
+            fields = message.decode()
+            self._infos[message.topic] = _head_of(fields)[1], fields
+        elif message.kind == TRANSFORMS and message.topic.endswith("tf_static"):
+            for each in message.decode().transforms:
+                pose = pose_of(each.transform.translation, each.transform.rotation)
+                self._parents[each.child_frame_id] = each.header.frame_id, pose
+
+    def lens(self, topic: str, frame_id: str, size: tuple[int, int]) -> LensModel | None:
+        """Of pictures on `topic`: the calibration in the nearest folder above it, as ROS drivers send it; else the one
+        of the same frame. None if there is none that fits."""
+        place = topic.split("/")
+        above = [name for name in self._infos if place[: name.count("/")] == name.split("/")[:-1]]
+        named = [name for name, (frame, _) in self._infos.items() if frame and frame == frame_id]
+        name = max(above, key=lambda each: each.count("/")) if above else next(iter(named), None)
+        if name is None:
+            return None
+        # by the conventions of image_pipeline, pictures on image_rect... are undistorted already
+        rectified = any(part.startswith("image_rect") for part in place)
+        try:
+            lens = lens_of_message(self._infos[name][1], rectified=rectified)
+            return None if lens is None else lens.resized(*size)
+        except ConfigError as error:
+            _LOG.warning("the calibration on %s is not used, state one in [source]: %s", name, error)
+            return None
+
+    def body_from_camera(self, body: str, camera: str) -> NDArray[np.float64]:
+        """[4, 4], between two frames; if it is not known, the camera is taken to look ahead from the body's origin."""
+        (body_root, root_from_body), (camera_root, root_from_camera) = self._root(body), self._root(camera)
+        if body_root != camera_root:
+            _LOG.warning("/tf_static does not say where %s is on %s: taken to look ahead from there", camera, body)
+            return _AHEAD
+        return np.linalg.inv(root_from_body) @ root_from_camera
+
+    def _root(self, frame: str) -> tuple[str, NDArray[np.float64]]:
+        """What a frame hangs on in the end, and root_from_frame."""
+        pose = np.eye(4)
+        for _ in range(len(self._parents)):
+            if frame in self._parents:
+                frame, parent_from_frame = self._parents[frame]
+                pose = parent_from_frame @ pose
+        return frame, pose
+
+
+def pose_of(place: Any, turn: Any) -> NDArray[np.float64]:
+    """parent_from_child, [4, 4], of a ROS position or translation and a quaternion. Raises SourceError: it is none."""
+    axis, norm = np.array([turn.x, turn.y, turn.z]), math.hypot(turn.x, turn.y, turn.z, turn.w)
+    pose = np.eye(4)
+    pose[:3, 3] = place.x, place.y, place.z
+    if not (0.5 < norm < 2 and np.isfinite(pose).all()):
+        raise SourceError(f"a pose has a quaternion of length {norm:g}: nobody filled it in")
+    sine = float(np.linalg.norm(axis))
+    pose[:3, :3] = cv2.Rodrigues(axis * (2 * math.atan2(sine, turn.w) / sine if sine > 0 else 2.0))[0]
+    return pose

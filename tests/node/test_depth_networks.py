@@ -65,9 +65,8 @@ def grey(values: NDArray[np.float64]) -> Image:
 )
 def test_a_metric_network_is_taken_at_its_word(tmp_path: Path, gives: Any, sides: Any) -> None:
     path = network(tmp_path / "net.onnx", (1, 3, *sides), (*gives[:-2], *sides))
-    picture, depth = OnnxDepth(path, kind="metric")(np.full((160, 240, 3), 255, np.uint8))
+    depth = OnnxDepth(path, kind="metric")(np.full((160, 240, 3), 255, np.uint8))
     white = np.mean((1 - np.array([0.485, 0.456, 0.406])) / [0.229, 0.224, 0.225])
-    assert picture.shape == (160, 240, 3)
     assert depth.shape == (160, 240)
     assert depth == pytest.approx(float(white), rel=1e-5)
 
@@ -79,7 +78,7 @@ def test_the_ground_gives_relative_depth_its_scale_and_shift(tmp_path: Path, a: 
     y = (inverse - b) / a
     assert y.max() <= 1
     assert y.min() >= 0
-    _, depth = OnnxDepth(network(tmp_path / "net.onnx"), kind="inverse", scale=MOUNT)(grey(y))
+    depth = OnnxDepth(network(tmp_path / "net.onnx"), kind="inverse", scale=MOUNT)(grey(y))
     near = inverse > 0.1
     assert np.mean(np.abs(depth[near] * inverse[near] - 1) < 0.03) > 0.97  # the rest are the edges of who stands there
 

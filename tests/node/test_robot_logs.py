@@ -268,22 +268,6 @@ def test_frames_carry_the_camera_s_pose_by_odometry_and_static_transforms(tmp_pa
     assert poses[3] is None
 
 
-def test_without_transforms_the_camera_is_taken_to_look_ahead_and_that_is_said(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    frames = companions(tmp_path / "log.mcap", [("/odom", ODOMETRY, odometry(float(i), at(i)), i) for i in range(4)])
-    assert "/tf_static" in caplog.text
-    pose = frames[2].odometry
-    assert pose is not None
-    np.testing.assert_allclose(pose[:3, 2:].T, [(1, 0, 0), (2, 0, 0)], atol=1e-9)
-
-
-def test_a_companion_topic_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    path = write_log(tmp_path / "log.mcap", ramp(3))
-    with pytest.raises(SourceError):
-        LogSource(path, depth_topic="/depht")
-
-
 # --- playing -----------------------------------------------------------------------------------------------------
 
 
