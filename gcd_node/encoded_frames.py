@@ -6,11 +6,13 @@ last bit whether its frames were encoded when they arrived, for the window befor
 """
 
 import hashlib
-from collections.abc import Callable, Set
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from gcd_model import (
     Augmentation,
@@ -23,9 +25,9 @@ from gcd_model import (
     require_motion,
 )
 from gcd_node.errors import DepthError
-from gcd_node.preprocess import to_image
+from gcd_node.preprocess import to_clip_tensor
 from gcd_node.sources.depth import DepthSource
-from gcd_node.window import PartialWindow
+from gcd_node.window import PartialWindow, PlacedFrame
 
 _Key: TypeAlias = tuple[int, int]  # epoch and stamp: a builder never gives the same twice
 
@@ -57,8 +59,7 @@ class EncodedFrames:
         out."""
         self._beat, self._on_bad_depth, self._on_odometry = beat, on_bad_depth, on_odometry
         self._last_pose: tuple[int, torch.Tensor] | None = None
-        self._rows: dict[_Key, SourceFeatures] = {}
-        self._guessed: Set[_Key] = set()
+        self._rows: dict[_Key, tuple[SourceFeatures, bool]] = {}  # and whether its depth is guessed
         self._alike: tuple[EncodeTerms, float] | None = None
 
     def __len__(self) -> int:
@@ -68,12 +69,11 @@ class EncodedFrames:
     @property
     def guessed(self) -> int:
         """Of how many of them the depth is the model's own, because the other could not be used."""
-        return len(self._guessed & self._rows.keys())
+        return sum(is_guessed for _, is_guessed in self._rows.values())
 
     def forget(self) -> None:
         """Keep nothing."""
         self._rows.clear()
-        self._guessed = set()
 
     def ahead(self, synthesizer: ViewSynthesizer, frames: PartialWindow, terms: EncodeTerms) -> bool:
         """Encode one more of these frames, the oldest that is not yet. False, and nothing was done, if all are.
@@ -90,72 +90,69 @@ class EncodedFrames:
 
         Raises: as ViewSynthesizer.encode.
         """
-        for index in self._missing(frames, terms):
-            self._encode(synthesizer, frames, index, terms)
-        keys = _keys(frames)
-        first, *others = (self._rows[key] for key in keys)
-        joined = first.followed_by(*others)
-        self._rows = {key: joined.rows(i, i + 1) for i, key in enumerate(keys)}  # the windows before may go
+        for frame in self._missing(frames, terms):
+            self._encode(synthesizer, frames, frame, terms)
+        keys = [(frames.epoch, stamp_ns) for stamp_ns in frames.stamps_ns]
+        first, *others = (self._rows[key][0] for key in keys)
+        joined = first.followed_by(*others)  # the windows before may go
+        self._rows = {key: (joined.rows(i, i + 1), self._rows[key][1]) for i, key in enumerate(keys)}
         return joined
 
-    def _missing(self, frames: PartialWindow, terms: EncodeTerms) -> list[int]:
-        """Places of the frames that are not encoded; all other frames are forgotten."""
+    def _missing(self, frames: PartialWindow, terms: EncodeTerms) -> list[PlacedFrame]:
+        """The frames that are not encoded; all others but these are forgotten."""
         if self._alike != (terms, frames.fps):
             self.forget()
             self._alike = (terms, frames.fps)
-        keys = _keys(frames)
-        self._rows = {key: self._rows[key] for key in keys if key in self._rows}
-        return [place for place, key in enumerate(keys) if key not in self._rows]
+        by_key = {(frames.epoch, frame.stamp_ns): frame for frame in frames.frames}
+        self._rows = {key: row for key, row in self._rows.items() if key in by_key}
+        return [frame for key, frame in by_key.items() if key not in self._rows]
 
-    def _encode(self, synthesizer: ViewSynthesizer, frames: PartialWindow, place: int, terms: EncodeTerms) -> None:
+    def _encode(
+        self, synthesizer: ViewSynthesizer, window: PartialWindow, frame: PlacedFrame, terms: EncodeTerms
+    ) -> None:
         self._beat()
-        video = torch.from_numpy(frames.clip[place : place + 1])
+        depth = self._depth(frame, terms.depth)
         clip = Clip(
-            video=video,
-            fps=frames.fps,
+            video=torch.from_numpy(to_clip_tensor(frame.image[None])),
+            fps=window.fps,
             mount=terms.mount,
             lens=terms.lens,
-            depth=self._depth(frames, place, terms.depth),
-            odometry=self._odometry(frames, place),
+            depth=None if depth is None else torch.from_numpy(depth)[None],
+            odometry=self._odometry(frame, window.epoch),
         )
-        noise = Augmentation(strength=terms.strength, seed=frame_seed(terms.digest, frames.seqs[place]))
-        self._rows[_keys(frames)[place]] = synthesizer.encode(clip, noise)
+        noise = Augmentation(strength=terms.strength, seed=frame_seed(terms.digest, frame.seq))
+        is_guessed = depth is None and (frame.depth is not None or terms.depth is not None)
+        self._rows[window.epoch, frame.stamp_ns] = synthesizer.encode(clip, noise), is_guessed
 
-    def _depth(self, frames: PartialWindow, place: int, network: DepthSource | None) -> torch.Tensor | None:
-        """Of one frame, [1, H, W], as it was measured, else as a network has it; None where neither can be used."""
-        measured, depth = frames.depths[place], None
-        if measured is None and network is None:
-            return None
+    def _depth(self, frame: PlacedFrame, network: DepthSource | None) -> NDArray[np.float32] | None:
+        """Of one frame, [H, W], as it was measured, else as a network has it; None where neither can be used."""
+        depth = frame.depth
         try:
-            if measured is None and network is not None:
-                measured = network(to_image(frames.clip[place]))
-            if measured is not None and not measured.any():
-                raise DepthError(f"a depth of {measured.shape[::-1]} is all holes: look at what measures it")
-            depth = measured
+            if depth is None and network is not None:
+                depth = network(frame.image)
+            if depth is not None and not depth.any():
+                raise DepthError(
+                    f"a depth of {depth.shape[1]} x {depth.shape[0]} is all holes: look at what measures it"
+                )
         except DepthError as error:
             self._on_bad_depth(error)
-        guessed = {_keys(frames)[place]} if depth is None else set[_Key]()
-        self._guessed = self._guessed & self._rows.keys() | guessed
-        return None if depth is None else torch.from_numpy(depth)[None]
-
-    def _odometry(self, frames: PartialWindow, place: int) -> torch.Tensor | None:
-        """Of one frame, [1, 4, 4]; None without one, or if no camera moves so. A jump costs the frame it ends at."""
-        stated, before = frames.odometry[place], self._last_pose
-        if stated is None:
             return None
+        return depth
+
+    def _odometry(self, frame: PlacedFrame, epoch: int) -> torch.Tensor | None:
+        """Of one frame, [1, 4, 4]; None without one, or if no camera moves so. A jump costs the frame it ends at."""
+        if frame.odometry is None:
+            return None
+        before = self._last_pose
         try:
-            pose = require_motion(None, torch.tensor(stated))
-            self._last_pose = frames.epoch, pose
-            require_motion(before[1] if before is not None and before[0] == frames.epoch else None, pose)
+            pose = require_motion(None, torch.tensor(frame.odometry))
+            self._last_pose = epoch, pose
+            require_motion(before[1] if before is not None and before[0] == epoch else None, pose)
         except PoseError as error:
             self._on_odometry(error)
             return None
         self._on_odometry(None)
         return pose[None]
-
-
-def _keys(frames: PartialWindow) -> list[_Key]:
-    return [(frames.epoch, stamp_ns) for stamp_ns in frames.stamps_ns]
 
 
 def window_seed(config_digest: str, window_id: int, attempt: int) -> int:

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from gcd_model import Cancelled, DeviceMemoryError, NonFiniteError, PoseError, RenderOptions, View
-from gcd_node.capture import WindowSlot
 from gcd_node.encoded_frames import EncodedFrames, EncodeTerms, window_seed
 from gcd_node.errors import DepthError
 from gcd_node.fallback import FULL, Condition, FailureCounter, OomLevel, oom_levels
@@ -28,7 +27,7 @@ from gcd_node.model import (
 from gcd_node.status import NodeServices
 from gcd_node.stream_context import StreamContext
 from gcd_node.views import EndOfStream, Settings, VirtualView, VirtualViews
-from gcd_node.window import FrameWindow, PartialWindow
+from gcd_node.window import FrameWindow, PartialWindow, WindowSlot
 
 _LOG = logging.getLogger(__name__)
 _KEPT = 1000  # a node runs for weeks

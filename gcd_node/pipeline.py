@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from gcd_model import ModelError
-from gcd_node.capture import WindowSlot, read
 from gcd_node.errors import (
     ConfigError,
     EndpointError,
@@ -25,7 +24,7 @@ from gcd_node.sources.live import Opener, SourceWatch
 from gcd_node.status import NodeServices, metadata
 from gcd_node.stream_context import ActiveSource, StreamContext
 from gcd_node.views import InputPreview, VirtualViews
-from gcd_node.window import Reason, WindowBuilder
+from gcd_node.window import Reason, WindowBuilder, WindowSlot, read
 
 _STOP_DELAY_MS = 100
 

@@ -92,19 +92,9 @@ def to_clip_tensor(images: Image) -> NDArray[np.float32]:
     count, height, width, _ = images.shape
     clip = np.empty((count, 3, height, width), np.float32)
     for image, planes in zip(images, clip, strict=True):
-        write_planes(image, planes)
+        for levels, plane in zip(cv2.split(image), planes, strict=True):
+            cv2.LUT(levels, _LEVELS, plane)
     return clip
-
-
-def to_image(planes: NDArray[np.float32]) -> Image:
-    """Inverse of write_planes(): float32 [3, H, W] in [-1, 1] -> u8 [H, W, 3], at the nearest level."""
-    return np.rint((planes.transpose(1, 2, 0) + 1.0) * 127.5).clip(0, 255).astype(np.uint8)
-
-
-def write_planes(image: Image, planes: NDArray[np.float32]) -> None:
-    """One picture, u8 [H, W, 3] in 0..255, into float32 [3, H, W] in [-1, 1], contiguous."""
-    for levels, plane in zip(cv2.split(image), planes, strict=True):
-        cv2.LUT(levels, _LEVELS, plane)
 
 
 _WIDEST_DEG, _NARROWEST_DEG = 120.0, 1.0

@@ -2,6 +2,7 @@
 
 import logging
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +15,7 @@ from gcd_node.errors import ConfigError
 from gcd_node.frame import SourceInfo
 from gcd_node.preprocess import Fit, Rectifier, assumed_hfov_deg, require_usable, stated_mount, widest_camera
 from gcd_node.sources.depth import DepthSource, OnnxDepth
-from gcd_node.window import RATE_TOLERANCE, choose_fps
+from gcd_node.window import RATE_TOLERANCE
 
 _LOG = logging.getLogger(__name__)
 _HFOV_TOLERANCE_DEG = 2.0
@@ -115,6 +116,15 @@ class ActiveSource:
         now = self.context
         context = prepare_stream(config, now.traits, info, boot_id=now.boot_id, before=now)
         self._contexts = [*self._contexts[1 - _KEPT_EPOCHS :], (epoch, context)]
+
+
+def choose_fps(source_fps: float, trained: Sequence[float]) -> tuple[float, bool]:
+    """The highest trained rate the source can give, False; without one, the source's own rate, True: it lies outside
+    what the network was trained with. trained: empty if any will do. Source: wire protocol, section 7, F8."""
+    if not trained:
+        return source_fps, False
+    reachable = [fps for fps in trained if fps <= source_fps * (1 + RATE_TOLERANCE)]
+    return (float(max(reachable)), False) if reachable else (source_fps, True)
 
 
 def _window_fps(config: NodeConfig, traits: Traits, source: SourceInfo) -> tuple[float, bool]:
