@@ -64,7 +64,7 @@ class LiveCamera:
 
     info: SourceInfo
     skipped = 0
-    """Pictures replaced by newer ones before they were taken."""
+    """Pictures replaced by newer ones before they were taken, since the first one was: nobody misses those before."""
 
     def __init__(
         self,
@@ -89,7 +89,7 @@ class LiveCamera:
         self._driver: Driver | None = None
         self._changed = threading.Condition()
         self._waiting: deque[Frame] = deque(maxlen=_WAITING)
-        self._over = self._closed = False
+        self._over = self._closed = self._is_read = False
         self._error: Exception | None = None
         self._described: SourceInfo | None = None
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -112,6 +112,7 @@ class LiveCamera:
         Raises: SourceLostError, every time: it is gone, and the last picture was taken.
         """
         with self._changed:
+            self._is_read = True
             self._changed.wait_for(lambda: self._waiting or self._over or self._closed, timeout_s)
             if self._closed or not (self._waiting or self._over):
                 return None
@@ -168,7 +169,7 @@ class LiveCamera:
         self._described = driver.describe(frame, fps)
         while frame is not None:
             with self._changed:
-                self.skipped += len(self._waiting) == _WAITING
+                self.skipped += self._is_read and len(self._waiting) == _WAITING
                 self._waiting.append(frame)
                 self._changed.notify_all()
             frame = self._next(driver)

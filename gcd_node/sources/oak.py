@@ -5,7 +5,6 @@ silence: the device's state explains it. A pipeline that is dropped before its t
 interpreter: the thread that stops a pipeline holds it until then.
 """
 
-import ipaddress
 import logging
 import os
 import threading
@@ -201,7 +200,7 @@ def camera_pipeline(config: OakSource) -> OakStream:
     here, by the lens that the device knows, with the user's calibration before the factory's.
 
     Raises:
-        SourceAbsentError: see find_device(); or there is no such socket.
+        SourceAbsentError: there is no such camera, or several.
     """
     import depthai as dai
 
@@ -242,63 +241,26 @@ def _set_up(control: "dai.CameraControl", config: OakSource) -> None:
 
 
 def _open_device(wanted: str | None) -> "dai.Device":
-    import depthai as dai
+    """The one camera that is meant: by id, name or address; without one, the only one there is.
 
-    found = find_device(wanted, dai.Device.getAllAvailableDevices, dai.Device.getAllConnectedDevices)
-    if found is not None:
-        return dai.Device(found)
-    try:
-        return dai.Device(dai.DeviceInfo(wanted or ""))
-    except RuntimeError as error:
-        raise SourceAbsentError(
-            f"no OAK camera answers at {wanted} ({error}); check the address and that this machine reaches it"
-        ) from error
-
-
-def find_device(
-    wanted: str | None,
-    available: "Callable[[], Sequence[dai.DeviceInfo]]",
-    connected: "Callable[[], Sequence[dai.DeviceInfo]]",
-) -> "dai.DeviceInfo | None":
-    """The one camera that is meant.
-
-    Args:
-        wanted: id, name or address; None if there is just one.
-        available: lists the devices that can be opened. connected: lists those in use too; asked for messages only.
-    Returns:
-        None for an address that the search, which ends at routers, has not found: try it.
     Raises:
         SourceAbsentError: none, or several; the message lists what there is.
     """
-    free = available()
-    matching = [each for each in free if wanted is None or wanted in (each.deviceId, each.name)]
-    if len(matching) == 1:
-        return matching[0]
-    if len(matching) > 1:
-        raise SourceAbsentError(
-            f"wanted one OAK camera, found {', '.join(map(_named, free))}; say which with device in [source]"
-        )
-    if wanted is not None and _is_address(wanted):
-        return None
-    ids = {each.deviceId for each in free}
-    busy = [f"{_named(each)} in use by another process" for each in connected() if each.deviceId not in ids]
-    there = ", ".join([*map(_named, free), *busy]) or "none"
+    import depthai as dai
+
+    free = dai.Device.getAllAvailableDevices()
+    reason = "there must be one"
+    if wanted is not None or len(free) == 1:
+        try:
+            return dai.Device(free[0] if wanted is None else dai.DeviceInfo(wanted))
+        except RuntimeError as error:
+            reason = str(error)
+    ids = {each.deviceId: each.name for each in [*dai.Device.getAllConnectedDevices(), *free]}
+    found = ", ".join(f"{number} (at {name})" for number, name in ids.items()) or "none"
     raise SourceAbsentError(
-        f"wanted {'an OAK camera' if wanted is None else f'OAK {wanted}'}, found {there}; "
-        "plug it in, or correct device in [source]; on Linux its udev rule must be there too"
+        f"OAK {wanted or 'camera'} cannot be opened: {reason}; found {found}, in use or not; plug it in, or name one "
+        "as device in [source]; on Linux its udev rule must be there too"
     )
-
-
-def _named(device: "dai.DeviceInfo") -> str:
-    return f"{device.deviceId} (at {device.name})"
-
-
-def _is_address(text: str) -> bool:
-    try:
-        ipaddress.IPv4Address(text)
-    except ValueError:
-        return False
-    return True
 
 
 def lens_in_memory(

@@ -8,16 +8,15 @@ import contextlib
 import logging
 import math
 import os
-import re
 import socket
 import stat
 import threading
 import time
 from collections.abc import Callable, Generator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -162,10 +161,12 @@ def open_v4l2(config: V4l2Source, open_capture: OpenCapture = cv2.VideoCapture) 
     if not os.access(path, os.R_OK | os.W_OK):
         raise SourceError(f"{path} may not be used by this user; add the user to the group `video` and log in again")
 
-    def open_driver() -> _V4l2Driver:
-        return _V4l2Driver(path, config, open_capture)
-
-    return LiveCamera(f"the camera {path}", open_driver, open_timeout_s=config.open_timeout_s, hint=_DEVICE_HINT)
+    return LiveCamera(
+        f"the camera {path}",
+        lambda: _V4l2Driver(path, config, open_capture),
+        open_timeout_s=config.open_timeout_s,
+        hint=_DEVICE_HINT,
+    )
 
 
 def list_v4l2() -> list[str]:
@@ -232,8 +233,7 @@ class _V4l2Driver(_OpenCvDriver):
 # Network streams.
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class StreamAddress:
+class StreamAddress(NamedTuple):
     """Where a stream is, without user, password, path and query: any of them may hold a secret.
 
     host: empty for a udp stream that is sent to this machine. port: None if there is neither a stated nor a usual one.
@@ -258,21 +258,17 @@ def parse_address(url: str) -> StreamAddress:
     Raises:
         ConfigError: no URL of a stream. The message does not repeat it.
     """
-    scheme, separator, rest = url.partition("://")
-    scheme = scheme.lower()
-    if not separator or scheme not in _DEFAULT_PORTS:
-        raise ConfigError(f"the url of a stream begins with one of {', '.join(f'{s}://' for s in _DEFAULT_PORTS)}")
-    authority, *tail = re.split(r"(?=[/?#])", rest, maxsplit=1)
-    found = re.fullmatch(r"(?:[^@]*@)?(?P<host>\[[0-9A-Fa-f:.%]+\]|[^\s:@\[\]]*)(?::(?P<port>\d{1,5}))?", authority)
-    if found is None or "@" in "".join(tail) or re.search(r"\s", url):
-        raise ConfigError(
-            f"the {scheme} url is not {scheme}://user:password@host:port/path; in a user name or password write @ as "
-            "%40, / as %2F and : as %3A"
-        )
-    if not found["host"] and scheme != "udp":
-        raise ConfigError(f"the {scheme} url names no host; write {scheme}://host/path")
-    port = int(found["port"]) if found["port"] else _DEFAULT_PORTS[scheme]
-    return StreamAddress(scheme=scheme, host=found["host"], port=port)
+    with contextlib.suppress(ValueError):  # of a port, or of brackets
+        parts = urlsplit(url)
+        host, port = parts.hostname or "", parts.port
+        is_plain = parts.netloc.count("@") < 2 and "@" not in f"{parts.path}{parts.query}{parts.fragment}"
+        if parts.scheme in _DEFAULT_PORTS and (host or parts.scheme == "udp") and is_plain and len(url.split()) == 1:
+            host = f"[{host}]" if ":" in host else host
+            return StreamAddress(parts.scheme, host, port or _DEFAULT_PORTS[parts.scheme])
+    raise ConfigError(
+        f"the url of a stream is scheme://user:password@host:port/path with one of {', '.join(_DEFAULT_PORTS)}; in a "
+        "user name or password write @ as %40, / as %2F and : as %3A"
+    )
 
 
 def open_stream(

@@ -16,7 +16,7 @@ from gcd_node.calibration import LensModel
 from gcd_node.config import parse_config
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError
 from gcd_node.source_config import OakSource
-from gcd_node.sources.oak import camera_pipeline, find_device, lens_in_memory, open_oak, open_pipeline
+from gcd_node.sources.oak import camera_pipeline, lens_in_memory, open_oak, open_pipeline
 
 try:
     import oak_pipelines as pipelines
@@ -41,30 +41,16 @@ def device(serial: str, name: str = "1.2") -> dai.DeviceInfo:
 ONE, TWO = device("18443010A1B2C3D4E5", "1.2"), device("19443010AABBCCDDEE", "192.168.1.20")
 
 
-@pytest.mark.parametrize(
-    ("wanted", "found"),
-    [(None, [ONE]), (ONE.deviceId, [ONE, TWO]), (ONE.name, [TWO, ONE])],
-    ids=["the only one", "by id", "by port"],
-)
-def test_the_device_that_is_meant_is_taken(wanted: str | None, found: list[dai.DeviceInfo]) -> None:
-    chosen = find_device(wanted, lambda: found, lambda: found)
-    assert chosen is not None
-    assert chosen.deviceId == ONE.deviceId
-
-
-def test_an_address_that_the_search_did_not_find_is_to_be_tried() -> None:
-    assert find_device("10.1.2.3", lambda: [ONE], lambda: [ONE]) is None
-
-
-@pytest.mark.parametrize(
-    ("wanted", "available", "connected"), [(None, [], [ONE]), (None, [ONE, TWO], [ONE, TWO]), ("14442C", [ONE], [ONE])]
-)
-def test_a_device_that_cannot_be_told_is_absent_and_the_others_are_listed(
-    wanted: str | None, available: list[dai.DeviceInfo], connected: list[dai.DeviceInfo]
+@pytest.mark.parametrize("found", [[], [ONE, TWO]], ids=["none", "several"])
+def test_without_a_name_there_must_be_one_device_and_all_are_listed(
+    found: list[dai.DeviceInfo], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    devices = create_autospec(dai.Device)
+    devices.getAllAvailableDevices.return_value, devices.getAllConnectedDevices.return_value = found, [ONE, TWO]
+    monkeypatch.setattr(dai, "Device", devices)
     with pytest.raises(SourceAbsentError) as caught:
-        find_device(wanted, lambda: available, lambda: connected)
-    assert all(each.deviceId in str(caught.value) for each in connected)
+        camera_pipeline(OakSource())
+    assert all(each.deviceId in str(caught.value) for each in (ONE, TWO))
 
 
 @pytest.fixture

@@ -251,6 +251,18 @@ def test_a_slow_reader_gets_the_newest_frames_and_the_rest_is_counted() -> None:
     assert watch.skipped + len(seqs) == fake.grabbed + 1
 
 
+def test_pictures_that_wait_before_anybody_reads_are_not_skipped() -> None:
+    fake = FakeVideoCapture(flat(9, 9, 9), fps=200.0)
+    camera = open_v4l2(V4l2Source(device="/dev/null"), fake.open)
+    until(lambda: fake.grabbed > 20)
+    frames = camera.frames()
+    assert next(frames).seq > 10
+    assert camera.skipped <= fake.grabbed - 16  # what came while it was read
+    fake.awake.clear()
+    camera.close()
+    fake.awake.set()
+
+
 def test_damaged_frames_are_counted_over_all_openings() -> None:
     camera, second = Camera(), Camera()
     camera.corrupt, second.corrupt = 3, 4
