@@ -9,7 +9,7 @@ import msgspec
 from msgspec import Meta
 
 from gcd_node.errors import ConfigError
-from gcd_node.source_config import Count, Positive, Rate, SourceConfig, prepare_source
+from gcd_node.sources import Count, Positive, Rate, SourceConfig, prepare_source
 
 NotNegative: TypeAlias = Annotated[float, Meta(ge=0)]
 _LEAST_ROTATE_MB, _LEAST_ROTATE_S = 0.1, 1.0

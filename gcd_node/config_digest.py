@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from gcd_model import ASSUMED_SOURCE, CameraMount, ModelConfig, Traits
 from gcd_node.config import ModelSection, NodeConfig
 from gcd_node.model import sampler_in_use
-from gcd_node.source_config import SourcePose
+from gcd_node.sources import SourcePose
 
 
 def config_digest(config: NodeConfig, traits: Traits) -> str:

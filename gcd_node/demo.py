@@ -26,7 +26,7 @@ from gcd_node.node import NodeOptions
 from gcd_node.pipeline import Summary
 from gcd_node.publisher import Publisher
 from gcd_node.session import open_session, run_until_signal
-from gcd_node.source_config import FileSource, SourcePose
+from gcd_node.sources import FileSource, SourcePose
 from gcd_node.sources.files import read_picture
 
 VIEW_ID = "topdown"

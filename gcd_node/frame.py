@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from gcd_node.calibration import LensModel
 from gcd_node.errors import SourceError
-from gcd_node.source_config import LIVE_KINDS, SourceKind
+from gcd_node.sources import LIVE_KINDS, SourceKind
 
 Image: TypeAlias = NDArray[np.uint8]
 """u8 [H, W, 3], RGB."""

@@ -12,7 +12,6 @@ import torch
 from gcd_model import Cancelled, DeviceMemoryError, NonFiniteError, PoseError, RenderOptions, View
 from gcd_node.encoded_frames import EncodedFrames, EncodeTerms, window_seed
 from gcd_node.errors import DepthError
-from gcd_node.fallback import FULL, Condition, FailureCounter, OomLevel, oom_levels
 from gcd_node.health import IDLE, Level
 from gcd_node.messages import Rendered, messages, newest_ns, utc_offset_ns, world_flags
 from gcd_node.model import (
@@ -24,7 +23,7 @@ from gcd_node.model import (
     render_grey,
     sampler_in_use,
 )
-from gcd_node.status import NodeServices
+from gcd_node.status import FULL, Condition, FailureCounter, NodeServices, OomLevel, oom_levels
 from gcd_node.stream_context import StreamContext
 from gcd_node.views import EndOfStream, Settings, VirtualView, VirtualViews
 from gcd_node.window import FrameWindow, PartialWindow, WindowSlot

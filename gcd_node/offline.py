@@ -35,7 +35,7 @@ from gcd_node.image_io import (
     write_video,
 )
 from gcd_node.preprocess import Fit, assumed_hfov_deg, stated_mount, stated_sphere, to_clip_tensor
-from gcd_node.source_config import SourcePose
+from gcd_node.sources import SourcePose
 from gcd_node.sources.depth import DepthPicture, OnnxDepth, StereoDepth, clean_depth
 from gcd_node.sources.files import PICTURES, ImageFolder, VideoFile, list_pictures, read_depth, read_picture
 

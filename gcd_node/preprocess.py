@@ -23,7 +23,7 @@ from gcd_model import (
 from gcd_node.calibration import HALF_PIXEL, LensModel
 from gcd_node.errors import ConfigError
 from gcd_node.frame import Image
-from gcd_node.source_config import SourcePose
+from gcd_node.sources import SourcePose
 
 Resize: TypeAlias = Literal["released", "area"]
 """released: bilinear, as in training; it aliases when it shrinks a lot. area: averages, and does not."""

@@ -27,8 +27,7 @@ from gcd_node.pipeline import Summary
 from gcd_node.publisher import Publisher
 from gcd_node.service import listen
 from gcd_node.sockets import PublisherOptions
-from gcd_node.source_config import LIVE_KINDS
-from gcd_node.sources import open_source
+from gcd_node.sources import LIVE_KINDS, open_source
 from gcd_node.transitions import Parts
 
 _LOG = logging.getLogger(__name__)

@@ -15,7 +15,7 @@ from gcd_node.inference import WindowReport
 from gcd_node.model import LoadModel, ModelSlot
 from gcd_node.pipeline import Stream, Summary
 from gcd_node.recorder import Recorder
-from gcd_node.source_config import LIVE_KINDS, OakSource, SourceConfig
+from gcd_node.sources import LIVE_KINDS, OakSource, SourceConfig
 from gcd_node.status import NodeServices
 from gcd_node.stream_context import StreamContext, prepare_stream
 from gcd_node.views import VirtualViews

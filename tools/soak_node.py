@@ -21,7 +21,7 @@ from gcd_node.inference import WindowReport
 from gcd_node.node import Node, NodeOptions
 from gcd_node.publisher import Publisher
 from gcd_node.session import publisher_options
-from gcd_node.source_config import V4l2Source
+from gcd_node.sources import V4l2Source
 from gcd_node.sources.live import LiveCamera
 from gcd_node.transitions import Parts
 

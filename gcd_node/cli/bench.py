@@ -29,7 +29,7 @@ from gcd_node.cli.run import Changes
 from gcd_node.config import ControlConfig, NodeConfig, ViewerConfig, load_config, parse_config
 from gcd_node.config_dump import to_toml
 from gcd_node.errors import NodeError, OutputError, UsageError
-from gcd_node.source_config import LIVE_KINDS, FileSource, FolderSource, McapSource, SyntheticSource
+from gcd_node.sources import LIVE_KINDS, FileSource, FolderSource, McapSource, SyntheticSource
 
 _RATES_HZ = (5.0, 10.0, 15.0)
 _FIRST_VIEW_S, _IDLE_S, _END_S, _POLL_S = 180.0, 2.0, 20.0, 0.05

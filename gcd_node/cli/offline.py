@@ -32,7 +32,7 @@ from gcd_node.image_io import write_npz
 from gcd_node.messages import ontology
 from gcd_node.offline import ClipRequest, plan, read_clip, read_noise, write_view
 from gcd_node.preprocess import require_usable
-from gcd_node.source_config import SourcePose
+from gcd_node.sources import SourcePose
 
 _view = partial(Option, rich_help_panel="The view")
 _clip = partial(Option, rich_help_panel="The clip")

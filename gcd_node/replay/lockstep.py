@@ -45,8 +45,7 @@ from gcd_node.replay.run import (
     read_windows,
 )
 from gcd_node.session import load_model, model_threads
-from gcd_node.source_config import LiveSource, SourceConfig, SyntheticSource
-from gcd_node.sources import open_source, resolve_path
+from gcd_node.sources import LiveSource, SourceConfig, SyntheticSource, open_source, resolve_path
 from gcd_node.transitions import Parts
 
 PARTS = Parts(open_source=open_source, load_model=load_model)

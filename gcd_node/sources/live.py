@@ -20,7 +20,7 @@ from typing import Protocol, TypeAlias
 from gcd_node.errors import SourceAbsentError, SourceError, SourceLostError
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.health import SourceState
-from gcd_node.source_config import LiveSource, SourceConfig, SourceKind
+from gcd_node.sources import LiveSource, SourceConfig, SourceKind
 from gcd_node.window import Reason
 
 _LOG = logging.getLogger(__name__)

@@ -290,9 +290,7 @@ class _Survey:
             raise TooShortError(f"TOO_SHORT n={len(stamps)}: pictures on {self.topic} of {self._path} make no video")
         fps = 1e9 / median(steps)
         if not _LOWEST_FPS <= fps <= MAX_FPS:
-            raise SourceError(
-                f"pictures on {self.topic} of {self._path} come {fps:g} times a second: is its clock right?"
-            )
+            raise SourceError(f"pictures on {self.topic} of {self._path} come {fps:g} times a second by their stamps")
         info = SourceInfo(
             kind="mcap",
             id=self._path.name,

@@ -19,7 +19,7 @@ import numpy as np
 from gcd_node.calibration import LensModel, depthai_lens
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError, SourceLostError
 from gcd_node.frame import Frame, Image, SourceInfo
-from gcd_node.source_config import OakSource
+from gcd_node.sources import OakSource
 from gcd_node.sources.live import LiveCamera
 
 if TYPE_CHECKING:
@@ -255,11 +255,13 @@ def _open_device(wanted: str | None) -> "dai.Device":
             return dai.Device(free[0] if wanted is None else dai.DeviceInfo(wanted))
         except RuntimeError as error:
             reason = str(error)
-    ids = {each.deviceId: each.name for each in [*dai.Device.getAllConnectedDevices(), *free]}
-    found = ", ".join(f"{number} (at {name})" for number, name in ids.items()) or "none"
+    ids = {each.deviceId for each in free}
+    busy = [each for each in dai.Device.getAllConnectedDevices() if each.deviceId not in ids]
+    there = [f"{each.deviceId} (at {each.name})" for each in free]
+    there += [f"{each.deviceId} (at {each.name}) in use by another process" for each in busy]
     raise SourceAbsentError(
-        f"OAK {wanted or 'camera'} cannot be opened: {reason}; found {found}, in use or not; plug it in, or name one "
-        "as device in [source]; on Linux its udev rule must be there too"
+        f"OAK {wanted or 'camera'} cannot be opened, {reason}; found {', '.join(there) or 'none'}; "
+        "plug it in, or correct device in [source]; on Linux its udev rule must be there too"
     )
 
 

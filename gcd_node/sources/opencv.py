@@ -24,7 +24,7 @@ from cv2.utils import logging as cv2_logging
 
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError, SourceLostError
 from gcd_node.frame import MAX_PIXELS, Frame, Image, SourceInfo
-from gcd_node.source_config import RtspSource, SourceKind, V4l2Source
+from gcd_node.sources import RtspSource, SourceKind, V4l2Source
 from gcd_node.sources.live import LiveCamera, sane_fps
 
 _LOG = logging.getLogger(__name__)

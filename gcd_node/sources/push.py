@@ -14,7 +14,7 @@ from gcd_client.protocol import MAX_HEADER, MAX_PAYLOAD, PREFIX, ClientError, Me
 from gcd_node.auth import Context, EventSink, ServerSecurity, SocketGuard, own_endpoint, unbind
 from gcd_node.errors import DepthError, SourceError, SourceLostError
 from gcd_node.frame import Frame, SourceInfo
-from gcd_node.source_config import PushSource
+from gcd_node.sources import PushSource
 from gcd_node.sources.depth import clean_depth
 from gcd_node.sources.live import LiveCamera
 

@@ -25,7 +25,7 @@ from gcd_node.pipeline import Summary
 from gcd_node.publisher import Publisher
 from gcd_node.service import ServiceManager
 from gcd_node.session import publisher_options
-from gcd_node.source_config import SourceConfig
+from gcd_node.sources import SourceConfig
 from gcd_node.transitions import Parts
 
 CAMERA = 'kind = "v4l2"'

@@ -14,7 +14,7 @@ from rig import Rig, Seen
 from gcd_client.control import Code
 from gcd_node.errors import SourceAbsentError, SourceLostError
 from gcd_node.frame import SourceInfo
-from gcd_node.source_config import OakSource, SourceConfig, V4l2Source
+from gcd_node.sources import OakSource, SourceConfig, V4l2Source
 
 CALIBRATION = """
 image_width: 384

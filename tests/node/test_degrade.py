@@ -10,11 +10,10 @@ from rig import Rig
 
 from gcd_model import PLAIN_SMALL, DeviceMemoryError
 from gcd_node.errors import ModelFailedError
-from gcd_node.fallback import FULL, FailureCounter, oom_levels
 from gcd_node.health import Health
 from gcd_node.model import IdleTimer
 from gcd_node.service import ClockWatch
-from gcd_node.status import Announcer
+from gcd_node.status import FULL, Announcer, FailureCounter, oom_levels
 
 
 class Hand:

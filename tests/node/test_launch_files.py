@@ -22,7 +22,7 @@ from gcd_node.check import check_launch
 from gcd_node.cli.main import COMMANDS, new_app
 from gcd_node.config import NodeConfig, load_config
 from gcd_node.errors import ConfigError, SourceError, TooShortError, UsageError
-from gcd_node.source_config import RecordedSource, SyntheticSource
+from gcd_node.sources import RecordedSource, SyntheticSource
 
 ROOT = Path(__file__).parents[2]
 LAUNCH = ROOT / "launch"

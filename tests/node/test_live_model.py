@@ -15,7 +15,7 @@ from gcd_node.errors import ConfigError
 from gcd_node.frame import SourceInfo
 from gcd_node.preprocess import assumed_hfov_deg, stated_mount
 from gcd_node.replay.run import open_run
-from gcd_node.source_config import SourcePose
+from gcd_node.sources import SourcePose
 from gcd_node.stream_context import prepare_stream
 from gcd_node.verbs import SetView
 from gcd_node.views import VirtualView

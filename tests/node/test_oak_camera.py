@@ -14,7 +14,7 @@ from media import HEIGHT, WIDTH, flat
 
 from gcd_node.errors import SourceAbsentError, SourceError, SourceLostError
 from gcd_node.frame import Frame, SourceInfo
-from gcd_node.source_config import OakSource
+from gcd_node.sources import OakSource
 from gcd_node.sources.live import LiveCamera, SourceWatch
 from gcd_node.sources.oak import camera_pipeline, open_oak, open_pipeline
 

@@ -15,7 +15,7 @@ from media import HEIGHT, WIDTH
 from gcd_node.calibration import LensModel
 from gcd_node.config import parse_config
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError
-from gcd_node.source_config import OakSource
+from gcd_node.sources import OakSource
 from gcd_node.sources.oak import camera_pipeline, lens_in_memory, open_oak, open_pipeline
 
 try:

@@ -12,8 +12,7 @@ from fake_camera import FakeVideoCapture
 from media import flat
 
 from gcd_node.errors import SourceAbsentError, SourceError, SourceLostError
-from gcd_node.source_config import V4l2Source
-from gcd_node.sources import open_source, opencv
+from gcd_node.sources import V4l2Source, open_source, opencv
 from gcd_node.sources.live import LiveCamera
 from gcd_node.sources.opencv import list_v4l2, open_v4l2, quiet_opencv
 

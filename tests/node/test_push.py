@@ -21,7 +21,7 @@ from gcd_client.frames import encode_frame
 from gcd_node.auth import Client, ServerSecurity, new_key_pair
 from gcd_node.errors import ConfigError, EndpointError, SourceLostError
 from gcd_node.frame import Frame
-from gcd_node.source_config import PushSource
+from gcd_node.sources import PushSource
 from gcd_node.sources.live import LiveCamera
 from gcd_node.sources.push import open_push
 

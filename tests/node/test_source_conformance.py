@@ -24,7 +24,7 @@ from rtsp_server import serving, write_transport_stream
 from gcd_client import FramePusher
 from gcd_node.errors import SourceAbsentError, SourceError
 from gcd_node.frame import Frame, FrameSource, Image
-from gcd_node.source_config import (
+from gcd_node.sources import (
     LIVE_KINDS,
     FileSource,
     FolderSource,
@@ -36,8 +36,8 @@ from gcd_node.source_config import (
     SourceKind,
     SyntheticSource,
     V4l2Source,
+    open_source,
 )
-from gcd_node.sources import open_source
 from gcd_node.sources.files import MovingPattern
 from gcd_node.sources.opencv import open_v4l2
 

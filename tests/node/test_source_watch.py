@@ -15,7 +15,7 @@ from media import flat
 from gcd_node.errors import ConfigError, SourceError, SourceLostError
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.health import SourceState
-from gcd_node.source_config import V4l2Source
+from gcd_node.sources import V4l2Source
 from gcd_node.sources.live import SourceWatch, backoff_s, patience_s
 from gcd_node.sources.opencv import open_v4l2
 from gcd_node.window import Reason

@@ -17,8 +17,7 @@ from media import HEIGHT, WIDTH, flat
 from rtsp_server import RtspServer, serving, split_pictures, write_transport_stream
 
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError, SourceLostError
-from gcd_node.source_config import RtspSource
-from gcd_node.sources import open_source
+from gcd_node.sources import RtspSource, open_source
 from gcd_node.sources.opencv import Backlog, open_stream, parse_address
 
 RED = flat(250, 10, 20)
@@ -174,7 +173,7 @@ def test_a_password_opens_the_stream_and_a_wrong_one_is_never_repeated(recording
 
 def test_no_password_reaches_the_terminal(recording: Path) -> None:
     code = (
-        "import logging, sys; from gcd_node.source_config import RtspSource; from gcd_node.errors import SourceError\n"
+        "import logging, sys; from gcd_node.sources import RtspSource; from gcd_node.errors import SourceError\n"
         "from gcd_node.sources import open_source\n"
         "logging.basicConfig(level=logging.DEBUG)\n"
         "try: open_source(RtspSource(url=sys.argv[1], open_timeout_s=20))\n"
