@@ -87,13 +87,6 @@ def test_a_bad_file_is_refused_in_one_line(find: bytes, put: bytes, tmp_path: Pa
     assert "\n" not in str(caught.value)
 
 
-def test_missing_and_huge_files_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "huge.yaml").write_bytes(FILE + b"#" * 70_000)
-    for path in (tmp_path / "none.yaml", tmp_path / "huge.yaml", tmp_path):
-        with pytest.raises(ConfigError):
-            load_lens(path)
-
-
 def test_aliases_that_multiply_and_deep_nesting_end_in_an_error(tmp_path: Path) -> None:
     laughs = b"a: &a [x, x, x, x, x, x, x, x]\n"
     for here, there in zip("bcdefghijkl", "abcdefghijk", strict=True):
@@ -180,3 +173,10 @@ def test_resizing_moves_every_point_with_the_picture() -> None:
 def test_a_picture_of_another_shape_is_refused() -> None:
     with pytest.raises(ConfigError):
         LENS.resized(640, 360)
+
+
+def test_missing_and_huge_files_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "huge.yaml").write_bytes(FILE + b"#" * 70_000)
+    for path in (tmp_path / "none.yaml", tmp_path / "huge.yaml", tmp_path):
+        with pytest.raises(ConfigError):
+            load_lens(path)

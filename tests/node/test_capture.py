@@ -8,7 +8,7 @@ import pytest
 from cameras import until
 from media import frames_at
 
-from gcd_node.errors import ReaderError, SourceError, TooShortError
+from gcd_node.errors import ReaderError, TooShortError
 from gcd_node.frame import Frame, SourceInfo
 from gcd_node.window import FrameWindow, PartialWindow, WindowBuilder, WindowSlot, read
 
@@ -131,15 +131,6 @@ def test_who_waits_works_meanwhile_until_nothing_is_left_to_do_and_again_when_mo
     assert got == [7]
 
 
-def test_an_item_is_taken_before_anything_else_is_done() -> None:
-    slot, done = WindowSlot(), []
-    slot.put(7)
-    assert slot.take(lambda: bool(done.append(1))) == 7
-    slot.finish()
-    assert slot.take(lambda: bool(done.append(1))) is None
-    assert done == []
-
-
 # --- the reader --------------------------------------------------------------------------------------------------
 
 
@@ -156,16 +147,6 @@ def test_the_last_window_is_not_forgotten_at_the_end() -> None:
     slot = WindowSlot()
     read(ScriptedSource(frames_at([0, 100, 200, 270])), WindowBuilder(frames=4, fps=10.0), slot)
     assert len(taken(slot)) == 1
-
-
-def test_a_lost_source_is_reported_after_its_last_window() -> None:
-    slot = WindowSlot(lossless=True)
-    source = ScriptedSource(ten_fps(6), failure=SourceError("camera unplugged"))
-    reader = started(lambda: read(source, builder(), slot))
-    assert slot.take() is not None
-    with pytest.raises(SourceError):
-        slot.take()
-    joined(reader)
 
 
 def test_a_fault_in_the_source_is_not_swallowed() -> None:

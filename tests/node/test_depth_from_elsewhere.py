@@ -66,16 +66,6 @@ def test_depth_takes_the_way_of_its_pictures_from_a_file_as_from_a_folder(video:
         assert np.allclose(clip.depth.numpy(), wanted, atol=6e-4)
 
 
-def test_what_is_no_distance_in_a_recording_is_a_hole(video: Path, tmp_path: Path) -> None:
-    depth = numbered_depth()
-    depth[:, :8] = np.array([np.nan, np.inf, -np.inf, -3.0] * 2)[:, None]
-    np.save(tmp_path / "d.npy", depth)
-    clip = read(video, depth=tmp_path / "d.npy").clip
-    assert clip.depth is not None
-    assert not clip.depth[:, :8].any()
-    assert (clip.depth[:, 8:] > 0).all()
-
-
 @pytest.mark.parametrize(
     ("depth", "error"),
     [
@@ -92,16 +82,6 @@ def test_depth_that_does_not_belong_to_the_pictures_is_refused(
     np.save(tmp_path / "d.npy", depth)
     with pytest.raises(error):
         read(video, depth=tmp_path / "d.npy")
-
-
-def test_pictures_of_eight_bits_and_files_that_are_missing_are_refused(video: Path, tmp_path: Path) -> None:
-    (tmp_path / "p").mkdir()
-    for i in range(FRAMES):
-        cv2.imwrite(str(tmp_path / "p" / f"{i}.png"), np.ones((HEIGHT, 2 * WIDTH), np.uint8))
-    cv2.imwrite(str(tmp_path / "one.png"), np.full((HEIGHT, 2 * WIDTH), 2000, np.uint16))  # of a whole video
-    for path in (tmp_path / "p", tmp_path / "missing.npy", tmp_path / "missing.png", tmp_path / "one.png"):
-        with pytest.raises(SourceError):
-            read(video, depth=path)
 
 
 # --- stereo pairs ----------------------------------------------------------------------------------------------------
@@ -335,12 +315,6 @@ def test_a_node_refuses_depth_that_it_cannot_use(tmp_path: Path, made: Traits, p
     (tmp_path / "junk.onnx").write_bytes(b"junk")
     with pytest.raises(ConfigError):
         run(FakeSynthesizer(made), f'depth_model = "{tmp_path / path}"\ndepth_kind = "{kind}"')
-
-
-def test_the_kinds_of_a_live_view_are_announced_before_the_first_window() -> None:
-    for made, kinds in ((LIVE, ["win", "frm", "cls", "vis", "depth", "std"]), (traits(), ["win", "frm"])):
-        box = run(FakeSynthesizer(made), "")  # its views hold nothing of them
-        assert next(fields for topic, fields in box.notes if topic == "meta")["kinds"] == kinds
 
 
 # --- a source unlike the training ------------------------------------------------------------------------------------

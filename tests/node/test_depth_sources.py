@@ -223,16 +223,6 @@ def test_an_unrectified_pair_gives_its_depth_through_its_calibration(
     assert np.mean(errors < 1.0) > 0.95
 
 
-def test_pairs_rectified_by_the_device_are_taken(tmp_path: Path) -> None:
-    path = written(tmp_path / "calib.json", board())
-    stereo = StereoDepth.from_depthai(path, size=SIZE, rectified=True)
-    ideal = LensModel(width=640, height=400, fx=409.0, fy=408.0, cx=327.0, cy=197.0)
-    left, right = (taken_by(ideal, moved(x)) for x in (0.0, stereo.baseline_m))
-    picture, depth = stereo(left, right)
-    assert picture.shape == (192, 320, 3)
-    assert np.median(step_errors(stereo, depth, truth(stereo.lens, np.eye(4)))) < 0.25
-
-
 def change(content: Any, *keys: Any, to: Any) -> Any:
     inner = content
     for key in keys[:-1]:

@@ -29,13 +29,6 @@ def camera(fake: FakeVideoCapture, open_timeout_s: float = GUARD_S, **asked: flo
 # --- a device of this machine ------------------------------------------------------------------------------------
 
 
-def test_a_device_is_opened_by_its_path_and_nothing_is_set_that_was_not_asked_for() -> None:
-    fake = FakeVideoCapture(RED)
-    camera(fake).close()
-    assert fake.opened_with == ("/dev/null", cv2.CAP_V4L2)
-    assert fake.calls == []
-
-
 def test_the_pixel_format_is_set_before_the_size_and_what_differs_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     fake = FakeVideoCapture(RED, fixed={cv2.CAP_PROP_FRAME_WIDTH: 640.0})
     with caplog.at_level(logging.WARNING):
@@ -96,17 +89,6 @@ def test_an_unplugged_camera_is_lost_every_time_it_is_asked() -> None:
         with pytest.raises(SourceLostError):
             list(source.frames())
     assert fake.released.wait(GUARD_S)
-
-
-def test_a_driver_that_raises_is_a_lost_camera_and_no_fault_of_the_node() -> None:
-    fake = FakeVideoCapture(RED)
-    source = camera(fake)
-    fake.breaks = True
-    with pytest.raises(SourceLostError):
-        list(source.frames())
-    assert fake.released.wait(GUARD_S)
-    with pytest.raises(SourceAbsentError):
-        camera(fake)
 
 
 def test_a_read_that_never_returns_is_left_behind(caplog: pytest.LogCaptureFixture) -> None:
@@ -173,3 +155,14 @@ def test_overlapping_silences_end_with_the_last_one() -> None:
     assert cv2.utils.logging.getLogLevel() == cv2.utils.logging.LOG_LEVEL_SILENT
     two.__exit__(None, None, None)
     assert cv2.utils.logging.getLogLevel() == level
+
+
+def test_a_driver_that_raises_is_a_lost_camera_and_no_fault_of_the_node() -> None:
+    fake = FakeVideoCapture(RED)
+    source = camera(fake)
+    fake.breaks = True
+    with pytest.raises(SourceLostError):
+        list(source.frames())
+    assert fake.released.wait(GUARD_S)
+    with pytest.raises(SourceAbsentError):
+        camera(fake)

@@ -210,14 +210,6 @@ def test_pictures_of_another_size_of_the_same_shape_are_taken() -> None:
     assert psnr(small, large) > 30.0
 
 
-def test_too_coarse_a_picture_is_refused_unless_it_may_be_enlarged() -> None:
-    lens = BARREL.resized(320, 180)
-    with pytest.raises(ConfigError):
-        rectifier_of(lens, width=384, height=256, hfov_deg=53.13)
-    enlarging = rectifier_of(lens, width=384, height=256, hfov_deg=53.13, allow_upscale=True)
-    assert enlarging.image(photograph(lens)).shape == (256, 384, 3)
-
-
 # --- in a run ----------------------------------------------------------------------------------------------------
 
 CALIBRATION = """

@@ -297,18 +297,6 @@ def test_of_several_topics_one_must_be_named(tmp_path: Path) -> None:
         LogSource(path, topic="/words")
 
 
-def test_maps_of_depths_are_not_taken_for_pictures(tmp_path: Path) -> None:
-    with ros_log(tmp_path / "log.mcap") as log:
-        for i in range(3):
-            log.say("/depth/image_raw", IMAGE, depth(np.ones((HEIGHT, WIDTH), np.uint16), at(i)))
-            other = compressed(flat(9, 9, 9), at(i), "16UC1; compressedDepth png")
-            log.say("/depth/image_raw/compressedDepth", COMPRESSED, other)
-            log.say("/color/image", COMPRESSED, compressed(flat(*COLOUR), at(i)))
-    assert LogSource(tmp_path / "log.mcap").topic == "/color/image"
-    with pytest.raises(SourceError):
-        LogSource(tmp_path / "log.mcap", topic="/depth/image_raw")
-
-
 def test_pictures_that_begin_late_are_found_and_one_is_too_few(tmp_path: Path) -> None:
     for count, error in ((0, SourceError), (1, TooShortError), (3, None)):
         with ros_log(tmp_path / "log.mcap") as log:

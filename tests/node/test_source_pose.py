@@ -4,13 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fakes import WIDTH, Box, FakeSource, FakeSynthesizer, live_traits, made_node, traits
+from fakes import Box, FakeSource, FakeSynthesizer, live_traits, made_node, traits
 
 from gcd_model import CameraMount, Traits
 from gcd_node.config import NodeConfig, load_config, parse_config
 from gcd_node.config_digest import config_digest
 from gcd_node.errors import ConfigError
-from gcd_node.preprocess import in_words, require_usable, stated_mount, stated_sphere
+from gcd_node.preprocess import require_usable, stated_mount, stated_sphere
 from gcd_node.sources import SourcePose
 
 
@@ -57,20 +57,6 @@ def test_what_is_left_out_is_as_the_model_was_trained() -> None:
     assert stated_mount(SourcePose(height_m=2.0), 70.0, live_traits()) == CameraMount(height_m=2.0, hfov_deg=70.0)
     assert stated_mount(SourcePose(), None, live_traits()) is None
     assert stated_mount(SourcePose(height_m=2.0), 60.0, traits()) is None
-
-
-def test_nothing_stated_leaves_the_mount_to_the_model() -> None:
-    model, box = run(config(), live_traits())
-    assert model.clips[0].mount is None
-    assert box.of("win")[0].header.quality.ood == ()
-
-
-def test_the_mounts_field_of_view_is_that_of_the_cropped_picture() -> None:
-    wide = FakeSource(14, fps=10.0, size=(4 * WIDTH, 2 * WIDTH))  # 2:1, cropped to 3:2
-    model, _ = run(config("height_m = 2.0", source="hfov_deg = 90.0"), live_traits(), wide)
-    mount = model.clips[0].mount
-    assert mount is not None
-    assert mount.hfov_deg == pytest.approx(2 * np.degrees(np.arctan(0.75)))  # three quarters of the width are left
 
 
 def test_meta_tells_a_stated_mount() -> None:
@@ -128,19 +114,6 @@ def test_meta_tells_an_assumed_source_and_none_where_the_view_is_fixed() -> None
     for made, told in ((traits(), {"el_deg": 5.0, "r": 15.0, "assumed": True}), (traits("driving"), None)):
         _, box = run(config(), made, FakeSource(14, fps=made.fps))
         assert next(fields for topic, fields in box.notes if topic == "meta")["src_pose"] == told
-
-
-@pytest.mark.parametrize(
-    ("pose", "words"),
-    [
-        (SourcePose(radius=1.3), "an elevation of 5 degrees and a radius of 1.3 m"),
-        (SourcePose(height_m=2.0), "2 m above the ground, 1.6 m ahead, tilted 0 degrees"),
-    ],
-)
-def test_where_the_camera_is_taken_to_stand_is_said_in_words(pose: SourcePose, words: str) -> None:
-    made = live_traits()
-    assert words in in_words(stated_mount(pose, None, made), pose, made)
-    assert in_words(None, None, made) == in_words(None, pose, traits()) == ""
 
 
 def test_the_mount_is_part_of_what_the_digest_names() -> None:

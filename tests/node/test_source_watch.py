@@ -12,7 +12,7 @@ from fake_camera import FakeVideoCapture
 from fakes import FakeSource
 from media import flat
 
-from gcd_node.errors import ConfigError, SourceError, SourceLostError
+from gcd_node.errors import SourceError, SourceLostError
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.health import SourceState
 from gcd_node.sources import V4l2Source
@@ -87,14 +87,6 @@ def test_a_recording_passes_as_if_nobody_watched() -> None:
     assert reader.log.heard == reader.frames
 
 
-def test_an_error_of_a_recording_is_not_mended() -> None:
-    source = FakeSource(3)
-    source.fails = SourceError("damaged")
-    reader = Reader(source).finish()
-    assert len(reader.frames) == 3
-    assert str(reader.failure) == "damaged"
-
-
 def test_a_silent_camera_stalls_and_goes_on() -> None:
     camera = Camera()
     reader = Reader(camera, stall_ms=100.0)
@@ -159,15 +151,6 @@ def test_a_device_that_never_answers_again_is_left_behind() -> None:
     assert reader.frames[-1].size == (96, 64)
 
 
-def test_attempts_go_on_for_ever_unless_a_limit_is_set() -> None:
-    camera, bench = Camera(), Bench()
-    reader = Reader(camera, bench)
-    camera.feed(SourceLostError("gone"))
-    until(lambda: bench.tries >= 8)
-    reader.watch.close()
-    assert reader.finish().failure is None
-
-
 def test_after_so_many_failed_attempts_in_a_row_it_is_given_up() -> None:
     camera, bench = Camera(), Bench()
     reader = Reader(camera, bench, max_reconnects=3)
@@ -201,15 +184,6 @@ def test_another_picture_size_is_told_before_its_first_frame() -> None:
     reader.finish()
     assert [(info.width, info.height) for info in reader.log.infos] == [(96, 64), (48, 32)]
     assert reader.log.told == ["connecting", "opened", "streaming", "SRC_FORMAT", "opened"]
-
-
-def test_what_the_listener_refuses_ends_the_frames() -> None:
-    class Strict(Log):
-        def source_opened(self, info: SourceInfo) -> bool:
-            raise ConfigError("too small")
-
-    with pytest.raises(ConfigError):
-        next(SourceWatch(Camera(), lambda _: Camera(), Strict(), V4l2Source()).frames())
 
 
 def test_frames_of_a_size_nobody_wants_are_told_of_and_not_given() -> None:
