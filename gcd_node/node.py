@@ -18,14 +18,13 @@ from gcd_node.control import Outcome
 from gcd_node.errors import NodeError, SourceAbsentError, SourceError, SourceLostError
 from gcd_node.health import Health, Level
 from gcd_node.inference import WindowReport
-from gcd_node.lifecycle import Lifecycle, State, Verb
+from gcd_node.lifecycle import Lifecycle, Parts, State, Transitions, Verb
+from gcd_node.messages import MessageSink
 from gcd_node.pipeline import Summary
-from gcd_node.publisher import MessageSink
 from gcd_node.recorder import Recorder, RecordingSink
 from gcd_node.service import ServiceManager, Watchdog
 from gcd_node.sources.live import backoff_s
-from gcd_node.status import Announcer, NodeServices
-from gcd_node.transitions import Parts, Transitions
+from gcd_node.status import Announcer
 from gcd_node.verbs import Command
 from gcd_node.views import LiveConfig
 
@@ -72,13 +71,12 @@ class Node:
         self.recorder = Recorder(config, boot_id, lambda: live.config, self._emit)
         self._sink = RecordingSink(sink, self.recorder)
         self._announcer = Announcer(config.node_id, boot_id, self._sink, self.health)
-        services = NodeServices(live=live, sink=self._sink, health=self.health, announcer=self._announcer)
         self._inbox: queue.SimpleQueue[_Done | str] = queue.SimpleQueue()
         self._transitions = Transitions(
-            services, parts, self.recorder, lambda: self._inbox.put("over"), self._options.on_window
+            live, self._announcer, parts, self.recorder, lambda: self._inbox.put("over"), self._options.on_window
         )
-        self._commands = NodeCommands(services, self._transitions, self.recorder, self.request)
-        self._life, self._order = Lifecycle(), threading.Lock()
+        self._commands = NodeCommands(live, self._announcer, self._transitions, self.recorder, self.request)
+        self._life = Lifecycle()
         self._work: threading.Thread | None = None
         self._watchdog = Watchdog(self._emit, self.health, config.life.hang_s, self._options.service)
         self._waits = backoff_s(config.source.kind)
@@ -114,9 +112,9 @@ class Node:
         self._announcer.event(code, level, fields)
 
     def event(self, code: str, fields: dict[str, object]) -> None:
-        """Publish what another part of the process has noticed; a warning if it gives no `level`."""
+        """Publish what another part of the process has noticed, and logged; a warning if it gives no `level`."""
         level = fields.get("level")
-        self._announcer.event(code, Level(level) if isinstance(level, int) else Level.WARN, fields)
+        self._announcer.event(code, Level(level) if isinstance(level, int) else Level.WARN, fields, is_logged=True)
 
     def request(self, verb: Verb, dry_run: bool) -> Outcome:
         """Begin a transition; an event tells how it ends."""
@@ -213,8 +211,7 @@ class Node:
 
     def _begin(self, verb: Verb, *, requested: bool = False) -> None:
         """Raises ControlError if it cannot be begun now."""
-        with self._order:
-            self._life.begin(verb)
+        self._life.begin(verb)
         self._publish_state()
         if verb == "configure":
             self._watchdog.loading()
@@ -244,23 +241,19 @@ class Node:
 
     def _finish(self, done: _Done) -> None:
         if done.error is None:
-            with self._order:
-                self._life.succeed()
+            self._life.succeed()
             self._publish_state()
             self._after_success(done)
             return
         is_expected = done.verb in ("configure", "activate") and isinstance(done.error, NodeError | ModelError)
-        with self._order:
-            if is_expected:
-                self._life.fail()
-            else:
-                self._life.error()
-        if not is_expected:
+        if is_expected:
+            self._life.fail()
+        else:
+            self._life.error()
             _LOG.error("%s broke", done.verb, exc_info=done.error)
             self._transitions.close(_PATIENCE_S)
             self.health.model("absent")
-            with self._order:
-                self._life.recover(cleaned=done.verb != "shutdown")
+            self._life.recover()
         self._publish_state()
         self._announcer.event(_code(done.error).value, Level.ERROR, {"verb": done.verb, "message": str(done.error)})
         self._after_failure(done.error, done.verb)

@@ -22,9 +22,9 @@ from gcd_node.inference import WORK_REASONS, ModelWorker, WindowReport, WorkCoun
 from gcd_node.model import ModelSlot
 from gcd_node.recorder import Recorder
 from gcd_node.sources.live import Opener, SourceWatch
-from gcd_node.status import NodeServices, metadata
+from gcd_node.status import Announcer, metadata
 from gcd_node.stream_context import ActiveSource, StreamContext
-from gcd_node.views import InputPreview, VirtualViews
+from gcd_node.views import InputPreview, LiveConfig, VirtualViews
 from gcd_node.window import Reason, WindowBuilder
 
 _STOP_DELAY_MS = 100
@@ -51,7 +51,8 @@ class Stream:
 
     def __init__(
         self,
-        services: NodeServices,
+        live: LiveConfig,
+        announcer: Announcer,
         model: ModelSlot,
         source: FrameSource,
         context: StreamContext,
@@ -72,11 +73,11 @@ class Stream:
         Raises:
             OptionError, PoseError: see VirtualView.
         """
-        self._live, self._health, self._announcer = services.live, services.health, services.announcer
+        self._live, self._health, self._announcer = live, announcer.health, announcer
         self._model, self._on_over, self._recorder = model, on_over, recorder
-        config, traits = services.live.config, model.traits
+        config, traits = live.config, model.traits
         self._source = ActiveSource(context, epoch=first[1])
-        VirtualViews(traits).sync(services.live.settings(), context.mount)
+        VirtualViews(traits).sync(live.settings(), context.mount)
         self._builder = WindowBuilder(
             frames=traits.config.frames,
             fps=context.fps,
@@ -90,8 +91,8 @@ class Stream:
         )
         self._newest = WindowSlot(lossless=config.source.pace == "lockstep")
         self._watch = SourceWatch(source, reopen, self, config.source)
-        self._preview = InputPreview(services.sink, lambda: self.context)
-        self.worker = ModelWorker(services, model, self._source.context_at, on_window)
+        self._preview = InputPreview(announcer.sink, lambda: self.context)
+        self.worker = ModelWorker(live, announcer, model, self._source.context_at, on_window)
         self._threads = [
             threading.Thread(target=self._work, name="model", daemon=True),
             threading.Thread(target=read, args=(self._watch, self._builder, self._newest), name="reader", daemon=True),

@@ -16,35 +16,28 @@ import torch
 
 from gcd_client.endpoints import read_key_pair
 from gcd_model import OptionError, ViewSynthesizer, load_synthesizer
-from gcd_node.auth import ServerSecurity, load_server_security
+from gcd_node.auth import EventSink, ServerSecurity, load_server_security
 from gcd_node.config import ModelSection, NodeConfig
 from gcd_node.control import ControlServer
 from gcd_node.errors import ConfigError
 from gcd_node.health import Health
 from gcd_node.inference import WindowReport
+from gcd_node.lifecycle import Parts
 from gcd_node.node import Node, NodeOptions
 from gcd_node.pipeline import Summary
 from gcd_node.publisher import Publisher
 from gcd_node.service import listen
-from gcd_node.sockets import PublisherOptions
 from gcd_node.source_config import LIVE_KINDS
 from gcd_node.sources import open_source
-from gcd_node.transitions import Parts
 
 _LOG = logging.getLogger(__name__)
 
 
-def publisher_options(config: NodeConfig, security: ServerSecurity | None = None) -> PublisherOptions:
-    """The publisher's options for a launch file."""
-    publish = config.publish
-    return PublisherOptions(
-        data=publish.data,
-        status=publish.status,
-        lockstep=config.source.pace == "lockstep",
-        min_subscribers=publish.min_subscribers,
-        end_delay_ms=publish.end_delay_ms,
-        security=security,
-    )
+def open_publisher(
+    config: NodeConfig, security: ServerSecurity | None = None, on_event: EventSink | None = None
+) -> Publisher:
+    """The publisher of a launch file, bound. Raises as Publisher."""
+    return Publisher(config.publish, on_event, lockstep=config.source.pace == "lockstep", security=security)
 
 
 def model_threads(section: ModelSection) -> int:
@@ -109,7 +102,7 @@ def open_session(
 
     security = load_server_security(config.security, emit)
     with ExitStack() as stack:
-        publisher = stack.enter_context(Publisher(publisher_options(config, security), emit))
+        publisher = stack.enter_context(open_publisher(config, security, emit))
         parts = Parts(open_source=lambda source: open_source(source, security, emit), load_model=load_model)
         node = Node(config, parts, publisher, options)
         nodes.append(node)
@@ -129,7 +122,7 @@ def open_session(
             node.watch(server.dead_threads)
             control = server.endpoint
         if config.health.http is not None:
-            stack.enter_context(_metrics_server(config.health.http, node.health))
+            stack.enter_context(metrics_server(config.health.http, node.health))
         if config.viewer.http is not None:
             arguments = viewer_arguments(config, publisher, control, security)
             if viewer:
@@ -173,8 +166,10 @@ def _viewer_process(arguments: list[str]) -> Generator[None]:
             process.communicate()
 
 
-def _metrics_server(address: str, health: Health) -> AbstractContextManager[object]:
-    """Raises ConfigError, EndpointError: see MetricsServer; ConfigError without the extra `metrics`."""
+def metrics_server(address: str, health: Health) -> AbstractContextManager[object]:
+    """The pages of a node's health, served until left.
+
+    Raises ConfigError, EndpointError: see MetricsServer; ConfigError without the extra `metrics`."""
     try:
         from gcd_node.metrics import MetricsServer  # needs prometheus_client, which not every node has
     except ImportError as error:

@@ -4,14 +4,13 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 
 from gcd_client.protocol import OriginHeader, to_json
 from gcd_node.health import Health, Level
-from gcd_node.messages import camera_matrix, family_name, ontology, published_kinds, source_pose
-from gcd_node.publisher import MessageSink
-from gcd_node.stream_context import StreamContext
-from gcd_node.views import LiveConfig, Settings
+from gcd_node.messages import MessageSink, camera_matrix, ontology
+from gcd_node.stream_context import StreamContext, family_name, published_kinds, source_pose
+from gcd_node.views import Settings
 
 _LOG = logging.getLogger(__name__)
 _PERIOD_S = 1.0
@@ -19,7 +18,10 @@ _LOG_PERIOD_S = 10.0  # of one code: a camera that loses a frame a second fills 
 
 
 class Announcer:
-    """Sends notes; every method may be called from any thread. Raises what the sink raises."""
+    """Sends notes; every method may be called from any thread. Raises what the sink raises.
+
+    sink, health: where a node's messages go, and how it does.
+    """
 
     def __init__(
         self,
@@ -31,18 +33,20 @@ class Announcer:
     ) -> None:
         """clock: monotonic seconds."""
         self.boot_id, self.node_id = boot_id, node_id
-        self._sink, self._health, self._clock = sink, health, clock
+        self.sink, self.health, self._clock = sink, health, clock
         self._next_s = clock()
         self._meta: Mapping[str, object] | None = None
         self._logged_s: dict[str, float] = {}
         self._order = threading.Lock()
 
-    def event(self, code: str, level: Level, fields: Mapping[str, object] | None = None) -> None:
+    def event(
+        self, code: str, level: Level, fields: Mapping[str, object] | None = None, *, is_logged: bool = False
+    ) -> None:
         """Something has happened. code: stable, for programs; fields: plain JSON, a `message` for people. Warnings and
-        worse are logged too, each code at most once in ten seconds."""
+        worse are logged too, each code at most once in ten seconds, unless that is done already (is_logged)."""
         event = {**(fields or {}), "code": code, "level": int(level)}
-        self._sink.note("event", self._origin(), event)
-        if level >= Level.WARN and self._clock() >= self._logged_s.get(code, 0.0):
+        self.sink.note("event", self._origin(), event)
+        if level >= Level.WARN and not is_logged and self._clock() >= self._logged_s.get(code, 0.0):
             self._logged_s[code] = self._clock() + _LOG_PERIOD_S
             rest = ", ".join(f"{name}: {value}" for name, value in (fields or {}).items() if name != "message")
             text = " ".join(part for part in (str(event.get("message", "")), f"({rest})" if rest else "") if part)
@@ -53,13 +57,13 @@ class Announcer:
         """Say how it is, now."""
         with self._order:
             self._next_s = self._clock() + _PERIOD_S
-            sent = self._sink.stats
-            self._health.totals(sent=sent.sent, subs=sent.subscribers, bytes=sent.bytes, queue=sent.dropped)
-            self._sink.note("status", self._origin(), self._health.report())
+            sent = self.sink.stats
+            self.health.totals(sent=sent.sent, subs=sent.subscribers, bytes=sent.bytes, queue=sent.dropped)
+            self.sink.note("status", self._origin(), self.health.report())
 
     def status_if_due(self) -> None:
         """The same once a second, and as soon as something that matters has changed."""
-        if self._clock() >= self._next_s or self._health.changed():
+        if self._clock() >= self._next_s or self.health.changed():
             self.status()
 
     def meta(self, fields: Mapping[str, object]) -> None:
@@ -68,20 +72,10 @@ class Announcer:
             if fields == self._meta:
                 return
             self._meta = dict(fields)
-            self._sink.note("meta", self._origin(), fields)
+            self.sink.note("meta", self._origin(), fields)
 
     def _origin(self) -> OriginHeader:
         return OriginHeader(node_id=self.node_id, boot_id=self.boot_id, t_publish_ns=time.time_ns())
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class NodeServices:
-    """What every part of a node shares: the configuration in force, where messages go, how it does, what it says."""
-
-    live: LiveConfig
-    sink: MessageSink
-    health: Health
-    announcer: Announcer
 
 
 def metadata(context: StreamContext, settings: Settings) -> dict[str, object]:

@@ -13,10 +13,9 @@ from gcd_client.protocol import PREVIEW_ID, PREVIEW_TOPIC, ViewKind, ViewMessage
 from gcd_model import CameraMount, OptionError, Orbit, SphericalDelta, Traits, Trajectory
 from gcd_node.config import ModelSection, NodeConfig, PublishConfig, ViewConfig, pose_matrix
 from gcd_node.frame import Frame
-from gcd_node.messages import PREVIEW_PERIOD_S, end_message, end_messages, preview_message, published_kinds
+from gcd_node.messages import PREVIEW_PERIOD_S, MessageSink, end_message, preview_message
 from gcd_node.preprocess import stated_sphere
-from gcd_node.publisher import MessageSink
-from gcd_node.stream_context import StreamContext
+from gcd_node.stream_context import StreamContext, published_kinds
 
 _KINDS: tuple[ViewKind, ...] = get_args(ViewKind)
 _LEAST = 0.9  # of a period between two previews, so that a camera's jitter does not make it miss every second one
@@ -228,9 +227,8 @@ class EndOfStream:
         return self._open.pop(view_id, set[str]()) | {view_topic(view_id, kind) for kind in now}
 
     def _end(self, view_id: str, rev: int, topics: Set[str], last: int, *, delay_ms: int | None) -> None:
-        kinds: list[ViewKind] = [kind for kind in _KINDS if view_topic(view_id, kind) in topics]
-        for message in end_messages(self._context(), view_id, rev, last, kinds):
-            self._sink.end(message, delay_ms=delay_ms)
+        for topic in [topic for kind in _KINDS if (topic := view_topic(view_id, kind)) in topics]:
+            self._sink.end(end_message(self._context(), topic, view_id, rev, last), delay_ms=delay_ms)
 
 
 class InputPreview:

@@ -15,8 +15,7 @@ from rich.table import Table
 from rich.text import Text
 from typer import Argument, Option
 
-from gcd_node.config import LifeConfig, load_config
-from gcd_node.config_dump import to_toml
+from gcd_node.config import LifeConfig, load_config, to_toml
 from gcd_node.service import ServiceManager, background_logging
 
 if TYPE_CHECKING:

@@ -29,9 +29,9 @@ from gcd_model import (
 from gcd_node.config import NodeConfig, parse_config
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.inference import WindowReport
+from gcd_node.lifecycle import Parts
+from gcd_node.messages import MessageSink, PublisherStats
 from gcd_node.node import Node, NodeOptions
-from gcd_node.publisher import MessageSink, PublisherStats
-from gcd_node.transitions import Parts
 
 HEIGHT, WIDTH = 64, 96
 

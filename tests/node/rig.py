@@ -20,13 +20,12 @@ from gcd_model import ViewSynthesizer
 from gcd_node.config import ModelSection, NodeConfig, parse_config
 from gcd_node.control import ControlServer
 from gcd_node.frame import FrameSource
+from gcd_node.lifecycle import Parts
 from gcd_node.node import Node, NodeOptions
 from gcd_node.pipeline import Summary
-from gcd_node.publisher import Publisher
 from gcd_node.service import ServiceManager
-from gcd_node.session import publisher_options
+from gcd_node.session import open_publisher
 from gcd_node.source_config import SourceConfig
-from gcd_node.transitions import Parts
 
 CAMERA = 'kind = "v4l2"'
 _SILENCE_MS = 300
@@ -91,7 +90,7 @@ class Rig:
             open_source=(lambda _: source.open()) if isinstance(source, Bench) else source,
             load_model=(lambda _: loaded) if hasattr(loaded, "traits") else loaded,  # type: ignore[arg-type,return-value]
         )
-        self.publisher = Publisher(publisher_options(self.config))
+        self.publisher = open_publisher(self.config)
         self.node = Node(self.config, parts, self.publisher, NodeOptions(once=once, service=service))
         self.control = ControlServer(
             f"ipc://{folder}/control",

@@ -11,7 +11,7 @@ from media import frames_at
 from gcd_node.capture import WindowSlot, read
 from gcd_node.errors import ReaderError, SourceError, TooShortError
 from gcd_node.frame import Frame, SourceInfo
-from gcd_node.window import FrameWindow, PartialWindow, WindowBuilder
+from gcd_node.window import FrameWindow, WindowBuilder
 
 GUARD_S = 5.0
 
@@ -88,13 +88,6 @@ def test_a_lossless_slot_hands_over_everything_in_order() -> None:
     assert slot.dropped == 0
 
 
-def test_what_was_left_can_be_taken_after_the_end() -> None:
-    slot = WindowSlot()
-    slot.put(7)
-    slot.finish()
-    assert [slot.take(), slot.take(), slot.take()] == [7, None, None]
-
-
 @pytest.mark.parametrize("ending", ["close", "finish"])
 def test_a_taker_who_waits_is_let_go(ending: str) -> None:
     slot = WindowSlot()
@@ -139,45 +132,7 @@ def test_who_waits_works_meanwhile_until_nothing_is_left_to_do_and_again_when_mo
     assert got == [7]
 
 
-def test_an_item_is_taken_before_anything_else_is_done() -> None:
-    slot, done = WindowSlot(), []
-    slot.put(7)
-    assert slot.take(lambda: bool(done.append(1))) == 7
-    slot.finish()
-    assert slot.take(lambda: bool(done.append(1))) is None
-    assert done == []
-
-
-def test_what_is_shown_while_there_is_work_under_way_is_not_lost() -> None:
-    slot, calls = WindowSlot(), []
-
-    def work() -> bool:
-        calls.append(len(calls))
-        if len(calls) == 1:
-            slot.show(None)  # from another thread, just now
-        else:
-            slot.put(7)
-        return False
-
-    assert slot.take(work) == 7
-    assert calls == [0, 1]
-
-
-def test_what_goes_wrong_meanwhile_reaches_the_taker() -> None:
-    with pytest.raises(SourceError):
-        WindowSlot().take(lambda: (_ for _ in ()).throw(SourceError("meanwhile")))
-
-
 # --- the reader --------------------------------------------------------------------------------------------------
-
-
-def test_a_slow_taker_gets_the_newest_window_and_every_frame_was_read() -> None:
-    slot = WindowSlot()
-    source = ScriptedSource(ten_fps(20))
-    read(source, builder(), slot)
-    windows = taken(slot)
-    assert [window.window_id for window in windows] == [4]
-    assert (source.given, slot.dropped) == (20, 4)
 
 
 def test_the_last_window_is_not_forgotten_at_the_end() -> None:
@@ -212,13 +167,6 @@ def test_too_few_frames_are_an_error_that_counts_them() -> None:
     assert caught.value.exit_code == 65
 
 
-def test_frames_with_too_many_holes_are_an_error_that_says_so() -> None:
-    slot = WindowSlot()
-    read(ScriptedSource(frames_at(i * 250.0 for i in range(20))), builder(), slot)
-    with pytest.raises(TooShortError):
-        slot.take()
-
-
 def test_closing_slot_and_source_stops_the_reader_without_an_error() -> None:
     slot = WindowSlot()
     source = ScriptedSource(ten_fps(2), stays=True)
@@ -228,25 +176,3 @@ def test_closing_slot_and_source_stops_the_reader_without_an_error() -> None:
     source.close()
     joined(reader)
     assert slot.take() is None
-
-
-def test_the_slot_shows_what_the_next_window_holds_so_far() -> None:
-    slot, shown = WindowSlot(), []
-    source, windows = ScriptedSource(ten_fps(9)), builder()
-
-    class Looking(WindowSlot):
-        def show(self, filling: PartialWindow) -> None:
-            super().show(filling)
-            shown.append(filling.seqs)
-
-        def put(self, item: FrameWindow) -> bool:
-            done = super().put(item)
-            assert self.filling is None
-            return done
-
-    assert slot.filling is None
-    slot = Looking()
-    read(source, windows, slot)
-    assert shown == [(0,), (0, 1), (0, 1, 2), (), (4,), (4, 5), (4, 5, 6), (), (8,)]
-    assert slot.filling is not None
-    assert slot.filling.clip.shape == (1, 3, 2, 4)

@@ -229,26 +229,6 @@ def test_when_a_window_is_complete_only_its_last_frame_is_left_to_encode() -> No
     assert model.encoded == list(range(T))
 
 
-@pytest.mark.parametrize("stride", [1, 6])
-def test_a_frame_of_several_windows_is_encoded_once(stride: int) -> None:
-    model = Encoder()
-    with Life(config(stride=stride), model) as life:
-        life.source.feed(26)
-    assert len(life.windows) == 1 + (26 - T) // stride
-    last = max(message.header.src.seq[-1] for message in life.box.of("win"))
-    assert model.encoded[: last + 1] == list(range(last + 1))
-    assert model.encoded[last + 1 :] == list(range(last + 1, len(model.encoded)))
-
-
-def test_nothing_is_encoded_for_nobody() -> None:
-    model = Encoder()
-    with Life(config("life = {idle_s = 0.05}", pace="realtime"), model) as life:
-        until(lambda: bool(model.asked))  # warm
-        time.sleep(0.2)
-        life.source.feed(T + 5)
-    assert model.encoded == []
-
-
 # What is forgotten.
 
 

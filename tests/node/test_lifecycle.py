@@ -76,12 +76,12 @@ def test_nothing_leads_out_of_finalized() -> None:
     assert all(at(State.FINALIZED).refusal(verb) for verb in VERBS)
 
 
-@pytest.mark.parametrize(("cleaned", "goal"), [(True, State.UNCONFIGURED), (False, State.FINALIZED)])
-def test_after_an_error_the_node_begins_anew_or_is_finished(cleaned: bool, goal: State) -> None:
+@pytest.mark.parametrize(("verb", "goal"), [("activate", State.UNCONFIGURED), ("shutdown", State.FINALIZED)])
+def test_after_an_error_the_node_begins_anew_or_is_finished(verb: Verb, goal: State) -> None:
     life = at(State.INACTIVE)
-    life.begin("activate")
+    life.begin(verb)
     life.error()
     assert life.state is State.ERRORPROCESSING
-    assert all(life.refusal(verb) for verb in VERBS)
-    life.recover(cleaned=cleaned)
+    assert all(life.refusal(each) for each in VERBS)
+    life.recover()
     assert life.state is goal

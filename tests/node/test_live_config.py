@@ -8,17 +8,6 @@ def config() -> NodeConfig:
     return parse_config(b'[source]\nkind = "synthetic"\n[model]\nweights = "w"\n[view.a]\n[view.b]\n', "test")
 
 
-def test_each_view_has_its_own_revision() -> None:
-    live = LiveConfig(config())
-    before = live.settings()
-    assert live.set_view("a", ViewConfig(azimuth_deg=5.0)) == 2
-    assert live.set_view("a", ViewConfig(azimuth_deg=6.0)) == 3
-    assert dict(live.settings().revisions) == {"a": 3, "b": 1}
-    assert live.config.view["a"].azimuth_deg == 6.0
-    assert dict(before.revisions) == {"a": 1, "b": 1}
-    assert before.config == config()
-
-
 def test_a_view_that_comes_back_goes_on_counting() -> None:
     live = LiveConfig(config())
     live.set_view("a", ViewConfig())

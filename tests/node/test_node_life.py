@@ -69,25 +69,6 @@ def test_a_node_goes_through_its_life_as_it_is_asked(tmp_path: Path) -> None:
     assert [view.sequence for view in rig.of()] == [0, 2]  # 1 was the end of the first stream
 
 
-def test_a_dry_run_changes_nothing(tmp_path: Path) -> None:
-    with Rig(tmp_path, Bench(), more="life = {autostart = false}") as rig:
-        assert rig.try_out("configure").code is Code.OK
-        assert rig.try_out("activate").code is Code.WRONG_STATE
-        assert rig.ask("state").state == "unconfigured"
-        rig.ask("configure")
-        rig.await_state("inactive")
-        reply = rig.try_out("set_view", view="main", azimuth_deg=5.0)
-        assert reply.code is Code.OK
-        assert rig.ask("views").result == {"main": view_told(10.0, 1)}
-        assert rig.try_out("set_param", steps=3).code is Code.OK
-        assert asked_config(rig)["model"]["steps"] is None
-
-
-def view_told(azimuth_deg: float, rev: int) -> dict[str, object]:
-    plain = {"elevation_deg": 0.0, "radius": 0.0, "rate_deg_s": None, "amplitude_deg": None, "kind": "fixed"}
-    return {**plain, "azimuth_deg": azimuth_deg, "view_rev": rev}
-
-
 def asked_config(rig: Rig) -> dict[str, Any]:
     result = rig.ask("get_config").result
     assert result is not None
@@ -157,25 +138,6 @@ def test_a_change_meant_for_another_revision_is_refused(tmp_path: Path) -> None:
         assert (refused.code, refused.result) == (Code.WRONG_STATE, {"view_rev": 2})
         assert rig.ask_at(1, "remove_view", view="main").code is Code.WRONG_STATE
         assert rig.ask_at(2, "remove_view", view="main").code is Code.OK
-
-
-def test_a_removed_view_ends_and_comes_back_under_a_higher_revision(tmp_path: Path) -> None:
-    with Rig(tmp_path, lambda _: Endless(), config=LOCKSTEP, views=TWO_VIEWS) as rig:
-        rig.await_views(2)
-        assert rig.ask("remove_view", view="main").code is Code.OK
-        assert rig.ask("remove_view", view="main").code is Code.UNKNOWN_VIEW
-        last = rig.ask("remove_view", view="swing")
-        assert last.code is Code.BAD_ARG
-        assert "last view" in last.message
-        before = len(rig.of("swing"))
-        rig.await_views(before + 3, "swing")
-        gone = len(rig.of())
-        rig.await_views(before + 6, "swing")
-        assert len(rig.of()) == gone
-        assert rig.ask("set_view", view="main", azimuth_deg=3.0).code is Code.OK
-        rig.await_views(gone + 1)
-        assert rig.of()[-1].header.view_rev == 2
-    assert [event["view"] for event in rig.events("VIEW_REMOVED")] == ["main"]
 
 
 def test_parameters_change_from_the_next_window_on(tmp_path: Path) -> None:

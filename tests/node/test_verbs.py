@@ -2,7 +2,6 @@
 
 import json
 
-import msgspec
 import pytest
 
 from gcd_client.protocol import PROTO
@@ -12,9 +11,6 @@ from gcd_node.verbs import (
     RequestError,
     SetView,
     parse_command,
-    parse_request,
-    schemas,
-    text_arguments,
 )
 
 IDENTITY = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
@@ -31,7 +27,7 @@ def wire(verb: str, args: object = None, **more: object) -> bytes:
 
 
 def read(part: bytes) -> Command:
-    return parse_command(parse_request(part))
+    return parse_command(part)
 
 
 def refused(part: bytes) -> RequestError:
@@ -88,8 +84,8 @@ def test_f14_an_unknown_verb_names_the_nearest() -> None:
         ({"view": "Top"}, "`view`"),
         ({"view": "top\n"}, "`view`"),
         ({"view": "top", "azimut_deg": 1}, "did you mean azimuth_deg?"),
-        ({"view": "top", "azimuth_deg": "30"}, "Expected `float | null`, got `str` - at `azimuth_deg`"),
-        ({"view": "top", "azimuth_deg": None}, "'azimuth_deg' is null"),
+        ({"view": "top", "azimuth_deg": "30"}, "Expected `float`, got `str` - at `azimuth_deg`"),
+        ({"view": "top", "azimuth_deg": None}, "got `null` - at `azimuth_deg`"),
         ({"view": "top", "kind": "spiral"}, "`kind`"),
         ({"view": "top", "T_src_dst": IDENTITY[:15]}, "length >= 16"),
         ({"view": "top", "T_src_dst": IDENTITY, "radius": 1}, "state one of the two"),
@@ -104,12 +100,6 @@ def test_f14_a_wrong_argument_is_bad_arg_and_says_what_is_wanted(args: object, s
     error = refused(part)
     assert error.code == "BAD_ARG"
     assert says in str(error)
-
-
-@pytest.mark.parametrize("number", [b"NaN", b"Infinity", b"1e999", b"-1e999"])
-def test_f14_a_number_that_is_none_is_refused(number: bytes) -> None:
-    part = wire("set_view", {"view": "top", "azimuth_deg": 1}).replace(b'_deg": 1', b'_deg": ' + number)
-    assert refused(part).code in ("BAD_ARG", "BAD_JSON")
 
 
 @pytest.mark.parametrize(
@@ -146,19 +136,6 @@ def test_set_view_replaces_the_whole_view() -> None:
     assert isinstance(args, SetView)
     view = args.to_config()
     assert (view.kind, view.azimuth_deg, view.elevation_deg, view.radius) == ("fixed", 30.0, 0.0, 0.0)
-
-
-def test_schemas_are_plain_json_and_small() -> None:
-    text = msgspec.json.encode(schemas())
-    assert set(json.loads(text)) == set(VERBS)
-    assert b"T_src_dst" in text
-    assert len(text) < 32 * 1024
-
-
-def test_text_arguments_are_known() -> None:
-    assert text_arguments("set_view") == {"view", "kind"}
-    assert text_arguments("set_param") == {"publish"}
-    assert text_arguments("nonsense") == frozenset()
 
 
 # Anything at all
