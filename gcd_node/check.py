@@ -1,7 +1,6 @@
 """Goes through a launch file as a start would, but loads no weights: what `gcd-node check` finds. Prints nothing."""
 
 import tempfile
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -29,8 +28,8 @@ from gcd_model import (
 from gcd_node.auth import load_server_security
 from gcd_node.config import ModelSection, NodeConfig
 from gcd_node.control import ControlServer, Outcome
-from gcd_node.errors import ConfigError, NodeError, SourceLostError
-from gcd_node.frame import Frame, FrameSource, SourceInfo
+from gcd_node.errors import ConfigError, NodeError, SourceError
+from gcd_node.frame import SourceInfo
 from gcd_node.health import Health
 from gcd_node.mcap_file import RoomError, check_room
 from gcd_node.preprocess import in_words
@@ -42,7 +41,6 @@ from gcd_node.views import LiveConfig, VirtualViews
 Verdict: TypeAlias = Literal["ok", "warning", "failed"]
 
 _P = ParamSpec("_P")
-_FIRST_FRAME_S = 5.0
 _MUCH_MEMORY = 0.7
 _BYTES = {"float32": 4, "bfloat16": 2, "float16": 2}
 
@@ -142,7 +140,9 @@ class _Look:
     def source(self) -> str:
         source = open_source(self._config.source, load_server_security(self._config.security))
         try:
-            first = _first_frame(source)
+            first = next(iter(source.frames()), None)  # of a camera it waits already, or opening had failed
+            if first is None:
+                raise SourceError(f"{source.info.id} has no frames; is it the right one?")
             info = self.info = source.info
             rate = f"{info.width} x {info.height} at {info.fps_nominal:g} FPS"
             lens = "" if info.lens is None else ", calibrated"
@@ -208,26 +208,6 @@ class _Look:
             f"a {unit} every {period_s:.2f} s, {runs} network evaluations each, so {1000 * period_s / runs:.1f} ms for "
             f"one if none is to be left out; {model_threads(model)} CPU threads"
         )
-
-
-def _first_frame(source: FrameSource) -> Frame:
-    """Raises SourceLostError if none comes."""
-    found: list[Frame | Exception] = []
-
-    def look() -> None:
-        try:
-            found.extend(frame for frame, _ in zip(source.frames(), range(1), strict=False))
-        except Exception as error:  # the end of a thread
-            found.append(error)
-
-    looker = threading.Thread(target=look, name="first frame", daemon=True)
-    looker.start()
-    looker.join(_FIRST_FRAME_S)
-    if not found:
-        raise SourceLostError(f"{source.info.id} opened, and gave no frame in {_FIRST_FRAME_S:g} s; is it covered?")
-    if isinstance(found[0], Exception):
-        raise found[0]
-    return found[0]
 
 
 def weights_path(weights: str) -> Path:

@@ -81,7 +81,11 @@ class ModelWorker:
         context_at: Callable[[int], StreamContext],
         on_window: Callable[[WindowReport], None] | None = None,
     ) -> None:
-        """context_at: what is known of the source in an epoch; -1 for now."""
+        """context_at: what is known of the source in an epoch; -1 for now.
+
+        Raises:
+            OptionError, PoseError: see VirtualView.
+        """
         self.counts = WorkCounts()
         self.warm = threading.Event()  # the first window may come
         self._model, self._context_at, self._on_window = model, context_at, on_window
@@ -90,6 +94,7 @@ class ModelWorker:
         self._realtime = config.source.pace == "realtime"
         self._out = EndOfStream(live, announcer.sink, lambda: context_at(-1))
         self._views = VirtualViews(model.traits)
+        self._views.sync(live.settings(), context_at(-1).mount)
         self._idle = IdleTimer(config.life.idle_s if self._realtime else 0.0)
         self._failures = FailureCounter(announcer)
         self._cancel = threading.Event()

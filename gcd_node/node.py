@@ -36,21 +36,6 @@ _LEAST_RECORD_S = 0.5
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class NodeOptions:
-    """How a node is run.
-
-    once: end with the first source that ends, and with whatever fails; else stay and wait for commands.
-    on_configured, on_window: called with the model once it is loaded, and with every window.
-    service: the service manager to notify, if there is one.
-    """
-
-    once: bool = True
-    on_configured: Callable[[Traits], None] | None = None
-    on_window: Callable[[WindowReport], None] | None = None
-    service: ServiceManager | None = None
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
 class _Done:
     """A transition is over. requested: by a command, rather than by the node itself."""
 
@@ -64,21 +49,36 @@ class Node:
     `stop` from a signal handler too. Transitions are worked through in a thread of their own, so that status and
     commands go on."""
 
-    def __init__(self, config: NodeConfig, parts: Parts, sink: MessageSink, options: NodeOptions | None = None) -> None:
-        """Nothing is opened or loaded before `run`."""
-        self._config, self._options = config, options or NodeOptions()
+    def __init__(
+        self,
+        config: NodeConfig,
+        parts: Parts,
+        sink: MessageSink,
+        *,
+        once: bool = True,
+        on_configured: Callable[[Traits], None] | None = None,
+        on_window: Callable[[WindowReport], None] | None = None,
+        service: ServiceManager | None = None,
+    ) -> None:
+        """Nothing is opened or loaded before `run`.
+
+        once: end with the first source that ends, and with whatever fails; else stay and wait for commands.
+        on_configured, on_window: called with the model once it is loaded, and with every window.
+        service: the service manager to notify, if there is one.
+        """
+        self._config, self._once, self._on_configured = config, once, on_configured
         self.health, live, boot_id = Health(), LiveConfig(config), uuid.uuid4().hex
         self.recorder = Recorder(config, boot_id, lambda: live.config, self._emit)
         self._sink = RecordingSink(sink, self.recorder)
         self._announcer = Announcer(config.node_id, boot_id, self._sink, self.health)
         self._inbox: queue.SimpleQueue[_Done | str] = queue.SimpleQueue()
         self._transitions = Transitions(
-            live, self._announcer, parts, self.recorder, lambda: self._inbox.put("over"), self._options.on_window
+            live, self._announcer, parts, self.recorder, lambda: self._inbox.put("over"), on_window
         )
         self._commands = NodeCommands(live, self._announcer, self._transitions, self.recorder, self.request)
         self._life = Lifecycle()
         self._work: threading.Thread | None = None
-        self._watchdog = Watchdog(self._emit, self.health, config.life.hang_s, self._options.service)
+        self._watchdog = Watchdog(self._emit, self.health, config.life.hang_s, service)
         self._waits = backoff_s(config.source.kind)
         self._stop_s: float | None = None
         self._retry_s: float | None = None
@@ -264,8 +264,8 @@ class Node:
             self._announcer.event("STATE", Level.OK, {"verb": done.verb, "state": self.state.label})
         if done.verb == "configure":
             traits = self._transitions.traits
-            if traits is not None and self._options.on_configured is not None:
-                self._options.on_configured(traits)
+            if traits is not None and self._on_configured is not None:
+                self._on_configured(traits)
             if self._on_its_own and not done.requested:
                 self._try("activate")
         elif done.verb == "activate":
@@ -277,7 +277,7 @@ class Node:
             failure = self._transitions.failure  # the stream has ended by itself
             if failure is not None:
                 self._after_failure(failure, "activate")
-            elif self._options.once:
+            elif self._once:
                 self._prepare_stop()
 
     def _after_failure(self, error: Exception, verb: Verb) -> None:
@@ -285,7 +285,7 @@ class Node:
         self._watchdog.ready()
         if self._stop_s is not None and verb != "shutdown":
             return
-        if self._options.once or isinstance(error, SourceLostError):
+        if self._once or isinstance(error, SourceLostError):
             self._failure = error
             self._prepare_stop()
         elif verb == "activate" and self._on_its_own and self._transitions.is_live and isinstance(error, SourceError):

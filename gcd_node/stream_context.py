@@ -37,7 +37,6 @@ from gcd_node.window import RATE_TOLERANCE, choose_fps
 _LOG = logging.getLogger(__name__)
 _HFOV_TOLERANCE_DEG = 2.0
 _FLAG_NAMES = {"fps": "frame rate", "hfov": "field of view"}
-_KEPT_EPOCHS = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,30 +108,6 @@ def prepare_stream(
         lens=lens,
         depth=before.depth if before is not None and before.mount == mount else _depth_network(config, traits, mount),
     )
-
-
-class ActiveSource:
-    """Of the source as it is now, and of former epochs, whose windows may still be in work. Changed in one thread."""
-
-    def __init__(self, context: StreamContext, epoch: int) -> None:
-        """context, epoch: of a source that was just opened."""
-        self._contexts = [(epoch, context)]
-
-    @property
-    def context(self) -> StreamContext:
-        """Everything that goes into messages, now."""
-        return self._contexts[-1][1]
-
-    def context_at(self, epoch: int) -> StreamContext:
-        """The same in an epoch."""
-        contexts = self._contexts
-        return next((context for since, context in reversed(contexts) if since <= epoch), contexts[-1][1])
-
-    def adapt(self, config: NodeConfig, info: SourceInfo, epoch: int) -> None:
-        """To another size, rate or camera, from an epoch on. Raises ConfigError, and changes nothing then."""
-        now = self.context
-        context = prepare_stream(config, now.traits, info, boot_id=now.boot_id, before=now)
-        self._contexts = [*self._contexts[1 - _KEPT_EPOCHS :], (epoch, context)]
 
 
 def _window_fps(config: NodeConfig, traits: Traits, source: SourceInfo) -> tuple[float, bool]:

@@ -39,7 +39,6 @@ class LiveConfig:
     def __init__(self, config: NodeConfig) -> None:
         self._lock = threading.Lock()
         self._revisions = dict.fromkeys(config.view, 1)  # of removed views too
-        self._removed: list[tuple[str, int]] = []
         self._settings = Settings(config=config, revisions=dict(self._revisions))
 
     @property
@@ -64,7 +63,6 @@ class LiveConfig:
         """Replace or add a view; gives its new revision."""
         with self._lock:
             self._revisions[view_id] = self._revisions.get(view_id, 0) + 1
-            self._removed = [each for each in self._removed if each[0] != view_id]
             self._replace(view={**self.config.view, view_id: view})
             return self._revisions[view_id]
 
@@ -73,19 +71,12 @@ class LiveConfig:
         with self._lock:
             left = dict(self.config.view)
             del left[view_id]
-            self._removed.append((view_id, self._revisions[view_id]))
             self._replace(view=left)
 
     def change(self, model: ModelSection, publish: PublishConfig) -> None:
         """Replace how views are drawn and how they are sent."""
         with self._lock:
             self._replace(model=model, publish=publish)
-
-    def take_removed(self) -> list[tuple[str, int]]:
-        """Views removed since the last call, with their last revision: their end is yet to be announced."""
-        with self._lock:
-            removed, self._removed = self._removed, []
-            return removed
 
     def _replace(self, **changes: object) -> None:
         config = msgspec.structs.replace(self.config, **changes)
@@ -191,7 +182,8 @@ class EndOfStream:
     def __init__(self, live: LiveConfig, sink: MessageSink, context: Callable[[], StreamContext]) -> None:
         """context: what is known of the source now."""
         self._live, self._sink, self._context = live, sink, context
-        self._open: dict[str, set[str]] = {}  # of each view: topics on which something was sent, and no end since
+        self._open: dict[str, Set[str]] = {view_id: set() for view_id in live.config.view}
+        """Views that have not ended, and on which of their topics something was sent."""
         self._newest_goal: dict[str, tuple[int, int]] = {}
 
     def send(self, messages: Sequence[ViewMessage]) -> None:
@@ -212,8 +204,9 @@ class EndOfStream:
 
     def announce_removed(self, last_window_id: int) -> None:
         """End views that were taken out."""
-        for view_id, rev in self._live.take_removed():
-            self._end(view_id, rev, self._topics(view_id), last_window_id, delay_ms=0)
+        config = self._live.config
+        for view_id in [each for each in self._open if each not in config.view]:
+            self._end(view_id, self._live.revision(view_id), self._topics(view_id), last_window_id, delay_ms=0)
 
     def announce_all(self, last_window_id: int, *, delay_ms: int | None) -> None:
         """End everything. delay_ms: see MessageSink."""

@@ -19,7 +19,7 @@ from gcd_node.errors import NodeError, SourceAbsentError, SourceLostError
 from gcd_node.frame import Frame, SourceInfo
 from gcd_node.inference import WindowReport
 from gcd_node.lifecycle import Parts
-from gcd_node.node import Node, NodeOptions
+from gcd_node.node import Node
 from gcd_node.publisher import Publisher
 from gcd_node.session import open_publisher
 from gcd_node.source_config import V4l2Source
@@ -241,7 +241,7 @@ def running_node(
         )
         parts = Parts(open_source=lambda _: script.open(), load_model=lambda _: model)
         with open_publisher(config) as publisher:
-            node = Node(config, parts, publisher, NodeOptions(once=False, on_window=on_window))
+            node = Node(config, parts, publisher, once=False, on_window=on_window)
             with ControlServer(
                 str(config.control.endpoint), node.handle, lambda: node.state.label, node.event
             ) as control:

@@ -23,7 +23,7 @@ from gcd_node.image_io import video_writer
 from gcd_node.inference import WindowReport
 from gcd_node.lifecycle import Parts
 from gcd_node.messages import PublisherStats
-from gcd_node.node import Node, NodeOptions
+from gcd_node.node import Node
 from gcd_node.pipeline import Summary
 from gcd_node.replay.run import (
     MANIFEST,
@@ -106,8 +106,9 @@ def replay(
 
     with new_folder(out) as folder, _repeatable():
         with RunWriter(folder, on_window) as writer:
-            options = NodeOptions(once=True, on_configured=traits.append, on_window=writer.finish_window)
-            summary = Node(config, Parts(open_source=open_and_note, load_model=parts.load_model), writer, options).run()
+            noting = Parts(open_source=open_and_note, load_model=parts.load_model)
+            node = Node(config, noting, writer, on_configured=traits.append, on_window=writer.finish_window)
+            summary = node.run()
         manifest = _manifest(config, infos[0], traits[-1], writer, summary)
         try:
             (folder / MANIFEST).write_bytes(encode_manifest(manifest))

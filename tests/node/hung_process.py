@@ -14,7 +14,7 @@ from rig import rig_config
 from gcd_model import ViewSynthesizer
 from gcd_node.config import ModelSection
 from gcd_node.lifecycle import Parts
-from gcd_node.node import Node, NodeOptions
+from gcd_node.node import Node
 from gcd_node.session import open_publisher, run_until_signal
 
 
@@ -34,7 +34,7 @@ def main() -> None:
     config = rig_config(Path(sys.argv[1]), f'kind = "synthetic"\npace = "{pace}"', "[view.main]", "")
     parts = Parts(open_source=lambda _: FakeSource(100_000), load_model=load)
     with open_publisher(config) as publisher:
-        node = Node(config, parts, publisher, NodeOptions(once=False))
+        node = Node(config, parts, publisher, once=False)
         run_until_signal(node, publisher)
     print("left behind" if node.left_behind else "all ended", flush=True)
 

@@ -9,7 +9,7 @@ from cameras import until
 from media import frames_at
 
 from gcd_node.capture import WindowSlot, read
-from gcd_node.errors import ReaderError, SourceError, TooShortError
+from gcd_node.errors import ReaderError, SourceError
 from gcd_node.frame import Frame, SourceInfo
 from gcd_node.window import FrameWindow, WindowBuilder
 
@@ -157,14 +157,6 @@ def test_a_fault_in_the_source_is_not_swallowed() -> None:
     with pytest.raises(ReaderError) as caught:
         slot.take()
     assert isinstance(caught.value.__cause__, ZeroDivisionError)
-
-
-def test_too_few_frames_are_an_error_that_counts_them() -> None:
-    slot = WindowSlot()
-    read(ScriptedSource(ten_fps(3)), builder(), slot)
-    with pytest.raises(TooShortError) as caught:
-        slot.take()
-    assert caught.value.exit_code == 65
 
 
 def test_closing_slot_and_source_stops_the_reader_without_an_error() -> None:

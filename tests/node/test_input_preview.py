@@ -27,14 +27,6 @@ REALTIME = 'kind = "synthetic"\npace = "realtime"'
 PREVIEW_KEY, VIEW_KEY = topic_key(PREVIEW_TOPIC), topic_key("view/main/win")
 
 
-class Steady(FakeSource):
-    """Frames at 24 FPS until it is closed."""
-
-    def __init__(self) -> None:
-        super().__init__(100_000)
-        self.period_s = 1 / 24
-
-
 class Watched(Box):
     """An outbox with so many subscribers of the preview."""
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import zmq
 from cameras import until
-from fakes import FakeSource, FakeSynthesizer, painting_traits
+from fakes import FakeSynthesizer, Steady, painting_traits
 from rig import Rig
 
 from gcd_client.control import Code
@@ -16,14 +16,6 @@ from gcd_client.protocol import EndMessage, StatusMessage, ViewMessage, decode
 
 LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
 TWO_VIEWS = '[view.top]\n[view.swing]\nkind = "orbit"\nrate_deg_s = 24.0\namplitude_deg = 60.0'
-
-
-class Endless(FakeSource):
-    """Frames until it is closed."""
-
-    def __init__(self) -> None:
-        super().__init__(1_000_000)
-        self.period_s = 0.002
 
 
 @dataclass
@@ -81,7 +73,7 @@ def heard_by_the_tape(rig: Rig) -> None:
 
 
 def test_a_topic_that_a_command_opens_and_closes_begins_and_ends_with_it(tmp_path: Path) -> None:
-    with taped(tmp_path) as tape, Rig(tmp_path, lambda _: Endless(), config=LOCKSTEP, views=TWO_VIEWS) as rig:
+    with taped(tmp_path) as tape, Rig(tmp_path, lambda _: Steady(), config=LOCKSTEP, views=TWO_VIEWS) as rig:
         heard_by_the_tape(rig)
         tape.await_more("view/top/win")
         assert rig.ask("set_param", samples=2).code is Code.OK
@@ -102,7 +94,7 @@ def test_a_topic_that_a_command_opens_and_closes_begins_and_ends_with_it(tmp_pat
 def test_a_removed_view_ends_on_every_topic_it_ever_had(tmp_path: Path) -> None:
     model = FakeSynthesizer(painting_traits())
     views = "[view.top]\n[view.second]"
-    with taped(tmp_path) as tape, Rig(tmp_path, lambda _: Endless(), model, config=LOCKSTEP, views=views) as rig:
+    with taped(tmp_path) as tape, Rig(tmp_path, lambda _: Steady(), model, config=LOCKSTEP, views=views) as rig:
         heard_by_the_tape(rig)
         rig.ask("set_param", samples=2)
         tape.await_more("view/second/std")
@@ -132,7 +124,7 @@ WILD: list[dict[str, object]] = [
 
 
 def test_no_number_in_a_view_can_end_the_stream(tmp_path: Path) -> None:
-    with Rig(tmp_path, lambda _: Endless(), config=LOCKSTEP) as rig:
+    with Rig(tmp_path, lambda _: Steady(), config=LOCKSTEP) as rig:
         rig.await_views(1)
         for wanted in WILD:
             reply = rig.ask("set_view", wanted, view="main")

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import pytest
 
-from gcd_node.errors import ConfigError
 from gcd_node.health import Health, Level
 
 prometheus = pytest.importorskip("prometheus_client", reason="needs the extra `metrics`")
@@ -156,11 +155,6 @@ def test_callers_that_say_nothing_neither_grow_the_node_nor_lock_probes_out_for_
     finally:
         for caller in silent:
             caller.close()
-
-
-def test_other_machines_are_refused(health: Health) -> None:
-    with pytest.raises(ConfigError):
-        MetricsServer("0.0.0.0:9100", health)
 
 
 def test_without_the_extra_a_launch_file_that_asks_for_it_is_refused(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@ import threading
 import time
 from collections.abc import Mapping
 from contextlib import nullcontext
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,6 @@ from gcd_model import (
     CheckpointError,
     DeviceMemoryError,
     NonFiniteError,
-    OptionError,
     RenderOptions,
     ShapeError,
     ViewFixedError,
@@ -252,14 +250,6 @@ def test_the_last_status_says_how_it_ended(
 def test_a_failure_keeps_its_own_code(failure: Exception, code: str) -> None:
     assert ending(failure, stopped=False) == (code, "closed")
     assert ending(failure, stopped=True) == (code, "closed")
-
-
-def test_a_motion_number_that_nobody_can_know_is_asked_for_before_the_first_frame() -> None:
-    unknown = replace(traits(), family=None)
-    with pytest.raises(OptionError, match="motion"):
-        made_node(config(), FakeSynthesizer(unknown), FakeSource(14), Box()).run()
-    told = made_node(config(model="motion_bucket = 100.0"), FakeSynthesizer(unknown), FakeSource(14), Box())
-    assert told.run().counts.windows == 1
 
 
 def test_an_outbox_that_fails_ends_the_run_and_every_thread() -> None:

@@ -1,4 +1,3 @@
-import socket
 import threading
 import time
 from pathlib import Path
@@ -6,8 +5,8 @@ from typing import Any
 
 import pytest
 from cameras import Bench, Camera, until
-from fakes import FakeSource, FakeSynthesizer, traits
-from rig import Rig
+from fakes import FakeSource, FakeSynthesizer, Steady, traits
+from rig import Rig, service_manager
 
 from gcd_client.control import Code
 from gcd_model import RenderOptions, SphericalDelta
@@ -33,14 +32,6 @@ class Gate:
             if options.cancel is not None and options.cancel.is_set():
                 return
             assert time.monotonic() < deadline_s
-
-
-class Endless(FakeSource):
-    """Frames until it is closed."""
-
-    def __init__(self) -> None:
-        super().__init__(1_000_000)
-        self.period_s = 0.002
 
 
 def test_a_node_goes_through_its_life_as_it_is_asked(tmp_path: Path) -> None:
@@ -80,7 +71,7 @@ def asked_config(rig: Rig) -> dict[str, Any]:
 def test_several_views_come_from_one_batch_and_change_alone(tmp_path: Path) -> None:
     gate = Gate()
     model = FakeSynthesizer(traits(), gate)
-    with Rig(tmp_path, lambda _: Endless(), model, config=LOCKSTEP, views=TWO_VIEWS, more="") as rig:
+    with Rig(tmp_path, lambda _: Steady(), model, config=LOCKSTEP, views=TWO_VIEWS, more="") as rig:
         gate.waits.release()
         rig.await_views(1, "swing")
         until(lambda: gate.begun == 2)
@@ -141,7 +132,7 @@ def test_a_change_meant_for_another_revision_is_refused(tmp_path: Path) -> None:
 
 
 def test_parameters_change_from_the_next_window_on(tmp_path: Path) -> None:
-    with Rig(tmp_path, lambda _: Endless(), config=LOCKSTEP) as rig:
+    with Rig(tmp_path, lambda _: Steady(), config=LOCKSTEP) as rig:
         rig.await_views(1)
         reply = rig.ask("set_param", steps=3, guidance=[1.0, 2.0], publish="jpeg", jpeg_quality=60)
         assert reply.code is Code.OK
@@ -161,7 +152,7 @@ def test_parameters_change_from_the_next_window_on(tmp_path: Path) -> None:
 
 
 def test_a_node_tells_who_it_is_and_what_it_can(tmp_path: Path) -> None:
-    with Rig(tmp_path, lambda _: Endless(), config=LOCKSTEP) as rig:
+    with Rig(tmp_path, lambda _: Steady(), config=LOCKSTEP) as rig:
         rig.await_views(1)
         hello, described, calib = (rig.ask(verb).result for verb in ("hello", "describe", "get_calib"))
         assert hello is not None
@@ -186,7 +177,7 @@ def test_a_node_tells_who_it_is_and_what_it_can(tmp_path: Path) -> None:
 
 def test_a_command_is_answered_while_the_model_computes(tmp_path: Path) -> None:
     gate = Gate()
-    with Rig(tmp_path, lambda _: Endless(), FakeSynthesizer(traits(), gate), config=LOCKSTEP) as rig:
+    with Rig(tmp_path, lambda _: Steady(), FakeSynthesizer(traits(), gate), config=LOCKSTEP) as rig:
         until(lambda: gate.begun == 1)
         took_s: list[float] = []
         for i in range(20):
@@ -198,7 +189,7 @@ def test_a_command_is_answered_while_the_model_computes(tmp_path: Path) -> None:
 
 
 def test_an_operator_who_deactivates_keeps_a_node_that_would_end_with_its_source(tmp_path: Path) -> None:
-    with Rig(tmp_path, lambda _: Endless(), config=LOCKSTEP, once=True) as rig:
+    with Rig(tmp_path, lambda _: Steady(), config=LOCKSTEP, once=True) as rig:
         rig.await_views(1)
         assert rig.ask("deactivate").code is Code.ACCEPTED
         rig.await_event("STATE")
@@ -213,19 +204,12 @@ def test_an_operator_who_deactivates_keeps_a_node_that_would_end_with_its_source
 
 def test_whoever_starts_the_node_is_told_when_it_is_ready_and_that_it_lives(tmp_path: Path) -> None:
     address = str(tmp_path / "notify")
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
-        listener.bind(address)
-        listener.settimeout(20)
-        environment = {"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "400000"}
-        with Rig(tmp_path, lambda _: Endless(), config=LOCKSTEP, service=ServiceManager(environment)) as rig:
+    environment, heard = {"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "400000"}, list[str]()
+    with service_manager(address) as receive:
+        with Rig(tmp_path, lambda _: Steady(), config=LOCKSTEP, service=ServiceManager(environment)) as rig:
             rig.await_views(1)
-            heard = [listener.recv(4096).decode() for _ in range(6)]
-        listener.settimeout(0.1)
-        try:
-            while True:
-                heard.append(listener.recv(4096).decode())
-        except TimeoutError:
-            pass
+            until(lambda: heard.extend(receive()) or "WATCHDOG=1" in heard)
+        heard += receive()
     assert heard[0].startswith("EXTEND_TIMEOUT_USEC")
     assert sum("READY=1" in line for line in heard) == 1
     assert "WATCHDOG=1" in heard

@@ -34,11 +34,12 @@ def examples() -> list[bytes]:
 
 @pytest.mark.parametrize("request_line", examples()[0::2])
 def test_the_requests_shown_are_requests(request_line: bytes) -> None:
-    try:
+    if b'"steps":2000' in request_line:  # the page shows one refusal
+        with pytest.raises(RequestError):
+            parse_command(request_line)
+    else:
         command = parse_command(request_line)
         assert command.if_view_rev == (1 if command.verb == "set_view" else None)
-    except RequestError as error:
-        assert error.code == "OUT_OF_RANGE"  # the page shows one refusal
 
 
 @pytest.mark.parametrize("reply_line", examples()[1::2])

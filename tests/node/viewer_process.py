@@ -13,7 +13,7 @@ from rig import rig_config
 from gcd_node.control import ControlServer
 from gcd_node.frame import Frame, SourceInfo
 from gcd_node.lifecycle import Parts
-from gcd_node.node import Node, NodeOptions
+from gcd_node.node import Node
 from gcd_node.session import open_publisher
 
 VIEWS = "[view.left]\nazimuth_deg = -30.0\n[view.swing]\nkind = 'orbit'\nrate_deg_s = 10.0\namplitude_deg = 20.0"
@@ -56,7 +56,7 @@ def main(folder: Path) -> None:
             config,
             Parts(open_source=lambda _: Bar(), load_model=lambda _: model),
             publisher,
-            NodeOptions(once=False),
+            once=False,
         )
         with ControlServer(f"ipc://{folder}/control", node.handle, lambda: node.state.label, node.event):
             print("there", flush=True)
