@@ -1,17 +1,16 @@
 """Goes through a launch file as a start would, but loads no weights: what `gcd-node check` finds. Prints nothing."""
 
 import tempfile
-import threading
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Literal, ParamSpec, TypeAlias
 
 import psutil
 import torch
 
-from gcd_client.endpoints import resolve_endpoint
 from gcd_client.protocol import ClientError
 from gcd_model import (
     FAMILIES,
@@ -27,20 +26,21 @@ from gcd_model import (
     load_synthesizer,
 )
 from gcd_node.auth import load_server_security
-from gcd_node.config import ModelSection, NodeConfig, RecordConfig
-from gcd_node.errors import ConfigError, NodeError, SourceLostError
-from gcd_node.frame import Frame, FrameSource, SourceInfo
+from gcd_node.config import ModelSection, NodeConfig
+from gcd_node.control import ControlServer, Outcome
+from gcd_node.errors import ConfigError, NodeError, SourceError
+from gcd_node.frame import SourceInfo
+from gcd_node.health import Health
 from gcd_node.mcap_file import RoomError, check_room
-from gcd_node.model import drawing_options, sampler_in_use
 from gcd_node.preprocess import in_words
-from gcd_node.session import load_model, model_threads, open_session
+from gcd_node.session import load_model, metrics_server, model_threads, open_publisher, viewer_arguments
 from gcd_node.sources import open_source
-from gcd_node.stream_context import prepare_stream
+from gcd_node.stream_context import StreamContext, drawing_options, prepare_stream, sampler_in_use
 from gcd_node.views import LiveConfig, VirtualViews
 
 Verdict: TypeAlias = Literal["ok", "warning", "failed"]
 
-_FIRST_FRAME_S = 5.0
+_P = ParamSpec("_P")
 _MUCH_MEMORY = 0.7
 _BYTES = {"float32": 4, "bfloat16": 2, "float16": 2}
 
@@ -55,15 +55,6 @@ class Finding:
     error: Exception | None = None
 
 
-@dataclass(slots=True)
-class _Known:
-    """What has been found out so far. weight_bytes: the weights in the precision they will be used in."""
-
-    info: SourceInfo | None = None
-    traits: Traits | None = None
-    weight_bytes: int = 0
-
-
 class _DoubtfulError(Exception):
     """A start would go on, with a warning."""
 
@@ -75,100 +66,148 @@ def check_launch(config: NodeConfig, free_memory: int | None = None) -> Iterator
     free_memory: bytes, on the model's device; measured if left out. What follows from something that failed is left
         out.
     """
-    known = _Known()
-    yield _finding("endpoints", lambda: _endpoints(config))
+    look = _Look(config, free_memory)
+    yield _finding("endpoints", look.endpoints)
     if config.record.folder is not None:
-        yield _finding("record", lambda: _record(Path(config.record.folder or ""), config.record))
-    yield _finding("source", lambda: _source(config, known))
-    yield _finding("weights", lambda: _weights(config.model, known))
-    info, traits = known.info, None if known.traits is None else known.traits.streaming()
-    if traits is not None:
-        yield _finding("memory", lambda: _memory(traits, known.weight_bytes, free_memory))
-    if traits is not None and info is not None:
-        yield _finding("views", lambda: _views(config, traits, info))
-        yield _finding("time", lambda: _time(config, traits, info))
+        yield _finding("record", look.record)
+    yield _finding("source", look.source)
+    yield _finding("weights", look.weights)
+    if look.traits is not None:
+        yield _finding("memory", look.memory, look.traits)
+    if look.traits is not None and look.info is not None:
+        yield _finding("views", look.views, look.traits, look.info)
+    if look.context is not None:
+        yield _finding("time", look.time, look.context)
 
 
-def _finding(topic: str, look: Callable[[], str]) -> Finding:
+def _finding(topic: str, look: Callable[_P, str], *args: _P.args, **kwargs: _P.kwargs) -> Finding:
     try:
-        return Finding(topic=topic, verdict="ok", detail=look())
+        return Finding(topic=topic, verdict="ok", detail=look(*args, **kwargs))
     except _DoubtfulError as doubt:
         return Finding(topic=topic, verdict="warning", detail=str(doubt))
     except (NodeError, ClientError, ModelError) as error:
         return Finding(topic=topic, verdict="failed", detail=str(error), error=error)
 
 
-def _endpoints(config: NodeConfig) -> str:
-    with open_session(config) as (_, publisher):
-        endpoint = config.control.endpoint
-        control = "no control" if endpoint is None else f"control {resolve_endpoint(endpoint, 'control')}"
-        return f"free: data {publisher.endpoint}, status {publisher.status_endpoint}, {control}"
+class _Look:
+    """Each method looks at one thing and says in words what it is; some leave what others go on from.
 
+    weight_bytes: the weights in the precision they will be used in.
+    """
 
-def _record(folder: Path, section: RecordConfig) -> str:
-    """What fails here ends no start, but nothing would be recorded."""
-    root = folder.expanduser()
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=root):
-            free_mb = check_room(section, root)
-    except OSError as error:
-        raise ConfigError(f"nothing can be recorded in {root}: {error}; check folder in [record]") from error
-    except RoomError as limit:
-        raise _DoubtfulError(f"nothing would be recorded: {limit}") from limit
-    when = "from the start" if section.autostart else "when asked to"
-    return f"{', '.join(section.what)} into {root}, {when}; {free_mb / 1000:.1f} GB are free"
+    def __init__(self, config: NodeConfig, free_memory: int | None) -> None:
+        self._config, self._free_memory = config, free_memory
+        self.info: SourceInfo | None = None
+        self.traits: Traits | None = None
+        self.weight_bytes = 0
+        self.context: StreamContext | None = None
 
+    def endpoints(self) -> str:
+        config, control = self._config, None
+        security = load_server_security(config.security)
+        with open_publisher(config, security) as publisher, ExitStack() as stack:
+            if config.control.endpoint is not None:
+                server = ControlServer(
+                    config.control.endpoint,
+                    lambda _command, _role: Outcome(message="the launch file is being checked"),
+                    lambda: "unconfigured",
+                    lambda _code, _fields: None,
+                    security=security,
+                )
+                control = stack.enter_context(server).endpoint
+            if config.health.http is not None:
+                stack.enter_context(metrics_server(config.health.http, Health()))
+            if config.viewer.http is not None:
+                viewer_arguments(config, publisher, control, security)
+            sockets = f"data {publisher.endpoint}, status {publisher.status_endpoint}"
+            return f"free: {sockets}, {'no control' if control is None else f'control {control}'}"
 
-def _source(config: NodeConfig, known: _Known) -> str:
-    source = open_source(config.source, load_server_security(config.security))
-    try:
-        first = _first_frame(source)
-        info = known.info = source.info
-        rate = f"{info.width} x {info.height} at {info.fps_nominal:g} FPS"
-        lens = "" if info.lens is None else ", calibrated"
-        return f"{info.kind} {info.id}: {rate}{lens}; its first frame is number {first.seq}"
-    finally:
-        source.close()
-
-
-def _first_frame(source: FrameSource) -> Frame:
-    """Raises SourceLostError if none comes."""
-    found: list[Frame | Exception] = []
-
-    def look() -> None:
+    def record(self) -> str:
+        """What fails here ends no start, but nothing would be recorded."""
+        section = self._config.record
+        root = Path(section.folder or "").expanduser()
         try:
-            found.extend(frame for frame, _ in zip(source.frames(), range(1), strict=False))
-        except Exception as error:  # the end of a thread
-            found.append(error)
+            root.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=root):
+                free_mb = check_room(section, root)
+        except OSError as error:
+            raise ConfigError(f"nothing can be recorded in {root}: {error}; check folder in [record]") from error
+        except RoomError as limit:
+            raise _DoubtfulError(f"nothing would be recorded: {limit}") from limit
+        when = "from the start" if section.autostart else "when asked to"
+        return f"{', '.join(section.what)} into {root}, {when}; {free_mb / 1000:.1f} GB are free"
 
-    looker = threading.Thread(target=look, name="first frame", daemon=True)
-    looker.start()
-    looker.join(_FIRST_FRAME_S)
-    if not found:
-        raise SourceLostError(f"{source.info.id} opened, and gave no frame in {_FIRST_FRAME_S:g} s; is it covered?")
-    if isinstance(found[0], Exception):
-        raise found[0]
-    return found[0]
+    def source(self) -> str:
+        source = open_source(self._config.source, load_server_security(self._config.security))
+        try:
+            first = next(iter(source.frames()), None)  # of a camera it waits already, or opening had failed
+            if first is None:
+                raise SourceError(f"{source.info.id} has no frames; is it the right one?")
+            info = self.info = source.info
+            rate = f"{info.width} x {info.height} at {info.fps_nominal:g} FPS"
+            lens = "" if info.lens is None else ", calibrated"
+            return f"{info.kind} {info.id}: {rate}{lens}; its first frame is number {first.seq}"
+        finally:
+            source.close()
 
+    def weights(self) -> str:
+        section = self._config.model
+        if section.weights.startswith("random:"):
+            self.traits = load_synthesizer(section.weights, device="cpu").traits.streaming()
+            raise _DoubtfulError(f"{section.weights}: these weights are random, so every picture is noise")
+        path = weights_path(section.weights)
+        if is_export(path):  # only loading says whether onnxruntime takes it here
+            traits = self.traits = load_model(section).traits.streaming()
+            self.weight_bytes = sum(file.stat().st_size for file in path.iterdir() if file.is_file())
+            return f"{traits.name}, {traits.precision}, an export of {self.weight_bytes / 1e6:.1f} MB"
+        report = inspect_weights(
+            path, family=section.family, head_width=section.head_width, image_heads=section.image_heads
+        )
+        # Only loading says whether weights and adapter belong together.
+        traits = _traits(report, section) if section.adapter is None else load_model(section).traits
+        self.traits, self.weight_bytes = traits.streaming(), report.parameters * _BYTES.get(traits.precision, 4)
+        family = "unknown" if traits.family is None else traits.family.name
+        return f"{traits.name}, family {family}, {report.parameters / 1e6:.1f} M parameters"
 
-def _weights(section: ModelSection, known: _Known) -> str:
-    if section.weights.startswith("random:"):
-        known.traits = load_synthesizer(section.weights, device="cpu").traits
-        raise _DoubtfulError(f"{section.weights}: these weights are random, so every picture is noise")
-    path = weights_path(section.weights)
-    if is_export(path):  # only loading says whether onnxruntime takes it here
-        known.traits = load_model(section).traits
-        known.weight_bytes = sum(file.stat().st_size for file in path.iterdir() if file.is_file())
-        return f"{known.traits.name}, {known.traits.precision}, an export of {known.weight_bytes / 1e6:.1f} MB"
-    report = inspect_weights(
-        path, family=section.family, head_width=section.head_width, image_heads=section.image_heads
-    )
-    # Only loading says whether weights and adapter belong together.
-    traits = known.traits = _traits(report, section) if section.adapter is None else load_model(section).traits
-    known.weight_bytes = report.parameters * _BYTES.get(traits.precision, 4)
-    family = "unknown" if traits.family is None else traits.family.name
-    return f"{traits.name}, family {family}, {report.parameters / 1e6:.1f} M parameters"
+    def memory(self, traits: Traits) -> str:
+        needed, free = self.weight_bytes, self._free_memory
+        on_gpu = traits.device.startswith("cuda")
+        if free is None:
+            free = torch.cuda.mem_get_info(traits.device)[0] if on_gpu else psutil.virtual_memory().available
+        line = f"weights take {needed / 2**30:.2f} GiB in {traits.precision}, {free / 2**30:.2f} are free on "
+        line += f"{traits.device if on_gpu else 'cpu'}; what the model needs to compute comes on top and is not counted"
+        if needed > free:
+            raise CheckpointError(f"{line}. Free some, or use bfloat16 or a smaller model")
+        if needed > _MUCH_MEMORY * free:
+            raise _DoubtfulError(line)
+        return line
+
+    def views(self, traits: Traits, info: SourceInfo) -> str:
+        config = self._config
+        context = self.context = prepare_stream(config, traits, info)
+        VirtualViews(traits).sync(LiveConfig(config).settings(), context.mount)
+        frames, names = traits.config.frames, ", ".join(config.view)
+        line = f"{names}: {f'windows of {frames} frames' if frames > 1 else 'every frame'} at {context.fps:g} FPS"
+        camera = in_words(context.mount, config.source.pose, traits)
+        line += f"; {camera}" if camera else ""
+        if context.ood:
+            raise _DoubtfulError(f"{line}; outside what {traits.name} was trained with: {', '.join(context.ood)}")
+        return line
+
+    def time(self, context: StreamContext) -> str:
+        config, traits, model = self._config, context.traits, self._config.model
+        frames = traits.config.frames
+        period_s = (config.window.stride or frames) / context.fps
+        if isinstance(traits.config, ModelConfig):
+            runs = Schedule.of(traits.config, drawing_options(model)).evaluations
+        else:
+            runs = sampler_in_use(model, traits).steps * frames
+        runs *= model.samples * len(config.view)
+        unit = "window" if frames > 1 else "frame"
+        return (
+            f"a {unit} every {period_s:.2f} s, {runs} network evaluations each, so {1000 * period_s / runs:.1f} ms for "
+            f"one if none is to be left out; {model_threads(model)} CPU threads"
+        )
 
 
 def weights_path(weights: str) -> Path:
@@ -197,46 +236,4 @@ def _traits(report: WeightsReport, section: ModelSection) -> Traits:
         device=device,
         trained=report.trained,
         uncertainty_scale=report.uncertainty_scale,
-    )
-
-
-def _memory(traits: Traits, needed: int, free: int | None) -> str:
-    on_gpu = traits.device.startswith("cuda")
-    if free is None:
-        free = torch.cuda.mem_get_info(traits.device)[0] if on_gpu else psutil.virtual_memory().available
-    line = f"weights take {needed / 2**30:.2f} GiB in {traits.precision}, {free / 2**30:.2f} are free on "
-    line += f"{traits.device if on_gpu else 'cpu'}; what the model needs to compute comes on top and is not counted"
-    if needed > free:
-        raise CheckpointError(f"{line}. Free some, or use bfloat16 or a smaller model")
-    if needed > _MUCH_MEMORY * free:
-        raise _DoubtfulError(line)
-    return line
-
-
-def _views(config: NodeConfig, traits: Traits, info: SourceInfo) -> str:
-    run = prepare_stream(config, traits, info)
-    VirtualViews(traits).sync(LiveConfig(config).settings(), run.mount)
-    frames = traits.config.frames
-    line = (
-        f"{', '.join(config.view)}: {f'windows of {frames} frames' if frames > 1 else 'every frame'} at {run.fps:g} FPS"
-    )
-    camera = in_words(run.mount, config.source.pose, traits)
-    line += f"; {camera}" if camera else ""
-    if run.ood:
-        raise _DoubtfulError(f"{line}; outside what {traits.name} was trained with: {', '.join(run.ood)}")
-    return line
-
-
-def _time(config: NodeConfig, traits: Traits, info: SourceInfo) -> str:
-    frames, model = traits.config.frames, config.model
-    period_s = (config.window.stride or frames) / prepare_stream(config, traits, info).fps
-    if isinstance(traits.config, ModelConfig):
-        runs = Schedule.of(traits.config, drawing_options(model)).evaluations
-    else:
-        runs = sampler_in_use(model, traits).steps * frames
-    runs *= model.samples * len(config.view)
-    unit = "window" if frames > 1 else "frame"
-    return (
-        f"a {unit} every {period_s:.2f} s, {runs} network evaluations each, so {1000 * period_s / runs:.1f} ms for one "
-        f"if none is to be left out; {model_threads(model)} CPU threads"
     )

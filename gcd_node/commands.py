@@ -11,18 +11,16 @@ from gcd_client.control import Code
 from gcd_client.protocol import PROTO
 from gcd_model import ASSUMED_SOURCE, DeltaFit, ModelError, Traits, ViewFixedError, ViewRangeError, nearest_delta
 from gcd_node.auth import Role
-from gcd_node.config import ViewConfig, pose_matrix
-from gcd_node.config_digest import config_digest
-from gcd_node.config_dump import without_secrets
+from gcd_node.config import ViewConfig, pose_matrix, without_secrets
 from gcd_node.control import Outcome
 from gcd_node.health import Level
-from gcd_node.lifecycle import Verb
+from gcd_node.lifecycle import Transitions, Verb
 from gcd_node.preprocess import stated_sphere
 from gcd_node.recorder import Recorder
-from gcd_node.status import NodeServices, calibration
-from gcd_node.transitions import Transitions
+from gcd_node.status import Announcer, calibration
+from gcd_node.stream_context import config_digest
 from gcd_node.verbs import Command, RemoveView, RequestError, SetParam, SetPose, SetView, schemas
-from gcd_node.views import VirtualView
+from gcd_node.views import LiveConfig, VirtualView
 
 _TOLERATED_DEG = 2.0
 
@@ -32,13 +30,14 @@ class NodeCommands:
 
     def __init__(
         self,
-        services: NodeServices,
+        live: LiveConfig,
+        announcer: Announcer,
         transitions: Transitions,
         recorder: Recorder,
         request_transition: Callable[[Verb, bool], Outcome],
     ) -> None:
         """request_transition: begins one; its second argument is dry_run."""
-        self._live, self._health, self._announcer = services.live, services.health, services.announcer
+        self._live, self._health, self._announcer = live, announcer.health, announcer
         self._transitions, self._recorder, self._request = transitions, recorder, request_transition
         self._queries: dict[str, Callable[[], dict[str, object]]] = {
             "describe": self._describe,
@@ -161,9 +160,7 @@ class NodeCommands:
         return Outcome(result=result)
 
     def _set_param(self, args: SetParam, *, dry_run: bool) -> Outcome:
-        stated: dict[str, object] = {
-            name: value for name in args.__struct_fields__ if (value := getattr(args, name)) is not None
-        }
+        stated: dict[str, object] = msgspec.to_builtins(args)
         if "publish" in stated:
             stated["encoding"] = stated.pop("publish")
         sending = {name: value for name, value in stated.items() if name in ("encoding", "jpeg_quality")}

@@ -22,7 +22,7 @@ from gcd_client.control import MAX_REPLY, MAX_REQUEST, Code, Reply
 from gcd_client.protocol import ClientError
 from gcd_node.auth import Client, Context, EventSink, Role, ServerSecurity, SocketGuard, own_endpoint, unbind
 from gcd_node.errors import NodeError
-from gcd_node.verbs import VERBS, Command, RequestError, parse_command, parse_request
+from gcd_node.verbs import VERBS, Command, RequestError, parse_command
 
 _LOG = logging.getLogger(__name__)
 _LINGER_MS = 500
@@ -177,59 +177,58 @@ class ControlServer:
         try:
             if len(parts) != 1:
                 raise RequestError(f"a request is one part, got {len(parts)}; use a DEALER socket", Code.BAD_JSON)
-            request = parse_request(parts[0])
-            request_id = request.id
-            return self._reply(parse_command(request), request_id, parts[0], client, received_ns), None
+            command = parse_command(parts[0])
+            request_id = command.id
+            return self._reply(command, parts[0], client, received_ns), None
         except RequestError as error:
-            outcome = Outcome(code=error.reason, message=str(error), result=error.result)
-            return self._encoded(error.request_id or request_id, outcome), error.reason
+            return self._encoded(error.request_id or request_id, _refusal(error)), error.reason
 
-    def _reply(self, command: Command, request_id: str, part: bytes, client: Client, received_ns: int) -> bytes:
+    def _reply(self, command: Command, part: bytes, client: Client, received_ns: int) -> bytes:
         """Raises RequestError."""
         needed = VERBS[command.verb].role
         if needed == "operator" and client.role != "operator":
             message = f"{command.verb} needs the operator role, {client.name or 'this client'} is a {client.role}"
             raise RequestError(message, Code.FORBIDDEN)
-        cache, key = self._kept[needed], (client.name, request_id)
+        cache, key = self._kept[needed], (client.name, command.id)
         try:
             kept = cache.find(key, part, time.monotonic())
         except KeyError as error:
-            message = f"the id {request_id} was used for another request; take a new one for each"
+            message = f"the id {command.id} was used for another request; take a new one for each"
             raise RequestError(message, Code.BAD_ARG) from error
         if kept is None:
-            kept = self._encoded(request_id, self._outcome(command, client.role, received_ns))
+            kept = self._carried_out(command, client.role, received_ns)
             cache.keep(key, part, kept, time.monotonic())
         return kept
 
-    def _outcome(self, command: Command, role: Role, received_ns: int) -> Outcome:
-        if command.verb == "time":
-            return Outcome(result={"t_rx": divmod(received_ns, _SECOND_NS), "t_tx": divmod(time.time_ns(), _SECOND_NS)})
+    def _carried_out(self, command: Command, role: Role, received_ns: int) -> bytes:
         try:
-            return self._handle(command, role)
+            if command.verb == "time":
+                times = {"t_rx": divmod(received_ns, _SECOND_NS), "t_tx": divmod(time.time_ns(), _SECOND_NS)}
+                return self._encoded(command.id, Outcome(result={**times}))
+            return self._encoded(command.id, self._handle(command, role))
         except RequestError as error:
-            return Outcome(code=error.reason, message=str(error), result=error.result)
+            outcome = _refusal(error)
         except (NodeError, ClientError) as error:
-            return Outcome(code=Code.INTERNAL, message=str(error))
+            outcome = Outcome(code=Code.INTERNAL, message=str(error))
         except Exception as error:
             _LOG.exception("%s failed", command.verb)
-            return Outcome(code=Code.INTERNAL, message=f"{command.verb} failed: {type(error).__name__}; see the log")
+            message = f"{command.verb} failed: {type(error).__name__}; see the log"
+            outcome = Outcome(code=Code.INTERNAL, message=message)
+        return self._encoded(command.id, outcome)
 
     def _encoded(self, request_id: str, outcome: Outcome) -> bytes:
-        try:
-            part = self._written(request_id, outcome)
-        except (TypeError, ValueError, RecursionError, OverflowError):
-            _LOG.exception("a result is not plain JSON")
-            return self._written(request_id, Outcome(code=Code.INTERNAL, message="the result is not plain JSON"))
-        if len(part) > MAX_REPLY:
-            message = f"the result has {len(part)} bytes, a reply at most {MAX_REPLY}"
-            return self._written(request_id, Outcome(code=Code.INTERNAL, message=message))
-        return part
-
-    def _written(self, request_id: str, outcome: Outcome) -> bytes:
+        """Raises NodeError: too long."""
         code = outcome.code
         ok, state = code in (Code.OK, Code.ACCEPTED), self._state()
         reply = Reply(id=request_id, ok=ok, code=code, message=outcome.message, state=state, result=outcome.result)
-        return msgspec.json.encode(reply)
+        part = msgspec.json.encode(reply)
+        if len(part) > MAX_REPLY:
+            raise NodeError(f"the result has {len(part)} bytes, a reply at most {MAX_REPLY}")
+        return part
+
+
+def _refusal(error: RequestError) -> Outcome:
+    return Outcome(code=error.reason, message=str(error), result=error.result)
 
 
 class ReplyCache:

@@ -22,7 +22,6 @@ from gcd_node.frame import Image
 from gcd_node.image_io import enlarged, make_folder, sheet, spread, strip, write_animation, write_png, write_video
 from gcd_node.inference import WindowReport
 from gcd_node.messages import ontology
-from gcd_node.node import NodeOptions
 from gcd_node.pipeline import Summary
 from gcd_node.publisher import Publisher
 from gcd_node.session import open_session, run_until_signal
@@ -74,7 +73,7 @@ def run_open_demo() -> Summary:
             control=ControlConfig(endpoint=f"ipc://{folder}/control"),
             viewer=ViewerConfig(http="127.0.0.1:0"),
         )
-        with open_session(config, options=NodeOptions(), viewer=True, show_page=True) as (node, publisher):
+        with open_session(config, once=True, viewer=True, show_page=True) as (node, publisher):
             return run_until_signal(node, publisher)
 
 
@@ -94,7 +93,7 @@ def run_demo(out: Path, on_window: Callable[[WindowReport], None]) -> DemoReport
 
     with tempfile.TemporaryDirectory(prefix="gcd-demo-") as name:
         received = Path(name) / "received"
-        session = open_session(demo_config(Path(name)), remember, NodeOptions(on_configured=models.append))
+        session = open_session(demo_config(Path(name)), once=True, on_configured=models.append, on_window=remember)
         with session as (node, publisher), _receiver(publisher, received) as receiver:
             summary = run_until_signal(node, publisher)
             publisher.close()

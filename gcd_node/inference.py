@@ -15,17 +15,20 @@ from gcd_node.errors import DepthError
 from gcd_node.health import IDLE, Level
 from gcd_node.messages import Rendered, messages, newest_ns, utc_offset_ns, world_flags
 from gcd_node.model import (
+    FULL,
+    Condition,
+    FailureCounter,
     IdleTimer,
     ModelSlot,
-    drawing_options,
+    OomLevel,
     interruptible,
     model_errors,
+    oom_levels,
     render_grey,
-    sampler_in_use,
 )
-from gcd_node.status import FULL, Condition, FailureCounter, NodeServices, OomLevel, oom_levels
-from gcd_node.stream_context import StreamContext
-from gcd_node.views import EndOfStream, Settings, VirtualView, VirtualViews
+from gcd_node.status import Announcer
+from gcd_node.stream_context import StreamContext, drawing_options, sampler_in_use
+from gcd_node.views import EndOfStream, LiveConfig, Settings, VirtualView, VirtualViews
 from gcd_node.window import FrameWindow, PartialWindow, WindowSlot
 
 _LOG = logging.getLogger(__name__)
@@ -71,28 +74,34 @@ class ModelWorker:
 
     def __init__(
         self,
-        services: NodeServices,
+        live: LiveConfig,
+        announcer: Announcer,
         model: ModelSlot,
         context_at: Callable[[int], StreamContext],
         on_window: Callable[[WindowReport], None] | None = None,
     ) -> None:
-        """context_at: what is known of the source in an epoch; -1 for now."""
+        """context_at: what is known of the source in an epoch; -1 for now.
+
+        Raises:
+            OptionError, PoseError: see VirtualView.
+        """
         self.counts = WorkCounts()
         self.warm = threading.Event()  # the first window may come
         self._model, self._context_at, self._on_window = model, context_at, on_window
-        self._live, self._sink, self._health = services.live, services.sink, services.health
-        config = services.live.config
+        self._live, self._sink, self._health = live, announcer.sink, announcer.health
+        config = live.config
         self._realtime = config.source.pace == "realtime"
-        self._out = EndOfStream(services.live, services.sink, lambda: context_at(-1))
+        self._out = EndOfStream(live, announcer.sink, lambda: context_at(-1))
         self._views = VirtualViews(model.traits)
+        self._views.sync(live.settings(), context_at(-1).mount)
         self._idle = IdleTimer(config.life.idle_s if self._realtime else 0.0)
-        self._failures = FailureCounter(services.health, services.announcer)
+        self._failures = FailureCounter(announcer)
         self._cancel = threading.Event()
         self._beat_s: float | None = None
         self._encoded = EncodedFrames(self._beat, self._count_bad_depth, self._tell_odometry)
         hold_s = _HOLD_S if model.streams else 0.0
         self._bad_depth, self._bad_odometry, self._lost_motion = (
-            Condition(code, services.health, services.announcer, hold_s=hold_s) for code in _INPUT_CODES
+            Condition(code, announcer, hold_s=hold_s) for code in _INPUT_CODES
         )
         self._may_encode_ahead = True
         self._epoch = -1

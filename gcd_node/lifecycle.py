@@ -1,19 +1,39 @@
-"""The life of a node as ROS 2 counts it: states, the transitions between them, nothing else (wire protocol, section 6).
+"""The life of a node as ROS 2 counts it: its states, the transitions between them, and the work of each (wire protocol,
+section 6).
 
     unconfigured --configure--> inactive --activate--> active
          ^            cleanup      |  ^   deactivate      |
          +-------------------------+  +-------------------+          shutdown from each of the three: finalized
 
-Pure: the holder of a `Lifecycle` does the work between `begin` and its outcome. The states of the source and of the
-model are beside this one: a lost source does not leave active.
+The states of the source and of the model are beside this one: a lost source does not leave active.
 """
 
 import enum
+import gc
+import logging
+import threading
+import time
 import types
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
+from msgspec.structs import replace
+
 from gcd_client.control import ControlError
+from gcd_model import Traits
+from gcd_node.frame import FrameSource, SourceInfo
+from gcd_node.inference import WindowReport
+from gcd_node.model import LoadModel, ModelSlot
+from gcd_node.pipeline import Stream, Summary
+from gcd_node.recorder import Recorder
+from gcd_node.sources import LIVE_KINDS, OakSource, SourceConfig
+from gcd_node.status import Announcer
+from gcd_node.stream_context import StreamContext, prepare_stream
+from gcd_node.views import LiveConfig, VirtualViews
+
+_LOG = logging.getLogger(__name__)
+_LOOK_S, _HURRY_S = 0.1, 2.0
 
 Verb: TypeAlias = Literal["configure", "activate", "deactivate", "cleanup", "shutdown"]
 """What may be asked of a node's life."""
@@ -58,21 +78,24 @@ PATHS: Mapping[Verb, tuple[frozenset[State], State, State]] = types.MappingProxy
 
 
 class Lifecycle:
-    """Where a node stands. One transition at a time: `begin`, then one of `succeed`, `fail` and `error`."""
+    """Where a node stands. One transition at a time: `begin`, from any thread, then one of the others."""
 
     def __init__(self) -> None:
-        self.state = self._from = self._to = State.UNCONFIGURED
+        self.state = self._from = State.UNCONFIGURED
         """state: where it stands now; changed here alone."""
+        self._verb: Verb = "configure"
+        self._order = threading.Lock()
 
     def refusal(self, verb: Verb) -> str | None:
         """Why `verb` cannot be begun now; None if it can."""
         allowed, passing, goal = PATHS[verb]
-        if self.state in allowed:
+        state = self.state
+        if state in allowed:
             return None
-        expected = " or ".join(sorted(state.label for state in allowed))
-        busy = "" if self.state.settled else "; wait until that is over"
-        already = " already" if self.state in (passing, goal) else ""
-        return f"{verb} is for a node that is {expected}, this one is {self.state.label}{already}{busy}"
+        expected = " or ".join(sorted(each.label for each in allowed))
+        busy = "" if state.settled else "; wait until that is over"
+        already = " already" if state in (passing, goal) else ""
+        return f"{verb} is for a node that is {expected}, this one is {state.label}{already}{busy}"
 
     def begin(self, verb: Verb) -> None:
         """Enter the state between.
@@ -80,15 +103,15 @@ class Lifecycle:
         Raises:
             ControlError: WRONG_STATE; nothing has changed.
         """
-        refusal = self.refusal(verb)
-        if refusal is not None:
-            raise ControlError(refusal, "WRONG_STATE")
-        _, passing, goal = PATHS[verb]
-        self._from, self._to, self.state = self.state, goal, passing
+        with self._order:
+            refusal = self.refusal(verb)
+            if refusal is not None:
+                raise ControlError(refusal, "WRONG_STATE")
+            self._from, self._verb, self.state = self.state, verb, PATHS[verb][1]
 
     def succeed(self) -> None:
         """The work was done: go where the transition leads."""
-        self.state = self._to
+        self.state = PATHS[self._verb][2]
 
     def fail(self) -> None:
         """It could not be done, and nothing has changed: back to where it was begun."""
@@ -98,6 +121,208 @@ class Lifecycle:
         """Something broke on the way: what still stands is unknown."""
         self.state = State.ERRORPROCESSING
 
-    def recover(self, *, cleaned: bool) -> None:
-        """After `error`: everything was let go, so that configuring can start anew; or it could not be."""
-        self.state = State.UNCONFIGURED if cleaned else State.FINALIZED
+    def recover(self) -> None:
+        """After `error`: everything was let go, so that configuring can start anew; or the end has come."""
+        self.state = State.FINALIZED if self._verb == "shutdown" else State.UNCONFIGURED
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Parts:
+    """What a node is made of; tests give others.
+
+    open_source: see sources.open_source(). load_model: see session.load_model().
+    """
+
+    open_source: Callable[[SourceConfig], FrameSource]
+    load_model: LoadModel
+
+
+class Transitions:
+    """The parts that work. `configure`, `activate`, `deactivate` and `cleanup` may take long; each either succeeds or
+    raises and leaves nothing half done.
+
+    stream: the activation under way. summary: of the last one. failure: what it ended with, None if it ended well.
+    model_failed: the model has to be loaded anew.
+    """
+
+    def __init__(
+        self,
+        live: LiveConfig,
+        announcer: Announcer,
+        parts: Parts,
+        recorder: Recorder,
+        on_over: Callable[[], None],
+        on_window: Callable[[WindowReport], None] | None,
+    ) -> None:
+        """on_over: called when a stream has ended."""
+        self._live, self._announcer, self._health = live, announcer, announcer.health
+        self._parts, self._recorder, self._on_over, self._on_window = parts, recorder, on_over, on_window
+        self._model: ModelSlot | None = None
+        self._source: FrameSource | None = None
+        self._info: SourceInfo | None = None
+        self._context: StreamContext | None = None
+        self._first = (0, 0)
+        self._interrupted = False
+        self._raised: tuple[str, ...] = ()
+        self._stuck: list[Stream] = []
+        self.stream: Stream | None = None
+        self.summary = Summary()
+        self.failure: Exception | None = None
+        self.model_failed = False
+
+    @property
+    def is_live(self) -> bool:
+        """Whether the source is a camera, rather than a recording."""
+        return self._live.config.source.kind in LIVE_KINDS
+
+    @property
+    def traits(self) -> Traits | None:
+        """The model's, None without one."""
+        return None if self._model is None else self._model.traits
+
+    @property
+    def source_info(self) -> SourceInfo | None:
+        """Of the source in use, or used last."""
+        stream = self.stream
+        return self._info if stream is None else stream.context.source
+
+    @property
+    def left_behind(self) -> bool:
+        """Whether a thread that should have ended still has not."""
+        self._stuck = [stream for stream in self._stuck if not stream.join(0.0)]
+        return bool(self._stuck)
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether there is a stream, and it has ended by itself."""
+        stream = self.stream
+        return stream is not None and stream.over
+
+    def configure(self) -> None:
+        """Check the configuration and load the model. A recording is opened, so that a bad one is known at once.
+
+        Raises:
+            SourceError, CheckpointError, ConfigError, OptionError, PoseError: see there.
+        """
+        if not self.is_live:
+            self._source = self._open()
+        try:
+            self._health.model("loading")
+            self._model = ModelSlot(self._live.config.model, self._parts.load_model)
+            self._context = None if self._source is None else self._prepare(self._model, self._source)
+            mount = None if self._context is None else self._context.mount
+            VirtualViews(self._model.traits).sync(self._live.settings(), mount)
+        except BaseException:
+            self.cleanup()
+            raise
+        self._health.model("ready")
+
+    def activate(self) -> None:
+        """Open the source, and let views come once the model is warm.
+
+        Raises:
+            SourceAbsentError: there is no such camera. SourceError, ConfigError, OptionError, PoseError: see there.
+        """
+        model = self._model
+        assert model is not None, "the lifecycle configures before it activates"
+        for code in self._raised:
+            self._health.clear_reason(code)
+        self._health.source("connecting")
+        source, self._source, self.failure = self._source, None, None
+        context, self._context = self._context, None
+        try:
+            source = self._open() if source is None else source
+            stream = Stream(
+                self._live,
+                self._announcer,
+                model,
+                source,
+                context or self._prepare(model, source),
+                reopen=lambda before: self._parts.open_source(same_camera(self._live.config.source, before)),
+                first=self._first,
+                on_over=self._on_over,
+                on_window=self._on_window,
+                recorder=self._recorder,
+            )
+        except BaseException:
+            self._health.source("closed")
+            if source is not None:
+                source.close()
+            raise
+        self.stream = stream
+        if self._interrupted:
+            stream.interrupt()
+        stream.start()
+        stream.worker.warm.wait()
+
+    def deactivate(self) -> None:
+        """Stop the stream, if it has not ended by itself, and say how it ended."""
+        stream = self.stream
+        if stream is None:
+            return
+        if not stream.over:
+            stream.interrupt()
+        if not self._has_ended(stream):
+            _LOG.error("a thread of the stream does not end; it is left behind")
+            self._stuck.append(stream)
+        self.stream = None
+        self._info, self.summary, self.failure = stream.context.source, stream.summary(), stream.failure
+        self._first, self._raised, self.model_failed = stream.next, stream.reasons, stream.model_failed
+        stream.announce_end()
+        del stream
+        gc.collect()  # its pixels hang on objects that refer to each other
+
+    def cleanup(self) -> None:
+        """Let go of the model."""
+        self._release()
+        gc.collect()
+        self._health.model("absent")
+
+    def interrupt(self) -> None:
+        """End what is under way soon, for good; from another thread than the transitions'."""
+        self._interrupted = True
+        stream = self.stream
+        if stream is not None:
+            stream.interrupt()
+
+    def close(self, patience_s: float) -> None:
+        """Let everything go, in whatever state, without a word. patience_s: for threads to end."""
+        stream, self.stream = self.stream, None
+        if stream is not None:
+            stream.interrupt()
+            if not stream.join(patience_s):
+                self._stuck.append(stream)
+        self._release()
+
+    def _has_ended(self, stream: Stream) -> bool:
+        """Wait for its threads: as long as a step of the model may take, or less once the node is stopping."""
+        begun_s = time.monotonic()
+        while not stream.join(_LOOK_S):
+            if time.monotonic() - begun_s > (_HURRY_S if self._interrupted else self._live.config.life.hang_s):
+                return False
+        return True
+
+    def _release(self) -> None:
+        source, self._source, self._model, self._context = self._source, None, None, None
+        self.model_failed = False
+        if source is not None:
+            source.close()
+
+    def _open(self) -> FrameSource:
+        source = self._parts.open_source(self._live.config.source)
+        self._info = source.info
+        return source
+
+    def _prepare(self, model: ModelSlot, source: FrameSource) -> StreamContext:
+        return prepare_stream(self._live.config, model.traits, source.info, boot_id=self._announcer.boot_id)
+
+
+def same_camera(config: SourceConfig, before: SourceInfo) -> SourceConfig:
+    """Settings that open the camera again that was open before.
+
+    An OAK that was taken because it was the only one is asked for by its id from then on: another one, plugged in
+    meanwhile, stands elsewhere and has another lens. Everything else is found where it was.
+    """
+    if isinstance(config, OakSource) and config.device is None:
+        return replace(config, device=before.id)
+    return config

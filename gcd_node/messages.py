@@ -2,9 +2,9 @@
 
 import functools
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -16,26 +16,28 @@ from gcd_client.protocol import (
     MAPS_PROTO,
     PREVIEW_ID,
     PREVIEW_TOPIC,
+    PROTO,
     ClassRecord,
     EndHeader,
     EndMessage,
     FrameRole,
     ModelRecord,
+    OriginHeader,
     PoseDelta,
     QualityRecord,
-    SourcePoseRecord,
     SourceRecord,
+    StatusTopic,
     ViewHeader,
     ViewKind,
     ViewMessage,
+    kind_of,
     view_topic,
 )
-from gcd_model import ASSUMED_SOURCE, Intrinsics, Traits, Trajectory, View
+from gcd_model import Intrinsics, Traits, Trajectory, View
 from gcd_node.calibration import HALF_PIXEL
 from gcd_node.frame import Frame, Image
 from gcd_node.image_io import to_u8
-from gcd_node.preprocess import stated_sphere
-from gcd_node.stream_context import StreamContext
+from gcd_node.stream_context import StreamContext, family_name, source_pose
 from gcd_node.window import FrameWindow
 
 PREVIEW_PERIOD_S = 0.2
@@ -48,7 +50,6 @@ _PATHS = 32  # most views stand still: their path is the same in every window
 _LARGEST_HALF = 65504  # of finite f16
 _IDENTITY = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 _NO_MODEL = ModelRecord(name="none", family="unknown", sha256_12="0" * 12, precision="none", device="none")
-_Header = TypeVar("_Header", ViewHeader, EndHeader)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -106,19 +107,9 @@ def end_message(context: StreamContext, topic: str, view_id: str, view_rev: int,
         view_rev=view_rev,
         window_id=last_window_id,
         clock=context.source.clock,
+        proto=_proto(kind_of(topic)),
     )
     return EndMessage(topic=topic, header=header)
-
-
-def end_messages(
-    context: StreamContext, view_id: str, view_rev: int, last_window_id: int, kinds: Iterable[ViewKind]
-) -> list[EndMessage]:
-    """End-of-stream of a view, for its topics of these kinds."""
-    found: list[EndMessage] = []
-    for kind in kinds:
-        end = end_message(context, view_topic(view_id, kind), view_id, view_rev, last_window_id)
-        found.append(replace(end, header=_of_kind(end.header, kind)))
-    return found
 
 
 def preview_message(context: StreamContext, frame: Frame, arrival_ns: int, epoch: int) -> ViewMessage:
@@ -168,17 +159,6 @@ def preview_message(context: StreamContext, frame: Frame, arrival_ns: int, epoch
         synthetic=False,
     )
     return ViewMessage(topic=PREVIEW_TOPIC, header=header, payload=payload)
-
-
-def published_kinds(context: StreamContext) -> Iterator[ViewKind]:
-    """What is published of each view, as far as it is known before there is one."""
-    yield from ("win", "frm")
-    if context.traits.classes:
-        yield "cls"
-    if context.traits.live:
-        yield from ("vis", "depth")
-    if context.traits.live or context.config.model.samples > 1:
-        yield "std"
 
 
 def ontology(traits: Traits) -> tuple[ClassRecord, ...]:
@@ -270,22 +250,9 @@ def _header(context: StreamContext, rendered: Rendered) -> ViewHeader:
     )
 
 
-def _of_kind(header: _Header, kind: ViewKind) -> _Header:
-    """A header that states the minor version in which the kind came."""
-    return replace(header, proto=MAPS_PROTO) if kind in ("vis", "depth") else header
-
-
-def family_name(traits: Traits) -> str:
-    return "unknown" if traits.family is None else traits.family.name
-
-
-def source_pose(context: StreamContext) -> SourcePoseRecord | None:
-    """Where the source camera of a steered model stands; None for a model with a fixed view, and on a vehicle."""
-    if context.traits.config.camera == "none" or context.mount is not None:
-        return None  # a fixed path states its rigid transforms itself
-    stated = stated_sphere(context.config.source.pose)
-    source = stated or ASSUMED_SOURCE
-    return SourcePoseRecord(el_deg=source.elevation_deg, r=source.radius_m, assumed=stated is None)
+def _proto(kind: str) -> str:
+    """The minor version in which the kind came."""
+    return MAPS_PROTO if kind in ("vis", "depth") else PROTO
 
 
 @functools.lru_cache(maxsize=_PATHS)
@@ -350,7 +317,7 @@ def _class_map(
 ) -> ViewMessage:
     pixels = numbers[..., None]  # [T, H, W, 1]
     fields = {"shape": pixels.shape, "classes": classes, "range": (0, max(each.id for each in classes))}
-    described = replace(_of_kind(header, kind), encoding="class8", **fields)
+    described = replace(header, proto=_proto(kind), encoding="class8", **fields)
     return ViewMessage(topic=view_topic(header.view_id, kind), header=described, payload=payload_of(pixels))
 
 
@@ -358,7 +325,7 @@ def _depth(header: ViewHeader, inverse: NDArray[np.float32]) -> ViewMessage:
     """What is no depth becomes 0, none: the door for numbers of a model or a sensor."""
     halves = np.where(np.isfinite(inverse), inverse, 0).clip(0, _LARGEST_HALF).astype("<f2")[..., None]
     fields = {"shape": halves.shape, "dtype": "f16", "range": (0, _LARGEST_HALF)}
-    described = replace(_of_kind(header, "depth"), encoding="invdepth16", **fields)
+    described = replace(header, proto=_proto("depth"), encoding="invdepth16", **fields)
     payload = payload_of(halves.view(np.uint8))
     return ViewMessage(topic=view_topic(header.view_id, "depth"), header=described, payload=payload)
 
@@ -369,3 +336,50 @@ def _narrowed(image: Image) -> Image:
         return image
     size = (PREVIEW_WIDTH, max(1, round(height * PREVIEW_WIDTH / width)))
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+# Where they go.
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PublisherStats:
+    """sent, bytes: handed to ZeroMQ on the data socket. dropped: refused because the queue was full. What ZeroMQ drops
+    for a slow reader shows in no counter here: that reader sees a gap in the sequence.
+    subscribers: subscriptions on the data socket now; watchers, previews: those that get views, previews of the input.
+    """
+
+    sent: int = 0
+    dropped: int = 0
+    bytes: int = 0
+    subscribers: int = 0
+    watchers: int = 0
+    previews: int = 0
+
+
+class MessageSink(Protocol):
+    """Where the node's messages go: a Publisher, the files of a replay, or a list in a test."""
+
+    def send(self, message: ViewMessage) -> object:
+        """Hand over a view."""
+        ...
+
+    def preview(self, made: Callable[[], ViewMessage]) -> None:
+        """Hand over the newest preview of the input, to be made when it leaves."""
+        ...
+
+    def end(self, message: EndMessage, *, delay_ms: int | None = None) -> None:
+        """Hand over an end-of-stream, to follow the last view."""
+        ...
+
+    def note(self, topic: StatusTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
+        """Hand over a status, event or meta note."""
+        ...
+
+    def stop_waiting(self) -> None:
+        """Stop waiting for readers."""
+        ...
+
+    @property
+    def stats(self) -> PublisherStats:
+        """What has left."""
+        ...

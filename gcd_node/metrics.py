@@ -128,12 +128,9 @@ class _HealthCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         snapshot = self._health.snapshot()
-        for name, (text, value) in _gauges(snapshot).items():
-            if value is not None:  # unknown
-                yield GaugeMetricFamily(name, text, value)
-        for name, (text, value) in _counters(snapshot).items():
-            yield CounterMetricFamily(name, text, value)
-        yield from _families(snapshot)
+        yield from _numbers(snapshot)
+        yield from _states(snapshot)
+        yield from _labelled(snapshot)
         stages = SummaryMetricFamily("gcd_stage_seconds", "How long each stage takes.", labels=["stage"])
         for name, stage in snapshot.stages.items():  # quantiles of the last minute, count and sum since the start
             for part, seconds in (("0.5", stage.p50_s), ("0.99", stage.p99_s)):
@@ -142,57 +139,57 @@ class _HealthCollector(Collector):
         yield stages
 
 
-def _gauges(snapshot: Snapshot) -> dict[str, tuple[str, float | None]]:
-    source, memory_mb = snapshot.status["source"], snapshot.status["model"].get("gpu_mem_mb")
-    age_ms = source.get("last_frame_age_ms")
-    return {
-        "gcd_level": ("0 OK, 1 WARN, 2 ERROR; the worst of gcd_reason_level.", int(snapshot.level)),
-        "gcd_ready": ("1 if views come, or would if somebody subscribed.", int(snapshot.ready)),
-        "gcd_source_fps": ("Frames a second by the latest stamps.", source.get("fps")),
-        "gcd_source_last_frame_age_seconds": ("Since a frame arrived.", age_ms and age_ms / 1000),
-        "gcd_model_gpu_memory_bytes": ("Device memory in use.", memory_mb and memory_mb * 1e6),
-        "gcd_subscriptions": ("Subscriptions on the data socket.", snapshot.status["publish"]["subs"]),
-    }
-
-
-def _counters(snapshot: Snapshot) -> dict[str, tuple[str, int]]:
-    source, model, publish = (snapshot.status[name] for name in ("source", "model", "publish"))
-    return {
-        "gcd_source_frames": ("Frames that arrived whole.", snapshot.frames),
-        "gcd_source_corrupt_frames": ("Frames that arrived damaged.", source["corrupt"]),
-        "gcd_source_reconnects": ("Times the source came back.", source["reconnects"]),
-        "gcd_model_out_of_memory": ("Windows the model found no memory for.", model["oom_count"]),
-        "gcd_model_nan_windows": ("Windows that came out with NaN.", model["nan_windows"]),
-        "gcd_windows_built": ("Windows of frames.", snapshot.status["window"]["built"]),
-        "gcd_messages_sent": ("Messages that left on the data socket.", publish["sent"]),
-        "gcd_bytes_sent": ("Bytes that left on the data socket.", publish["bytes"]),
-    }
-
-
-def _families(snapshot: Snapshot) -> Iterator[Metric]:
+def _numbers(snapshot: Snapshot) -> Iterator[Metric]:
     status = snapshot.status
-    reasons = {code: int(level) for code, level in snapshot.findings.items()}
-    ages_s = {view_id: view["last_ms"] / 1000 for view_id, view in status["views"].items() if view}
-    faults = status["window"]["reason_counts"]
-    states = {
-        "node": ([state.label for state in State], status["state"]),
-        "source": (get_args(SourceState), status["source"]["state"]),
-        "model": (get_args(ModelState), status["model"]["state"]),
-    }
-    for name, (known, now) in states.items():
-        family = GaugeMetricFamily(
-            f"gcd_{name}_state", f"1 for the state of the {name}, 0 for others.", labels=["state"]
-        )
-        for state in known:
-            family.add_metric([state], int(state == now))
-        yield family
-    for kind, name, text, label, values in (
-        (GaugeMetricFamily, "gcd_reason_level", "Level of each reason there is now.", "code", reasons),
-        (CounterMetricFamily, "gcd_window_faults", "What spoilt windows.", "reason", faults),
-        (CounterMetricFamily, "gcd_dropped", "Frames, windows or messages given up.", "hop", status["drops"]),
-        (GaugeMetricFamily, "gcd_view_last_published_seconds", "Since a view was published.", "view", ages_s),
+    source, model, publish = status["source"], status["model"], status["publish"]
+    age_ms, memory_mb = source.get("last_frame_age_ms"), model.get("gpu_mem_mb")
+    gauge, counter = GaugeMetricFamily, CounterMetricFamily
+    for family, name, text, value in (
+        (gauge, "level", "0 OK, 1 WARN, 2 ERROR; the worst of gcd_reason_level.", status["level"]),
+        (gauge, "ready", "1 if views come, or would if somebody subscribed.", int(status["ready"])),
+        (gauge, "source_fps", "Frames a second by the latest stamps.", source.get("fps")),
+        (gauge, "source_last_frame_age_seconds", "Since a frame arrived.", age_ms and age_ms / 1000),
+        (gauge, "model_gpu_memory_bytes", "Device memory in use.", memory_mb and memory_mb * 1e6),
+        (gauge, "subscriptions", "Subscriptions on the data socket.", publish["subs"]),
+        (counter, "source_frames", "Frames that arrived whole.", snapshot.frames),
+        (counter, "source_corrupt_frames", "Frames that arrived damaged.", source["corrupt"]),
+        (counter, "source_reconnects", "Times the source came back.", source["reconnects"]),
+        (counter, "model_out_of_memory", "Windows the model found no memory for.", model["oom_count"]),
+        (counter, "model_nan_windows", "Windows that came out with NaN.", model["nan_windows"]),
+        (counter, "windows_built", "Windows of frames.", status["window"]["built"]),
+        (counter, "messages_sent", "Messages that left on the data socket.", publish["sent"]),
+        (counter, "bytes_sent", "Bytes that left on the data socket.", publish["bytes"]),
     ):
-        family = kind(name, text, labels=[label])
-        for value, number in values.items():
-            family.add_metric([value], number)
-        yield family
+        if value is not None:  # unknown
+            yield family(f"gcd_{name}", text, value)
+
+
+def _states(snapshot: Snapshot) -> Iterator[Metric]:
+    status = snapshot.status
+    for name, known, now in (
+        ("node", [state.label for state in State], status["state"]),
+        ("source", get_args(SourceState), status["source"]["state"]),
+        ("model", get_args(ModelState), status["model"]["state"]),
+    ):
+        text = f"1 for the state of the {name}, 0 for others."
+        yield _with_label(GaugeMetricFamily, f"{name}_state", text, "state", {each: int(each == now) for each in known})
+
+
+def _labelled(snapshot: Snapshot) -> Iterator[Metric]:
+    status, gauge, counter = snapshot.status, GaugeMetricFamily, CounterMetricFamily
+    ages_s = {view_id: view["last_ms"] / 1000 for view_id, view in status["views"].items() if view}
+    reasons = {code: int(level) for code, level in snapshot.findings.items()}
+    faults = status["window"]["reason_counts"]
+    yield _with_label(gauge, "reason_level", "Level of each reason there is now.", "code", reasons)
+    yield _with_label(counter, "window_faults", "What spoilt windows.", "reason", faults)
+    yield _with_label(counter, "dropped", "Frames, windows or messages given up.", "hop", status["drops"])
+    yield _with_label(gauge, "view_last_published_seconds", "Since a view was published.", "view", ages_s)
+
+
+def _with_label(
+    kind: type[GaugeMetricFamily | CounterMetricFamily], name: str, text: str, label: str, values: Mapping[str, float]
+) -> Metric:
+    family = kind(f"gcd_{name}", text, labels=[label])
+    for value, number in values.items():
+        family.add_metric([value], number)
+    return family

@@ -18,14 +18,13 @@ from gcd_node.control import Outcome
 from gcd_node.errors import NodeError, SourceAbsentError, SourceError, SourceLostError
 from gcd_node.health import Health, Level
 from gcd_node.inference import WindowReport
-from gcd_node.lifecycle import Lifecycle, State, Verb
+from gcd_node.lifecycle import Lifecycle, Parts, State, Transitions, Verb
+from gcd_node.messages import MessageSink
 from gcd_node.pipeline import Summary
-from gcd_node.publisher import MessageSink
 from gcd_node.recorder import Recorder, RecordingSink
 from gcd_node.service import ServiceManager, Watchdog
 from gcd_node.sources.live import backoff_s
-from gcd_node.status import Announcer, NodeServices
-from gcd_node.transitions import Parts, Transitions
+from gcd_node.status import Announcer
 from gcd_node.verbs import Command
 from gcd_node.views import LiveConfig
 
@@ -34,21 +33,6 @@ _TICK_S = 0.1
 _PATIENCE_S = 3.0  # of the 5 s an end may take; the rest is for what is still to be sent
 _LEAST_PATIENCE_S = 0.1
 _LEAST_RECORD_S = 0.5
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class NodeOptions:
-    """How a node is run.
-
-    once: end with the first source that ends, and with whatever fails; else stay and wait for commands.
-    on_configured, on_window: called with the model once it is loaded, and with every window.
-    service: the service manager to notify, if there is one.
-    """
-
-    once: bool = True
-    on_configured: Callable[[Traits], None] | None = None
-    on_window: Callable[[WindowReport], None] | None = None
-    service: ServiceManager | None = None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -65,22 +49,36 @@ class Node:
     `stop` from a signal handler too. Transitions are worked through in a thread of their own, so that status and
     commands go on."""
 
-    def __init__(self, config: NodeConfig, parts: Parts, sink: MessageSink, options: NodeOptions | None = None) -> None:
-        """Nothing is opened or loaded before `run`."""
-        self._config, self._options = config, options or NodeOptions()
+    def __init__(
+        self,
+        config: NodeConfig,
+        parts: Parts,
+        sink: MessageSink,
+        *,
+        once: bool = True,
+        on_configured: Callable[[Traits], None] | None = None,
+        on_window: Callable[[WindowReport], None] | None = None,
+        service: ServiceManager | None = None,
+    ) -> None:
+        """Nothing is opened or loaded before `run`.
+
+        once: end with the first source that ends, and with whatever fails; else stay and wait for commands.
+        on_configured, on_window: called with the model once it is loaded, and with every window.
+        service: the service manager to notify, if there is one.
+        """
+        self._config, self._once, self._on_configured = config, once, on_configured
         self.health, live, boot_id = Health(), LiveConfig(config), uuid.uuid4().hex
         self.recorder = Recorder(config, boot_id, lambda: live.config, self._emit)
         self._sink = RecordingSink(sink, self.recorder)
         self._announcer = Announcer(config.node_id, boot_id, self._sink, self.health)
-        services = NodeServices(live=live, sink=self._sink, health=self.health, announcer=self._announcer)
         self._inbox: queue.SimpleQueue[_Done | str] = queue.SimpleQueue()
         self._transitions = Transitions(
-            services, parts, self.recorder, lambda: self._inbox.put("over"), self._options.on_window
+            live, self._announcer, parts, self.recorder, lambda: self._inbox.put("over"), on_window
         )
-        self._commands = NodeCommands(services, self._transitions, self.recorder, self.request)
-        self._life, self._order = Lifecycle(), threading.Lock()
+        self._commands = NodeCommands(live, self._announcer, self._transitions, self.recorder, self.request)
+        self._life = Lifecycle()
         self._work: threading.Thread | None = None
-        self._watchdog = Watchdog(self._emit, self.health, config.life.hang_s, self._options.service)
+        self._watchdog = Watchdog(self._emit, self.health, config.life.hang_s, service)
         self._waits = backoff_s(config.source.kind)
         self._stop_s: float | None = None
         self._retry_s: float | None = None
@@ -114,9 +112,9 @@ class Node:
         self._announcer.event(code, level, fields)
 
     def event(self, code: str, fields: dict[str, object]) -> None:
-        """Publish what another part of the process has noticed; a warning if it gives no `level`."""
+        """Publish what another part of the process has noticed, and logged; a warning if it gives no `level`."""
         level = fields.get("level")
-        self._announcer.event(code, Level(level) if isinstance(level, int) else Level.WARN, fields)
+        self._announcer.event(code, Level(level) if isinstance(level, int) else Level.WARN, fields, is_logged=True)
 
     def request(self, verb: Verb, dry_run: bool) -> Outcome:
         """Begin a transition; an event tells how it ends."""
@@ -213,8 +211,7 @@ class Node:
 
     def _begin(self, verb: Verb, *, requested: bool = False) -> None:
         """Raises ControlError if it cannot be begun now."""
-        with self._order:
-            self._life.begin(verb)
+        self._life.begin(verb)
         self._publish_state()
         if verb == "configure":
             self._watchdog.loading()
@@ -244,23 +241,19 @@ class Node:
 
     def _finish(self, done: _Done) -> None:
         if done.error is None:
-            with self._order:
-                self._life.succeed()
+            self._life.succeed()
             self._publish_state()
             self._after_success(done)
             return
         is_expected = done.verb in ("configure", "activate") and isinstance(done.error, NodeError | ModelError)
-        with self._order:
-            if is_expected:
-                self._life.fail()
-            else:
-                self._life.error()
-        if not is_expected:
+        if is_expected:
+            self._life.fail()
+        else:
+            self._life.error()
             _LOG.error("%s broke", done.verb, exc_info=done.error)
             self._transitions.close(_PATIENCE_S)
             self.health.model("absent")
-            with self._order:
-                self._life.recover(cleaned=done.verb != "shutdown")
+            self._life.recover()
         self._publish_state()
         self._announcer.event(_code(done.error).value, Level.ERROR, {"verb": done.verb, "message": str(done.error)})
         self._after_failure(done.error, done.verb)
@@ -271,8 +264,8 @@ class Node:
             self._announcer.event("STATE", Level.OK, {"verb": done.verb, "state": self.state.label})
         if done.verb == "configure":
             traits = self._transitions.traits
-            if traits is not None and self._options.on_configured is not None:
-                self._options.on_configured(traits)
+            if traits is not None and self._on_configured is not None:
+                self._on_configured(traits)
             if self._on_its_own and not done.requested:
                 self._try("activate")
         elif done.verb == "activate":
@@ -284,7 +277,7 @@ class Node:
             failure = self._transitions.failure  # the stream has ended by itself
             if failure is not None:
                 self._after_failure(failure, "activate")
-            elif self._options.once:
+            elif self._once:
                 self._prepare_stop()
 
     def _after_failure(self, error: Exception, verb: Verb) -> None:
@@ -292,7 +285,7 @@ class Node:
         self._watchdog.ready()
         if self._stop_s is not None and verb != "shutdown":
             return
-        if self._options.once or isinstance(error, SourceLostError):
+        if self._once or isinstance(error, SourceLostError):
             self._failure = error
             self._prepare_stop()
         elif verb == "activate" and self._on_its_own and self._transitions.is_live and isinstance(error, SourceError):

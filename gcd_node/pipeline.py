@@ -21,12 +21,13 @@ from gcd_node.inference import WORK_REASONS, ModelWorker, WindowReport, WorkCoun
 from gcd_node.model import ModelSlot
 from gcd_node.recorder import Recorder
 from gcd_node.sources.live import Opener, SourceWatch
-from gcd_node.status import NodeServices, metadata
-from gcd_node.stream_context import ActiveSource, StreamContext
-from gcd_node.views import InputPreview, VirtualViews
+from gcd_node.status import Announcer, metadata
+from gcd_node.stream_context import StreamContext, prepare_stream
+from gcd_node.views import InputPreview, LiveConfig
 from gcd_node.window import Reason, WindowBuilder, WindowSlot, read
 
 _STOP_DELAY_MS = 100
+_KEPT_EPOCHS = 8  # windows of a former epoch may still be in work
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -50,7 +51,8 @@ class Stream:
 
     def __init__(
         self,
-        services: NodeServices,
+        live: LiveConfig,
+        announcer: Announcer,
         model: ModelSlot,
         source: FrameSource,
         context: StreamContext,
@@ -71,11 +73,10 @@ class Stream:
         Raises:
             OptionError, PoseError: see VirtualView.
         """
-        self._live, self._health, self._announcer = services.live, services.health, services.announcer
+        self._live, self._health, self._announcer = live, announcer.health, announcer
         self._model, self._on_over, self._recorder = model, on_over, recorder
-        config, traits = services.live.config, model.traits
-        self._source = ActiveSource(context, epoch=first[1])
-        VirtualViews(traits).sync(services.live.settings(), context.mount)
+        config, traits = live.config, model.traits
+        self._contexts = [(first[1], context)]  # of the source as it is now last; replaced in the reader thread
         self._builder = WindowBuilder(
             frames=traits.config.frames,
             fps=context.fps,
@@ -89,8 +90,8 @@ class Stream:
         )
         self._newest = WindowSlot(lossless=config.source.pace == "lockstep")
         self._watch = SourceWatch(source, reopen, self, config.source)
-        self._preview = InputPreview(services.sink, lambda: self.context)
-        self.worker = ModelWorker(services, model, self._source.context_at, on_window)
+        self._preview = InputPreview(announcer.sink, lambda: self.context)
+        self.worker = ModelWorker(live, announcer, model, self.context_at, on_window)
         self._threads = [
             threading.Thread(target=self._work, name="model", daemon=True),
             threading.Thread(target=read, args=(self._watch, self._builder, self._newest), name="reader", daemon=True),
@@ -105,7 +106,12 @@ class Stream:
     @property
     def context(self) -> StreamContext:
         """What is known of the source now."""
-        return self._source.context
+        return self._contexts[-1][1]
+
+    def context_at(self, epoch: int) -> StreamContext:
+        """The same in an epoch; now, if it is none."""
+        contexts = self._contexts
+        return next((context for since, context in reversed(contexts) if since <= epoch), contexts[-1][1])
 
     @property
     def next(self) -> tuple[int, int]:
@@ -250,10 +256,11 @@ class Stream:
 
     def _adapt(self, info: SourceInfo) -> None:
         """To another size, rate or camera. Raises ConfigError, and changes nothing then."""
-        before = self.context.ood
-        self._source.adapt(self._live.config, info, self._builder.epoch)
-        self._builder.run_at(self.context.fps, info.fps_nominal)
-        self._raise_flags(before, self.context.ood)
+        before = self.context
+        now = prepare_stream(self._live.config, before.traits, info, boot_id=before.boot_id, before=before)
+        self._contexts = [*self._contexts[1 - _KEPT_EPOCHS :], (self._builder.epoch, now)]
+        self._builder.run_at(now.fps, info.fps_nominal)
+        self._raise_flags(before.ood, now.ood)
         self.notice_change()
 
     def _raise_flags(self, before: tuple[str, ...], now: tuple[str, ...]) -> None:

@@ -10,105 +10,98 @@ import os
 import queue
 import threading
 import time
+import weakref
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from itertools import cycle
 from types import TracebackType
-from typing import Any, Protocol
+from typing import Any
 
 import zmq
 from msgspec.structs import replace
 
-from gcd_client.protocol import ClientError, EndMessage, OriginHeader, StatusMessage, StatusTopic, ViewMessage, encode
-from gcd_node.auth import Context, EventSink, SocketGuard, unbind
+from gcd_client.protocol import (
+    PREVIEW_TOPIC,
+    TOPIC_BYTES,
+    WELCOME,
+    ClientError,
+    EndMessage,
+    OriginHeader,
+    StatusMessage,
+    StatusTopic,
+    ViewMessage,
+    encode,
+    topic_key,
+)
+from gcd_node.auth import Context, EventSink, ServerSecurity, Socket, SocketGuard, own_endpoint, unbind
+from gcd_node.config import PublishConfig
 from gcd_node.errors import EndpointError, NodeError, PublisherError
-from gcd_node.sockets import DataSocket, PublisherOptions, Queued, StatusSocket, pending_events
+from gcd_node.messages import PublisherStats
 
 _LOG = logging.getLogger(__name__)
+_DATA_HWM, _STATUS_HWM = 4, 100
+_MAX_SUBSCRIPTION = 4096
+_PREVIEW_KEY = topic_key(PREVIEW_TOPIC)
 _RETRY_MS, _REPEAT_MS = 3, 10
 _LEAST_LINGER_MS = 100
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PublisherStats:
-    """sent, bytes: handed to ZeroMQ on the data socket. dropped: refused because the queue was full. What ZeroMQ drops
-    for a slow reader shows in no counter here: that reader sees a gap in the sequence.
-    subscribers: subscriptions on the data socket now; watchers, previews: those that get views, previews of the input.
-    """
-
-    sent: int = 0
-    dropped: int = 0
-    bytes: int = 0
-    subscribers: int = 0
-    watchers: int = 0
-    previews: int = 0
-
-
-class MessageSink(Protocol):
-    """Where the node's messages go: a Publisher, the files of a replay, or a list in a test."""
-
-    def send(self, message: ViewMessage) -> object:
-        """Hand over a view."""
-        ...
-
-    def preview(self, made: Callable[[], ViewMessage]) -> None:
-        """Hand over the newest preview of the input, to be made when it leaves."""
-        ...
-
-    def end(self, message: EndMessage, *, delay_ms: int | None = None) -> None:
-        """Hand over an end-of-stream, to follow the last view."""
-        ...
-
-    def note(self, topic: StatusTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
-        """Hand over a status, event or meta note."""
-        ...
-
-    def stop_waiting(self) -> None:
-        """Stop waiting for readers."""
-        ...
-
-    @property
-    def stats(self) -> PublisherStats:
-        """What has left."""
-        ...
 
 
 class Publisher:
     """Publishes views, ends and notes. Use it as a context manager; every method may be called from any thread.
 
     Make one per boot_id: sequences count from 0 here. on_event gets AUTH_DENIED and its fields, from another thread.
+    lockstep: wait for slow readers instead of skipping, and for min_subscribers before the first message.
+    security: keys and allowed clients of tcp endpoints; without them only this machine can be let in.
+    linger_ms: how long an orderly close waits for readers to take the end and leave; drain_ms: the same in lockstep,
+        and there also how long a queued message may wait for a reader.
+    queue_size: messages between the callers and the thread.
+    endpoint, status_endpoint: where data and status were bound, with the port that was chosen if 0 was asked for.
 
     Raises:
         EndpointError: an endpoint is in use or cannot be bound.
         ConfigError: an endpoint is no endpoint, or others than this machine could reach it.
     """
 
-    def __init__(self, options: PublisherOptions, on_event: EventSink | None = None) -> None:
-        self._options = options
-        self._queue: queue.Queue[Queued] = queue.Queue(options.queue_size)
+    def __init__(
+        self,
+        config: PublishConfig,
+        on_event: EventSink | None = None,
+        *,
+        lockstep: bool = False,
+        security: ServerSecurity | None = None,
+        linger_ms: int = 1000,
+        drain_ms: int = 5000,
+        queue_size: int = 8,
+    ) -> None:
+        self._config, self._lockstep, self._linger_ms, self._drain_ms = config, lockstep, linger_ms, drain_ms
+        self._queue: queue.Queue[tuple[bytes, float | None]] = queue.Queue(queue_size)  # and what it follows by
         self._notes: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._preview: Callable[[], ViewMessage] | None = None
         self._sequences: Counter[tuple[str, str]] = Counter()
-        self._hand_over, self._note_order, self._waking = threading.Lock(), threading.Lock(), threading.Lock()
-        self._hurried = threading.Event()
-        self._closing, self._abandoned, self._closed = threading.Event(), threading.Event(), threading.Event()
+        self._hand_over, self._note_order = threading.Lock(), threading.Lock()
+        self._is_hurried = self._is_abandoned = self._has_begun = False
         self._failure: Exception | None = None
-        self._dropped, self._closing_s = 0, 0.0
+        self._closing_s: float | None = None
+        self._sent = self._bytes = self._dropped = 0
+        self._last_sent_s = time.monotonic()
+        self._ends: list[bytes] = []  # those since the last view
+        self._last_notes: dict[bytes, bytes] = {}
+        self._topics: dict[bytes, int] = {}  # subscriptions on the data socket; never changed, only replaced
         self._wake_fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        weakref.finalize(self, os.close, self._wake_fd)  # no sooner: then it may mean another file to who wakes late
         self._context: Context = zmq.Context()
-        self._guard = SocketGuard(self._context, options.security, on_event)
+        self._guard = SocketGuard(self._context, security, on_event)
         try:
-            self._data = DataSocket(self._context, self._guard, options)
-            self._status = None if options.status is None else StatusSocket(self._context, self._guard, options.status)
+            self._data = _xpub(self._context, _DATA_HWM, no_drop=lockstep)
+            self.endpoint = self._guard.bind(self._data, own_endpoint(config.data, "data"), "data")
+            self._status = _xpub(self._context, _STATUS_HWM, no_drop=False)
+            self.status_endpoint = self._guard.bind(self._status, own_endpoint(config.status, "status"), "status")
         except BaseException:
             self._guard.close()
             self._context.destroy(linger=0)
-            self._close_wake()
             raise
         self._poller = zmq.Poller()
-        sockets = [self._data.socket] if self._status is None else [self._data.socket, self._status.socket]
-        for source in (self._wake_fd, *sockets, *self._guard.monitors):
+        for source in (self._wake_fd, self._data, self._status, *self._guard.monitors):
             self._poller.register(source, zmq.POLLIN)
         self._thread = threading.Thread(target=self._serve, name="publisher", daemon=True)
         self._thread.start()
@@ -125,10 +118,10 @@ class Publisher:
         """
         with self._hand_over:
             self.check()
-            if self._queue.full() and not self._options.lockstep:
+            if self._queue.full() and not self._lockstep:
                 self._dropped += 1
                 return False
-            self._put(Queued(self._encoded(message)))
+            self._put(self._encoded(message), None)
         time.sleep(0)  # lets the thread begin now, instead of when the caller has time
         return True
 
@@ -146,10 +139,10 @@ class Publisher:
 
         Raises: as send().
         """
-        delay = self._options.end_delay_ms if delay_ms is None else delay_ms
+        delay = self._config.end_delay_ms if delay_ms is None else delay_ms
         with self._hand_over:
             self.check()
-            self._put(Queued(self._encoded(message), delay / 1000))
+            self._put(self._encoded(message), delay / 1000)
 
     def note(self, topic: StatusTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
         """Send a status, event or meta message; the last of each topic is repeated to new subscribers.
@@ -163,7 +156,7 @@ class Publisher:
 
     def stop_waiting(self) -> None:
         """Stop waiting for readers, for a node that is stopping: what does not leave in `linger_ms` is lost."""
-        self._hurried.set()
+        self._is_hurried = True
 
     def dead_threads(self) -> list[str]:
         """Threads that have died, of those whose end shows nowhere else."""
@@ -171,32 +164,26 @@ class Publisher:
 
     def check(self) -> None:
         """Raises what stopped the thread, or NodeError if the publisher is closed."""
-        self._raise_failure()
-        if self._closed.is_set():
+        if isinstance(self._failure, NodeError):
+            raise self._failure
+        if self._failure is not None:
+            raise PublisherError(f"the publisher thread died: {self._failure}") from self._failure
+        if self._closing_s is not None:
             raise NodeError("the publisher is closed; make a new one")
 
     @property
     def stats(self) -> PublisherStats:
         """Counters since the start."""
-        data, readers = self._data, self._data.readers.now
+        topics = self._topics.items()
+        # ZeroMQ matches prefixes: who subscribes to everything gets views and previews.
         return PublisherStats(
-            sent=data.sent,
+            sent=self._sent,
             dropped=self._dropped,
-            bytes=data.bytes,
-            subscribers=readers.total,
-            watchers=readers.watchers,
-            previews=readers.previews,
+            bytes=self._bytes,
+            subscribers=sum(count for _, count in topics),
+            watchers=sum(count for topic, count in topics if topic == b"" or not _PREVIEW_KEY.startswith(topic)),
+            previews=sum(count for topic, count in topics if _PREVIEW_KEY.startswith(topic)),
         )
-
-    @property
-    def endpoint(self) -> str:
-        """Where data was bound, with the port that was chosen if 0 was asked for."""
-        return self._data.endpoint
-
-    @property
-    def status_endpoint(self) -> str | None:
-        """Where status was bound, None without a status socket."""
-        return None if self._status is None else self._status.endpoint
 
     def close(self, *, orderly: bool = True) -> None:
         """Send what is queued, give readers `linger_ms`, close. Not orderly: close at once. A second call does
@@ -205,76 +192,58 @@ class Publisher:
         Raises:
             EndpointError: lockstep messages that no reader took. Else whatever stopped the thread.
         """
-        is_first = not self._closed.is_set()
-        self._shut(orderly)
+        is_first = self._closing_s is None
+        self._is_abandoned |= not orderly
         if is_first:
-            self._raise_failure()
+            self._closing_s = time.monotonic()
+        self._wake()
+        if not is_first:
+            return
+        self._thread.join()
+        self._guard.close()
+        self._context.term()
+        if self._failure is not None:
+            self.check()
 
     def __enter__(self) -> "Publisher":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
-        if error is None:
-            self.close()
-            return
-        self._shut(orderly=False)
-        if self._failure is not None:
-            _LOG.error("the publisher had failed too: %s", self._failure)
+        try:
+            self.close(orderly=error is None)
+        except NodeError as failure:
+            if error is None:
+                raise
+            _LOG.error("the publisher had failed too: %s", failure)
 
     def _encoded(self, message: ViewMessage | EndMessage | StatusMessage) -> bytes:
         key = (message.header.boot_id, message.topic)
+        is_local = self.endpoint.startswith("ipc://")
         numbered = replace(message, sequence=self._sequences[key])
-        part = encode(numbered, checksum=isinstance(message, StatusMessage) or not self._data.local)
+        part = encode(numbered, checksum=isinstance(message, StatusMessage) or not is_local)
         self._sequences[key] += 1
         return part
 
-    def _put(self, queued: Queued) -> None:
-        while not self._hurried.is_set():
+    def _put(self, part: bytes, follow_s: float | None) -> None:
+        """follow_s: how long it must come after the last view; None for at once."""
+        while not self._is_hurried:
             try:
-                self._queue.put(queued, timeout=0.05)
+                self._queue.put((part, follow_s), timeout=0.05)
             except queue.Full:
                 self.check()
             else:
                 self._wake()
                 return
-        if queued.follow_s is not None:
+        if follow_s is not None:
             self._queue.maxsize += 1  # room of its own: an end is never lost to a full queue
         try:
-            self._queue.put_nowait(queued)
+            self._queue.put_nowait((part, follow_s))
         except queue.Full:
             self._dropped += 1
         self._wake()
 
     def _wake(self) -> None:
-        with self._waking:
-            if self._wake_fd >= 0:  # else it may mean another file by now
-                os.eventfd_write(self._wake_fd, 1)
-
-    def _raise_failure(self) -> None:
-        if isinstance(self._failure, NodeError):
-            raise self._failure
-        if self._failure is not None:
-            raise PublisherError(f"the publisher thread died: {self._failure}") from self._failure
-
-    def _shut(self, orderly: bool) -> None:
-        if not orderly:
-            self._abandoned.set()  # also cuts short an orderly close that another thread is in
-            self._wake()
-        if self._closed.is_set():
-            return
-        self._closed.set()
-        self._closing_s = time.monotonic()
-        self._closing.set()
-        self._wake()
-        self._thread.join()
-        self._guard.close()
-        self._context.term()
-        self._close_wake()
-
-    def _close_wake(self) -> None:
-        with self._waking:
-            descriptor, self._wake_fd = self._wake_fd, -1
-        os.close(descriptor)
+        os.eventfd_write(self._wake_fd, 1)
 
     # What follows runs in the publisher thread alone.
 
@@ -282,21 +251,20 @@ class Publisher:
         linger_ms = 0
         try:
             self._run()
-            if not self._abandoned.is_set():
+            if not self._is_abandoned:
                 self._see_off()
                 linger_ms = max(_LEAST_LINGER_MS, round(1000 * self._left_s(time.monotonic())))
         except Exception as error:
             self._failure = error
         finally:
-            unbind(self._data.socket, self._data.endpoint, linger_ms)
-            if self._status is not None:
-                unbind(self._status.socket, self._status.endpoint, linger_ms)
+            unbind(self._data, self.endpoint, linger_ms)
+            unbind(self._status, self.status_endpoint, linger_ms)
 
     def _run(self) -> None:
-        queued: Queued | None = None
+        queued: tuple[bytes, float | None] | None = None
         progress = time.monotonic()
-        while not self._abandoned.is_set():
-            closing = self._closing.is_set()  # read first: what was queued before it is seen below
+        while not self._is_abandoned:
+            closing = self._closing_s is not None  # read first: what was queued before it is seen below
             self._serve_sockets()
             if queued is None:
                 with contextlib.suppress(queue.Empty):
@@ -306,15 +274,41 @@ class Publisher:
                     return
                 self._wait(None)
                 progress = time.monotonic()
-            elif self._data.send(queued):
+            elif self._send(*queued):
                 queued, progress = None, time.monotonic()
             elif closing and self._left_s(progress) < 0:
-                if self._hurried.is_set():
+                if self._is_hurried:
                     return
                 raise EndpointError(self._undelivered())
             else:
                 progress = progress if closing else time.monotonic()
                 self._wait(_RETRY_MS)
+
+    def _send(self, part: bytes, follow_s: float | None) -> bool:
+        """Whether it left; if not, try again later."""
+        if self._lockstep and not self._has_begun and self.stats.watchers < self._config.min_subscribers:
+            return False
+        if follow_s is not None and time.monotonic() < self._last_sent_s + follow_s:
+            return False
+        if not self._try_send(part):
+            return False
+        self._has_begun = True
+        if follow_s is not None:
+            self._ends.append(part)
+        else:
+            self._ends.clear()
+            self._last_sent_s = time.monotonic()
+        return True
+
+    def _try_send(self, part: bytes) -> bool:
+        """Whether it left."""
+        try:
+            self._data.send(part, zmq.NOBLOCK, copy=False)  # a copy would cost more than all the rest
+        except zmq.Again:
+            return False
+        self._sent += 1
+        self._bytes += len(part)
+        return True
 
     def _wait(self, timeout_ms: int | None) -> None:
         """Until a message, a subscription or the end comes."""
@@ -326,42 +320,76 @@ class Publisher:
         """Wait until readers have left. ZeroMQ's linger ends when its last batch of bytes is on its way, and loses it
         to a reader too slow to take it at once; who leaves has the end-of-stream message. The ends are sent again
         meanwhile: ZeroMQ skips them where a reader has no room."""
-        until, ends = time.monotonic(), cycle(self._data.ends)
+        until, ends = time.monotonic(), cycle(self._ends)
         until += self._left_s(until)
-        while self._data.ends and self._data.readers.now.total > 0 and time.monotonic() < until:
+        while self._ends and self._topics and time.monotonic() < until:
             self._serve_sockets()
             self._wait(_REPEAT_MS)
-            self._data.try_send(next(ends))
-            if self._abandoned.is_set():
+            self._try_send(next(ends))
+            if self._is_abandoned:
                 return
 
     def _left_s(self, progress_s: float) -> float:
         """How much longer to wait for readers at the end, after the last progress. A node that is stopping has
         linger_ms for all of it, so that slow readers cannot stretch the end one message at a time."""
-        hurried, options = self._hurried.is_set(), self._options
-        patience_ms = options.drain_ms if options.lockstep and not hurried else options.linger_ms
-        return (self._closing_s if hurried else progress_s) + patience_ms / 1000 - time.monotonic()
+        patience_ms = self._drain_ms if self._lockstep and not self._is_hurried else self._linger_ms
+        begun_s = self._closing_s if self._is_hurried and self._closing_s is not None else progress_s
+        return begun_s + patience_ms / 1000 - time.monotonic()
 
     def _serve_sockets(self) -> None:
         self._guard.report_failures()
-        for event in pending_events(self._data.socket):
-            self._data.readers.count(event)
+        for event in _pending_events(self._data):
+            self._count_reader(event)
         made, self._preview = self._preview, None
         if made is not None:
             try:
-                self._data.try_send(self._encoded(made()))
+                self._try_send(self._encoded(made()))
             except (NodeError, ClientError) as error:  # views must not suffer from it
                 _LOG.warning("a preview of the input cannot be sent: %s", error)
         while not self._notes.empty():
             part = self._notes.get()
-            if self._status is not None:
-                self._status.send(part)
-        if self._status is not None:
-            self._status.repeat()
+            self._last_notes[part[:TOPIC_BYTES]] = part
+            self._status.send(part)
+        for event in _pending_events(self._status):  # a new subscriber gets the last of each topic; so do all others,
+            for part in [part for key, part in self._last_notes.items() if event[0] and key.startswith(event[1:])]:
+                self._status.send(part)  # who know it by its sequence
+
+    def _count_reader(self, event: bytes) -> None:
+        """A subscription (first byte 1) or its end (first byte 0).
+
+        One to the welcome message alone is none. The end of one that never came is not counted: noise on the socket
+        must not make readers disappear.
+        """
+        topic, change = event[1:], 1 if event[0] else -1
+        is_noise = (topic and topic == WELCOME[: len(topic)]) or (change < 0 and topic not in self._topics)
+        if not is_noise:
+            topics = {**self._topics, topic: self._topics.get(topic, 0) + change}
+            self._topics = {each: count for each, count in topics.items() if count > 0}
 
     def _undelivered(self) -> str:
-        count, seconds, readers = self._queue.qsize() + 1, self._options.drain_ms / 1000, self.stats.watchers
+        count, seconds, readers = self._queue.qsize() + 1, self._drain_ms / 1000, self.stats.watchers
         return (
             f"{count} messages were not taken within {seconds:g} s at {self.endpoint} ({readers} subscribers, wanted "
-            f"{self._options.min_subscribers}); start the reader"
+            f"{self._config.min_subscribers}); start the reader"
         )
+
+
+def _pending_events(socket: Socket) -> list[bytes]:
+    """Pending subscribe (first byte 1) and unsubscribe (first byte 0) events; anything else a peer sends is ignored."""
+    events: list[bytes] = []
+    while socket.poll(0):
+        event = socket.recv(zmq.NOBLOCK)
+        if event[:1] in (b"\0", b"\1"):
+            events.append(event)
+    return events
+
+
+def _xpub(context: Context, high_water_mark: int, *, no_drop: bool) -> Socket:
+    socket = context.socket(zmq.XPUB)
+    socket.set(zmq.XPUB_VERBOSER, 1)  # VERBOSE, and unsubscriptions too: only so can subscribers be counted
+    socket.set(zmq.XPUB_NODROP, int(no_drop))
+    socket.set(zmq.XPUB_WELCOME_MSG, WELCOME)
+    socket.set(zmq.SNDHWM, high_water_mark)
+    socket.set(zmq.MAXMSGSIZE, _MAX_SUBSCRIPTION)
+    socket.set(zmq.LINGER, 0)
+    return socket

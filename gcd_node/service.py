@@ -231,7 +231,7 @@ class JsonLines(logging.Formatter):
 
     Always there: `time` (UTC, RFC 3339, microseconds), `level`, `logger`, `message`, `thread`, `pid`. `exception`: with
     its traceback, if there is one. What was passed as `extra` comes under its own name; what JSON cannot hold is
-    written as text. Long texts are cut, and nothing a record holds makes this fail.
+    written as text. Long texts are cut.
     """
 
     def format(self, record: logging.LogRecord) -> str:
@@ -266,19 +266,12 @@ def _log_uncaught_in_thread(args: threading.ExceptHookArgs) -> None:
 def _message(record: logging.LogRecord) -> str:
     try:
         return record.getMessage()
-    except Exception:  # whatever an argument does when it is written: better this than no line
-        return f"{_text(record.msg)} {_text(record.args)}"
+    except Exception:  # arguments that do not fit the text: better this than no line
+        return f"{record.msg} {record.args}"
 
 
 def _plain(value: object) -> Any:
     if value is None or isinstance(value, bool) or (isinstance(value, float) and math.isfinite(value)):
         return value
     whole = isinstance(value, int) and abs(value) <= _LARGEST_INTEGER
-    return value if whole else _text(value)[:_LONGEST]
-
-
-def _text(value: object) -> str:
-    try:
-        return str(value)
-    except Exception:  # a foreign object's own method
-        return f"<{type(value).__name__} that cannot be written>"
+    return value if whole else str(value)[:_LONGEST]

@@ -7,7 +7,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Generator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 
@@ -15,35 +14,28 @@ import cv2
 import torch
 
 from gcd_client.endpoints import read_key_pair
-from gcd_model import OptionError, ViewSynthesizer, load_synthesizer
-from gcd_node.auth import ServerSecurity, load_server_security
+from gcd_model import OptionError, Traits, ViewSynthesizer, load_synthesizer
+from gcd_node.auth import EventSink, ServerSecurity, load_server_security
 from gcd_node.config import ModelSection, NodeConfig
 from gcd_node.control import ControlServer
 from gcd_node.errors import ConfigError
 from gcd_node.health import Health
 from gcd_node.inference import WindowReport
-from gcd_node.node import Node, NodeOptions
+from gcd_node.lifecycle import Parts
+from gcd_node.node import Node
 from gcd_node.pipeline import Summary
 from gcd_node.publisher import Publisher
-from gcd_node.service import listen
-from gcd_node.sockets import PublisherOptions
+from gcd_node.service import ServiceManager, listen
 from gcd_node.sources import LIVE_KINDS, open_source
-from gcd_node.transitions import Parts
 
 _LOG = logging.getLogger(__name__)
 
 
-def publisher_options(config: NodeConfig, security: ServerSecurity | None = None) -> PublisherOptions:
-    """The publisher's options for a launch file."""
-    publish = config.publish
-    return PublisherOptions(
-        data=publish.data,
-        status=publish.status,
-        lockstep=config.source.pace == "lockstep",
-        min_subscribers=publish.min_subscribers,
-        end_delay_ms=publish.end_delay_ms,
-        security=security,
-    )
+def open_publisher(
+    config: NodeConfig, security: ServerSecurity | None = None, on_event: EventSink | None = None
+) -> Publisher:
+    """The publisher of a launch file, bound. Raises as Publisher."""
+    return Publisher(config.publish, on_event, lockstep=config.source.pace == "lockstep", security=security)
 
 
 def model_threads(section: ModelSection) -> int:
@@ -84,14 +76,17 @@ def ends_by_itself(config: NodeConfig) -> bool:
 @contextmanager
 def open_session(
     config: NodeConfig,
-    on_window: Callable[[WindowReport], None] | None = None,
-    options: NodeOptions | None = None,
     *,
+    once: bool | None = None,
+    on_configured: Callable[[Traits], None] | None = None,
+    on_window: Callable[[WindowReport], None] | None = None,
+    service: ServiceManager | None = None,
     viewer: bool = False,
     show_page: bool = False,
 ) -> Generator[tuple[Node, Publisher]]:
     """A node ready to run, and its publisher, already bound; its control and health sockets too, if it has any.
 
+    once: see Node; left out, as ends_by_itself() says. on_configured, on_window, service: see Node.
     viewer: start `gcd-node viewer` beside the node, if its launch file has a [viewer]; else that is only checked.
     show_page: let it open its page in a browser.
 
@@ -99,7 +94,6 @@ def open_session(
         EndpointError, ConfigError: see Publisher, ControlServer, MetricsServer, Recorder, viewer_arguments(). Nothing
             stays open.
     """
-    options = replace(options or NodeOptions(once=ends_by_itself(config)), on_window=on_window)
     nodes: list[Node] = []  # none yet: what publishes the node's events is made before it
 
     def emit(code: str, fields: dict[str, object]) -> None:
@@ -108,32 +102,42 @@ def open_session(
 
     security = load_server_security(config.security, emit)
     with ExitStack() as stack:
-        publisher = stack.enter_context(Publisher(publisher_options(config, security), emit))
+        publisher = stack.enter_context(open_publisher(config, security, emit))
         parts = Parts(open_source=lambda source: open_source(source, security, emit), load_model=load_model)
-        node = Node(config, parts, publisher, options)
+        node = Node(
+            config,
+            parts,
+            publisher,
+            once=ends_by_itself(config) if once is None else once,
+            on_configured=on_configured,
+            on_window=on_window,
+            service=service,
+        )
         nodes.append(node)
         node.watch(publisher.dead_threads)
         control: str | None = None
         if config.control.endpoint is not None:
-            server = stack.enter_context(
-                ControlServer(
-                    config.control.endpoint,
-                    node.handle,
-                    state=lambda: node.state.label,
-                    on_event=emit,
-                    on_answer=node.recorder.command,
-                    security=security,
-                )
-            )
+            server = stack.enter_context(_control_server(config.control.endpoint, node, emit, security))
             node.watch(server.dead_threads)
             control = server.endpoint
         if config.health.http is not None:
-            stack.enter_context(_metrics_server(config.health.http, node.health))
+            stack.enter_context(metrics_server(config.health.http, node.health))
         if config.viewer.http is not None:
             arguments = viewer_arguments(config, publisher, control, security)
             if viewer:
                 stack.enter_context(_viewer_process([*arguments, *(["--open"] if show_page else [])]))
         yield node, publisher
+
+
+def _control_server(endpoint: str, node: Node, emit: EventSink, security: ServerSecurity | None) -> ControlServer:
+    return ControlServer(
+        endpoint,
+        node.handle,
+        state=lambda: node.state.label,
+        on_event=emit,
+        on_answer=node.recorder.command,
+        security=security,
+    )
 
 
 def viewer_arguments(
@@ -172,8 +176,11 @@ def _viewer_process(arguments: list[str]) -> Generator[None]:
             process.communicate()
 
 
-def _metrics_server(address: str, health: Health) -> AbstractContextManager[object]:
-    """Raises ConfigError, EndpointError: see MetricsServer; ConfigError without the extra `metrics`."""
+def metrics_server(address: str, health: Health) -> AbstractContextManager[object]:
+    """The pages of a node's health, served until left.
+
+    Raises ConfigError, EndpointError: see MetricsServer; ConfigError without the extra `metrics`.
+    """
     try:
         from gcd_node.metrics import MetricsServer  # needs prometheus_client, which not every node has
     except ImportError as error:

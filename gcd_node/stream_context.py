@@ -1,26 +1,50 @@
-"""What is known of a stream before its first frame: frame rate, cameras, and what lies outside the trained domain."""
+"""What is known of a stream before its first frame: frame rate, cameras, what lies outside the trained domain, how
+views are drawn."""
 
+import hashlib
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from gcd_model import LIVE_LENS_DEG, CameraMount, Intrinsics, OptionError, Traits
+import msgspec
+from msgspec import structs
+
+from gcd_client.protocol import SourcePoseRecord, ViewKind
+from gcd_model import (
+    ASSUMED_SOURCE,
+    LIVE_LENS_DEG,
+    CameraMount,
+    Intrinsics,
+    ModelConfig,
+    OptionError,
+    RenderOptions,
+    Sampler,
+    Traits,
+    sampler_of,
+)
 from gcd_node.calibration import LensModel, load_lens
-from gcd_node.config import NodeConfig
-from gcd_node.config_digest import config_digest
+from gcd_node.config import ModelSection, NodeConfig
 from gcd_node.errors import ConfigError
 from gcd_node.frame import SourceInfo
-from gcd_node.preprocess import Fit, Rectifier, assumed_hfov_deg, require_usable, stated_mount, widest_camera
+from gcd_node.preprocess import (
+    Fit,
+    Rectifier,
+    assumed_hfov_deg,
+    require_usable,
+    stated_mount,
+    stated_sphere,
+    widest_camera,
+)
+from gcd_node.sources import SourcePose
 from gcd_node.sources.depth import DepthSource, OnnxDepth
 from gcd_node.window import RATE_TOLERANCE
 
 _LOG = logging.getLogger(__name__)
 _HFOV_TOLERANCE_DEG = 2.0
 _FLAG_NAMES = {"fps": "frame rate", "hfov": "field of view"}
-_KEPT_EPOCHS = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,30 +116,6 @@ def prepare_stream(
         lens=lens,
         depth=before.depth if before is not None and before.mount == mount else _depth_network(config, traits, mount),
     )
-
-
-class ActiveSource:
-    """Of the source as it is now, and of former epochs, whose windows may still be in work. Changed in one thread."""
-
-    def __init__(self, context: StreamContext, epoch: int) -> None:
-        """context, epoch: of a source that was just opened."""
-        self._contexts = [(epoch, context)]
-
-    @property
-    def context(self) -> StreamContext:
-        """Everything that goes into messages, now."""
-        return self._contexts[-1][1]
-
-    def context_at(self, epoch: int) -> StreamContext:
-        """The same in an epoch."""
-        contexts = self._contexts
-        return next((context for since, context in reversed(contexts) if since <= epoch), contexts[-1][1])
-
-    def adapt(self, config: NodeConfig, info: SourceInfo, epoch: int) -> None:
-        """To another size, rate or camera, from an epoch on. Raises ConfigError, and changes nothing then."""
-        now = self.context
-        context = prepare_stream(config, now.traits, info, boot_id=now.boot_id, before=now)
-        self._contexts = [*self._contexts[1 - _KEPT_EPOCHS :], (epoch, context)]
 
 
 def choose_fps(source_fps: float, trained: Sequence[float]) -> tuple[float, bool]:
@@ -231,3 +231,126 @@ def _is_foreign_field(camera: Intrinsics | None, traits: Traits) -> bool:
 
 def _trained_hfov_deg(traits: Traits) -> float | None:
     return None if traits.family is None else traits.family.hfov_deg
+
+
+# What messages say of it.
+
+
+def published_kinds(context: StreamContext) -> Iterator[ViewKind]:
+    """What is published of each view, as far as it is known before there is one."""
+    yield from ("win", "frm")
+    if context.traits.classes:
+        yield "cls"
+    if context.traits.live:
+        yield from ("vis", "depth")
+    if context.traits.live or context.config.model.samples > 1:
+        yield "std"
+
+
+def family_name(traits: Traits) -> str:
+    """ "unknown" for a model of none."""
+    return "unknown" if traits.family is None else traits.family.name
+
+
+def source_pose(context: StreamContext) -> SourcePoseRecord | None:
+    """Where the source camera of a steered model stands; None for a model with a fixed view, and on a vehicle."""
+    if context.traits.config.camera == "none" or context.mount is not None:
+        return None  # a fixed path states its rigid transforms itself
+    stated = stated_sphere(context.config.source.pose)
+    source = stated or ASSUMED_SOURCE
+    return SourcePoseRecord(el_deg=source.elevation_deg, r=source.radius_m, assumed=stated is None)
+
+
+# How views are drawn, and a short name for that.
+
+
+def drawing_options(section: ModelSection) -> RenderOptions:
+    """What [model] says of drawing; without a seed, which is the window's."""
+    return RenderOptions(
+        quality=section.quality,
+        steps=section.steps,
+        solver=section.solver,
+        guidance=section.guidance,
+        guidance_interval=section.guidance_interval,
+        samples=section.samples,
+        motion_bucket=section.motion_bucket,
+    )
+
+
+def sampler_in_use(section: ModelSection, traits: Traits) -> Sampler:
+    """The same in full: what [model] leaves out as quality and checkpoint have it."""
+    return sampler_of(traits.config.sampling, drawing_options(section))
+
+
+def config_digest(config: NodeConfig, traits: Traits) -> str:
+    """12 hex digits that name how views are rendered from given pictures: not from which camera or recording they
+    come, on which device, in which precision or at what pace, nor where they are sent. Seeds follow from it, so that a
+    recording of a camera is rendered as the camera was.
+
+    What was left out counts as the value it stands for, wherever the model or its checkpoint decides that; so a default
+    changes nothing when it is written out. Two are for the source to decide and count as they are written: `fps` of
+    [window], and `hfov_deg` of [source]. `motion_bucket`, where it follows from each path, is the third.
+
+    Args:
+        traits: of the model in use.
+    """
+    source = config.source
+    taken = source.resize, source.allow_upscale, source.hfov_deg, _pose_in_use(source.pose, traits)
+    views = {view_id: view.plain for view_id, view in config.view.items()}
+    window = structs.replace(config.window, stride=config.window.stride or traits.config.frames)
+    filled = taken, _model_in_use(config.model, traits), views, window
+    plain = _without_negative_zero(msgspec.to_builtins(filled))
+    return hashlib.sha256(msgspec.json.encode(plain, order="deterministic")).hexdigest()[:12]
+
+
+def _model_in_use(section: ModelSection, traits: Traits) -> ModelSection:
+    sampling, family = traits.config.sampling, traits.family
+    networks = traits.config if isinstance(traits.config, ModelConfig) else None
+    tower = None if networks is None else networks.image_encoder
+    used = sampler_in_use(section, traits)
+    return structs.replace(
+        section,
+        device="auto",
+        threads=None,
+        engine=None,
+        providers=(),
+        dtype=None,
+        family=section.family if family is None else family.name,
+        quality="exact",
+        steps=used.steps,
+        solver=used.solver,
+        guidance=used.guidance,
+        guidance_interval=used.guidance_interval,
+        cond_aug=sampling.augmentation if section.cond_aug is None else section.cond_aug,
+        move_time=traits.move_time if section.move_time is None else section.move_time,
+        motion_bucket=family.motion_bucket if section.motion_bucket is None and family else section.motion_bucket,
+        head_width=None if networks is None else networks.unet.head_width,
+        image_heads=None if tower is None else tower.heads,
+    )
+
+
+def _pose_in_use(pose: SourcePose | None, traits: Traits) -> SourcePose | None:
+    """Where the camera stands in the words the model knows; None for a model that has no use for them."""
+    stated, mount = pose or SourcePose(), CameraMount()
+    if traits.live and stated.on_vehicle:
+        return SourcePose(
+            height_m=mount.height_m if stated.height_m is None else stated.height_m,
+            forward_m=mount.forward_m if stated.forward_m is None else stated.forward_m,
+            left_m=mount.left_m if stated.left_m is None else stated.left_m,
+            tilt_deg=mount.tilt_deg if stated.tilt_deg is None else stated.tilt_deg,
+        )
+    if traits.config.camera == "none":
+        return None
+    return SourcePose(
+        elevation_deg=ASSUMED_SOURCE.elevation_deg if stated.elevation_deg is None else stated.elevation_deg,
+        radius=ASSUMED_SOURCE.radius_m if stated.radius is None else stated.radius,
+    )
+
+
+def _without_negative_zero(value: object) -> object:
+    """-0.0 is written otherwise than 0.0 and means the same."""
+    if isinstance(value, dict):
+        return {key: _without_negative_zero(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_negative_zero(each) for each in value]
+    return value + 0.0 if isinstance(value, float) else value

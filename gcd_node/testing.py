@@ -125,8 +125,7 @@ class ReplayFixture:
         Raises:
             ConfigError, SourceError, CheckpointError and others: as `gcd-node replay`.
         """
-        from gcd_node.config import load_config
-        from gcd_node.config_dump import to_change
+        from gcd_node.config import load_config, to_change
         from gcd_node.replay.lockstep import replay
 
         changes = [to_change(key, value) for key, value in (settings or {}).items()]

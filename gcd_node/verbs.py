@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal, TypeAlias
 
 import msgspec
-from msgspec import Meta
+from msgspec import UNSET, Meta, UnsetType
 
 from gcd_client.control import MAX_REQUEST, Code, ControlError, Request, RequestId
 from gcd_client.protocol import LARGEST_INTEGER, MessageError, check_version
 from gcd_node.auth import Role
-from gcd_node.config import Matrix, Pose, ViewConfig, pose_matrix
+from gcd_node.config import Matrix, Pose, Positive, ViewConfig, pose_matrix
 
 ViewName: TypeAlias = Annotated[str, Meta(pattern=r"^[a-z0-9_]{1,16}$(?!\n)")]
 _Scale: TypeAlias = Annotated[float, Meta(ge=0, le=100)]
@@ -34,34 +34,28 @@ class SetView(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     view: ViewName
     kind: Literal["fixed", "orbit"] = "fixed"
-    azimuth_deg: float | None = None
-    elevation_deg: float | None = None
-    radius: float | None = None
-    position_m: tuple[float, float, float] | None = None
-    look_at_m: tuple[float, float, float] | None = None
-    source_from_view: Matrix | None = msgspec.field(default=None, name="T_src_dst")
-    rate_deg_s: float | None = None
-    amplitude_deg: Annotated[float, Meta(gt=0)] | None = None
+    azimuth_deg: float | UnsetType = UNSET
+    elevation_deg: float | UnsetType = UNSET
+    radius: float | UnsetType = UNSET
+    position_m: tuple[float, float, float] | UnsetType = UNSET
+    look_at_m: tuple[float, float, float] | UnsetType = UNSET
+    source_from_view: Matrix | UnsetType = msgspec.field(default=UNSET, name="T_src_dst")
+    rate_deg_s: float | UnsetType = UNSET
+    amplitude_deg: Positive | UnsetType = UNSET
 
     def __post_init__(self) -> None:
-        angles = (self.azimuth_deg, self.elevation_deg, self.radius, self.position_m)
-        if self.source_from_view is not None and angles != (None,) * 4:
+        goal = {self.azimuth_deg, self.elevation_deg, self.radius, self.position_m}
+        if self.source_from_view is not UNSET and goal != {UNSET}:
             raise ValueError("a goal is T_src_dst, or azimuth_deg, elevation_deg and radius: state one of the two")
         self.to_config()
 
     def to_config(self) -> ViewConfig:
         """The view as a launch file states it. Raises ValueError as ViewConfig."""
-        return ViewConfig(
-            kind=self.kind if self.source_from_view is None else "pose",
-            azimuth_deg=self.azimuth_deg or 0.0,
-            elevation_deg=self.elevation_deg or 0.0,
-            radius=self.radius or 0.0,
-            position_m=self.position_m,
-            look_at_m=self.look_at_m,
-            pose=self.source_from_view,
-            rate_deg_s=self.rate_deg_s,
-            amplitude_deg=self.amplitude_deg,
-        )
+        stated: dict[str, Any] = msgspec.to_builtins(self)  # what is unset is left out
+        del stated["view"]
+        if "T_src_dst" in stated:
+            stated |= {"kind": "pose", "pose": stated.pop("T_src_dst")}
+        return ViewConfig(**stated)
 
 
 class SetPose(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -94,15 +88,15 @@ class SetParam(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     steps, guidance, seed, samples: as in [model]. jpeg_quality: as in [publish]. publish: its `encoding`.
     """
 
-    steps: Annotated[int, Meta(ge=1, le=1000)] | None = None
-    guidance: tuple[_Scale, _Scale] | None = None
-    seed: Annotated[int, Meta(ge=0, le=LARGEST_INTEGER)] | None = None
-    samples: Annotated[int, Meta(ge=1, le=64)] | None = None
-    jpeg_quality: Annotated[int, Meta(ge=50, le=100)] | None = None
-    publish: Literal["rgb8", "jpeg"] | None = None
+    steps: Annotated[int, Meta(ge=1, le=1000)] | UnsetType = UNSET
+    guidance: tuple[_Scale, _Scale] | UnsetType = UNSET
+    seed: Annotated[int, Meta(ge=0, le=LARGEST_INTEGER)] | UnsetType = UNSET
+    samples: Annotated[int, Meta(ge=1, le=64)] | UnsetType = UNSET
+    jpeg_quality: Annotated[int, Meta(ge=50, le=100)] | UnsetType = UNSET
+    publish: Literal["rgb8", "jpeg"] | UnsetType = UNSET
 
     def __post_init__(self) -> None:
-        if all(getattr(self, name) is None for name in self.__struct_fields__):
+        if not msgspec.to_builtins(self):
             raise ValueError(f"nothing to change; name one of {', '.join(self.__struct_fields__)}")
 
 
@@ -164,25 +158,11 @@ VERBS: Mapping[str, Verb] = types.MappingProxyType(
 
 @functools.cache
 def schemas() -> Mapping[str, dict[str, Any]]:
-    """Role and JSON schema of every verb's arguments, for `describe`; null is left out, as no argument may be that."""
+    """Role and JSON schema of every verb's arguments, for `describe`."""
     return {
-        name: {
-            "role": verb.role,
-            "args": _without_null(msgspec.json.schema(verb.arguments)),
-            "if_view_rev": verb.names_view,
-        }
+        name: {"role": verb.role, "args": msgspec.json.schema(verb.arguments), "if_view_rev": verb.names_view}
         for name, verb in VERBS.items()
     }
-
-
-def _without_null(schema: dict[str, Any]) -> dict[str, Any]:
-    """What may be left out is an optional argument of msgspec, which counts null among its values."""
-    for definition in schema.get("$defs", {}).values():
-        for name, argument in definition.get("properties", {}).items():
-            kinds = [kind for kind in argument.get("anyOf", ()) if kind != {"type": "null"}]
-            if len(kinds) == 1:
-                definition["properties"][name] = kinds[0]
-    return schema
 
 
 def _properties(verb: str) -> dict[str, Any]:
@@ -212,6 +192,7 @@ class Command:
     {"view_rev": the one it has} and nothing changes.
     """
 
+    id: str = ""
     verb: str
     args: msgspec.Struct
     dry_run: bool = False
@@ -223,35 +204,20 @@ _RANGE = re.compile(r"Expected `(?:int|float)` (?:>=|<=|>|<) \S+ - at `\$\.([^`\
 _UNKNOWN = re.compile(r"contains unknown field `([^`]*)`")
 
 
-def parse_request(part: bytes) -> Request:
-    """Read a request; its arguments are looked at by parse_command().
+def parse_command(part: bytes) -> Command:
+    """What a request asks for.
 
     Raises:
-        RequestError: TOO_LARGE, BAD_JSON (not one JSON object), BAD_PROTO (another major version, or none), BAD_ARG.
+        RequestError: TOO_LARGE, BAD_JSON (not one JSON object), BAD_PROTO (another major version, or none),
+            UNKNOWN_VERB, BAD_ARG, OUT_OF_RANGE; `result` says what is allowed: {"allowed": {NAME: [least, most]}}.
     """
     if len(part) > MAX_REQUEST:
         raise RequestError(f"a request has at most {MAX_REQUEST} bytes, got {len(part)}", Code.TOO_LARGE)
     try:
-        fields = msgspec.json.decode(part, type=dict[str, msgspec.Raw])
-    except _MALFORMED as error:
-        raise RequestError(f"a request is one JSON object in UTF-8: {error!s:.200}", Code.BAD_JSON) from error
-    request_id = _text(fields.get("id"), RequestId)
-    try:
-        check_version(_text(fields.get("proto"), str))
-        return msgspec.json.decode(part, type=Request)
-    except MessageError as error:
-        raise RequestError(str(error), Code.BAD_PROTO, request_id) from error
-    except _MALFORMED as error:
-        raise RequestError(_explained(error, Request), Code.BAD_ARG, request_id) from error
-
-
-def parse_command(request: Request) -> Command:
-    """What a request asks for.
-
-    Raises:
-        RequestError: UNKNOWN_VERB, BAD_ARG, OUT_OF_RANGE; `result` says what is allowed:
-            {"allowed": {NAME: [least, most]}}.
-    """
+        request = msgspec.json.decode(part, type=Request)
+        check_version(request.proto)
+    except (*_MALFORMED, MessageError) as error:
+        raise _unreadable(part, error) from error
     verb = VERBS.get(request.verb)
     if verb is None:
         known = _nearest(request.verb, tuple(VERBS))
@@ -259,10 +225,6 @@ def parse_command(request: Request) -> Command:
     if request.if_view_rev is not None and not verb.names_view:
         raise RequestError(f"{request.verb} names no view, so leave if_view_rev out", Code.BAD_ARG, request.id)
     try:
-        for name, value in msgspec.json.decode(request.args, type=dict[str, msgspec.Raw]).items():
-            if bytes(value).strip() == b"null":
-                message = f"{name!a:.60} is null, as NaN becomes on some ways to JSON; leave out what you do not set"
-                raise RequestError(message, Code.BAD_ARG, request.id)
         args = msgspec.json.decode(request.args, type=verb.arguments)
     except _MALFORMED as error:
         message, beyond = _explained(error, verb.arguments), _RANGE.search(str(error))
@@ -270,10 +232,26 @@ def parse_command(request: Request) -> Command:
             raise RequestError(message, Code.BAD_ARG, request.id) from error
         allowed: dict[str, object] = {"allowed": {beyond[1]: _interval(_properties(request.verb)[beyond[1]])}}
         raise RequestError(message, Code.OUT_OF_RANGE, request.id, allowed) from error
-    return Command(verb=request.verb, args=args, dry_run=request.dry_run, if_view_rev=request.if_view_rev)
+    return Command(
+        id=request.id, verb=request.verb, args=args, dry_run=request.dry_run, if_view_rev=request.if_view_rev
+    )
 
 
-def _text(raw: msgspec.Raw | None, kind: object) -> str:
+def _unreadable(part: bytes, error: Exception) -> RequestError:
+    """Why a request cannot be read, with as much of it as can be: its version is looked at first, then the rest."""
+    try:
+        fields = msgspec.json.decode(part, type=dict[str, msgspec.Raw])
+    except _MALFORMED as worse:
+        return RequestError(f"a request is one JSON object in UTF-8: {worse!s:.200}", Code.BAD_JSON)
+    request_id = _text(fields.get("id"), RequestId)
+    try:
+        check_version(_text(fields.get("proto"), str))
+    except MessageError as other:
+        return RequestError(str(other), Code.BAD_PROTO, request_id)
+    return RequestError(_explained(error, Request), Code.BAD_ARG, request_id)
+
+
+def _text(raw: msgspec.Raw | None, kind: Any) -> str:
     """The text that `raw` holds, "" if it holds none of this kind."""
     try:
         return str(msgspec.json.decode(raw or b"", type=kind))

@@ -13,10 +13,9 @@ from gcd_client.protocol import PREVIEW_ID, PREVIEW_TOPIC, ViewKind, ViewMessage
 from gcd_model import CameraMount, OptionError, Orbit, SphericalDelta, Traits, Trajectory
 from gcd_node.config import ModelSection, NodeConfig, PublishConfig, ViewConfig, pose_matrix
 from gcd_node.frame import Frame
-from gcd_node.messages import PREVIEW_PERIOD_S, end_message, end_messages, preview_message, published_kinds
+from gcd_node.messages import PREVIEW_PERIOD_S, MessageSink, end_message, preview_message
 from gcd_node.preprocess import stated_sphere
-from gcd_node.publisher import MessageSink
-from gcd_node.stream_context import StreamContext
+from gcd_node.stream_context import StreamContext, published_kinds
 
 _KINDS: tuple[ViewKind, ...] = get_args(ViewKind)
 _LEAST = 0.9  # of a period between two previews, so that a camera's jitter does not make it miss every second one
@@ -40,7 +39,6 @@ class LiveConfig:
     def __init__(self, config: NodeConfig) -> None:
         self._lock = threading.Lock()
         self._revisions = dict.fromkeys(config.view, 1)  # of removed views too
-        self._removed: list[tuple[str, int]] = []
         self._settings = Settings(config=config, revisions=dict(self._revisions))
 
     @property
@@ -65,7 +63,6 @@ class LiveConfig:
         """Replace or add a view; gives its new revision."""
         with self._lock:
             self._revisions[view_id] = self._revisions.get(view_id, 0) + 1
-            self._removed = [each for each in self._removed if each[0] != view_id]
             self._replace(view={**self.config.view, view_id: view})
             return self._revisions[view_id]
 
@@ -74,19 +71,12 @@ class LiveConfig:
         with self._lock:
             left = dict(self.config.view)
             del left[view_id]
-            self._removed.append((view_id, self._revisions[view_id]))
             self._replace(view=left)
 
     def change(self, model: ModelSection, publish: PublishConfig) -> None:
         """Replace how views are drawn and how they are sent."""
         with self._lock:
             self._replace(model=model, publish=publish)
-
-    def take_removed(self) -> list[tuple[str, int]]:
-        """Views removed since the last call, with their last revision: their end is yet to be announced."""
-        with self._lock:
-            removed, self._removed = self._removed, []
-            return removed
 
     def _replace(self, **changes: object) -> None:
         config = msgspec.structs.replace(self.config, **changes)
@@ -192,7 +182,8 @@ class EndOfStream:
     def __init__(self, live: LiveConfig, sink: MessageSink, context: Callable[[], StreamContext]) -> None:
         """context: what is known of the source now."""
         self._live, self._sink, self._context = live, sink, context
-        self._open: dict[str, set[str]] = {}  # of each view: topics on which something was sent, and no end since
+        self._open: dict[str, Set[str]] = {view_id: set() for view_id in live.config.view}
+        """Views that have not ended, and on which of their topics something was sent."""
         self._newest_goal: dict[str, tuple[int, int]] = {}
 
     def send(self, messages: Sequence[ViewMessage]) -> None:
@@ -213,8 +204,9 @@ class EndOfStream:
 
     def announce_removed(self, last_window_id: int) -> None:
         """End views that were taken out."""
-        for view_id, rev in self._live.take_removed():
-            self._end(view_id, rev, self._topics(view_id), last_window_id, delay_ms=0)
+        config = self._live.config
+        for view_id in [each for each in self._open if each not in config.view]:
+            self._end(view_id, self._live.revision(view_id), self._topics(view_id), last_window_id, delay_ms=0)
 
     def announce_all(self, last_window_id: int, *, delay_ms: int | None) -> None:
         """End everything. delay_ms: see MessageSink."""
@@ -228,9 +220,8 @@ class EndOfStream:
         return self._open.pop(view_id, set[str]()) | {view_topic(view_id, kind) for kind in now}
 
     def _end(self, view_id: str, rev: int, topics: Set[str], last: int, *, delay_ms: int | None) -> None:
-        kinds: list[ViewKind] = [kind for kind in _KINDS if view_topic(view_id, kind) in topics]
-        for message in end_messages(self._context(), view_id, rev, last, kinds):
-            self._sink.end(message, delay_ms=delay_ms)
+        for topic in [topic for kind in _KINDS if (topic := view_topic(view_id, kind)) in topics]:
+            self._sink.end(end_message(self._context(), topic, view_id, rev, last), delay_ms=delay_ms)
 
 
 class InputPreview:

@@ -18,12 +18,12 @@ from gcd_node.control import ControlServer
 from gcd_node.errors import NodeError, SourceAbsentError, SourceLostError
 from gcd_node.frame import Frame, SourceInfo
 from gcd_node.inference import WindowReport
-from gcd_node.node import Node, NodeOptions
+from gcd_node.lifecycle import Parts
+from gcd_node.node import Node
 from gcd_node.publisher import Publisher
-from gcd_node.session import publisher_options
+from gcd_node.session import open_publisher
 from gcd_node.sources import V4l2Source
 from gcd_node.sources.live import LiveCamera
-from gcd_node.transitions import Parts
 
 VIEW = "soak"
 WIDTH, HEIGHT, FPS = 384, 256, 24.0
@@ -240,8 +240,8 @@ def running_node(
             node_id="soak",
         )
         parts = Parts(open_source=lambda _: script.open(), load_model=lambda _: model)
-        with Publisher(publisher_options(config)) as publisher:
-            node = Node(config, parts, publisher, NodeOptions(once=False, on_window=on_window))
+        with open_publisher(config) as publisher:
+            node = Node(config, parts, publisher, once=False, on_window=on_window)
             with ControlServer(
                 str(config.control.endpoint), node.handle, lambda: node.state.label, node.event
             ) as control:

@@ -26,8 +26,7 @@ from typer import Argument, Option
 
 from gcd_client.subscriber import ViewSubscriber
 from gcd_node.cli.run import Changes
-from gcd_node.config import ControlConfig, NodeConfig, ViewerConfig, load_config, parse_config
-from gcd_node.config_dump import to_toml
+from gcd_node.config import ControlConfig, NodeConfig, ViewerConfig, load_config, parse_config, to_toml
 from gcd_node.errors import NodeError, OutputError, UsageError
 from gcd_node.sources import LIVE_KINDS, FileSource, FolderSource, McapSource, SyntheticSource
 

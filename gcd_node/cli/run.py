@@ -15,8 +15,7 @@ from rich.table import Table
 from rich.text import Text
 from typer import Argument, Option
 
-from gcd_node.config import LifeConfig, load_config
-from gcd_node.config_dump import to_toml
+from gcd_node.config import LifeConfig, load_config, to_toml
 from gcd_node.service import ServiceManager, background_logging
 
 if TYPE_CHECKING:
@@ -47,19 +46,20 @@ def run(config: ConfigPath, changes: Changes = None, print_config: PrintConfig =
     if print_config:
         typer.echo(to_toml(settings), nl=False)
         return
-    from gcd_node.node import NodeOptions
-    from gcd_node.session import ends_by_itself, open_session, run_until_signal
+    from gcd_node.session import open_session, run_until_signal
 
     apply_scheduling(settings.life)
     console = Console(stderr=True, markup=False)
     status = console.status(Text(f"loading {settings.model.weights}"))
-    options = NodeOptions(
-        once=ends_by_itself(settings) if once is None else once,
+    session = open_session(
+        settings,
+        once=once,
         on_configured=lambda traits: _show_configured(console, status, traits),
+        on_window=_window_printer(console),
         service=ServiceManager(os.environ),
+        viewer=True,
     )
-    logging = background_logging(as_json=settings.health.log == "json")
-    with logging, status, open_session(settings, _window_printer(console), options, viewer=True) as (node, publisher):
+    with background_logging(as_json=settings.health.log == "json"), status, session as (node, publisher):
         console.print(f"views on {publisher.endpoint}, status on {publisher.status_endpoint}", soft_wrap=True)
         summary = run_until_signal(node, publisher)
     console.print(_summary_table(summary, f"{publisher.stats.sent} messages sent"))

@@ -16,16 +16,15 @@ from msgspec.structs import replace
 
 from gcd_client.protocol import ClassRecord, EndMessage, OriginHeader, StatusTopic, ViewMessage, kind_of
 from gcd_model import Traits
-from gcd_node.config import LifeConfig, NodeConfig
-from gcd_node.config_digest import config_digest
-from gcd_node.config_dump import to_toml
+from gcd_node.config import LifeConfig, NodeConfig, to_toml
 from gcd_node.errors import ConfigError, DamagedRunError, ModelFailedError, OutputError, SourceError
 from gcd_node.frame import FrameSource, SourceInfo
 from gcd_node.image_io import video_writer
 from gcd_node.inference import WindowReport
-from gcd_node.node import Node, NodeOptions
+from gcd_node.lifecycle import Parts
+from gcd_node.messages import PublisherStats
+from gcd_node.node import Node
 from gcd_node.pipeline import Summary
-from gcd_node.publisher import PublisherStats
 from gcd_node.replay.run import (
     MANIFEST,
     Manifest,
@@ -46,7 +45,7 @@ from gcd_node.replay.run import (
 )
 from gcd_node.session import load_model, model_threads
 from gcd_node.sources import LiveSource, SourceConfig, SyntheticSource, open_source, resolve_path
-from gcd_node.transitions import Parts
+from gcd_node.stream_context import config_digest
 
 PARTS = Parts(open_source=open_source, load_model=load_model)
 """What a launch file names, as `gcd-node run` opens it."""
@@ -106,8 +105,9 @@ def replay(
 
     with new_folder(out) as folder, _repeatable():
         with RunWriter(folder, on_window) as writer:
-            options = NodeOptions(once=True, on_configured=traits.append, on_window=writer.finish_window)
-            summary = Node(config, Parts(open_source=open_and_note, load_model=parts.load_model), writer, options).run()
+            noting = Parts(open_source=open_and_note, load_model=parts.load_model)
+            node = Node(config, noting, writer, on_configured=traits.append, on_window=writer.finish_window)
+            summary = node.run()
         manifest = _manifest(config, infos[0], traits[-1], writer, summary)
         try:
             (folder / MANIFEST).write_bytes(encode_manifest(manifest))

@@ -3,14 +3,15 @@
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
 from wire_messages import end, window
 
+from gcd_node.config import PublishConfig
 from gcd_node.control import ControlServer, Outcome
 from gcd_node.publisher import Publisher
-from gcd_node.sockets import PublisherOptions
 from gcd_node.verbs import Command
 
 CLIENT = Path(__file__).parents[2] / "client"
@@ -39,10 +40,14 @@ def test_the_client_alone_reads_views_and_commands(tmp_path: Path) -> None:
     python, clean = tmp_path / "venv" / "bin" / "python", {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     subprocess.run([sys.executable, "-m", "venv", tmp_path / "venv"], check=True, timeout=100)
     subprocess.run([python, "-m", "pip", "install", "-q", CLIENT], check=True, timeout=300, env=clean)
-    options = PublisherOptions(data=f"ipc://{tmp_path}/d", status=None, lockstep=True, min_subscribers=1)
+    opened = partial(
+        Publisher,
+        PublishConfig(data=f"ipc://{tmp_path}/d", status=f"ipc://{tmp_path}/status", min_subscribers=1),
+        lockstep=True,
+    )
     with (
         ControlServer(f"ipc://{tmp_path}/c", Views().handle, lambda: "active", print) as server,
-        Publisher(options) as publisher,
+        opened() as publisher,
     ):
         command = [python, "-c", PROGRAM, publisher.endpoint, server.endpoint]
         reader = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=clean, cwd=tmp_path)

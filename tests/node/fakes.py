@@ -29,9 +29,9 @@ from gcd_model import (
 from gcd_node.config import NodeConfig, parse_config
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.inference import WindowReport
-from gcd_node.node import Node, NodeOptions
-from gcd_node.publisher import MessageSink, PublisherStats
-from gcd_node.transitions import Parts
+from gcd_node.lifecycle import Parts
+from gcd_node.messages import MessageSink, PublisherStats
+from gcd_node.node import Node
 
 HEIGHT, WIDTH = 64, 96
 
@@ -171,7 +171,7 @@ def made_node(
 ) -> Node:
     """A node over parts that are there already; it ends with its source."""
     parts = Parts(open_source=lambda _: source, load_model=lambda _: synthesizer)
-    return Node(config, parts, outbox, NodeOptions(once=True, on_window=on_window))
+    return Node(config, parts, outbox, on_window=on_window)
 
 
 @dataclass

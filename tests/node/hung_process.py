@@ -13,10 +13,9 @@ from rig import rig_config
 
 from gcd_model import ViewSynthesizer
 from gcd_node.config import ModelSection
-from gcd_node.node import Node, NodeOptions
-from gcd_node.publisher import Publisher
-from gcd_node.session import publisher_options, run_until_signal
-from gcd_node.transitions import Parts
+from gcd_node.lifecycle import Parts
+from gcd_node.node import Node
+from gcd_node.session import open_publisher, run_until_signal
 
 
 def hang(_: object = None) -> None:
@@ -34,8 +33,8 @@ def main() -> None:
     pace = "realtime" if sys.argv[2] == "warm" else "lockstep"  # nothing is warmed up in lockstep
     config = rig_config(Path(sys.argv[1]), f'kind = "synthetic"\npace = "{pace}"', "[view.main]", "")
     parts = Parts(open_source=lambda _: FakeSource(100_000), load_model=load)
-    with Publisher(publisher_options(config)) as publisher:
-        node = Node(config, parts, publisher, NodeOptions(once=False))
+    with open_publisher(config) as publisher:
+        node = Node(config, parts, publisher, once=False)
         run_until_signal(node, publisher)
     print("left behind" if node.left_behind else "all ended", flush=True)
 

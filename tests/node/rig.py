@@ -1,9 +1,11 @@
 """A whole node over real sockets in a folder of its own: its cameras and its model do what a test tells them."""
 
+import contextlib
 import gc
+import socket
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,13 +22,12 @@ from gcd_model import ViewSynthesizer
 from gcd_node.config import ModelSection, NodeConfig, parse_config
 from gcd_node.control import ControlServer
 from gcd_node.frame import FrameSource
-from gcd_node.node import Node, NodeOptions
+from gcd_node.lifecycle import Parts
+from gcd_node.node import Node
 from gcd_node.pipeline import Summary
-from gcd_node.publisher import Publisher
 from gcd_node.service import ServiceManager
-from gcd_node.session import publisher_options
+from gcd_node.session import open_publisher
 from gcd_node.sources import SourceConfig
-from gcd_node.transitions import Parts
 
 CAMERA = 'kind = "v4l2"'
 _SILENCE_MS = 300
@@ -66,6 +67,23 @@ def rig_config(folder: Path, source: str, views: str, more: str) -> NodeConfig:
     return parse_config(text.encode(), "test", [*endpoints, f"control.endpoint=ipc://{folder}/control"])
 
 
+@contextlib.contextmanager
+def service_manager(address: str) -> Generator[Callable[[], list[str]]]:
+    """Listens as systemd does; calling it gives the lines that have arrived since."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link:
+        link.bind(address)
+        link.setblocking(False)
+
+        def receive() -> list[str]:
+            lines: list[str] = []
+            with contextlib.suppress(BlockingIOError):
+                while True:
+                    lines += link.recv(4096).decode().splitlines()
+            return lines
+
+        yield receive
+
+
 class Rig:
     """Use it as a context manager; at its end the node was shut down, and everything it said is still here."""
 
@@ -91,8 +109,8 @@ class Rig:
             open_source=(lambda _: source.open()) if isinstance(source, Bench) else source,
             load_model=(lambda _: loaded) if hasattr(loaded, "traits") else loaded,  # type: ignore[arg-type,return-value]
         )
-        self.publisher = Publisher(publisher_options(self.config))
-        self.node = Node(self.config, parts, self.publisher, NodeOptions(once=once, service=service))
+        self.publisher = open_publisher(self.config)
+        self.node = Node(self.config, parts, self.publisher, once=once, service=service)
         self.control = ControlServer(
             f"ipc://{folder}/control",
             self.node.handle,

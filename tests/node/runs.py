@@ -10,9 +10,9 @@ from fakes import FakeSource, FakeSynthesizer, traits
 
 from gcd_model import NonFiniteError, RenderOptions, SourceFeatures, Traits, Trajectory, View
 from gcd_node.config import NodeConfig, parse_config
+from gcd_node.lifecycle import Parts
 from gcd_node.replay.lockstep import replay
 from gcd_node.replay.run import RunFolder
-from gcd_node.transitions import Parts
 
 LAUNCH = """
 [source]

@@ -13,8 +13,8 @@ from gcd_model.own_format import Card
 from gcd_model.weights_export import write_adapter
 from gcd_node.check import check_launch
 from gcd_node.config import NodeConfig, parse_config
-from gcd_node.config_digest import config_digest
 from gcd_node.session import load_model
+from gcd_node.stream_context import config_digest
 
 _RANK = 2
 

@@ -248,7 +248,7 @@ def test_an_oak_is_opened_again_by_its_own_id_unless_its_place_was_stated(stated
 
 
 def test_only_an_oak_has_an_id_to_be_asked_for() -> None:
-    from gcd_node.transitions import same_camera
+    from gcd_node.lifecycle import same_camera
 
     config = V4l2Source()
     before = SourceInfo(kind="v4l2", id="video0", width=96, height=64, fps_nominal=24.0, clock="realtime")

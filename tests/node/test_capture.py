@@ -8,9 +8,9 @@ import pytest
 from cameras import until
 from media import frames_at
 
-from gcd_node.errors import ReaderError, TooShortError
+from gcd_node.errors import ReaderError
 from gcd_node.frame import Frame, SourceInfo
-from gcd_node.window import FrameWindow, PartialWindow, WindowBuilder, WindowSlot, read
+from gcd_node.window import FrameWindow, WindowBuilder, WindowSlot, read
 
 GUARD_S = 5.0
 
@@ -134,15 +134,6 @@ def test_who_waits_works_meanwhile_until_nothing_is_left_to_do_and_again_when_mo
 # --- the reader --------------------------------------------------------------------------------------------------
 
 
-def test_a_slow_taker_gets_the_newest_window_and_every_frame_was_read() -> None:
-    slot = WindowSlot()
-    source = ScriptedSource(ten_fps(20))
-    read(source, builder(), slot)
-    windows = taken(slot)
-    assert [window.window_id for window in windows] == [4]
-    assert (source.given, slot.dropped) == (20, 4)
-
-
 def test_the_last_window_is_not_forgotten_at_the_end() -> None:
     slot = WindowSlot()
     read(ScriptedSource(frames_at([0, 100, 200, 270])), WindowBuilder(frames=4, fps=10.0), slot)
@@ -157,14 +148,6 @@ def test_a_fault_in_the_source_is_not_swallowed() -> None:
     assert isinstance(caught.value.__cause__, ZeroDivisionError)
 
 
-def test_too_few_frames_are_an_error_that_counts_them() -> None:
-    slot = WindowSlot()
-    read(ScriptedSource(ten_fps(3)), builder(), slot)
-    with pytest.raises(TooShortError) as caught:
-        slot.take()
-    assert caught.value.exit_code == 65
-
-
 def test_closing_slot_and_source_stops_the_reader_without_an_error() -> None:
     slot = WindowSlot()
     source = ScriptedSource(ten_fps(2), stays=True)
@@ -174,25 +157,3 @@ def test_closing_slot_and_source_stops_the_reader_without_an_error() -> None:
     source.close()
     joined(reader)
     assert slot.take() is None
-
-
-def test_the_slot_shows_what_the_next_window_holds_so_far() -> None:
-    slot, shown = WindowSlot(), []
-    source, windows = ScriptedSource(ten_fps(9)), builder()
-
-    class Looking(WindowSlot):
-        def show(self, filling: PartialWindow) -> None:
-            super().show(filling)
-            shown.append(filling.seqs)
-
-        def put(self, item: FrameWindow) -> bool:
-            done = super().put(item)
-            assert self.filling is None
-            return done
-
-    assert slot.filling is None
-    slot = Looking()
-    read(source, windows, slot)
-    assert shown == [(0,), (0, 1), (0, 1, 2), (), (4,), (4, 5), (4, 5, 6), (), (8,)]
-    assert slot.filling is not None
-    assert slot.filling.seqs == (8,)

@@ -7,11 +7,9 @@ from tiny_weights import write_tiny
 
 from gcd_node.check import check_launch
 from gcd_node.cli.main import run_app
-from gcd_node.config import NodeConfig, load_config, parse_config
-from gcd_node.config_dump import to_toml
+from gcd_node.config import NodeConfig, PublishConfig, load_config, parse_config, to_toml
 from gcd_node.errors import ConfigError
 from gcd_node.publisher import Publisher
-from gcd_node.sockets import PublisherOptions
 
 SIZE = (128, 192)  # smaller than any model takes unless it may be enlarged
 
@@ -71,16 +69,10 @@ def test_what_would_fail_is_named_and_is_the_exit_code(
     assert capsys.readouterr().err.strip().splitlines()[-1].startswith("error: ")
 
 
-def test_a_setting_that_is_named_in_brackets_is_printed_whole(
-    launch: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "300")
-    assert run_app(["check", str(launch), "--set", "publish.data=tcp://0.0.0.0:5580"]) == 78
-    assert "both [security] keys and [security] allow" in capsys.readouterr().out
-
-
 def test_one_failure_does_not_hide_the_next(launch: Path) -> None:
-    with Publisher(PublisherOptions(data=f"ipc://{launch.parent}/data", status=None, linger_ms=0)):
+    with Publisher(
+        PublishConfig(data=f"ipc://{launch.parent}/data", status=f"ipc://{launch.parent}/status"), linger_ms=0
+    ):
         findings = found(launch, "source.path=/no/such.mp4", "model.weights=/no/such.ckpt")
     assert [findings[topic][0] for topic in ("endpoints", "source", "weights")] == ["failed"] * 3
     assert "in use" in findings["endpoints"][1]

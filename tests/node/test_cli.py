@@ -13,11 +13,10 @@ from typer.main import get_command
 
 from gcd_node import session
 from gcd_node.cli.main import COMMANDS, new_app, run_app
-from gcd_node.config import load_config
+from gcd_node.config import PublishConfig, load_config
 from gcd_node.image_io import write_png, write_video
 from gcd_node.publisher import Publisher
 from gcd_node.session import open_session
-from gcd_node.sockets import PublisherOptions
 
 SIZE = (128, 192)  # of the small random model
 KUBRIC = ["--weights", "random:kubric90"]
@@ -229,7 +228,7 @@ def test_a_missing_launch_file_is_exit_78(capsys: pytest.CaptureFixture[str]) ->
 
 
 def test_an_endpoint_in_use_is_exit_73(video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with Publisher(PublisherOptions(data=f"ipc://{tmp_path}/data", status=None, linger_ms=0)):
+    with Publisher(PublishConfig(data=f"ipc://{tmp_path}/data", status=f"ipc://{tmp_path}/status"), linger_ms=0):
         assert f"{tmp_path}/data" in failed(["run", launch_file(tmp_path, video)], 73, capsys)
 
 

@@ -9,7 +9,7 @@ from fakes import live_traits, traits
 from gcd_model import RenderOptions, Traits, sampler_of
 from gcd_model.config import SamplingConfig
 from gcd_node.config import NodeConfig, parse_config
-from gcd_node.config_digest import config_digest
+from gcd_node.stream_context import config_digest
 
 MINIMAL = """
 [source]

@@ -1,9 +1,7 @@
 """The control server and its client over real sockets, and with plain ZeroMQ sockets as strangers have them."""
 
 import json
-import socket
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +9,7 @@ import pytest
 import zmq
 from control_fakes import Events, FakeCommands, wait_for
 
-from gcd_client.control import ControlClient, ControlError, Reply, decode_reply
+from gcd_client.control import ControlClient, Reply, decode_reply
 from gcd_client.protocol import PROTO
 from gcd_node.auth import Client, Socket
 from gcd_node.control import ControlServer, FloodGuard, ReplyCache
@@ -92,23 +90,6 @@ def test_an_error_of_the_node_is_internal_and_shows_no_code(client: ControlClien
     assert reply.code == "INTERNAL"
     assert "secret" not in reply.message
     assert client.request("hello").ok
-
-
-def test_a_node_that_cannot_say_its_state_costs_one_reply(tmp_path: Path, events: Events) -> None:
-    states = iter(["active"])  # asked a second time it raises
-    with ControlServer(
-        f"ipc://{tmp_path}/c", FakeCommands().handle, lambda: next(states, None) or _fail(), events
-    ) as server:
-        with ControlClient(server.endpoint, timeout_s=20.0) as client:
-            assert client.request("hello", request_id="one").ok
-        with ControlClient(server.endpoint, timeout_s=0.2) as client, pytest.raises(ControlError, match="not answer"):
-            client.request("hello", request_id="two")
-        with ControlClient(server.endpoint, timeout_s=20.0) as client:
-            assert client.request("hello", request_id="one").ok  # kept, so nobody asks for the state
-
-
-def _fail() -> str:
-    raise RuntimeError("no state")
 
 
 @pytest.mark.parametrize("result", [{"a": object()}, {"a": {1: {2: set()}, (1, 2): 3}}, {"a": 1 << 70}])
@@ -203,18 +184,6 @@ def test_f17_a_huge_request_drops_its_sender_alone(
     assert client.request("hello").ok
     wait_for(lambda: _answered(stranger))  # it reconnects by itself
     assert commands.view_rev == 1
-
-
-def test_f17_who_leaves_or_talks_something_else_was_not_too_large(tmp_path: Path, events: Events) -> None:
-    with ControlServer("tcp://127.0.0.1:0", FakeCommands().handle, lambda: "active", events) as server:
-        port = int(server.endpoint.rpartition(":")[2])
-        for text in (b"", b"GET / HTTP/1.1\r\n\r\n", b"\xff" * 64):
-            socket.create_connection(("127.0.0.1", port)).sendall(text)
-        for _ in range(3):
-            with ControlClient(server.endpoint, timeout_s=20.0) as client:
-                assert client.request("hello").ok
-        time.sleep(0.3)
-    assert "TOO_LARGE" not in events.codes()
 
 
 # Life

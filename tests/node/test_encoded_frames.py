@@ -20,13 +20,12 @@ from gcd_model import (
     Augmentation,
     CameraMount,
     Clip,
-    DeviceMemoryError,
     RenderOptions,
     SourceFeatures,
     load_synthesizer,
 )
 from gcd_node.config import NodeConfig, parse_config
-from gcd_node.encoded_frames import EncodedFrames, EncodeTerms, frame_seed, window_seed
+from gcd_node.encoded_frames import EncodedFrames, EncodeTerms
 from gcd_node.frame import Frame
 from gcd_node.window import FrameWindow, WindowBuilder
 
@@ -202,17 +201,6 @@ def test_it_makes_no_difference_in_what_order_frames_are_encoded(seed: int) -> N
     assert sorted(set(model.encoded)) == sorted(model.encoded)  # each once
 
 
-def test_the_noise_of_a_frame_follows_from_what_its_message_says() -> None:
-    model, box = Encoder(), Box()
-    made_node(config(stride=7), model, FakeSource(28), box).run()
-    header = box.of("win")[-1].header
-    assert model.encoded == list(range(28))
-    assert model.seeds[T:] == [frame_seed(header.cfg_digest, seq) for seq in header.src.seq]
-    assert len({*model.seeds, window_seed(header.cfg_digest, 0, 0)}) == 29
-    noise = np.frombuffer(box.of("win")[-1].payload, np.uint8).reshape(T, -1).astype(float)
-    assert noise.std(axis=1).min() > 5  # grey levels
-
-
 # When frames are encoded.
 
 
@@ -227,26 +215,6 @@ def test_when_a_window_is_complete_only_its_last_frame_is_left_to_encode() -> No
         until(lambda: len(life.windows) == 1)
         assert begun.is_set()
     assert model.encoded == list(range(T))
-
-
-@pytest.mark.parametrize("stride", [1, 6])
-def test_a_frame_of_several_windows_is_encoded_once(stride: int) -> None:
-    model = Encoder()
-    with Life(config(stride=stride), model) as life:
-        life.source.feed(26)
-    assert len(life.windows) == 1 + (26 - T) // stride
-    last = max(message.header.src.seq[-1] for message in life.box.of("win"))
-    assert model.encoded[: last + 1] == list(range(last + 1))
-    assert model.encoded[last + 1 :] == list(range(last + 1, len(model.encoded)))
-
-
-def test_nothing_is_encoded_for_nobody() -> None:
-    model = Encoder()
-    with Life(config("life = {idle_s = 0.05}", pace="realtime"), model) as life:
-        until(lambda: bool(model.asked))  # warm
-        time.sleep(0.2)
-        life.source.feed(T + 5)
-    assert model.encoded == []
 
 
 # What is forgotten.
@@ -270,22 +238,3 @@ def test_what_was_encoded_on_other_terms_is_encoded_anew(other: EncodeTerms) -> 
     encoded.features(model, changed(window, fps=5.0), other)
     encoded.features(model, changed(window, epoch=window.epoch + 1, fps=5.0), other)
     assert len(model.encoded) == 4 * T
-
-
-def test_a_device_that_is_full_encodes_nothing_ahead_until_the_next_window() -> None:
-    calls: list[int] = []
-
-    def full_once(seq: int) -> None:
-        calls.append(seq)
-        if len(calls) == 1:
-            raise DeviceMemoryError("no memory")
-
-    model = Encoder(before=full_once)
-    with Life(config(), model) as life:
-        life.source.feed(T - 1)
-        until(lambda: calls == [0])
-        life.source.feed(1)
-        until(lambda: len(life.windows) == 1)
-        assert calls == [0, *range(T)]
-        life.source.feed(5)
-        until(lambda: len(calls) == 1 + T + 5)

@@ -7,9 +7,9 @@ from fakes import traits
 
 from gcd_node.cli.main import run_app
 from gcd_node.config import parse_config
-from gcd_node.config_digest import config_digest
 from gcd_node.errors import ConfigError
 from gcd_node.session import load_model
+from gcd_node.stream_context import config_digest
 
 LAUNCH = b"""
 [source]

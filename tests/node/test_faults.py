@@ -5,7 +5,6 @@ F16 to F19 with control and security, F20 in test_publisher.py and test_fault_ex
 """
 
 import os
-import socket
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -16,7 +15,7 @@ import numpy as np
 import pytest
 from cameras import FPS, Bench, Camera, until
 from fakes import FakeSource, FakeSynthesizer, Steady, traits
-from rig import Rig
+from rig import Rig, service_manager
 
 from gcd_client.control import Code
 from gcd_client.subscriber import ViewSubscriber
@@ -313,21 +312,19 @@ def test_f21_a_model_that_hangs_is_an_error_and_the_watchdog_is_not_fed(tmp_path
         stuck.wait(60)
 
     address = str(tmp_path / "notify")
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
-        listener.bind(address)
-        listener.setblocking(False)
+    with service_manager(address) as heard:
         service = ServiceManager({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "200000"})
         model, more = FakeSynthesizer(traits(), hang), "life = {hang_s = 0.5}"
         with Rig(tmp_path, lambda _: Steady(), model, config=LOCKSTEP, more=more, service=service) as rig:
             rig.await_event("MODEL_HUNG")
             status = rig.await_status(lambda status: "MODEL_HUNG" in status["reasons"])
-            heard_of(listener)
+            heard()
             rig.await_status(lambda later: later["heartbeat_seq"] >= status["heartbeat_seq"] + 2)
-            assert "WATCHDOG=1" not in heard_of(listener)
+            assert "WATCHDOG=1" not in heard()
             assert rig.ask("state").code is Code.OK
             stuck.set()
             until(lambda: "MODEL_HUNG" not in rig.statuses()[-1]["reasons"])
-            until(lambda: "WATCHDOG=1" in heard_of(listener))
+            until(lambda: "WATCHDOG=1" in heard())
     assert status["level"] == 2
 
 
@@ -335,9 +332,7 @@ def test_a_control_thread_that_died_is_an_error_and_the_watchdog_is_not_fed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     address = str(tmp_path / "notify")
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
-        listener.bind(address)
-        listener.setblocking(False)
+    with service_manager(address) as heard:
         service = ServiceManager({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "200000"})
         with Rig(tmp_path, lambda _: Steady(), config=LOCKSTEP, service=service) as rig:
             rig.await_status(lambda status: status["ready"])
@@ -345,9 +340,9 @@ def test_a_control_thread_that_died_is_an_error_and_the_watchdog_is_not_fed(
             os.eventfd_write(rig.control._wake_fd, 1)
             assert rig.await_event("THREAD_DIED")["thread"] == "control"
             status = rig.await_status(lambda status: "THREAD_DIED" in status["reasons"])
-            heard_of(listener)
+            heard()
             rig.await_status(lambda later: later["heartbeat_seq"] >= status["heartbeat_seq"] + 2)
-            assert "WATCHDOG=1" not in heard_of(listener)
+            assert "WATCHDOG=1" not in heard()
     assert (status["level"], status["ready"], status["not_ready"]) == (2, False, ["THREAD_DIED"])
     assert len(rig.events("THREAD_DIED")) == 1
 
@@ -355,15 +350,6 @@ def test_a_control_thread_that_died_is_an_error_and_the_watchdog_is_not_fed(
 class Broken:
     def __call__(self) -> None:
         raise RuntimeError("nobody foresaw this")
-
-
-def heard_of(listener: socket.socket) -> list[str]:
-    lines: list[str] = []
-    while True:
-        try:
-            lines += listener.recv(4096).decode().splitlines()
-        except BlockingIOError:
-            return lines
 
 
 def test_f24_ages_do_not_notice_that_somebody_set_the_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

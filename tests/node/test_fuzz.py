@@ -23,7 +23,7 @@ from mutations import BYTE_PIECES, ROUNDS, TEXT_PIECES, Mutator, outcomes
 from rich.console import Console
 from wire_messages import class_map, end, origin, pixels, view_header, window
 
-from gcd_client.control import Reply, decode_reply, encode_request
+from gcd_client.control import Reply, decode_reply
 from gcd_client.images import colours, decode_jpegs, encode_jpegs, images
 from gcd_client.protocol import (
     MAGIC,
@@ -40,11 +40,10 @@ from gcd_client.protocol import (
 from gcd_node.auth import load_clients
 from gcd_node.calibration import load_lens
 from gcd_node.cli.watch import StatusBoard
-from gcd_node.config import parse_config
-from gcd_node.config_dump import to_toml
+from gcd_node.config import parse_config, to_toml
 from gcd_node.errors import ConfigError, NodeError, SourceError
 from gcd_node.sources.files import read_picture
-from gcd_node.verbs import VERBS, Command, RequestError, parse_command, parse_request
+from gcd_node.verbs import VERBS, Command, RequestError, parse_command
 
 SETTINGS = settings(
     max_examples=max(30, ROUNDS // 16),
@@ -192,10 +191,8 @@ def requests() -> list[bytes]:
 
 
 def commanded(part: bytes) -> str:
-    parsed = parse_request(part)
-    command = parse_command(parsed)
+    command = parse_command(part)
     assert isinstance(command, Command)
-    encode_request(parsed)  # what was understood can be said again
     return command.verb
 
 

@@ -1,6 +1,7 @@
 """The preview of the input on src/frm: who gets it, what it says, and that nobody else pays for it."""
 
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,24 +15,16 @@ from gcd_client.images import images
 from gcd_client.protocol import PREVIEW_TOPIC, ViewMessage, topic_key
 from gcd_client.subscriber import ReceivedView, ViewSubscriber
 from gcd_model import ViewSynthesizer
+from gcd_node.config import PublishConfig
 from gcd_node.frame import Frame, FrameSource
-from gcd_node.messages import PREVIEW_WIDTH, preview_message
-from gcd_node.publisher import Publisher, PublisherStats
-from gcd_node.sockets import PublisherOptions
+from gcd_node.messages import PREVIEW_WIDTH, PublisherStats, preview_message
+from gcd_node.publisher import Publisher
 from gcd_node.stream_context import StreamContext, prepare_stream
 from gcd_node.views import InputPreview
 
 pytestmark = pytest.mark.timeout(90)
 REALTIME = 'kind = "synthetic"\npace = "realtime"'
 PREVIEW_KEY, VIEW_KEY = topic_key(PREVIEW_TOPIC), topic_key("view/main/win")
-
-
-class Steady(FakeSource):
-    """Frames at 24 FPS until it is closed."""
-
-    def __init__(self) -> None:
-        super().__init__(100_000)
-        self.period_s = 1 / 24
 
 
 class Watched(Box):
@@ -146,9 +139,13 @@ def test_a_reader_of_previews_that_hangs_does_not_hold_up_a_lockstep_run(tmp_pat
     noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
     frame = Frame(image=noise, stamp_ns=0, seq=0)
     picture = preview_message(run_of(tmp_path, FakeSource(1, size=(640, 480))), frame, time.monotonic_ns(), 0)
-    options = PublisherOptions(data=f"ipc://{tmp_path}/data", status=None, lockstep=True, min_subscribers=1)
+    opened = partial(
+        Publisher,
+        PublishConfig(data=f"ipc://{tmp_path}/data", status=f"ipc://{tmp_path}/status", min_subscribers=1),
+        lockstep=True,
+    )
     with (
-        Publisher(options) as publisher,
+        opened() as publisher,
         ViewSubscriber(publisher.endpoint, "src", "frm", conflate=False),
         ViewSubscriber(publisher.endpoint, "top", conflate=False) as views,
     ):

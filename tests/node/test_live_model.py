@@ -10,13 +10,12 @@ from msgspec.structs import replace
 from gcd_model import CameraMount, OptionError, load_synthesizer
 from gcd_node.cli.main import run_app
 from gcd_node.config import NodeConfig, ViewConfig, parse_config
-from gcd_node.config_digest import config_digest
 from gcd_node.errors import ConfigError
 from gcd_node.frame import SourceInfo
 from gcd_node.preprocess import assumed_hfov_deg, stated_mount
 from gcd_node.replay.run import open_run
 from gcd_node.sources import SourcePose
-from gcd_node.stream_context import prepare_stream
+from gcd_node.stream_context import config_digest, prepare_stream
 from gcd_node.verbs import SetView
 from gcd_node.views import VirtualView
 

@@ -6,39 +6,20 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import torch
 from fakes import FakeSource, FakeSynthesizer, traits
 from rig import Rig
-from tiny_weights import write_tiny
 
 from gcd_model import (
-    Clip,
     DeviceMemoryError,
     RenderOptions,
     SourceFeatures,
-    SphericalDelta,
     Trajectory,
     View,
     ViewSynthesizer,
 )
 from gcd_node.config import ModelSection
-from gcd_node.model import ModelSlot
-from gcd_node.session import load_model
 
 LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
-
-
-def test_a_halved_model_has_half_the_weights_and_still_renders(tmp_path: Path) -> None:
-    slot = ModelSlot(ModelSection(weights=str(write_tiny(tmp_path)), device="cpu", threads=1), load_model)
-    assert (slot.traits.precision, slot.can_halve) == ("float32", False)  # a CPU gains nothing by it, and is not asked
-    slot.halve()
-    assert slot.traits.precision == "bfloat16"
-    assert slot.synthesizer.traits is slot.traits
-    config = slot.traits.config
-    clip = Clip(video=torch.zeros(config.frames, 3, config.height, config.width), fps=slot.traits.fps)
-    path = slot.traits.plan_view(SphericalDelta(azimuth_deg=0.0, elevation_deg=0.0, radius_m=0.0))
-    drawn = slot.synthesizer.render(slot.synthesizer.encode(clip), [path], RenderOptions(steps=1))
-    assert drawn[0].video.isfinite().all()
 
 
 class OnGpu(FakeSynthesizer):

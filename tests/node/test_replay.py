@@ -16,7 +16,6 @@ from runs import FRAMES, WINDOWS, LevelModel, copied, launch, made_run, nan_mode
 
 from gcd_node.cli.main import run_app
 from gcd_node.config import parse_config
-from gcd_node.config_digest import config_digest
 from gcd_node.encoded_frames import window_seed
 from gcd_node.errors import (
     ConfigError,
@@ -41,6 +40,7 @@ from gcd_node.replay.run import (
     pixel_digest,
     read_windows,
 )
+from gcd_node.stream_context import config_digest
 
 pytestmark = pytest.mark.timeout(60)
 

@@ -1,6 +1,7 @@
 """Visibility, depth and a stated spread, from the view that holds them to a reader: what is published, and when."""
 
 import threading
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,8 @@ from fakes import Box, FakeSource, FakeSynthesizer, fake_config, fake_maps, made
 
 from gcd_client.images import depth_m, images, inverse_depth
 from gcd_client.subscriber import ReceivedView, ViewSubscriber
+from gcd_node.config import PublishConfig
 from gcd_node.publisher import Publisher
-from gcd_node.sockets import PublisherOptions
 
 pytestmark = pytest.mark.timeout(30)
 HELD = ("visibility", "inverse_depth")
@@ -92,16 +93,18 @@ def test_one_sample_of_a_model_that_states_its_spread_has_a_deviation() -> None:
 
 
 def test_a_reader_of_both_kinds_gets_exactly_what_was_published_in_order(tmp_path: Path) -> None:
-    options = PublisherOptions(
-        data=f"ipc://{tmp_path}/d", status=f"ipc://{tmp_path}/s", lockstep=True, min_subscribers=2, end_delay_ms=0
+    opened = partial(
+        Publisher,
+        PublishConfig(data=f"ipc://{tmp_path}/d", status=f"ipc://{tmp_path}/s", min_subscribers=2, end_delay_ms=0),
+        lockstep=True,
     )
     received: list[ReceivedView] = []
 
     def read() -> None:
-        with ViewSubscriber(options.data, "main", ("vis", "depth"), conflate=False) as views:
+        with ViewSubscriber(f"ipc://{tmp_path}/d", "main", ("vis", "depth"), conflate=False) as views:
             received.extend(views)
 
-    with Publisher(options) as publisher:
+    with opened() as publisher:
         reader = threading.Thread(target=read, daemon=True)
         reader.start()
         model = FakeSynthesizer(traits("driving"), holds=HELD)

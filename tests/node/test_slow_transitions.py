@@ -92,20 +92,6 @@ def test_f23_whatever_part_of_the_model_is_at_work_it_is_abandoned(
     assert "does not end" not in caplog.text
 
 
-def test_a_node_that_is_told_to_stop_interrupts_nobody_elses_network() -> None:
-    cancel, x = threading.Event(), torch.zeros(1)
-    cancel.set()
-    with interruptible(cancel):
-        with pytest.raises(Cancelled, match="Pause"):
-            Pause()(x)
-        other = threading.Thread(target=lambda: done.append(Pause()(x)))
-        done: list[torch.Tensor] = []
-        other.start()
-        other.join(30)
-    assert len(done) == 1
-    Pause()(x)  # and not here any more
-
-
 def test_while_a_transition_is_under_way_the_node_is_busy_and_can_still_be_ended(tmp_path: Path) -> None:
     loaded = threading.Event()
 
@@ -140,3 +126,17 @@ def test_a_thread_left_behind_keeps_the_node_from_starting_only_until_it_ends(tm
         assert rig.views == []  # nothing follows the end of a view
         assert rig.ask("activate").code is Code.ACCEPTED
         rig.await_views(1)
+
+
+def test_a_node_that_is_told_to_stop_interrupts_nobody_elses_network() -> None:
+    cancel, x = threading.Event(), torch.zeros(1)
+    cancel.set()
+    with interruptible(cancel):
+        with pytest.raises(Cancelled, match="Pause"):
+            Pause()(x)
+        other = threading.Thread(target=lambda: done.append(Pause()(x)))
+        done: list[torch.Tensor] = []
+        other.start()
+        other.join(30)
+    assert len(done) == 1
+    Pause()(x)  # and not here any more

@@ -8,10 +8,10 @@ from fakes import Box, FakeSource, FakeSynthesizer, live_traits, made_node, trai
 
 from gcd_model import CameraMount, Traits
 from gcd_node.config import NodeConfig, load_config, parse_config
-from gcd_node.config_digest import config_digest
 from gcd_node.errors import ConfigError
 from gcd_node.preprocess import require_usable, stated_mount, stated_sphere
 from gcd_node.sources import SourcePose
+from gcd_node.stream_context import config_digest
 
 
 def config(pose: str | None = None, *, source: str = "", more: str = "") -> NodeConfig:

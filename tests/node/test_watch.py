@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +24,10 @@ from gcd_node.auth import Client, ServerSecurity, new_key_pair, write_key_pair
 from gcd_node.cli.main import run_app
 from gcd_node.cli.view_saver import ViewSaver
 from gcd_node.cli.watch import StatusBoard, ViewTable
+from gcd_node.config import PublishConfig
 from gcd_node.errors import OutputError
 from gcd_node.health import Health, Level
 from gcd_node.publisher import Publisher
-from gcd_node.sockets import PublisherOptions
 
 pytestmark = pytest.mark.timeout(60)
 SEEN = np.random.default_rng(0).integers(0, 3, (2, 16, 16), np.uint8)
@@ -62,10 +63,13 @@ def watch(folder: Path, options: list[str], *messages: ViewMessage | EndMessage,
     """The exit code of `gcd-node view` beside a publisher that sends these."""
     codes: list[int] = []
     command = ["view", f"ipc://{folder}/data", "--timeout", "20", *options]
-    options_ = PublisherOptions(
-        data=command[1], status=None, lockstep=True, min_subscribers=readers, end_delay_ms=0, drain_ms=3000
+    opened = partial(
+        Publisher,
+        PublishConfig(data=command[1], status=command[1] + ".status", min_subscribers=readers, end_delay_ms=0),
+        lockstep=True,
+        drain_ms=3000,
     )
-    with Publisher(options_) as publisher:
+    with opened() as publisher:
         thread = threading.Thread(target=lambda: codes.append(run_app(command)), daemon=True)
         thread.start()
         for message in messages:
@@ -289,7 +293,7 @@ def endpoint(tmp_path: Path) -> str:
 def silence(endpoint: str) -> Iterator[Callable[[], None]]:
     """A node that repeats its status, meta and an event until this is called."""
     stopped = threading.Event()
-    with Publisher(PublisherOptions(data=endpoint + ".data", status=endpoint)) as publisher:
+    with Publisher(PublishConfig(data=endpoint + ".data", status=endpoint)) as publisher:
 
         def speak() -> None:
             while not stopped.wait(0.1):
@@ -357,8 +361,10 @@ def test_a_node_that_asks_for_keys_is_reached_with_them_alone(
     clients = {(ours if known else other).public: Client(name="planner", role="viewer")}
     security = ServerSecurity(keys=node, find_client=clients.get)
     write_key_pair(tmp_path / "keys", ours)
-    options = PublisherOptions(data=f"ipc://{tmp_path}/data", status="tcp://127.0.0.1:0", security=security)
-    with Publisher(options) as publisher:
+    opened = partial(
+        Publisher, PublishConfig(data=f"ipc://{tmp_path}/data", status="tcp://127.0.0.1:0"), security=security
+    )
+    with opened() as publisher:
         publisher.note("status", origin(), working())
         assert publisher.status_endpoint is not None
         command = ["status", publisher.status_endpoint, "--once", "--timeout", "20"]

@@ -12,10 +12,9 @@ from rig import rig_config
 
 from gcd_node.control import ControlServer
 from gcd_node.frame import Frame, SourceInfo
-from gcd_node.node import Node, NodeOptions
-from gcd_node.publisher import Publisher
-from gcd_node.session import publisher_options
-from gcd_node.transitions import Parts
+from gcd_node.lifecycle import Parts
+from gcd_node.node import Node
+from gcd_node.session import open_publisher
 
 VIEWS = "[view.left]\nazimuth_deg = -30.0\n[view.swing]\nkind = 'orbit'\nrate_deg_s = 10.0\namplitude_deg = 20.0"
 SOURCE = 'kind = "synthetic"\npace = "realtime"'
@@ -52,12 +51,12 @@ def main(folder: Path) -> None:
     """Run the node on sockets in `folder`."""
     config = rig_config(folder, SOURCE, VIEWS, "")
     model = FakeSynthesizer(traits())
-    with Publisher(publisher_options(config)) as publisher:
+    with open_publisher(config) as publisher:
         node = Node(
             config,
             Parts(open_source=lambda _: Bar(), load_model=lambda _: model),
             publisher,
-            NodeOptions(once=False),
+            once=False,
         )
         with ControlServer(f"ipc://{folder}/control", node.handle, lambda: node.state.label, node.event):
             print("there", flush=True)
