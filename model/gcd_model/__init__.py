@@ -19,6 +19,7 @@ from gcd_model.config import (
     ModelConfig,
     SemanticClass,
 )
+from gcd_model.engines.onnx_export import ExportPrecision, Manifest, is_export
 from gcd_model.errors import (
     Cancelled,
     CheckpointError,
@@ -50,25 +51,7 @@ from gcd_model.geometry import (
 )
 from gcd_model.live.ego_motion import require_motion
 from gcd_model.live.synthesizer import visibility_of
-from gcd_model.loading import ENGINES, EngineName, default_precision, load_synthesizer
-from gcd_model.measuring import (
-    IMPLEMENTATIONS,
-    STAGES,
-    Difference,
-    Implementation,
-    ImplementationName,
-    MemoryFigures,
-    ModelBench,
-    ModelBenchOptions,
-    StageFigures,
-    StageName,
-    bench_model,
-    load_measured,
-    save_random,
-)
-from gcd_model.onnx_export import is_export
-from gcd_model.onnx_manifest import ExportPrecision, Manifest
-from gcd_model.onnx_source import export_weights
+from gcd_model.loading import ENGINES, EngineName, default_precision, export_weights, load_synthesizer
 from gcd_model.quality import Sampler, sampler_of
 from gcd_model.schedule import Schedule
 from gcd_model.settings import explain_settings_error
@@ -81,13 +64,11 @@ __all__ = [
     "DRIVING_CLASSES",
     "ENGINES",
     "FAMILIES",
-    "IMPLEMENTATIONS",
     "LIVE_LENS_DEG",
     "PLAIN_SMALL",
     "QUALITIES",
     "SMALL",
     "SOLVERS",
-    "STAGES",
     "SVD_14",
     "Augmentation",
     "CameraMount",
@@ -96,19 +77,13 @@ __all__ = [
     "Clip",
     "DeltaFit",
     "DeviceMemoryError",
-    "Difference",
     "EngineName",
     "ExportPrecision",
     "Family",
     "FileError",
     "FrameSynthesizer",
-    "Implementation",
-    "ImplementationName",
     "Intrinsics",
     "Manifest",
-    "MemoryFigures",
-    "ModelBench",
-    "ModelBenchOptions",
     "ModelConfig",
     "ModelError",
     "NonFiniteError",
@@ -125,8 +100,6 @@ __all__ = [
     "SourceFeatures",
     "Spherical",
     "SphericalDelta",
-    "StageFigures",
-    "StageName",
     "Synthesizer",
     "Traits",
     "Trajectory",
@@ -136,7 +109,6 @@ __all__ = [
     "ViewRangeError",
     "ViewSynthesizer",
     "WeightsReport",
-    "bench_model",
     "center_crop_box",
     "convert_weights",
     "decode_json",
@@ -149,7 +121,6 @@ __all__ = [
     "hatched",
     "inspect_weights",
     "is_export",
-    "load_measured",
     "load_synthesizer",
     "nearest_delta",
     "palette",
@@ -159,7 +130,6 @@ __all__ = [
     "read_small",
     "require_motion",
     "sampler_of",
-    "save_random",
     "spherical_trajectory",
     "synthesize",
     "visibility_of",

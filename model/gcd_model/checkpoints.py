@@ -22,7 +22,7 @@ from torch import Tensor
 
 from gcd_model.adapter import Adapter, adapted
 from gcd_model.diffusers_folder import PARTS, chosen_file, folder_hints, shards
-from gcd_model.errors import CheckpointError, FileError, OptionError
+from gcd_model.errors import CheckpointError, FileError
 from gcd_model.examination import (
     Examined,
     Options,
@@ -38,8 +38,7 @@ from gcd_model.gcd_layout import CARRIED
 from gcd_model.lightning import Contents, contents
 from gcd_model.live.view import LiveNetworks
 from gcd_model.networks import LoadedWeights, Networks, weights_digest
-from gcd_model.own_format import CONFIG_KEY, Card, Entry, precision
-from gcd_model.packed import divided
+from gcd_model.own_format import Card, Entry, precision
 from gcd_model.restricted_pickle import RestrictedPickle, check_storages
 from gcd_model.small_files import read_small
 from gcd_model.weights_export import Report, own_content, write_published, write_safetensors, written_dtype
@@ -180,17 +179,14 @@ def convert_weights(
     Args:
         layout: "gcd-node" leaves behind what inference does not use; "gcd-ckpt" is for the released code, see
             `gcd_state`, and holds all weights in memory where `dtype` changes them.
-        dtype: store in this precision, or in "int8", a quarter of float32, which networks are unpacked from; else as it
-            is. What computes in float32 (decoder, plane mix) is never narrowed. "int8" is for our own layout.
+        dtype: store in this precision; else as it is. What computes in float32 (the decoder) is never narrowed.
         uncertainty_scale: what was measured, instead of what the file says; see `Traits`.
         progress: called with (bytes written, bytes).
     Returns:
         The report of the new file.
     Raises: as `load_weights`; OptionError if `out` exists and `overwrite` is not set, or the layout cannot hold it.
     """
-    if dtype == "int8" and layout == "gcd-ckpt":
-        raise OptionError("the published layout has no place for int8; take another precision, or layout gcd-node")
-    wanted = None if dtype is None or dtype == "int8" else precision(dtype)
+    wanted = None if dtype is None else precision(dtype)
     options = Options(family=family, head_width=head_width, image_heads=image_heads, frames=frames)
     examined = _examined(Path(path), options)
     with _about(path):
@@ -210,7 +206,7 @@ def convert_weights(
     else:
         shapes = examined.networks.state_dict()
         entries = {name: Entry(tuple(shapes[name].shape), kind) for name, kind in dtypes.items()}
-        content = own_content(entries, examined.tensor, card, packed=dtype == "int8")
+        content = own_content(entries, examined.tensor, card)
         write_safetensors(Path(out), content, overwrite=overwrite, report=progress)
     return inspect_weights(out)
 
@@ -282,13 +278,11 @@ def read_weights(path: Path) -> WeightsFile:
     if path.is_dir():
         return _read_folder(path)
     held, metadata = _read_file(path)
-    tensors, scales = divided(held.tensors) if CONFIG_KEY in (metadata or {}) else (held.tensors, {})
     return WeightsFile(
         name=path.stem,
-        layout=layout_of(tensors, metadata),
+        layout=layout_of(held.tensors, metadata),
         files=(path,),
-        tensors=tensors,
-        scales=scales,
+        tensors=held.tensors,
         metadata=held.notes if metadata is None else metadata,
         yaml=_yaml_beside(path),
         optimizer_size=held.optimizer_size,

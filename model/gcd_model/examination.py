@@ -18,7 +18,6 @@ from gcd_model.live.view import LiveNetworks
 from gcd_model.matching import Match, match_weights
 from gcd_model.networks import Networks, empty_networks
 from gcd_model.own_format import CONFIG_KEY, Card
-from gcd_model.packed import Packed
 from gcd_model.provenance import Provenance, at_trained_size, checked_family, combined, told_by_name, told_by_yaml
 from gcd_model.weight_names import GCD_UNET, Levels, assembled, diffusers_source, gcd_source, own_source
 from gcd_model.weights_report import Layout, Leftover, NetworkReport
@@ -37,15 +36,14 @@ _NAMINGS: dict[Layout, Naming] = {
 class WeightsFile:
     """A checkpoint as it lies on the disk: mapped tensors by published name, and what comes with them.
 
-    name: of the file, without suffix, or of the folder. files: all that hold weights. scales: of weights that are
-    stored in eight bits. yaml: text of the configuration beside it, or "". See `WeightsReport` for the others.
+    name: of the file, without suffix, or of the folder. files: all that hold weights. yaml: text of the
+    configuration beside it, or "". See `WeightsReport` for the others.
     """
 
     name: str
     layout: Layout
     files: tuple[Path, ...]
     tensors: Mapping[str, Tensor]
-    scales: Mapping[str, Tensor] = field(default_factory=dict[str, Tensor])
     metadata: Mapping[str, str] = field(default_factory=dict[str, str])
     hints: Hints = field(default_factory=Hints)
     yaml: str = ""
@@ -56,11 +54,6 @@ class WeightsFile:
     def shapes(self) -> Shapes:
         """Published names and shapes."""
         return {name: tuple(tensor.shape) for name, tensor in self.tensors.items()}
-
-    def weight(self, name: str) -> Tensor:
-        """The numbers of that name: mapped, or unpacked from eight bits."""
-        stored = self.tensors[name]
-        return Packed(stored, self.scales[name]).unpacked() if name in self.scales else stored
 
 
 def layout_of(tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None) -> Layout:
@@ -125,7 +118,7 @@ class Examined:
     def tensor(self, name: str) -> Tensor:
         """Our parameter of that name, made of mapped tensors."""
         source = self.match.sources[name]
-        return assembled([self.file.weight(published) for published in source.names], source.form)
+        return assembled([self.file.tensors[published] for published in source.names], source.form)
 
     def stored_dtype(self, name: str) -> torch.dtype:
         """Precision our parameter of that name is stored in."""
@@ -206,7 +199,7 @@ def _empty(config: ModelConfig | LiveConfig) -> Networks | LiveNetworks:
 def _require_usable(file: WeightsFile, match: Match) -> None:
     """Quantised weights have the right names and shapes and mean nothing without their scales."""
     names = [name for source in match.sources.values() for name in source.names]
-    bad = [name for name in names if name not in file.scales and file.tensors[name].dtype not in _USABLE]
+    bad = [name for name in names if file.tensors[name].dtype not in _USABLE]
     if bad:
         kinds = sorted({str(file.tensors[name].dtype).removeprefix("torch.") for name in bad})
         raise CheckpointError(

@@ -1,14 +1,12 @@
 """Weights under the published names of GCD's checkpoints, for those who run the released code. Opens nothing.
 
 The names come from the table that reads such checkpoints. Besides what a model uses, published files hold weights that
-nothing uses; they are carried over from the file training started from, or stood in for, so that a strict reader
-finds every name. The VGG weights of LPIPS are never invented: without a file to take them from they are left out.
+nothing uses: they are carried over from the file training started from, and left out without one.
 """
 
 from collections.abc import Mapping
 
 import msgspec
-import torch
 from torch import Tensor
 
 from gcd_model.architecture import Hints, gcd_levels, infer_config
@@ -16,7 +14,7 @@ from gcd_model.carry_over import unshared
 from gcd_model.config import ModelConfig
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.own_format import Card
-from gcd_model.weight_names import GCD_CLIP, GCD_CONDITION_VAE, GCD_VAE, Levels, gcd_source
+from gcd_model.weight_names import Levels, gcd_source
 
 CARRIED = ("CLIP text tower", "decoder of the condition VAE", "LPIPS")
 """Leftovers worth carrying from file to file; averages and tables of the old weights are not."""
@@ -25,8 +23,6 @@ NOTES = "gcd_node"
 """Where in a checkpoint's hyper-parameters our card stands."""
 
 _LIGHTNING = "2.1.0"
-_WORDS, _TEXT_LENGTH = 49408, 77  # of CLIP's text tower
-_ACROSS_FRAMES = (".time_stack.", ".mix_factor", ".time_mix_conv.")
 
 
 def published_config(config: ModelConfig) -> ModelConfig:
@@ -51,7 +47,7 @@ def gcd_state(weights: Mapping[str, Tensor], config: ModelConfig, carried: Mappi
         assert source is not None, f"{name} has no published name"
         state[source.names[0]] = tensor.detach()
     _require_told(state, published_config(config))
-    return {**_stand_ins(state, config), **carried, **state}
+    return {**carried, **state}
 
 
 def lightning_checkpoint(state: Mapping[str, Tensor], card: Card, updates: int) -> dict[str, object]:
@@ -88,28 +84,3 @@ def _require_told(state: Mapping[str, Tensor], config: ModelConfig) -> None:
             f"the published layout cannot say this architecture: its {wrong[0]} would be read as "
             f"{getattr(told, wrong[0])}; keep our own .safetensors for it"
         )
-
-
-def _stand_ins(state: Mapping[str, Tensor], config: ModelConfig) -> dict[str, Tensor]:
-    """Weights that nothing uses, for readers that want every name."""
-    decoder = f"{GCD_VAE}.decoder."
-    stand_ins = {
-        name.replace(GCD_VAE, GCD_CONDITION_VAE, 1): tensor
-        for name, tensor in state.items()
-        if name.startswith(decoder) and not any(part in name for part in _ACROSS_FRAMES)
-    }
-    like = state[f"{decoder}conv_in.weight"]
-    stand_ins[f"{GCD_CONDITION_VAE}.post_quant_conv.weight"] = torch.eye(like.shape[1]).to(like)[..., None, None]
-    stand_ins[f"{GCD_CONDITION_VAE}.post_quant_conv.bias"] = like.new_zeros(like.shape[1])
-    if config.image_encoder is None:
-        return stand_ins
-    width = config.image_encoder.output_width
-    shapes = {
-        "positional_embedding": (_TEXT_LENGTH, width),
-        "text_projection": (width, width),
-        "logit_scale": (),
-        "token_embedding.weight": (_WORDS, width),
-        "ln_final.weight": (width,),
-        "ln_final.bias": (width,),
-    }
-    return stand_ins | {f"{GCD_CLIP}.{name}": like.new_zeros(shape) for name, shape in shapes.items()}

@@ -11,6 +11,8 @@ import torch
 from gcd_model.checkpoints import load_adapted, load_weights, read_adapter
 from gcd_model.config import SMALL
 from gcd_model.engine import Engine
+from gcd_model.engines.onnx import load_export
+from gcd_model.engines.onnx_export import ExportPrecision, Manifest, Report, export_onnx, is_export, require_onnx
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.examination import Options
 from gcd_model.families import LIVE, Family, family_named
@@ -18,8 +20,6 @@ from gcd_model.live.config import LIVE_TINY
 from gcd_model.live.synthesizer import LiveSynthesizer
 from gcd_model.live.view import LiveNetworks
 from gcd_model.networks import LoadedWeights, Networks, random_networks, weights_digest
-from gcd_model.onnx_export import is_export
-from gcd_model.onnx_loading import load_export
 from gcd_model.own_format import FULL_PRECISION, precision
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
@@ -104,6 +104,29 @@ def loaded_weights(
     if adapter is not None:
         loaded = load_adapted(loaded, read_adapter(adapter))
     return loaded
+
+
+def export_weights(
+    source: str | Path,
+    out: str | Path,
+    *,
+    precision: ExportPrecision = "float32",
+    height: int | None = None,
+    width: int | None = None,
+    family: str | None = None,
+    head_width: int | None = None,
+    image_heads: int | None = None,
+    adapter: str | Path | None = None,
+    overwrite: bool = False,
+    progress: Report | None = None,
+) -> Manifest:
+    """Write every network of a checkpoint as an ONNX graph; arguments and errors as `loaded_weights` and `export_onnx`
+    have them."""
+    require_onnx()
+    loaded = loaded_weights(source, family=family, head_width=head_width, image_heads=image_heads, adapter=adapter)
+    return export_onnx(
+        loaded, out, precision=precision, height=height, width=width, overwrite=overwrite, progress=progress
+    )
 
 
 def placed_synthesizer(loaded: LoadedWeights, *, device: str = "auto", dtype: str | None = None) -> Synthesizer:

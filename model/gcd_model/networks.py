@@ -15,7 +15,7 @@ from gcd_model.families import Family
 from gcd_model.image_encoder import ImageEncoder
 from gcd_model.live.config import LiveConfig
 from gcd_model.live.view import LiveNetworks
-from gcd_model.own_format import NO_DIFFUSION
+from gcd_model.own_format import NO_DIFFUSION, Card
 from gcd_model.unet import VideoUNet
 from gcd_model.vae import Encoder, TemporalDecoder
 from gcd_model.weights_report import Layout
@@ -71,6 +71,19 @@ class LoadedWeights:
         if isinstance(self.networks, LiveNetworks):
             raise CheckpointError(f"{self.name} {NO_DIFFUSION}")
         return self.networks
+
+    @property
+    def card(self) -> Card:
+        """What a file made of them says about itself."""
+        return Card(
+            name=self.name,
+            config=self.networks.config,
+            family=None if self.family is None else self.family.name,
+            move_time=self.move_time,
+            trained=self.trained,
+            origin=self.sha256_12,
+            uncertainty_scale=self.uncertainty_scale,
+        )
 
 
 @overload

@@ -14,8 +14,7 @@ from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.live.config import LiveConfig
 from gcd_model.small_files import decode_json
 
-FORMAT, PACKED_FORMAT = "1", "2"
-"""Of files whose weights are numbers as they are, and of those that hold some in eight bits."""
+FORMAT = "1"
 CONFIG_KEY = "gcd.config"
 LINE = 64
 """Bytes of a cache line, and of what torch aligns memory to."""
@@ -32,7 +31,7 @@ PRECISIONS: dict[str, torch.dtype] = {
 FULL_PRECISION = ("decoder",)
 """Networks that compute in float32 whatever --dtype says: what they make is looked at."""
 
-_DTYPES = {torch.float64: "F64", torch.float32: "F32", torch.bfloat16: "BF16", torch.float16: "F16", torch.int8: "I8"}
+_DTYPES = {torch.float64: "F64", torch.float32: "F32", torch.bfloat16: "BF16", torch.float16: "F16"}
 
 
 def precision(name: str) -> torch.dtype:
@@ -71,11 +70,11 @@ class Card:
             raise CheckpointError(f"{self.name or 'it'} {NO_DIFFUSION}")
         return self.config
 
-    def to_metadata(self, *, packed: bool = False) -> dict[str, str]:
-        """As safetensors metadata: text to text. packed: whether weights are stored in eight bits."""
+    def to_metadata(self) -> dict[str, str]:
+        """As safetensors metadata: text to text."""
         scale = self.uncertainty_scale
         return {
-            "gcd.format": PACKED_FORMAT if packed else FORMAT,
+            "gcd.format": FORMAT,
             CONFIG_KEY: msgspec.json.encode(self.config).decode(),
             "gcd.name": self.name,
             "gcd.family": self.family or "",
@@ -88,10 +87,9 @@ class Card:
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str]) -> Self:
         """Raises CheckpointError for another format or a damaged config."""
-        if metadata.get("gcd.format", FORMAT) not in (FORMAT, PACKED_FORMAT):
+        if metadata.get("gcd.format", FORMAT) != FORMAT:
             raise CheckpointError(
-                f"its format is {metadata['gcd.format']!r}, this version reads {FORMAT!r} and {PACKED_FORMAT!r}; "
-                "install a newer gcd-node"
+                f"its format is {metadata['gcd.format']!r}, this version reads {FORMAT!r}; install a newer gcd-node"
             )
         try:
             return cls(

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from gcd_model.config import UNetConfig
-from gcd_model.frugal import frugal, laid_out, rows_at_once, silu
+from gcd_model.frugal import laid_out, rows_at_once, silu
 from gcd_model.layers import Downsample, Layers, Upsample, embedding_mlp, sinusoid, zeroed
-from gcd_model.mapped import let_go
 from gcd_model.temporal import TemporalShare, VideoResBlock, VideoTransformer
 
 
@@ -97,14 +96,11 @@ class Stage(nn.Module):
 
     def plan(self, embedding: Tensor, tokens: Tensor | None, frames: int) -> StagePlan:
         """embedding: [S, N, E]. tokens: [N', D], one per frame of the whole batch."""
-        plan = StagePlan(
+        return StagePlan(
             self.res.spatial.project(embedding),
             self.res.temporal.project(embedding),
             *self._crosses(tokens, frames),
         )
-        if frugal(embedding):
-            let_go(self.res.spatial.embed, self.res.temporal.embed)
-        return plan
 
     def _crosses(self, tokens: Tensor | None, frames: int) -> tuple[Tensor | None, Tensor | None]:
         if self.attention is None or tokens is None:
@@ -112,10 +108,7 @@ class Stage(nn.Module):
         spatial, temporal = self.attention.spatial.token, self.attention.temporal.token
         assert spatial is not None, "tokens were given to a U-Net without cross-attention"
         assert temporal is not None, "tokens were given to a U-Net without cross-attention"
-        crosses = spatial(tokens), temporal(tokens[::frames])  # across frames only the first frame's token counts
-        if frugal(tokens):
-            let_go(spatial.value, spatial.out, temporal.value, temporal.out)
-        return crosses
+        return spatial(tokens), temporal(tokens[::frames])  # across frames only the first frame's token counts
 
     def forward(self, x: Tensor, inputs: StageInputs, frames: int | None) -> Tensor:
         """x: [N, C, h, w] -> [N, C', h, w]. frames: None for unrelated frames."""

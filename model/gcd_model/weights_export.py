@@ -17,7 +17,6 @@ from gcd_model.adapter import Adapter
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.gcd_layout import gcd_state, lightning_checkpoint, published_config
 from gcd_model.own_format import FULL_PRECISION, Card, Entry, file_order, header
-from gcd_model.packed import SCALE, Packed, is_packable
 
 Report = Callable[[int, int], None]
 """Called with (bytes written, bytes)."""
@@ -39,24 +38,9 @@ def written_dtype(name: str, stored: torch.dtype, wanted: torch.dtype | None) ->
     return wanted
 
 
-def own_content(
-    entries: Mapping[str, Entry], tensor: Callable[[str], Tensor], card: Card, *, packed: bool = False
-) -> Content:
-    """Networks in our own layout. packed: large weights in eight bits, but for what computes in float32."""
-    if not packed:
-        return Content(dict(entries), tensor, card.to_metadata())
-    kept = dict(entries)
-    for name, entry in entries.items():
-        if name.partition(".")[0] not in FULL_PRECISION and is_packable(entry.shape):
-            kept[name] = Entry(entry.shape, torch.int8)
-            kept[name + SCALE] = Entry(entry.shape[:1], torch.float32)
-
-    def stored(name: str) -> Tensor:
-        if name.endswith(SCALE):
-            return Packed.of(tensor(name.removesuffix(SCALE))).scales
-        return Packed.of(tensor(name)).codes if kept[name].dtype == torch.int8 else tensor(name)
-
-    return Content(kept, stored, card.to_metadata(packed=True))
+def own_content(entries: Mapping[str, Entry], tensor: Callable[[str], Tensor], card: Card) -> Content:
+    """Networks in our own layout."""
+    return Content(dict(entries), tensor, card.to_metadata())
 
 
 def write_safetensors(out: Path, content: Content, *, overwrite: bool, report: Report | None = None) -> None:

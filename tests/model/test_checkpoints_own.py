@@ -170,7 +170,7 @@ def tampered(**changes: object) -> str:
 @pytest.mark.parametrize(
     ("metadata", "said"),
     [
-        ({"gcd.format": "3"}, "this version reads '1' and '2'; install a newer"),
+        ({"gcd.format": "2"}, "this version reads '1'; install a newer"),
         ({"gcd.config": "{"}, "its metadata cannot be used"),
         ({"gcd.config": tampered(shiny=1)}, "unknown field `shiny`"),
         ({"gcd.config": tampered(camera="none")}, "contradicts camera_width"),

@@ -12,16 +12,17 @@ import torch
 from diffusers.models.autoencoders.autoencoder_kl_temporal_decoder import AutoencoderKLTemporalDecoder
 from diffusers.models.unets.unet_3d_blocks import MidBlockTemporalDecoder
 from diffusers.models.unets.unet_spatio_temporal_condition import UNetSpatioTemporalConditionModel
+from msgspec.structs import replace
 from torch import Tensor, nn
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
 from gcd_model.clip import RenderOptions
 from gcd_model.conditioning import Conditioning
 from gcd_model.config import ImageEncoderConfig, ModelConfig, UNetConfig, VAEConfig
+from gcd_model.errors import OptionError
 from gcd_model.geometry import Trajectory
 from gcd_model.image_encoder import clip_pixels
-from gcd_model.measuring.published_form import require_published
-from gcd_model.networks import Networks
+from gcd_model.networks import Networks, empty_networks
 from gcd_model.noise import preconditioning
 from gcd_model.sampler import guided, sample
 from gcd_model.schedule import Schedule
@@ -38,6 +39,41 @@ class DiffusersModules:
     vae: AutoencoderKLTemporalDecoder
     tower: CLIPVisionModelWithProjection
     image_size: int
+
+
+def require_published(config: ModelConfig) -> None:
+    """Raises OptionError for what diffusers has no module for."""
+    unet = config.unet
+    lacks = {
+        "camera control": config.camera != "none",
+        "switches of ours (patches, x0-prediction)": config.is_ours,
+        "a U-Net without image tower": config.image_encoder is None,
+        "an embedding that is not four times as wide as the first level": unet.embedding_width != 4 * unet.width,
+    }
+    found = [what for what, present in lacks.items() if present]
+    if found:
+        raise OptionError(
+            f"diffusers has no module for {', nor for '.join(found)}; measure this model without --peer, or another "
+            "one with it: random:full, random:kubric90 or a published checkpoint"
+        )
+
+
+def without_camera(networks: Networks) -> Networks:
+    """The same networks, sharing all tensors, without the camera's embedding: diffusers knows none.
+
+    It is a small map of one vector per frame, computed once a window.
+    """
+    config = networks.config
+    if config.camera == "none":
+        return networks
+    bare = empty_networks(replace(config, camera="none", unet=replace(config.unet, camera_width=0)))
+    kept = {
+        name: value
+        for name, value in networks.state_dict().items()
+        if not name.startswith(("camera.", "unet.embed_camera."))
+    }
+    bare.load_state_dict(kept, strict=True, assign=True)
+    return bare
 
 
 def diffusers_modules(networks: Networks) -> DiffusersModules:
@@ -121,7 +157,7 @@ def _empty_unet(config: ModelConfig) -> UNetSpatioTemporalConditionModel:
             out_channels=unet.latent_channels,
             down_block_types=tuple(f"{_attending(each)}DownBlockSpatioTemporal" for each in unet.attention),
             up_block_types=tuple(f"{_attending(each)}UpBlockSpatioTemporal" for each in reversed(unet.attention)),
-            block_out_channels=unet.widths,  # pyright: ignore[reportArgumentType]
+            block_out_channels=unet.widths,
             addition_time_embed_dim=unet.vector_width // 3,
             projection_class_embeddings_input_dim=unet.vector_width,
             layers_per_block=unet.blocks_per_level,
@@ -152,8 +188,8 @@ def _give_published_epsilon(unet: nn.Module) -> None:
 def _empty_vae(vae: VAEConfig) -> AutoencoderKLTemporalDecoder:
     with torch.device("meta"), _norms_in(vae.norm_groups):
         made = AutoencoderKLTemporalDecoder(
-            down_block_types=("DownEncoderBlock2D",) * len(vae.multipliers),  # pyright: ignore[reportArgumentType]
-            block_out_channels=vae.widths,  # pyright: ignore[reportArgumentType]
+            down_block_types=("DownEncoderBlock2D",) * len(vae.multipliers),
+            block_out_channels=vae.widths,
             layers_per_block=vae.blocks_per_level,
             latent_channels=vae.latent_channels,
             scaling_factor=vae.scale,
@@ -204,31 +240,25 @@ class DiffusersEngine:
 
     @property
     def like(self) -> Tensor:
-        """See Engine."""
         return self._modules.unet.conv_in.weight
 
     def tokens(self, frames: Tensor) -> Tensor | None:
-        """See Engine."""
         pixels = clip_pixels(frames.to(self.like.device), self._modules.image_size)
         return self._modules.tower(pixels.to(self.like)).image_embeds
 
     def condition_mean(self, frames: Tensor) -> Tensor:
-        """See Engine."""
         (posterior,) = self._modules.vae.encode(frames.to(self.like), return_dict=False)
         return posterior.mean
 
     def camera(self, path: Trajectory) -> Tensor | None:
-        """See Engine."""
         return None
 
     def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
-        """See Engine."""
         denoiser = _Denoiser(self._modules.unet, given, schedule)
         start = start.to(self.like.device)
         return sample(denoiser, start, schedule.steps, progress=options.progress, cancel=options.cancel)
 
     def decode(self, latents: Tensor) -> Tensor:
-        """See Engine."""
         vae, frames = self._modules.vae, len(latents)
         (decoded,) = vae.decode(latents.to(vae.decoder.conv_in.weight), num_frames=frames, return_dict=False)
         return decoded
