@@ -24,6 +24,7 @@ from gcd_model.clip import Clip, RenderOptions, View
 from gcd_model.conditioning import Conditioning
 from gcd_model.config import SVD_14, ModelConfig
 from gcd_model.engine import Engine, TorchEngine
+from gcd_model.engines.cpu import arrange
 from gcd_model.errors import OptionError
 from gcd_model.families import KUBRIC90
 from gcd_model.geometry import Trajectory
@@ -175,6 +176,7 @@ def engine_named(name: str, networks: Networks) -> Engine:
     if name == "ours":
         networks.requires_grad_(False)
         prepare(networks)
+        arrange(networks)
         return TorchEngine(networks)
     if name in VARIANTS:
         from gcd_model.compiled_regions import twin

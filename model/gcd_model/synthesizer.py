@@ -18,6 +18,7 @@ from gcd_model.conditioning import (
 )
 from gcd_model.decoding import Finish, Pictures, decode
 from gcd_model.engine import Engine, TorchEngine
+from gcd_model.engines.cpu import arrange
 from gcd_model.errors import DeviceMemoryError, NonFiniteError, OptionError, ShapeError
 from gcd_model.geometry import Trajectory
 from gcd_model.layers import prepare
@@ -106,7 +107,9 @@ class Synthesizer:
         self._config = networks.config
         networks.requires_grad_(False)
         prepare(networks)
-        self._engine: Engine = TorchEngine(networks) if engine is None else engine
+        if engine is None:
+            arrange(networks)
+        self._engine: Engine = engine or TorchEngine(networks)
 
     @property
     def traits(self) -> Traits:

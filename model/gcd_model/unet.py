@@ -7,10 +7,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gcd_model.config import UNetConfig
-from gcd_model.frugal import laid_out, rows_at_once, silu
 from gcd_model.layers import Downsample, Layers, Upsample, embedding_mlp, sinusoid, zeroed
 from gcd_model.temporal import TemporalShare, VideoResBlock, VideoTransformer
 
@@ -208,40 +208,26 @@ class VideoUNet(nn.Module):
             image_mode: leave out every layer across frames; the rows are then unrelated frames, any number of them.
         Returns:
             [B*T, C, h, w].
-
-        Clips that are large together go through it one after the other: nothing of one is held for the next.
         """
         frames = None if image_mode else self.frames
-        clips = 1 if frames is None else len(latents) // frames
-        widest = self.stem.out_channels * latents.shape[-2:].numel()
-        if clips == 1 or rows_at_once(latents, widest) >= len(latents):
-            return self._together(latents, condition, inputs, frames)
-        each = zip(*(stage.split(clips) for stage in inputs), strict=True)
-        parts = zip(latents.chunk(clips), condition.chunk(clips), each, strict=True)
-        return torch.cat([self._together(*part, frames) for part in parts])
-
-    def _together(
-        self, latents: Tensor, condition: Tensor, inputs: Sequence[StageInputs], frames: int | None
-    ) -> Tensor:
         inputs_left = iter(inputs)
-        x = laid_out(self.stem(torch.cat([latents, condition], dim=1)))
+        x = self.stem(torch.cat([latents, condition], dim=1))
         skips = [x]
         for level in self.down:
             for stage in level.stages:
                 x = stage(x, next(inputs_left), frames)
                 skips.append(x)
             if level.down is not None:
-                x = laid_out(level.down(x))
+                x = level.down(x)
                 skips.append(x)
         for stage in self.middle:
             x = stage(x, next(inputs_left), frames)
         for level in self.up:
             for stage in level.stages:
-                x = torch.cat([x, skips.pop()], dim=1)  # so that nobody holds the two any more
-                x = stage(x, next(inputs_left), frames)
+                x = stage(torch.cat([x, skips.pop()], dim=1), next(inputs_left), frames)
             if level.up is not None:
-                x = laid_out(level.up(x))
-        return self.conv_out(silu(self.norm_out(x))).contiguous()
+                x = level.up(x)
+        return self.conv_out(F.silu(self.norm_out(x)))
 
     def start_apart(self) -> None:
         """Make all transformers across frames the identity too: for learning from single frames first, then clips."""
