@@ -19,14 +19,12 @@ from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 from gcd_model.clip import RenderOptions
 from gcd_model.conditioning import Conditioning
 from gcd_model.config import ImageEncoderConfig, ModelConfig, UNetConfig, VAEConfig
+from gcd_model.diffusion import Schedule, guided, preconditioning, sample
 from gcd_model.errors import OptionError
 from gcd_model.geometry import Trajectory
 from gcd_model.image_encoder import clip_pixels
 from gcd_model.networks import Networks, empty_networks
-from gcd_model.noise import preconditioning
-from gcd_model.sampler import guided, sample
-from gcd_model.schedule import Schedule
-from gcd_model.weight_names import Form, Levels, diffusers_source
+from gcd_model.weights.names import Form, Levels, diffusers_source
 
 _DEFAULT_GROUPS = 32
 

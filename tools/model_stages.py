@@ -19,24 +19,23 @@ from msgspec.structs import replace
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
-from gcd_model.checkpoints import save_weights
 from gcd_model.clip import Clip, RenderOptions, View
 from gcd_model.conditioning import Conditioning
 from gcd_model.config import SVD_14, ModelConfig
-from gcd_model.engine import Engine, TorchEngine
+from gcd_model.diffusion import Schedule, unit_noise
 from gcd_model.engines.cpu import arrange
+from gcd_model.engines.torch import Engine, TorchEngine
 from gcd_model.errors import OptionError
-from gcd_model.families import KUBRIC90
 from gcd_model.geometry import Trajectory
 from gcd_model.layers import prepare
 from gcd_model.live.synthesizer import LiveSynthesizer
 from gcd_model.loading import load_synthesizer, placed_synthesizer, random_weights
 from gcd_model.networks import LoadedWeights, Networks, empty_networks, random_networks
-from gcd_model.noise import unit_noise
-from gcd_model.own_format import NO_DIFFUSION
-from gcd_model.schedule import Schedule
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
+from gcd_model.weights.card import NO_DIFFUSION
+from gcd_model.weights.families import KUBRIC90
+from gcd_model.weights.load import save_weights
 
 FULL = "random:full"
 """The published architecture with random weights: 1.5 billion numbers in the U-Net alone, 6 GB in float32."""
@@ -179,8 +178,7 @@ def engine_named(name: str, networks: Networks) -> Engine:
         arrange(networks)
         return TorchEngine(networks)
     if name in VARIANTS:
-        from gcd_model.compiled_regions import twin
-        from gcd_model.cuda_engine import CudaEngine, CudaOptions
+        from gcd_model.engines.cuda import CudaEngine, CudaOptions, twin
 
         # with a copy of what it lays out anew, since others use the same networks
         return CudaEngine(twin(networks), CudaOptions(**VARIANTS[name]) if VARIANTS[name] else None)

@@ -7,18 +7,11 @@
 The node imports from here only. Source: Van Hoorick et al., "Generative Camera Dolly", ECCV 2024.
 """
 
-from gcd_model.checkpoints import WeightsReport, convert_weights, inspect_weights
-from gcd_model.clip import QUALITIES, SOLVERS, Augmentation, Clip, Quality, RenderOptions, SolverName, View
-from gcd_model.colours import hatched, palette
+from gcd_model.clip import Augmentation, Clip, Quality, RenderOptions, SolverName, View
+from gcd_model.colours import hatched
 from gcd_model.conditioning import SourceFeatures
-from gcd_model.config import (
-    DRIVING_CLASSES,
-    PLAIN_SMALL,
-    SMALL,
-    SVD_14,
-    ModelConfig,
-    SemanticClass,
-)
+from gcd_model.config import ModelConfig
+from gcd_model.diffusion import Sampler, Schedule, sampler_of
 from gcd_model.engines.onnx_export import ExportPrecision, Manifest, is_export
 from gcd_model.errors import (
     Cancelled,
@@ -33,7 +26,6 @@ from gcd_model.errors import (
     ViewFixedError,
     ViewRangeError,
 )
-from gcd_model.families import FAMILIES, LIVE_LENS_DEG, Family, ViewLimits
 from gcd_model.geometry import (
     CameraMount,
     DeltaFit,
@@ -43,33 +35,22 @@ from gcd_model.geometry import (
     SphericalDelta,
     Trajectory,
     center_crop_box,
-    driving_trajectory,
-    fitted_trajectory,
     nearest_delta,
     pose_trajectory,
-    spherical_trajectory,
 )
 from gcd_model.live.ego_motion import require_motion
 from gcd_model.live.synthesizer import visibility_of
-from gcd_model.loading import ENGINES, EngineName, default_precision, export_weights, load_synthesizer
-from gcd_model.quality import Sampler, sampler_of
-from gcd_model.schedule import Schedule
-from gcd_model.settings import explain_settings_error
-from gcd_model.small_files import decode_json, decode_toml, printable, read_json, read_small
+from gcd_model.loading import EngineName, default_precision, export_weights, load_synthesizer
+from gcd_model.small_files import decode_toml, explain_settings_error, printable, read_json, read_small
 from gcd_model.synthesizer import FrameSynthesizer, Synthesizer, ViewSynthesizer, synthesize
 from gcd_model.traits import ASSUMED_SOURCE, Traits
+from gcd_model.weights.families import FAMILIES, LIVE_LENS_DEG, Family
+from gcd_model.weights.load import WeightsReport, convert_weights, inspect_weights
 
 __all__ = [
     "ASSUMED_SOURCE",
-    "DRIVING_CLASSES",
-    "ENGINES",
     "FAMILIES",
     "LIVE_LENS_DEG",
-    "PLAIN_SMALL",
-    "QUALITIES",
-    "SMALL",
-    "SOLVERS",
-    "SVD_14",
     "Augmentation",
     "CameraMount",
     "Cancelled",
@@ -94,7 +75,6 @@ __all__ = [
     "RenderOptions",
     "Sampler",
     "Schedule",
-    "SemanticClass",
     "ShapeError",
     "SolverName",
     "SourceFeatures",
@@ -105,32 +85,26 @@ __all__ = [
     "Trajectory",
     "View",
     "ViewFixedError",
-    "ViewLimits",
     "ViewRangeError",
     "ViewSynthesizer",
     "WeightsReport",
     "center_crop_box",
     "convert_weights",
-    "decode_json",
     "decode_toml",
     "default_precision",
-    "driving_trajectory",
     "explain_settings_error",
     "export_weights",
-    "fitted_trajectory",
     "hatched",
     "inspect_weights",
     "is_export",
     "load_synthesizer",
     "nearest_delta",
-    "palette",
     "pose_trajectory",
     "printable",
     "read_json",
     "read_small",
     "require_motion",
     "sampler_of",
-    "spherical_trajectory",
     "synthesize",
     "visibility_of",
 ]

@@ -8,21 +8,21 @@ from typing import Literal, get_args
 import msgspec
 import torch
 
-from gcd_model.checkpoints import load_adapted, load_weights, read_adapter
 from gcd_model.config import SMALL
-from gcd_model.engine import Engine
 from gcd_model.engines.onnx import load_export
 from gcd_model.engines.onnx_export import ExportPrecision, Manifest, Report, export_onnx, is_export, require_onnx
+from gcd_model.engines.torch import Engine
 from gcd_model.errors import CheckpointError, OptionError
-from gcd_model.examination import Options
-from gcd_model.families import LIVE, Family, family_named
 from gcd_model.live.config import LIVE_TINY
 from gcd_model.live.synthesizer import LiveSynthesizer
 from gcd_model.live.view import LiveNetworks
 from gcd_model.networks import LoadedWeights, Networks, random_networks, weights_digest
-from gcd_model.own_format import FULL_PRECISION, precision
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
+from gcd_model.weights.card import FULL_PRECISION, precision
+from gcd_model.weights.examine import Options
+from gcd_model.weights.families import LIVE, Family, family_named
+from gcd_model.weights.load import load_adapted, load_weights, read_adapter
 
 EngineName = Literal["torch", "cuda", "onnxruntime"]
 """What can compute networks; see `Engine`."""
@@ -260,7 +260,7 @@ def _synthesizer(loaded: LoadedWeights, place: _Place) -> Synthesizer:
 
 
 def _cuda_engine(networks: Networks) -> Engine:
-    from gcd_model.cuda_engine import CudaEngine  # torch.compile takes seconds to import
+    from gcd_model.engines.cuda import CudaEngine  # torch.compile takes seconds to import
 
     return CudaEngine(networks)
 

@@ -11,14 +11,13 @@ from torch import Tensor, nn
 from gcd_model.conditioning import CameraEmbedder
 from gcd_model.config import ModelConfig
 from gcd_model.errors import CheckpointError
-from gcd_model.families import Family
 from gcd_model.image_encoder import ImageEncoder
 from gcd_model.live.config import LiveConfig
 from gcd_model.live.view import LiveNetworks
-from gcd_model.own_format import NO_DIFFUSION, Card
 from gcd_model.unet import VideoUNet
 from gcd_model.vae import Encoder, TemporalDecoder
-from gcd_model.weights_report import Layout
+from gcd_model.weights.card import NO_DIFFUSION, Card, Layout
+from gcd_model.weights.families import Family
 
 
 class Networks(nn.Module):

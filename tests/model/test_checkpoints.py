@@ -27,8 +27,8 @@ from published import (
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from gcd_model.checkpoints import digest, inspect_weights, load_weights
 from gcd_model.networks import Networks
+from gcd_model.weights.load import digest, inspect_weights, load_weights
 
 UNET = "model.diffusion_model"
 CONV = f"{UNET}.input_blocks.1.0.in_layers.2.weight"

@@ -20,10 +20,10 @@ from published import (
 )
 from safetensors.torch import load_file, save_file
 
-from gcd_model.checkpoints import convert_weights, digest, inspect_weights, load_weights, save_weights
 from gcd_model.config import SMALL, ModelConfig
 from gcd_model.errors import CheckpointError, OptionError
-from gcd_model.own_format import Card
+from gcd_model.weights.card import Card
+from gcd_model.weights.load import convert_weights, digest, inspect_weights, load_weights, save_weights
 
 UNET = "model.diffusion_model"
 CONV = f"{UNET}.input_blocks.1.0.in_layers.2.weight"
@@ -203,7 +203,7 @@ def test_the_digest_of_a_file_is_its_sha256(tmp_path: Path) -> None:
 
 
 def test_a_large_file_is_digested_by_samples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gcd_model.checkpoints._SAMPLED_ABOVE", 1 << 20)
+    monkeypatch.setattr("gcd_model.weights.load._SAMPLED_ABOVE", 1 << 20)
     path = tmp_path / "a"
     content = bytearray(8 << 20)
     path.write_bytes(content)

@@ -22,7 +22,7 @@ from published import (
 )
 from safetensors.torch import save_file
 
-from gcd_model.checkpoints import inspect_weights, load_weights
+from gcd_model.weights.load import inspect_weights, load_weights
 
 UNET = "model.diffusion_model"
 CONV = f"{UNET}.input_blocks.1.0.in_layers.2.weight"

@@ -12,15 +12,13 @@ from small_models import TINY, TINY_DRIVING, random_clip, relative_error, tiny_d
 from tape import HostAskedError, TapeRecorder
 
 from gcd_model.clip import Clip, RenderOptions, View
-from gcd_model.compiled_regions import cache_folder, keep_compiled, regions, twin
 from gcd_model.config import ModelConfig
-from gcd_model.cuda_engine import CudaEngine, CudaOptions
-from gcd_model.cuda_graphs import CudaGraphs, Recent, RecordedCall, Recorder, Replay, Unrecorded
+from gcd_model.diffusion import Schedule
+from gcd_model.engines.cuda import CudaEngine, CudaOptions, cache_folder, keep_compiled, regions, twin
+from gcd_model.engines.graphs import CudaGraphs, Recent, RecordedCall, Recorder, Replay, Unrecorded, step_numbers
 from gcd_model.errors import Cancelled, DeviceMemoryError, NonFiniteError, OptionError
-from gcd_model.fused_step import step_numbers
 from gcd_model.geometry import SphericalDelta, Trajectory
 from gcd_model.loading import load_synthesizer
-from gcd_model.schedule import Schedule
 from gcd_model.synthesizer import Synthesizer
 
 PLAIN = CudaOptions(backend=None, channels_last=False, decoder="float32")

@@ -7,9 +7,7 @@ import torch
 from small_models import TINY, tiny_synthesizer
 from torch import nn
 
-from gcd_model.compiled_regions import twin
-from gcd_model.cuda_engine import CudaEngine, CudaOptions
-from gcd_model.decoder_check import checked_decoder, drifting_clip, psnr_db
+from gcd_model.engines.cuda import CudaEngine, CudaOptions, checked_decoder, drifting_clip, psnr_db, twin
 from gcd_model.networks import Networks
 
 

@@ -21,17 +21,17 @@ from small_models import (
 from torch import Tensor
 from torch.testing import assert_close
 
-from gcd_model.checkpoints import save_weights
 from gcd_model.clip import Augmentation, RenderOptions, View
 from gcd_model.colours import nearest_classes, palette
 from gcd_model.config import DRIVING_CLASSES, PLAIN_SMALL, SMALL, SVD_14, ModelConfig, SemanticClass
 from gcd_model.errors import OptionError
-from gcd_model.families import DRIVING
 from gcd_model.geometry import CameraMount
 from gcd_model.loading import load_synthesizer
 from gcd_model.networks import Networks, empty_networks
-from gcd_model.own_format import FULL_PRECISION, Card
 from gcd_model.synthesizer import Synthesizer
+from gcd_model.weights.card import FULL_PRECISION, Card
+from gcd_model.weights.families import DRIVING
+from gcd_model.weights.load import save_weights
 
 FRAMES, HEIGHT, WIDTH = TINY_DRIVING.frames, TINY_DRIVING.height, TINY_DRIVING.width
 LATENTS = (FRAMES, 4, HEIGHT // 4, WIDTH // 4)

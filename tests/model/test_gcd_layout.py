@@ -19,15 +19,14 @@ from published import (
 from small_models import TINY_DRIVING, draw
 from torch import Tensor
 
-from gcd_model.carry_over import CAMERA
-from gcd_model.checkpoints import convert_weights, inspect_weights, load_weights
 from gcd_model.config import SMALL, SVD_14, ModelConfig
 from gcd_model.errors import OptionError
-from gcd_model.gcd_layout import gcd_state
-from gcd_model.matching import LEFTOVERS
 from gcd_model.networks import Networks, empty_networks
-from gcd_model.own_format import Card
-from gcd_model.weights_export import write_published
+from gcd_model.weights.adapter import CAMERA
+from gcd_model.weights.card import Card
+from gcd_model.weights.infer import LEFTOVERS
+from gcd_model.weights.load import convert_weights, inspect_weights, load_weights
+from gcd_model.weights.save import gcd_state, write_published
 
 
 def card(config: ModelConfig, family: str = "kubric90") -> Card:

@@ -8,16 +8,16 @@ from published import SMALL_GCD, filled, write_diffusers, write_gcd
 from torch import Tensor
 
 from gcd_model import loading
-from gcd_model.checkpoints import convert_weights, save_weights
 from gcd_model.clip import Clip, RenderOptions, View
 from gcd_model.config import SMALL
 from gcd_model.errors import CheckpointError, OptionError, ViewFixedError
-from gcd_model.families import FAMILIES
 from gcd_model.geometry import SphericalDelta
 from gcd_model.live.config import LIVE_TINY
 from gcd_model.loading import load_synthesizer
-from gcd_model.own_format import Card
 from gcd_model.synthesizer import Synthesizer, synthesize
+from gcd_model.weights.card import Card
+from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.load import convert_weights, save_weights
 
 
 def view(synthesizer: Synthesizer, height: int = 16, width: int = 24) -> View:

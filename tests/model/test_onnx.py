@@ -9,7 +9,6 @@ from msgspec import structs
 from small_models import TINY, random_clip, relative_error, tiny_synthesizer
 from torch import Tensor
 
-from gcd_model.checkpoints import LoadedWeights, digest
 from gcd_model.clip import RenderOptions
 from gcd_model.engines.onnx import (
     CPU_PROVIDER,
@@ -30,12 +29,13 @@ from gcd_model.engines.onnx_export import (
     read_manifest,
 )
 from gcd_model.errors import CheckpointError, DeviceMemoryError, ModelError, OptionError
-from gcd_model.families import KUBRIC90
 from gcd_model.geometry import SphericalDelta
 from gcd_model.loading import load_synthesizer
 from gcd_model.networks import empty_networks
-from gcd_model.own_format import Card
 from gcd_model.synthesizer import Synthesizer
+from gcd_model.weights.card import Card
+from gcd_model.weights.families import KUBRIC90
+from gcd_model.weights.load import LoadedWeights, digest
 
 
 class TorchGraphs:

@@ -9,13 +9,13 @@ import pytest
 from msgspec import structs
 from small_models import TINY_DRIVING, random_clip, relative_error, tiny_driving, tiny_synthesizer
 
-from gcd_model.checkpoints import LoadedWeights
 from gcd_model.clip import RenderOptions, View
 from gcd_model.engines.onnx_export import Manifest, export_onnx
 from gcd_model.errors import OptionError
 from gcd_model.geometry import SphericalDelta
 from gcd_model.loading import load_synthesizer
 from gcd_model.synthesizer import Synthesizer
+from gcd_model.weights.load import LoadedWeights
 
 pytest.importorskip("onnxruntime", reason="needs the extra `onnx`")
 pytest.importorskip("onnxscript", reason="needs the extra `onnx`")

@@ -11,11 +11,11 @@ from msgspec import structs
 from small_models import TINY, random_clip, tiny_synthesizer
 from torch import Tensor
 
-from gcd_model import SVD_14, RenderOptions, Sampler, Schedule, SphericalDelta, sampler_of, synthesize
+from gcd_model import RenderOptions, Sampler, Schedule, SphericalDelta, sampler_of, synthesize
 from gcd_model.clip import QUALITIES, Quality, SolverName
-from gcd_model.config import PLAIN_SMALL, SamplingConfig
+from gcd_model.config import PLAIN_SMALL, SVD_14, SamplingConfig
+from gcd_model.diffusion import FAST, FASTEST
 from gcd_model.errors import Cancelled, OptionError
-from gcd_model.quality import FAST, FASTEST
 
 PUBLISHED = SamplingConfig()
 

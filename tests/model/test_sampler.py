@@ -13,9 +13,17 @@ from torch.testing import assert_close
 
 from gcd_model.clip import SOLVERS, SolverName
 from gcd_model.config import SamplingConfig
+from gcd_model.diffusion import (
+    edm_sigmas,
+    guidance_scale,
+    guided,
+    multistep_steps,
+    preconditioning,
+    sample,
+    solver_steps,
+    unit_noise,
+)
 from gcd_model.errors import Cancelled
-from gcd_model.noise import edm_sigmas, guidance_scale, preconditioning, unit_noise
-from gcd_model.sampler import guided, multistep_steps, sample, solver_steps
 
 PUBLISHED = SamplingConfig()
 

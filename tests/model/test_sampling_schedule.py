@@ -9,10 +9,10 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from gcd_model.clip import RenderOptions
-from gcd_model.engine import TorchEngine
+from gcd_model.diffusion import Schedule
+from gcd_model.engines.torch import TorchEngine
 from gcd_model.errors import OptionError
 from gcd_model.geometry import SphericalDelta
-from gcd_model.schedule import Schedule
 from gcd_model.synthesizer import Synthesizer, synthesize
 from gcd_model.unet import StageInputs
 

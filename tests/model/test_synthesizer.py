@@ -10,9 +10,9 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from gcd_model.clip import Augmentation, Clip, RenderOptions, View
+from gcd_model.diffusion import unit_noise
 from gcd_model.errors import Cancelled
 from gcd_model.geometry import SphericalDelta, Trajectory
-from gcd_model.noise import unit_noise
 from gcd_model.synthesizer import Synthesizer, synthesize
 from gcd_model.vae import to_pixels
 

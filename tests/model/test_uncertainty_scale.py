@@ -10,10 +10,10 @@ from safetensors.torch import save_file
 from small_models import TINY, random_clip, tiny_synthesizer, tiny_traits
 
 from gcd_model import RenderOptions, SphericalDelta, Synthesizer, convert_weights, inspect_weights, load_synthesizer
-from gcd_model.checkpoints import load_weights, save_weights
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.networks import random_networks
-from gcd_model.own_format import Card
+from gcd_model.weights.card import Card
+from gcd_model.weights.load import load_weights, save_weights
 
 CARD = Card(name="small", config=TINY, family="kubric90", move_time=13, uncertainty_scale=1.75)
 

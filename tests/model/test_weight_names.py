@@ -8,12 +8,20 @@ import pytest
 import torch
 from published import SMALL_GCD, diffusers_manifest, fixed_view, manifest, shared_vae, taken_apart
 
-from gcd_model.architecture import Hints, Naming, Shapes, diffusers_levels, gcd_levels, infer_config
 from gcd_model.config import SVD_14, ModelConfig, UNetConfig
 from gcd_model.errors import CheckpointError
-from gcd_model.matching import Match, match_weights
 from gcd_model.networks import empty_networks
-from gcd_model.weight_names import Form, Levels, Source, assembled, diffusers_source, gcd_source
+from gcd_model.weights.infer import (
+    Hints,
+    Match,
+    Naming,
+    Shapes,
+    diffusers_levels,
+    gcd_levels,
+    infer_config,
+    match_weights,
+)
+from gcd_model.weights.names import Form, Levels, Source, assembled, diffusers_source, gcd_source
 
 UNET = "model.diffusion_model"
 SVD_FIXED = fixed_view(SVD_14)

@@ -8,7 +8,8 @@ from fakes import Box, FakeSynthesizer, traits
 from msgspec.structs import replace as struct_replace
 from rig import Rig
 
-from gcd_model import PLAIN_SMALL, DeviceMemoryError
+from gcd_model import DeviceMemoryError
+from gcd_model.config import PLAIN_SMALL
 from gcd_node.errors import ModelFailedError
 from gcd_node.fallback import FULL, FailureCounter, oom_levels
 from gcd_node.health import Health

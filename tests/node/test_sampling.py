@@ -6,7 +6,8 @@ from typing import get_args, get_type_hints
 import msgspec
 from fakes import traits
 
-from gcd_model import QUALITIES, SOLVERS, RenderOptions, Sampler, sampler_of
+from gcd_model import RenderOptions, Sampler, sampler_of
+from gcd_model.clip import QUALITIES, SOLVERS
 from gcd_model.config import SamplingConfig
 from gcd_node.config import ModelSection
 from gcd_node.model import drawing_options, sampler_in_use

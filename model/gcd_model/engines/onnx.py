@@ -15,19 +15,17 @@ from torch import Tensor, nn
 from gcd_model.clip import RenderOptions
 from gcd_model.conditioning import Conditioning, camera_features
 from gcd_model.config import ModelConfig
-from gcd_model.denoiser import Denoiser
+from gcd_model.diffusion import Denoiser, Schedule, sample
 from gcd_model.engines.onnx_export import read_manifest
 from gcd_model.errors import DeviceMemoryError, ModelError, OptionError
-from gcd_model.families import family_named
 from gcd_model.geometry import Trajectory
 from gcd_model.image_encoder import clip_pixels
 from gcd_model.networks import empty_networks
-from gcd_model.own_format import Card
-from gcd_model.sampler import sample
-from gcd_model.schedule import Schedule
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
 from gcd_model.unet import StageInputs, StagePlan, UNetPlan
+from gcd_model.weights.card import Card
+from gcd_model.weights.families import family_named
 
 CPU_PROVIDER, CUDA_PROVIDER = "CPUExecutionProvider", "CUDAExecutionProvider"
 TENSORRT_PROVIDER = "TensorrtExecutionProvider"

@@ -21,15 +21,15 @@ import msgspec
 import torch
 from torch import Tensor, nn
 
-from gcd_model.checkpoints import digest
 from gcd_model.config import CAMERA_FEATURES
 from gcd_model.errors import CheckpointError, FileError, OptionError
 from gcd_model.layers import Layers, prepare
 from gcd_model.networks import LoadedWeights, Networks
-from gcd_model.own_format import FULL_PRECISION, Card
 from gcd_model.small_files import decode_json, read_small
 from gcd_model.temporal import SpatialBlock, TemporalBlock
 from gcd_model.unet import StageInputs, VideoUNet
+from gcd_model.weights.card import FULL_PRECISION, Card
+from gcd_model.weights.load import digest
 
 MANIFEST = "manifest.json"
 """The file that makes a folder an export."""

@@ -1,7 +1,6 @@
 """Weights into files: our own `.safetensors`, and the `.ckpt` of the released code. An exporter, so it opens files.
 
-Every file appears under its name only once it is complete, and replaces another only when that is allowed.
-"""
+Every file appears under its name only once it is complete, and replaces another only when that is allowed."""
 
 import os
 from collections.abc import Callable, Generator, Mapping
@@ -10,13 +9,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
+import msgspec
 import torch
 from torch import Tensor
 
-from gcd_model.adapter import Adapter
+from gcd_model.config import ModelConfig
 from gcd_model.errors import CheckpointError, OptionError
-from gcd_model.gcd_layout import gcd_state, lightning_checkpoint, published_config
-from gcd_model.own_format import FULL_PRECISION, Card, Entry, file_order, header
+from gcd_model.weights.adapter import Adapter, unshared
+from gcd_model.weights.card import FULL_PRECISION, Card, Entry, file_order, header
+from gcd_model.weights.infer import Hints, gcd_levels, infer_config
+from gcd_model.weights.names import Levels, gcd_source
 
 Report = Callable[[int, int], None]
 """Called with (bytes written, bytes)."""
@@ -118,3 +120,76 @@ def _require_writable(out: Path, suffix: str, *, overwrite: bool) -> None:
         raise OptionError(f"{out}: there is no folder {out.parent}; make it first")
     if out.exists() and not overwrite:
         raise OptionError(f"{out} exists; give another name, or allow it to be overwritten")
+
+
+# --- the `.ckpt` of the released code --------------------------------------------------------------------------------
+
+
+CARRIED = ("CLIP text tower", "decoder of the condition VAE", "LPIPS")
+"""Leftovers worth carrying from file to file; averages and tables of the old weights are not."""
+
+NOTES = "gcd_node"
+"""Where in a checkpoint's hyper-parameters our card stands."""
+
+_LIGHTNING = "2.1.0"
+
+
+def published_config(config: ModelConfig) -> ModelConfig:
+    """The config as the published layout tells it: with one encoder for targets and one for conditions."""
+    return msgspec.structs.replace(config, vae=msgspec.structs.replace(config.vae, shared=False))
+
+
+def gcd_state(weights: Mapping[str, Tensor], config: ModelConfig, carried: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """All weights by published name.
+
+    Args:
+        weights: by our names. carried: leftovers of the file they came from, by published name.
+    Raises:
+        OptionError: the published layout cannot say this architecture.
+    """
+    if config.is_ours:
+        raise OptionError("the published layout holds the paper's networks only; keep our own .safetensors for this")
+    weights = unshared(weights) if config.vae.shared else weights
+    levels, state = Levels.of(config), dict[str, Tensor]()
+    for name, tensor in weights.items():
+        source = gcd_source(name, levels)
+        assert source is not None, f"{name} has no published name"
+        state[source.names[0]] = tensor.detach()
+    _require_told(state, published_config(config))
+    return {**carried, **state}
+
+
+def lightning_checkpoint(state: Mapping[str, Tensor], card: Card, updates: int) -> dict[str, object]:
+    """What stands at the root of a Lightning checkpoint: plain containers and tensors, no optimizer state.
+
+    updates: of the optimizer, so far.
+    """
+    return {
+        "epoch": 0,
+        "global_step": updates,
+        "pytorch-lightning_version": _LIGHTNING,
+        "state_dict": dict(state),
+        "loops": {},
+        "callbacks": {},
+        "optimizer_states": [],
+        "lr_schedulers": [],
+        "hparams_name": "kwargs",
+        "hyper_parameters": {NOTES: card.to_metadata()},
+    }
+
+
+def _require_told(state: Mapping[str, Tensor], config: ModelConfig) -> None:
+    """Whether a reader of the names and shapes alone would build these networks."""
+    shapes = {name: tuple(tensor.shape) for name, tensor in state.items()}
+    try:
+        told = infer_config(shapes, gcd_source, gcd_levels(shapes), Hints())
+    except CheckpointError as error:
+        raise OptionError(f"the published layout cannot say this architecture: {error}") from error
+    wrong = [
+        part for part in ("camera", "unet", "vae", "image_encoder") if getattr(told, part) != getattr(config, part)
+    ]
+    if wrong:
+        raise OptionError(
+            f"the published layout cannot say this architecture: its {wrong[0]} would be read as "
+            f"{getattr(told, wrong[0])}; keep our own .safetensors for it"
+        )

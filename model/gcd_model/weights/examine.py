@@ -8,19 +8,34 @@ import msgspec
 import torch
 from torch import Tensor
 
-from gcd_model.adapter import ADAPTER_KEY
-from gcd_model.architecture import Hints, Naming, Shapes, diffusers_levels, gcd_levels, infer_config
 from gcd_model.config import ModelConfig
 from gcd_model.errors import CheckpointError, OptionError
-from gcd_model.families import Family, family_named
 from gcd_model.live.config import LiveConfig
 from gcd_model.live.view import LiveNetworks
-from gcd_model.matching import Match, match_weights
 from gcd_model.networks import Networks, empty_networks
-from gcd_model.own_format import CONFIG_KEY, Card
-from gcd_model.provenance import Provenance, at_trained_size, checked_family, combined, told_by_name, told_by_yaml
-from gcd_model.weight_names import GCD_UNET, Levels, assembled, diffusers_source, gcd_source, own_source
-from gcd_model.weights_report import Layout, Leftover, NetworkReport
+from gcd_model.weights.adapter import ADAPTER_KEY
+from gcd_model.weights.card import CONFIG_KEY, Card, Layout, Leftover, NetworkReport
+from gcd_model.weights.families import (
+    Family,
+    Provenance,
+    at_trained_size,
+    checked_family,
+    combined,
+    family_named,
+    told_by_name,
+    told_by_yaml,
+)
+from gcd_model.weights.infer import (
+    Hints,
+    Match,
+    Naming,
+    Shapes,
+    diffusers_levels,
+    gcd_levels,
+    infer_config,
+    match_weights,
+)
+from gcd_model.weights.names import GCD_UNET, Levels, assembled, diffusers_source, gcd_source, own_source
 
 _NO_LEVELS = Levels(attention=(), unet_blocks=0, vae_levels=0, vae_blocks=0, image_layers=0)
 _USABLE = (torch.float64, torch.float32, torch.float16, torch.bfloat16)

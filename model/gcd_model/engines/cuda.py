@@ -1,33 +1,45 @@
 """The networks as a GPU runs them best: compiled blocks, a whole denoising step as one CUDA graph.
 
-Every part also runs on a CPU, compiled or not and without graphs, which is how most of it is tested.
-"""
+Every part also runs on a CPU, compiled or not and without graphs, which is how most of it is tested."""
 
 import copy
 import logging
-from collections.abc import Callable
+import math
+import os
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import wraps
+from itertools import chain
 from pathlib import Path
 from typing import Concatenate, Literal, ParamSpec, Self, TypeVar
 
 import torch
-from torch import Tensor
+import torch.nn.functional as F
+from torch import Tensor, nn
 
 from gcd_model.clip import RenderOptions
-from gcd_model.compiled_regions import cache_folder, channels_last, compile_regions, keep_compiled
 from gcd_model.conditioning import Conditioning
-from gcd_model.cuda_graphs import CudaGraphs, Pace, Recent, RecordedCall, Recorder, Unrecorded
-from gcd_model.decoder_check import checked_decoder
-from gcd_model.denoiser import TorchBackbone
-from gcd_model.engine import TorchEngine
+from gcd_model.diffusion import Schedule, TorchBackbone, unit_noise
+from gcd_model.engines.graphs import (
+    CudaGraphs,
+    Pace,
+    Recent,
+    RecordedCall,
+    Recorder,
+    StepMemory,
+    Unrecorded,
+    Update,
+    solved,
+)
+from gcd_model.engines.torch import TorchEngine
 from gcd_model.errors import Cancelled
-from gcd_model.fused_step import StepMemory, Update, solved
 from gcd_model.geometry import Trajectory
-from gcd_model.image_encoder import clip_pixels
-from gcd_model.layers import prepare
+from gcd_model.image_encoder import ImageTransformerLayer, clip_pixels
+from gcd_model.layers import Downsample, ResBlock, Upsample, prepare
 from gcd_model.networks import Networks
-from gcd_model.schedule import Schedule
+from gcd_model.temporal import VideoResBlock
+from gcd_model.unet import Stage
+from gcd_model.vae import PixelAttention, TemporalDecoder, to_pixels
 
 _LOG = logging.getLogger(__name__)
 
@@ -184,3 +196,124 @@ def _compiled(networks: Networks, options: CudaOptions) -> Update:
         keep_compiled(options.cache or cache_folder())
     compile_regions(networks, options.backend)
     return torch.compile(solved, backend=options.backend, fullgraph=True, dynamic=False)
+
+
+# --- compiling networks region by region -----------------------------------------------------------------------------
+
+
+Model = TypeVar("Model", bound=nn.Module)
+
+_REGIONS = (Stage, VideoResBlock, ResBlock, PixelAttention, ImageTransformerLayer, Downsample, Upsample)
+_SHAPES = 256  # of one kind of region: the U-Net has about 20, with and without the unconditional branch
+
+
+def twin(model: Model) -> Model:
+    """The same network with the same weights in memory, to be compiled without touching the first.
+
+    To move or to convert one of the two would do so to both.
+    """
+    memo: dict[int, object] = {id(each): each for each in chain(model.parameters(), model.buffers())}
+    return copy.deepcopy(model, memo).eval()
+
+
+def regions(model: nn.Module) -> Iterator[nn.Module]:
+    """The parts that are compiled, outermost first found."""
+    if isinstance(model, _REGIONS):
+        yield model
+        return
+    for child in model.children():
+        yield from regions(child)
+
+
+def compile_regions(model: nn.Module, backend: str) -> int:
+    """Compile every region, in place, when it is first called; how many there are. backend: of torch.compile."""
+    _allow_shapes()
+    found = list(regions(model))
+    for region in found:
+        region.compile(backend=backend, fullgraph=True, dynamic=False)
+    return len(found)
+
+
+def _allow_shapes() -> None:
+    """All blocks of a kind share one piece of code, which torch compiles for eight shapes unless told otherwise."""
+    from torch._dynamo import config  # takes seconds
+
+    name = "recompile_limit" if hasattr(config, "recompile_limit") else "cache_size_limit"  # before torch 2.7
+    setattr(config, name, max(_SHAPES, getattr(config, name)))
+
+
+def channels_last(model: nn.Module) -> None:
+    """Lay convolution weights out as tensor cores read them; what they make is then laid out so, too."""
+    for module in model.modules():
+        if isinstance(module, nn.Conv2d):
+            module.weight = _laid_out(module.weight, torch.channels_last)
+        elif isinstance(module, nn.Conv3d):
+            module.weight = _laid_out(module.weight, torch.channels_last_3d)
+
+
+def _laid_out(weight: Tensor, order: torch.memory_format) -> nn.Parameter:
+    return nn.Parameter(weight.contiguous(memory_format=order), requires_grad=False)
+
+
+def cache_folder() -> Path:
+    """Where compiled code lies unless TORCHINDUCTOR_CACHE_DIR says otherwise; GCD_CACHE_DIR names another."""
+    own = os.environ.get("GCD_CACHE_DIR")
+    root = Path(own) if own else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gcd-node"
+    return root / "compiled" / torch.__version__
+
+
+def keep_compiled(folder: Path) -> None:
+    """Have all that is compiled in this process kept in a folder, so that the next one finds it.
+
+    What TORCHINDUCTOR_CACHE_DIR and TRITON_CACHE_DIR say already stands.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(folder))
+    os.environ.setdefault("TRITON_CACHE_DIR", str(folder / "triton"))
+
+
+# --- whether the decoder may compute in bfloat16 ---------------------------------------------------------------------
+
+
+WANTED_DB = 50.0
+"""PSNR against float32 from which bfloat16 is used: less than one level of 8 bits, on average."""
+
+_COARSE = 16
+_SEED = 11
+_FRAMES = 4  # decoding all of a clip in float32 without graphs takes more memory than anything else does
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DecoderChoice:
+    """The decoder that is used. psnr_db: of its pictures in bfloat16 against float32."""
+
+    decoder: TemporalDecoder
+    psnr_db: float
+
+
+@torch.inference_mode()
+def checked_decoder(networks: Networks) -> DecoderChoice:
+    """The decoder in bfloat16 if its pictures of a test clip are good enough for that, else as it is."""
+    config, full = networks.config, networks.decoder
+    frames = drifting_clip(min(config.frames, _FRAMES), config.height, config.width)
+    encoder = networks.condition_encoder
+    latents = torch.cat([encoder(each[None].to(encoder.stem.weight)).mean for each in frames]).float()
+    half = copy.deepcopy(full).to(torch.bfloat16)
+    psnr = psnr_db(*(to_pixels(each(latents.to(each.stem.weight), len(latents))) for each in (half, full)))
+    return DecoderChoice(decoder=half if psnr > WANTED_DB else full, psnr_db=psnr)
+
+
+def drifting_clip(frames: int, height: int, width: int) -> Tensor:
+    """A smooth random picture with a fine pattern that moves by a pixel a frame: [frames, 3, height, width]."""
+    coarse = unit_noise((1, 3, max(2, height // _COARSE), max(2, width // _COARSE)), _SEED)
+    smooth = F.interpolate(coarse, size=(height, width), mode="bilinear")[0]
+    fine = 0.2 * unit_noise((3, height, width), _SEED, 1)
+    return torch.stack([(smooth + fine).roll(t, dims=-1) for t in range(frames)]).clamp(-1, 1)
+
+
+def psnr_db(ours: Tensor, truth: Tensor) -> float:
+    """Peak signal to noise ratio of pictures in [0, 1]; infinite for equal ones, 0 if there is NaN or Inf."""
+    error = F.mse_loss(ours.float(), truth.float()).item()
+    if not math.isfinite(error):
+        return 0.0
+    return math.inf if error == 0 else -10 * math.log10(error)

@@ -6,12 +6,10 @@ from torch import Tensor
 
 from gcd_model.clip import RenderOptions
 from gcd_model.conditioning import Conditioning
-from gcd_model.denoiser import Denoiser, TorchBackbone
+from gcd_model.diffusion import Denoiser, Schedule, TorchBackbone, sample
 from gcd_model.geometry import Trajectory
 from gcd_model.image_encoder import clip_pixels
 from gcd_model.networks import Networks
-from gcd_model.sampler import sample
-from gcd_model.schedule import Schedule
 
 
 class Engine(Protocol):

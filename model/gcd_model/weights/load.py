@@ -1,52 +1,39 @@
-"""Weights from files; the only place of the package that opens any to read. `weights_export` writes them.
+"""Weights by path: loaded, inspected, converted, saved.
 
 Layouts are told by content: GCD's Lightning `.ckpt`, `svd.safetensors`, a diffusers folder, and our own
-`.safetensors` with the config in its metadata. Everything is memory-mapped: what is not used, such as optimizer
-state, is never read. Nothing in a file is ever executed, see `restricted_pickle`.
-
-Longer than other files because reading is allowed nowhere else; naming, matching and formats live next door.
-"""
+`.safetensors` with the config in its metadata. Everything is memory-mapped: what is not used is never read."""
 
 import hashlib
 import logging
-import zipfile
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, cast
+from typing import BinaryIO, Literal
 
-import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from gcd_model.adapter import Adapter, adapted
-from gcd_model.diffusers_folder import PARTS, chosen_file, folder_hints, shards
-from gcd_model.errors import CheckpointError, FileError
-from gcd_model.examination import (
+from gcd_model.errors import CheckpointError
+from gcd_model.live.view import LiveNetworks
+from gcd_model.networks import LoadedWeights, Networks, weights_digest
+from gcd_model.weights.adapter import Adapter, adapted
+from gcd_model.weights.card import Card, Entry, WeightsReport, precision
+from gcd_model.weights.examine import (
     Examined,
     Options,
-    WeightsFile,
     examine,
-    layout_of,
     leftover_reports,
     network_reports,
 )
-from gcd_model.families import FAMILIES, family_named
-from gcd_model.file_kind import FETCH_AGAIN, HEAD, FileKind, check_archive, file_kind
-from gcd_model.gcd_layout import CARRIED
-from gcd_model.lightning import Contents, contents
-from gcd_model.live.view import LiveNetworks
-from gcd_model.networks import LoadedWeights, Networks, weights_digest
-from gcd_model.own_format import Card, Entry, precision
-from gcd_model.restricted_pickle import RestrictedPickle, check_storages
-from gcd_model.small_files import read_small
-from gcd_model.weights_export import Report, own_content, write_published, write_safetensors, written_dtype
-from gcd_model.weights_report import WeightsReport
+from gcd_model.weights.families import FAMILIES, family_named
+from gcd_model.weights.read import (
+    read_file,
+    read_weights,
+)
+from gcd_model.weights.save import CARRIED, Report, own_content, write_published, write_safetensors, written_dtype
 
 _log = logging.getLogger(__name__)
 
-_LARGEST_YAML = 1 << 18
 _SAMPLED_ABOVE = 512 << 20  # bytes; larger files are digested by samples
 _SAMPLE, _SAMPLES, _END = 64 << 10, 64, 1 << 20
 
@@ -118,7 +105,7 @@ def read_adapter(path: str | Path) -> Adapter:
     with _about(path):
         if not path.exists():
             raise CheckpointError("there is no such file; check the path")
-        held, metadata = _read_file(path)
+        held, metadata = read_file(path)
         return Adapter.of_file(metadata or {}, held.tensors)
 
 
@@ -247,7 +234,7 @@ def _samples(file: BinaryIO, size: int) -> Iterator[bytes]:
         yield file.read(_SAMPLE)
 
 
-# --- reading -------------------------------------------------------------------------------------------------------
+# --- errors, leftovers -----------------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -269,112 +256,3 @@ def _carried(examined: Examined) -> dict[str, Tensor]:
 def _examined(path: Path, options: Options) -> Examined:
     with _about(path):
         return examine(read_weights(path), options)
-
-
-def read_weights(path: Path) -> WeightsFile:
-    """Map a file or folder and tell its layout by its content. Raises CheckpointError, OSError."""
-    if not path.exists():
-        raise CheckpointError("there is no such file or folder; check the path")
-    if path.is_dir():
-        return _read_folder(path)
-    held, metadata = _read_file(path)
-    return WeightsFile(
-        name=path.stem,
-        layout=layout_of(held.tensors, metadata),
-        files=(path,),
-        tensors=held.tensors,
-        metadata=held.notes if metadata is None else metadata,
-        yaml=_yaml_beside(path),
-        optimizer_size=held.optimizer_size,
-        other_entries=held.other_entries,
-    )
-
-
-def _read_folder(path: Path) -> WeightsFile:
-    absent = [part for part in PARTS if not (path / part).is_dir()]
-    if absent:
-        raise CheckpointError(f"is a folder without {', '.join(absent)}; a diffusers folder has {', '.join(PARTS)}")
-    files = {part: _part_files(path / part) for part in PARTS}
-    tensors = {
-        f"{part}/{name}": tensor for part in PARTS for file in files[part] for name, tensor in _read_part(file).items()
-    }
-    configs = [path / part / "config.json" for part in PARTS]
-    return WeightsFile(
-        name=path.resolve().name,
-        layout="diffusers",
-        files=tuple(file for part in PARTS for file in files[part]),
-        tensors=tensors,
-        hints=folder_hints(*(_text(config) if config.exists() else None for config in configs)),
-    )
-
-
-def _part_files(folder: Path) -> list[Path]:
-    """The weights files of one part of a diffusers folder."""
-    chosen = folder / chosen_file((entry.name for entry in folder.iterdir()), folder.name)
-    if chosen.suffix != ".json":
-        return [chosen]
-    files = [folder / name for name in shards(_text(chosen), f"{folder.name}/{chosen.name}")]
-    absent = [file.name for file in files if not file.exists()]
-    if absent:
-        raise CheckpointError(f"its folder {folder.name} lacks {len(absent)} shards, first: {absent[0]}; {FETCH_AGAIN}")
-    return files
-
-
-def _text(file: Path) -> str:
-    try:
-        return read_small(file)
-    except FileError as error:
-        raise CheckpointError(f"its file {file.parent.name}/{file.name} {error}") from error
-
-
-def _read_part(file: Path) -> dict[str, Tensor]:
-    try:
-        return _read_file(file)[0].tensors
-    except CheckpointError as error:
-        raise CheckpointError(f"its file {file.parent.name}/{file.name} {error}") from error
-
-
-def _read_file(path: Path) -> tuple[Contents, dict[str, str] | None]:
-    """What a single file holds, and the metadata if it is safetensors."""
-    if _kind(path) == "zip":
-        return _read_zip(path), None
-    try:
-        with safe_open(path, framework="pt", device="cpu") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  it is no dict
-            return Contents(tensors), file.metadata() or {}
-    except SafetensorError as error:
-        raise CheckpointError(f"is damaged or truncated safetensors ({error}); {FETCH_AGAIN}") from error
-
-
-def _kind(path: Path) -> FileKind:
-    if not path.is_file():
-        raise CheckpointError("is neither a file nor a folder; give a checkpoint")
-    with path.open("rb") as file:
-        return file_kind(file.read(HEAD), path.stat().st_size)
-
-
-def _read_zip(path: Path) -> Contents:
-    """Tensors of a torch zip: views of one private mapping of the file, whatever else stands in it."""
-    if path.suffix == ".safetensors":  # torch goes by the suffix
-        raise CheckpointError("is a torch zip under the name .safetensors; rename it to .ckpt")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            check_archive(archive.infolist())
-            check_storages(archive)
-        reader = cast("Any", RestrictedPickle)
-        return contents(torch.load(str(path), map_location="cpu", mmap=True, weights_only=False, pickle_module=reader))
-    except CheckpointError:
-        raise
-    except zipfile.BadZipFile as error:
-        raise CheckpointError(f"is a truncated or damaged torch zip ({error}); {FETCH_AGAIN}") from error
-    except Exception as error:  # a damaged or hostile pickle can raise anything at all
-        raise CheckpointError(f"cannot be unpickled ({type(error).__name__}: {error}); {FETCH_AGAIN}") from error
-
-
-def _yaml_beside(path: Path) -> str:
-    """Text of the training configuration a published checkpoint comes with, or "" """
-    yaml = path.with_suffix(".yaml")
-    if not yaml.is_file():
-        return ""
-    with yaml.open("rb") as file:
-        return file.read(_LARGEST_YAML).decode("utf-8", errors="replace")
