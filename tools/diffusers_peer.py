@@ -19,7 +19,7 @@ from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 from gcd_model.clip import RenderOptions
 from gcd_model.conditioning import Conditioning
 from gcd_model.config import ImageEncoderConfig, ModelConfig, UNetConfig, VAEConfig
-from gcd_model.diffusion import Schedule, guided, preconditioning, sample
+from gcd_model.diffusion import GuidedDenoiser, Schedule, preconditioning, sample
 from gcd_model.errors import OptionError
 from gcd_model.geometry import Trajectory
 from gcd_model.image_encoder import clip_pixels
@@ -252,8 +252,8 @@ class DiffusersEngine:
         return None
 
     def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
-        denoiser = _Denoiser(self._modules.unet, given, schedule)
         start = start.to(self.like.device)
+        denoiser = GuidedDenoiser(_Network(self._modules.unet, given, schedule), schedule, start.device)
         return sample(denoiser, start, schedule.steps, progress=options.progress, cancel=options.cancel)
 
     def decode(self, latents: Tensor) -> Tensor:
@@ -262,37 +262,29 @@ class DiffusersEngine:
         return decoded
 
 
-class _Denoiser:
-    """D(x, sigma_i) as diffusers' pipeline for this U-Net computes it: both branches in one batch."""
+class _Network:
+    """The U-Net as diffusers' pipeline calls it: both branches in one batch."""
 
     def __init__(self, unet: UNetSpatioTemporalConditionModel, given: Conditioning, schedule: Schedule) -> None:
-        self._unet, self._schedule = unet, schedule
-        levels = preconditioning(schedule.sigmas[:-1], schedule.prediction)
-        self._c_in, self._c_out, self._c_skip = (c.tolist() for c in (levels.c_in, levels.c_out, levels.c_skip))
-        like, frames = given.latents, len(schedule.guidance)
-        self._labels = levels.c_noise.float().to(like.device)
-        self._guidance = schedule.guidance.to(like.device)
-        self._latents = given.latents.unflatten(0, (-1, frames))  # [R*K, T, C', h, w]
+        self._unet, self._frames = unet, len(schedule.guidance)
+        labels = preconditioning(schedule.sigmas[:-1]).c_noise
+        self._labels = labels.float().to(given.latents.device)
+        self._latents = given.latents.unflatten(0, (-1, self._frames))  # [R*K, T, C', h, w]
         assert given.tokens is not None  # `require_published` looked
-        self._tokens = given.tokens[::frames, None]  # [R*K, 1, D]
-        self._vectors = given.vector[::frames].repeat(given.branches, 1)  # [R*K, V]
-        self._branches = given.branches
+        self._tokens = given.tokens[:: self._frames, None]  # [R*K, 1, D]
+        self._vectors = given.vector[:: self._frames].repeat(given.branches, 1)  # [R*K, V]
 
-    def __call__(self, x: Tensor, step: int) -> Tensor:
-        """x: [K, T, C, h, w] float32 -> the same shape."""
-        branches = 2 if self._schedule.guided[step] else 1
-        rows = (x * self._c_in[step]).to(self._latents).repeat(branches, 1, 1, 1, 1)
-        kept = slice(-len(rows), None)  # the conditional ones come last
+    def __call__(self, rows: Tensor, step: int, _branches: int) -> Tensor:
+        clips = rows.to(self._latents).unflatten(0, (-1, self._frames))
+        kept = slice(-len(clips), None)  # the conditional ones come last
         (raw,) = self._unet(
-            torch.cat([rows, self._latents[kept]], dim=2),
+            torch.cat([clips, self._latents[kept]], dim=2),
             self._labels[step],
             self._tokens[kept],
             self._vectors[kept],
             return_dict=False,
         )
-        raw = raw.float().unflatten(0, (branches, -1))  # [R, K, T, C, h, w]
-        denoised = self._c_skip[step] * x + self._c_out[step] * raw
-        return guided(denoised[0], denoised[1], self._guidance) if branches == 2 else denoised[0]
+        return raw.float().flatten(0, 1)
 
 
 def compile_modules(modules: DiffusersModules) -> DiffusersModules:

@@ -302,30 +302,45 @@ class TorchBackbone:
         return self._unet(rows.to(self._unet.stem.weight), condition, inputs).float()
 
 
-class Denoiser:
-    """D(x, sigma_i) with guidance, for one batch of views."""
+Network = Callable[[Tensor, int, int], Tensor]
+"""F by rows, step and branches: rows float32 [R*K*T, C, h, w], scaled by c_in -> float32, the same shape."""
 
-    def __init__(self, backbone: Backbone, given: Conditioning, schedule: Schedule) -> None:
-        self._backbone, self._given, self._schedule = backbone, given, schedule
+
+class GuidedDenoiser:
+    """D(x, sigma_i) with guidance, for one batch of views, whatever computes the network."""
+
+    def __init__(self, network: Network, schedule: Schedule, device: torch.device) -> None:
+        self._network, self._schedule = network, schedule
         levels = preconditioning(schedule.sigmas[:-1], schedule.prediction)
         self._c_in, self._c_out, self._c_skip = (c.tolist() for c in (levels.c_in, levels.c_out, levels.c_skip))
-        self._plan = backbone.plan(levels.c_noise.float(), given)
-        self._guidance = schedule.guidance.to(given.latents.device)
+        self._guidance = schedule.guidance.to(device)
 
     def __call__(self, x: Tensor, step: int) -> Tensor:
         """x: [K, T, C, h, w] float32 -> the same shape."""
         branches = 2 if self._schedule.guided[step] else 1
         rows = (x * self._c_in[step]).flatten(0, 1).repeat(branches, 1, 1, 1)
-        raw = self._network(rows, step, branches).unflatten(0, (-1, *x.shape[:2]))
-        denoised = self._c_skip[step] * x + self._c_out[step] * raw  # [R, K, T, C, h, w]
-        return guided(denoised[0], denoised[1], self._guidance) if branches == 2 else denoised[0]
+        raw = self._network(rows, step, branches).unflatten(0, (branches, *x.shape[:2]))
+        return denoised(x, raw, self._c_skip[step], self._c_out[step], self._guidance)
 
-    def _network(self, rows: Tensor, step: int, branches: int) -> Tensor:
-        condition, inputs = self._given.latents, self._plan.step(step)
-        if branches < self._given.branches:
-            condition = condition.chunk(self._given.branches)[-1]
-            inputs = tuple(_conditional(each, self._given.branches) for each in inputs)
-        return self._backbone.predict(rows, condition, inputs)
+
+def denoised(x: Tensor, raw: Tensor, c_skip: Tensor | float, c_out: Tensor | float, guidance: Tensor) -> Tensor:
+    """D of what the network said, guided where it said it for both branches. raw: [R, K, T, C, h, w]. guidance: [T]."""
+    both = c_skip * x + c_out * raw
+    return guided(both[0], both[1], guidance) if len(both) == 2 else both[0]
+
+
+def planned_denoiser(backbone: Backbone, given: Conditioning, schedule: Schedule) -> GuidedDenoiser:
+    """A denoiser whose network computes once what does not depend on the pixels."""
+    plan = backbone.plan(preconditioning(schedule.sigmas[:-1]).c_noise.float(), given)
+
+    def network(rows: Tensor, step: int, branches: int) -> Tensor:
+        condition, inputs = given.latents, plan.step(step)
+        if branches < given.branches:
+            condition = condition.chunk(given.branches)[-1]
+            inputs = tuple(_conditional(each, given.branches) for each in inputs)
+        return backbone.predict(rows, condition, inputs)
+
+    return GuidedDenoiser(network, schedule, given.latents.device)
 
 
 def _conditional(inputs: StageInputs, branches: int) -> StageInputs:

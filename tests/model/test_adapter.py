@@ -124,12 +124,6 @@ def test_a_model_without_camera_gives_all_but_the_camera() -> None:
     assert all(over.weights[name] is not None and torch.equal(over.weights[name], state[name]) for name in state)
 
 
-def test_another_control_starts_its_camera_anew_and_no_control_leaves_it_out() -> None:
-    assert len(carried_over(filled(), SMALL_GCD).fresh) == 0
-    assert carried_over(filled(), FIXED).fresh == ()
-    assert set(carried_over(filled(), FIXED).weights) == set(filled(FIXED).state_dict())
-
-
 def test_from_scratch_keeps_autoencoders_and_image_tower_alone() -> None:
     over = carried_over(filled(), SMALL_GCD, anew=DIFFUSION)
     kept = {name.partition(".")[0] for name in over.weights}

@@ -169,14 +169,6 @@ def test_what_is_no_checkpoint_is_named_with_a_remedy(tmp_path: Path, content: b
     assert said in refused(path)
 
 
-def test_files_of_the_old_format_are_refused_by_name(tmp_path: Path) -> None:
-    path = tmp_path / "old.ckpt"
-    torch.save({"state_dict": gcd_state(filled())}, path, _use_new_zipfile_serialization=False)
-    message = refused(path)
-    assert "old format" in message
-    assert "torch.save" in message
-
-
 def test_zips_of_another_kind_are_refused(tmp_path: Path) -> None:
     for inner, said in (("a/b.txt", "without data.pkl"), ("a/constants.pkl", "TorchScript")):
         with zipfile.ZipFile(tmp_path / "a.ckpt", "w") as archive:

@@ -131,28 +131,6 @@ def test_heads_that_names_and_shapes_do_not_tell_are_refused() -> None:
         gcd_state(empty_networks(narrow).state_dict(), narrow, {})
 
 
-def test_a_file_that_is_there_is_replaced_only_when_told(tmp_path: Path) -> None:
-    path = written(tmp_path / "mine.ckpt", filled())
-    before = path.read_bytes()
-    with pytest.raises(OptionError, match="exists; give another name"):
-        written(path, filled())
-    with pytest.raises(OptionError, match="this layout is a ckpt file"):
-        written(tmp_path / "mine.safetensors", filled())
-    assert path.read_bytes() == before
-    written(path, filled(), overwrite=True)
-    assert [entry.name for entry in tmp_path.iterdir()] == ["mine.ckpt"]
-
-
-def test_what_cannot_be_written_whole_does_not_appear(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full_disk(_content: object, file: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(torch, "save", full_disk)
-    with pytest.raises(Exception, match="cannot be written: No space left"):
-        written(tmp_path / "mine.ckpt", filled())
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_note_that_lies_about_the_networks_is_refused(tmp_path: Path) -> None:
     path = written(tmp_path / "mine.ckpt", filled())
     root = torch.load(path, weights_only=True)

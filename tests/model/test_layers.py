@@ -14,17 +14,13 @@ from gcd_model.layers import (
     Derived,
     Downsample,
     FeedForward,
-    Layers,
     ResBlock,
     TokenAttention,
     Upsample,
-    embedding_mlp,
-    phase_kernels,
     prepare,
     sinusoid,
-    zeroed,
 )
-from gcd_model.temporal import FramePositions, TemporalShare, VideoResBlock, VideoTransformer
+from gcd_model.temporal import FramePositions, TemporalShare, VideoResBlock
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 4), (3, 5), (4, 6), (7, 2)])
@@ -39,13 +35,6 @@ def test_up_sampling_by_phases_equals_nearest_neighbour_then_convolution(
     x = draw(2, 5, height, width).double()
     plain = F.conv2d(F.interpolate(x, scale_factor=2.0, mode="nearest"), up.conv.weight, up.conv.bias, padding=1)
     assert relative_error(up(x), plain) < 1e-12
-
-
-def test_each_phase_kernel_keeps_the_sum_of_the_kernel_it_came_from() -> None:
-    weight = draw(4, 3, 3, 3).double()
-    kernels = phase_kernels(weight)
-    assert kernels.shape == (2, 2, 4, 3, 2, 2)
-    assert_close(kernels.sum(dim=(-2, -1)), weight.sum(dim=(-2, -1)).expand(2, 2, 4, 3))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
@@ -143,22 +132,6 @@ def test_a_video_block_normalises_over_all_frames_of_a_clip_and_of_no_other(fram
     assert not torch.allclose(changed, together.unflatten(0, (2, frames))[:, 0], atol=1e-3)
 
 
-def test_the_frame_table_is_the_mlp_of_each_frame_number() -> None:
-    positions = FramePositions(8, frames=5)
-    randomise(positions)
-    rows = [positions.mlp(sinusoid(torch.tensor(float(t)), 8)) for t in range(5)]
-    assert_close(positions.derived(), torch.stack(rows))
-
-
-def test_a_transformer_without_image_token_works_and_is_changed_by_one() -> None:
-    transformer = VideoTransformer(16, head_width=8, context_width=None, groups=4, frames=3)
-    randomise(transformer)
-    x = draw(6, 16, 2, 4)
-    without = transformer(x, 3, None, None)
-    assert without.shape == x.shape
-    assert not torch.allclose(without, transformer(x, 3, torch.ones(6, 16), torch.ones(2, 16)), atol=1e-3)
-
-
 def _derived_modules() -> list[Derived[Tensor]]:
     return [Upsample(4), FramePositions(4, 3), TemporalShare(of_sigmoid="space", initial=0.5)]
 
@@ -208,10 +181,3 @@ def test_dormant_weights_survive_the_round_trip_but_are_never_moved_cast_or_trai
         "dormant.norm_weight",
         "dormant.norm_bias",
     }
-
-
-def test_a_list_of_layers_gives_them_in_order_and_zeroed_layers_give_nothing() -> None:
-    mlp = embedding_mlp(3, 4, 5)
-    layers = Layers[nn.Linear](layer for layer in mlp if isinstance(layer, nn.Linear))
-    assert [layer.out_features for layer in layers] == [4, 5]
-    assert not zeroed(mlp)(torch.ones(2, 3)).any()

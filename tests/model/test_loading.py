@@ -135,11 +135,6 @@ def test_impossible_options_are_said(options: dict[str, str], said: str) -> None
         load_synthesizer("random:kubric90", **options)
 
 
-def test_an_unknown_random_family_lists_the_known_ones() -> None:
-    with pytest.raises(OptionError, match="there are kubric90"):
-        load_synthesizer("random:")
-
-
 def test_a_path_object_is_always_a_path(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="there is no such file"):
         load_synthesizer(tmp_path / "random:kubric90")

@@ -31,10 +31,6 @@ def test_a_card_survives_the_round_trip() -> None:
         assert Card.from_metadata(card.to_metadata()) == card
 
 
-def test_without_a_scale_the_metadata_is_as_it_was() -> None:
-    assert not any("uncertainty" in key for key in replace(CARD, uncertainty_scale=None).to_metadata())
-
-
 def test_the_scale_comes_with_the_weights(file: Path) -> None:
     assert load_weights(file).uncertainty_scale == 1.75
     assert inspect_weights(file).uncertainty_scale == 1.75

@@ -1,6 +1,5 @@
 """Published names: a bijection, at full size and at others, and the facts the manifest's shapes cannot tell."""
 
-from dataclasses import replace
 from functools import lru_cache
 
 import msgspec
@@ -288,10 +287,3 @@ def test_further_condition_channels_are_told_by_the_stem() -> None:
     shapes = published_shapes(SMALL_GCD, gcd_source) | {f"{UNET}.input_blocks.0.0.weight": (32, 11, 3, 3)}
     config = infer_config(shapes, gcd_source, gcd_levels(shapes), Hints())
     assert config.extra_condition_channels == 3
-
-
-def test_levels_of_a_config_are_those_of_its_names() -> None:
-    shapes = published_shapes(DEEP, gcd_source)
-    found = gcd_levels(shapes)
-    assert replace(found, attention=DEEP.unet.attention) == Levels.of(DEEP)
-    assert len(found.attention) == 3

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gcd_model.conditioning import Conditioning
-from gcd_model.diffusion import Backbone, Schedule, guided, preconditioning
+from gcd_model.diffusion import Backbone, Schedule, denoised, preconditioning
 from gcd_model.unet import StageInputs, StagePlan, UNetPlan
 
 Kept = TypeVar("Kept")
@@ -202,9 +202,8 @@ def solved(x: Tensor, before: Tensor, raw: Tensor, numbers: Tensor, guidance: Te
         The next x, and D of this step.
     """
     _, c_out, c_skip, keep, rest, early = numbers.unbind()
-    both = c_skip * x + c_out * raw
-    denoised = guided(both[0], both[1], guidance) if len(both) == 2 else both[0]
-    return torch.lerp(denoised, x, keep) + rest * denoised + early * before, denoised
+    clean = denoised(x, raw, c_skip, c_out, guidance)
+    return torch.lerp(clean, x, keep) + rest * clean + early * before, clean
 
 
 class PlanMemory:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from gcd_model.clip import RenderOptions
 from gcd_model.conditioning import Conditioning, camera_features
 from gcd_model.config import ModelConfig
-from gcd_model.diffusion import Denoiser, Schedule, sample
+from gcd_model.diffusion import Schedule, planned_denoiser, sample
 from gcd_model.engines.onnx_export import read_manifest
 from gcd_model.errors import DeviceMemoryError, ModelError, OptionError
 from gcd_model.geometry import Trajectory
@@ -124,7 +124,7 @@ class OnnxEngine:
 
     def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
         """See Engine."""
-        denoiser = Denoiser(self._backbone, given, schedule)
+        denoiser = planned_denoiser(self._backbone, given, schedule)
         return sample(denoiser, start, schedule.steps, progress=options.progress, cancel=options.cancel)
 
     def decode(self, latents: Tensor) -> Tensor:

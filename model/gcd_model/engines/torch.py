@@ -6,7 +6,7 @@ from torch import Tensor
 
 from gcd_model.clip import RenderOptions
 from gcd_model.conditioning import Conditioning
-from gcd_model.diffusion import Denoiser, Schedule, TorchBackbone, sample
+from gcd_model.diffusion import Schedule, TorchBackbone, planned_denoiser, sample
 from gcd_model.geometry import Trajectory
 from gcd_model.image_encoder import clip_pixels
 from gcd_model.networks import Networks
@@ -77,7 +77,7 @@ class TorchEngine:
 
     def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
         """See Engine."""
-        denoiser = Denoiser(self._backbone, given, schedule)
+        denoiser = planned_denoiser(self._backbone, given, schedule)
         start = start.to(self.like.device)
         return sample(denoiser, start, schedule.steps, progress=options.progress, cancel=options.cancel)
 
