@@ -293,12 +293,10 @@ class TorchBackbone:
         self._unet = unet
 
     def plan(self, labels: Tensor, given: Conditioning) -> UNetPlan:
-        """See Backbone."""
         on_device = labels.to(self._unet.stem.weight.device)
         return self._unet.plan(on_device, given.vector, given.camera, given.tokens, repeats=given.branches)
 
     def predict(self, rows: Tensor, condition: Tensor, inputs: tuple[StageInputs, ...]) -> Tensor:
-        """See Backbone."""
         return self._unet(rows.to(self._unet.stem.weight), condition, inputs).float()
 
 

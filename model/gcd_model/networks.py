@@ -23,7 +23,7 @@ from gcd_model.weights.families import Family
 class Networks(nn.Module):
     """U-Net, camera embedder, image tower and autoencoders.
 
-    Attribute names are ours; `checkpoints.py` knows the published ones. With a shared VAE the target encoder is
+    Attribute names are ours; `weights/names.py` knows the published ones. With a shared VAE the target encoder is
     also the condition encoder.
     """
 
@@ -51,7 +51,7 @@ class LoadedWeights:
 
     family: None if nobody could tell. move_time: frame in which the goal pose is reached.
     sha256_12: first 12 digits of `digest`. uncertainty_scale: see `Traits`. layout: of the file.
-    carried: leftovers of a published file that its next owner may want, by published name; see `gcd_layout.CARRIED`.
+    carried: leftovers of a published file that its next owner may want, by published name; see `CARRIED`.
     """
 
     name: str

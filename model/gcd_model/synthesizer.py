@@ -140,17 +140,6 @@ class Pictures:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Finish:
-    """What becomes of decoded pictures.
-
-    painted: the classes in whose colours the model paints. whole_levels: as uint8.
-    """
-
-    painted: tuple[SemanticClass, ...] = ()
-    whole_levels: bool = False
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
 class _Coming:
     """A decoded clip that may still be arriving. finite: bool, on the device."""
 
@@ -159,23 +148,22 @@ class _Coming:
     finite: Tensor
 
 
-def decode(engine: Engine, latents: Tensor, finish: Finish | None = None) -> list[Pictures]:
+def decode(engine: Engine, latents: Tensor, painted: tuple[SemanticClass, ...], *, as_levels: bool) -> list[Pictures]:
     """Decode view by view, one clip at a time; while one is decoded, the one before it arrives on the CPU.
 
     latents: [V, S, T, C, h, w], unscaled: V views, S samples of each.
     """
-    finish = Finish() if finish is None else finish
-    views = [[_decoded_clip(engine, clip, finish) for clip in view] for view in latents]
+    views = [[_decoded_clip(engine, clip, painted, as_levels=as_levels) for clip in view] for view in latents]
     return [_arrived(clips) for clips in views]
 
 
-def _decoded_clip(engine: Engine, latents: Tensor, finish: Finish) -> _Coming:
+def _decoded_clip(engine: Engine, latents: Tensor, painted: tuple[SemanticClass, ...], *, as_levels: bool) -> _Coming:
     """latents: [T, C, h, w]. Pixels [T, 3, H, W] and class ids [T, H, W]."""
     decoded = engine.decode(latents)
     pixels = to_pixels(decoded)
     return _Coming(
-        pixels=Download(whole_levels(pixels) if finish.whole_levels else pixels),
-        classes=Download(nearest_classes(pixels, finish.painted)) if finish.painted else None,
+        pixels=Download(whole_levels(pixels) if as_levels else pixels),
+        classes=Download(nearest_classes(pixels, painted)) if painted else None,
         finite=decoded.isfinite().all(),
     )
 
@@ -257,7 +245,6 @@ class Synthesizer:
     def render(
         self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
     ) -> list[View]:
-        """See ViewSynthesizer."""
         options = RenderOptions() if options is None else options
         self._check_lengths(features, trajectories)
         buckets = [self._bucket(path, options) for path in trajectories]
@@ -337,8 +324,8 @@ class Synthesizer:
         )
 
     def _decode(self, job: "_Job", latents: Tensor) -> list[Pictures]:
-        finish = Finish(painted=self._traits.painted_classes, whole_levels=job.options.whole_levels)
-        pictures = decode(self._engine, latents / self._config.vae.scale, finish)
+        painted, as_levels = self._traits.painted_classes, job.options.whole_levels
+        pictures = decode(self._engine, latents / self._config.vae.scale, painted, as_levels=as_levels)
         if not all(view.finite for view in pictures):
             raise NonFiniteError(f"{self._traits.name} decoded to NaN or Inf; the weights are damaged")
         return pictures

@@ -121,10 +121,3 @@ def test_the_image_tower_sees_the_frames_clean() -> None:
     assert noisy.tokens is not None
     assert torch.equal(clean.tokens, noisy.tokens)
     assert not torch.allclose(clean.latents, noisy.latents)
-
-
-def test_the_condition_encoder_has_the_quant_convolution_and_the_target_encoder_has_none() -> None:
-    networks = tiny_synthesizer().networks
-    assert networks.condition_encoder is not networks.target_encoder
-    assert networks.condition_encoder.quant is not None
-    assert networks.target_encoder.quant is None

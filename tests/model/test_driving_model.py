@@ -28,7 +28,7 @@ from gcd_model.geometry import CameraMount
 from gcd_model.loading import load_synthesizer
 from gcd_model.networks import Networks
 from gcd_model.synthesizer import Synthesizer
-from gcd_model.weights.card import FULL_PRECISION, Card
+from gcd_model.weights.card import Card
 from gcd_model.weights.families import DRIVING
 from gcd_model.weights.load import save_weights
 
@@ -93,33 +93,6 @@ def test_one_step_gives_what_the_network_says_the_clean_latents_are() -> None:
     view = rendered(synthesizer)
     assert len(said) == 1
     assert_close(view.latents[0], said[0])
-
-
-def test_views_and_samples_in_one_batch_equal_those_made_alone(synthesizer: Synthesizer) -> None:
-    features, traits = synthesizer.encode(random_clip(TINY_DRIVING)), synthesizer.traits
-    gradual, direct = traits.plan_view(), traits.plan_view(move_time=0)
-    options = RenderOptions(samples=2, steps=2)
-    together = synthesizer.render(features, [gradual, direct], options)
-    for path, view in zip((gradual, direct), together, strict=True):
-        (alone,) = synthesizer.render(features, [path], options)
-        assert relative_error(view.latents, alone.latents) < 1e-4
-        assert relative_error(view.samples, alone.samples) < 1e-4
-        assert view.classes is not None
-        assert alone.classes is not None
-        assert (view.classes == alone.classes).float().mean() > 0.99
-
-
-def test_networks_in_bfloat16_give_float32_views_near_those_of_float32(synthesizer: Synthesizer) -> None:
-    half = tiny_driving()
-    for name, network in half.networks.named_children():
-        if name not in FULL_PRECISION:
-            network.bfloat16()
-    exact, rounded = rendered(synthesizer), rendered(half)
-    assert rounded.samples.dtype == rounded.latents.dtype == torch.float32
-    assert 0 < relative_error(rounded.latents, exact.latents) < 0.05
-    assert rounded.classes is not None
-    assert exact.classes is not None
-    assert (rounded.classes == exact.classes).float().mean() > 0.9
 
 
 def test_the_checkpoint_names_its_augmentation(synthesizer: Synthesizer) -> None:

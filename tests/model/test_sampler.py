@@ -1,7 +1,6 @@
 """The sampler: noise levels, preconditioning, guidance, Euler steps, and the whole of it against a plain reference."""
 
 import math
-import threading
 from collections.abc import Callable
 from itertools import pairwise
 
@@ -23,7 +22,6 @@ from gcd_model.diffusion import (
     solver_steps,
     unit_noise,
 )
-from gcd_model.errors import Cancelled
 
 PUBLISHED = SamplingConfig()
 
@@ -95,16 +93,6 @@ def test_guidance_moves_each_frame_away_from_the_unconditional_prediction_by_its
     assert_close(result[:, 2], 2.5 * conditional[:, 2] - 1.5 * unconditional[:, 2])
 
 
-@pytest.mark.parametrize("slope", [0.0, 0.3, 0.9])
-def test_euler_follows_the_closed_form_for_a_denoiser_that_scales(slope: float) -> None:
-    sigmas = edm_sigmas(PUBLISHED, 25)
-    start = draw(4).double()
-    factor = 1.0
-    for sigma, following in pairwise(sigmas.tolist()):
-        factor *= slope + (1 - slope) * following / sigma
-    assert_close(follow(lambda x, _i: slope * x, start, sigmas), start * factor)
-
-
 @pytest.mark.parametrize(("solver", "order", "bound"), [("euler", 1, 0.02), ("dpmpp_2m", 2, 0.0005)])
 def test_a_solver_approaches_the_true_flow_of_a_gaussian_with_its_order(
     solver: SolverName, order: int, bound: float
@@ -145,27 +133,6 @@ def test_every_step_of_a_solver_weighs_its_terms_to_one_and_the_last_leaves_no_n
     assert [step.keep + step.new + step.before for step in made] == pytest.approx([1.0] * steps)
     assert (made[-1].keep, made[-1].before) == (0.0, 0.0)
     assert made[0].before == 0.0
-
-
-def test_progress_counts_every_step_once() -> None:
-    seen: list[tuple[int, int]] = []
-    steps = solver_steps("euler", edm_sigmas(PUBLISHED, 4))
-    sample(lambda x, _i: x, draw(2), steps, progress=lambda done, total: seen.append((done, total)))
-    assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
-
-
-def test_a_cancelled_run_stops_before_the_next_network_evaluation() -> None:
-    stop, evaluations = threading.Event(), list[int]()
-
-    def denoise(x: Tensor, i: int) -> Tensor:
-        evaluations.append(i)
-        if i == 1:
-            stop.set()
-        return x
-
-    with pytest.raises(Cancelled, match="before step 3 of 5"):
-        sample(denoise, draw(2), solver_steps("euler", edm_sigmas(PUBLISHED, 5)), cancel=stop)
-    assert evaluations == [0, 1]
 
 
 def test_unit_noise_is_fixed_by_seed_and_stream_and_differs_between_them() -> None:

@@ -124,12 +124,10 @@ class CudaEngine:
 
     @property
     def like(self) -> Tensor:
-        """See Engine."""
         return self._networks.unet.stem.weight
 
     @_forgetful
     def tokens(self, frames: Tensor) -> Tensor | None:
-        """See Engine."""
         tower = self._networks.image_encoder
         if tower is None:
             return None
@@ -137,12 +135,10 @@ class CudaEngine:
 
     @_forgetful
     def condition_mean(self, frames: Tensor) -> Tensor:
-        """See Engine."""
         return self._encoder(frames.to(self.like))
 
     @_forgetful
     def camera(self, path: Trajectory) -> Tensor | None:
-        """See Engine."""
         return self._plain.camera(path)
 
     @_forgetful
@@ -171,7 +167,6 @@ class CudaEngine:
 
     @_forgetful
     def decode(self, latents: Tensor) -> Tensor:
-        """See Engine."""
         return self._decoder(latents.to(self._networks.decoder.stem.weight)).float()
 
     def _tokens_of(self, pixels: Tensor) -> Tensor:

@@ -41,7 +41,6 @@ class Unrecorded:
     """Implements Recorder: does the work anew each time. On a CPU, and where graphs are not wanted."""
 
     def record(self, work: Replay) -> Replay:
-        """See Recorder."""
         work()
         return work
 
@@ -60,7 +59,6 @@ class CudaGraphs:
         self._pool = torch.cuda.graph_pool_handle()
 
     def record(self, work: Replay) -> Replay:
-        """See Recorder."""
         graph = torch.cuda.CUDAGraph()
         with _choosing_convolutions():
             _warm(work)

@@ -100,7 +100,6 @@ class OnnxEngine:
         """See Engine: float32 on the CPU; onnxruntime copies to its own device."""
 
     def tokens(self, frames: Tensor) -> Tensor | None:
-        """See Engine."""
         tower = self._config.image_encoder
         if tower is None:
             return None
@@ -123,12 +122,10 @@ class OnnxEngine:
         return None if control == "none" else camera_features(control, path)
 
     def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
-        """See Engine."""
         denoiser = planned_denoiser(self._backbone, given, schedule)
         return sample(denoiser, start, schedule.steps, progress=options.progress, cancel=options.cancel)
 
     def decode(self, latents: Tensor) -> Tensor:
-        """See Engine."""
         return self._graphs.run("decoder", latents)[0]
 
     def _frame_by_frame(self, name: str, frames: Tensor) -> Tensor:
@@ -142,7 +139,6 @@ class OnnxBackbone:
         self._graphs, self._frames = graphs, frames
 
     def plan(self, labels: Tensor, given: Conditioning) -> UNetPlan:
-        """See Backbone."""
         rows = [given.vector] if given.camera is None else [given.vector, given.camera]
         clips = list(zip(*(each.split(self._frames) for each in rows), strict=True))
         steps = [self._joined([("embeddings", label, *clip) for clip in clips]) for label in labels.float().split(1)]
@@ -153,7 +149,6 @@ class OnnxBackbone:
         return UNetPlan((StagePlan(spatial, temporal, crosses[0], crosses[1]),), given.branches)
 
     def predict(self, rows: Tensor, condition: Tensor, inputs: tuple[StageInputs, ...]) -> Tensor:
-        """See Backbone."""
         (stage,) = inputs
         parts = [rows, condition, stage.spatial_embedding, stage.temporal_embedding]
         clips = [each.split(self._frames) for each in parts]

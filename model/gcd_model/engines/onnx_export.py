@@ -185,7 +185,7 @@ class TensorRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 class FileRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One file of the folder. sha256: see `checkpoints.digest`."""
+    """One file of the folder. sha256: see `digest`."""
 
     name: str
     size: int

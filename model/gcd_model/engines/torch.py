@@ -56,32 +56,26 @@ class TorchEngine:
 
     @property
     def like(self) -> Tensor:
-        """See Engine."""
         return self._networks.unet.stem.weight
 
     def tokens(self, frames: Tensor) -> Tensor | None:
-        """See Engine."""
         tower = self._networks.image_encoder
         if tower is None:
             return None
         return tower(clip_pixels(frames.to(self.like.device), tower.config.image_size).to(self.like))
 
     def condition_mean(self, frames: Tensor) -> Tensor:
-        """See Engine."""
         return self._networks.condition_encoder(frames.to(self.like)).mean
 
     def camera(self, path: Trajectory) -> Tensor | None:
-        """See Engine."""
         embedder = self._networks.camera
         return None if embedder is None else embedder(path)
 
     def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
-        """See Engine."""
         denoiser = planned_denoiser(self._backbone, given, schedule)
         start = start.to(self.like.device)
         return sample(denoiser, start, schedule.steps, progress=options.progress, cancel=options.cancel)
 
     def decode(self, latents: Tensor) -> Tensor:
-        """See Engine."""
         decoder = self._networks.decoder
         return decoder(latents.to(decoder.stem.weight), len(latents))

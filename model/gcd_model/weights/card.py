@@ -186,7 +186,7 @@ class WeightsReport:
     uncertainty_scale: see `Traits`.
     family: None if unknown; told_by: "option", "metadata", "file name" or "yaml".
     optimizer_size: bytes of optimizer state, which is never read; 0 without. other_entries: further top-level names.
-    size: bytes on disk, all files together. digest: see `checkpoints.digest`.
+    size: bytes on disk, all files together. digest: see `digest`.
     """
 
     path: str

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TypedDict
 
 import msgspec
 import torch
@@ -96,9 +97,22 @@ def layout_of(tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None)
     )
 
 
+class Told(TypedDict, total=False):
+    """What a caller may say of a checkpoint, see `Options`."""
+
+    family: str | None
+    head_width: int | None
+    image_heads: int | None
+    frames: int | None
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Options:
-    """What the user says about a checkpoint; None leaves it to the file."""
+    """What the user says about a checkpoint; None leaves it to the file.
+
+    family: its name, instead of what metadata, file name or a yaml beside the file tell. head_width, image_heads,
+    frames: what published weights do not tell, instead of the published values.
+    """
 
     family: str | None = None
     head_width: int | None = None

@@ -9,7 +9,7 @@ from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import BinaryIO, Literal, Unpack
 
 from torch import Tensor
 
@@ -21,6 +21,7 @@ from gcd_model.weights.card import Card, Entry, WeightsReport, precision
 from gcd_model.weights.examine import (
     Examined,
     Options,
+    Told,
     examine,
     leftover_reports,
     network_reports,
@@ -41,23 +42,18 @@ _SAMPLE, _SAMPLES, _END = 64 << 10, 64, 1 << 20
 def load_weights(
     path: str | Path,
     *,
-    family: str | None = None,
-    head_width: int | None = None,
-    image_heads: int | None = None,
-    frames: int | None = None,
     ask_family: bool = True,
+    **told: Unpack[Told],
 ) -> LoadedWeights:
     """Load a checkpoint of any layout.
 
     Args:
-        family: name of the family, instead of what metadata, file name or a yaml beside the file tell.
-        ask_family: warn where nobody knows it; False for those who only want the weights.
-        head_width, image_heads, frames: what published weights do not tell, instead of the published values.
+        ask_family: warn where the family is not known; False for those who only want the weights. told: see `Options`.
     Raises:
         CheckpointError: the file is missing, damaged, hostile or of another architecture.
         OptionError: an option is unknown or contradicts the file.
     """
-    options = Options(family=family, head_width=head_width, image_heads=image_heads, frames=frames)
+    options = Options(**told)
     examined = _examined(Path(path), options)
     with _about(path):
         networks = examined.networks
@@ -112,11 +108,8 @@ def read_adapter(path: str | Path) -> Adapter:
 def inspect_weights(
     path: str | Path,
     *,
-    family: str | None = None,
-    head_width: int | None = None,
-    image_heads: int | None = None,
-    frames: int | None = None,
     full_digest: bool = False,
+    **told: Unpack[Told],
 ) -> WeightsReport:
     """Say what a checkpoint holds; checks names and shapes as `load_weights` does, reads no weights.
 
@@ -124,7 +117,7 @@ def inspect_weights(
         full_digest: read the whole file for the digest, whatever its size.
     Raises: as `load_weights`.
     """
-    options = Options(family=family, head_width=head_width, image_heads=image_heads, frames=frames)
+    options = Options(**told)
     examined = _examined(Path(path), options)
     file = examined.file
     with _about(path):
@@ -153,13 +146,10 @@ def convert_weights(
     *,
     layout: Literal["gcd-node", "gcd-ckpt"] = "gcd-node",
     dtype: str | None = None,
-    family: str | None = None,
-    head_width: int | None = None,
-    image_heads: int | None = None,
-    frames: int | None = None,
     uncertainty_scale: float | None = None,
     overwrite: bool = False,
     progress: Report | None = None,
+    **told: Unpack[Told],
 ) -> WeightsReport:
     """Write a checkpoint of any layout as our own `.safetensors`, tensor by tensor, or as GCD's `.ckpt`.
 
@@ -174,7 +164,7 @@ def convert_weights(
     Raises: as `load_weights`; OptionError if `out` exists and `overwrite` is not set, or the layout cannot hold it.
     """
     wanted = None if dtype is None else precision(dtype)
-    options = Options(family=family, head_width=head_width, image_heads=image_heads, frames=frames)
+    options = Options(**told)
     examined = _examined(Path(path), options)
     with _about(path):
         card = Card(
