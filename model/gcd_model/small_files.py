@@ -1,7 +1,8 @@
 """Small text files as strangers may write them: read, decoded and shown within limits.
 
 Launch files, recipes, calibrations, manifests, indexes and lists all come through here. Messages begin where a file's
-name ends: whoever opens the file puts that before them, and the remedy behind."""
+name ends: whoever opens the file puts that before them, and the remedy behind.
+"""
 
 import difflib
 import math

@@ -1,6 +1,7 @@
 """The networks as a GPU runs them best: compiled blocks, a whole denoising step as one CUDA graph.
 
-Every part also runs on a CPU, compiled or not and without graphs, which is how most of it is tested."""
+Every part also runs on a CPU, compiled or not and without graphs, which is how most of it is tested.
+"""
 
 import copy
 import logging

@@ -4,7 +4,8 @@ World: right-handed, z up. Camera: x right, y down, z ahead, as OpenCV has them.
 `a_from_b` takes coordinates in b to coordinates in a, so `a_from_b @ b_from_c` reads as `a_from_c`; the columns of
 `world_from_camera` are the camera's right, down and ahead axes and its position, in the world.
 A pose is a float64 CPU tensor [4, 4] or [..., 4, 4] with the last row (0, 0, 0, 1). Public types speak degrees and
-metres; a metre is a scene unit where the video has no scale of its own."""
+metres; a metre is a scene unit where the video has no scale of its own.
+"""
 
 import math
 from dataclasses import dataclass

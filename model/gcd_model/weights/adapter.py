@@ -2,7 +2,8 @@
 
     weight = base weight + alpha / rank * up @ down
 
-Source: Hu et al. 2022, "LoRA: Low-Rank Adaptation of Large Language Models", section 4.1."""
+Source: Hu et al. 2022, "LoRA: Low-Rank Adaptation of Large Language Models", section 4.1.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,6 +1,7 @@
 """What a checkpoint's names and shapes cannot tell: limits, rates, motion, the fixed path.
 
-A family is how a checkpoint was trained."""
+A family is how a checkpoint was trained.
+"""
 
 import re
 from dataclasses import dataclass, replace

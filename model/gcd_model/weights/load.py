@@ -1,7 +1,8 @@
 """Weights by path: loaded, inspected, converted, saved.
 
 Layouts are told by content: GCD's Lightning `.ckpt`, `svd.safetensors`, a diffusers folder, and our own
-`.safetensors` with the config in its metadata. Everything is memory-mapped: what is not used is never read."""
+`.safetensors` with the config in its metadata. Everything is memory-mapped: what is not used is never read.
+"""
 
 import hashlib
 import logging

@@ -2,7 +2,8 @@
 
 A checkpoint of somebody else may name any function of any module and ask to have it called. Here only tensor
 rebuilding is real; every other name becomes an inert placeholder, which takes whatever the file does to it and
-keeps none of it. So foreign classes (a trainer's callbacks, an option container) do not stop us, and nothing runs."""
+keeps none of it. So foreign classes (a trainer's callbacks, an option container) do not stop us, and nothing runs.
+"""
 
 import io
 import pickle

@@ -1,6 +1,7 @@
 """Weight files mapped and told apart by their content: the only place that opens checkpoints to read.
 
-Nothing in a file is ever executed, see `RestrictedPickle`."""
+Nothing in a file is ever executed, see `RestrictedPickle`.
+"""
 
 import zipfile
 from collections.abc import Iterable, Sequence

@@ -1,6 +1,7 @@
 """Weights into files: our own `.safetensors`, and the `.ckpt` of the released code. An exporter, so it opens files.
 
-Every file appears under its name only once it is complete, and replaces another only when that is allowed."""
+Every file appears under its name only once it is complete, and replaces another only when that is allowed.
+"""
 
 import os
 from collections.abc import Callable, Generator, Mapping
