@@ -21,7 +21,7 @@ from safetensors.torch import save_file
 from warm_commands import LIMIT_MB, LIMIT_S, WarmCommands
 
 from gcd_model.config import PLAIN_SMALL
-from gcd_model.own_format import Card
+from gcd_model.weights.card import Card
 from gcd_node.auth import new_key_pair, write_key_pair
 from gcd_train.evaluation.record import RunNote
 

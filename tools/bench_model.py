@@ -22,18 +22,17 @@ from pathlib import Path
 import msgspec
 import psutil
 import torch
-
-from gcd_model import (
+from model_stages import (
     STAGES,
     Implementation,
     MemoryFigures,
     ModelBench,
-    ModelBenchOptions,
-    ModelError,
     bench_model,
     load_measured,
     save_random,
 )
+
+from gcd_model import ModelError, OptionError
 
 ENGINES = {
     "torch": "ours",
@@ -112,28 +111,34 @@ def _without_json(words: list[str]) -> list[str]:
 
 def _bench(options: argparse.Namespace) -> ModelBench:
     """Memory comes first, so that a measurement that fills the machine fails at once."""
-    chosen = _model_options(options)
-    memories = _memories(options, chosen) if options.memory else {}
-    report = bench_model(_load(options, stages=chosen.stages), chosen, lambda part: print(part, file=sys.stderr))
+    names, stages = _implementations(options), _stages(options)
+    if not names or not stages or options.repeats < 1:
+        raise OptionError("a bench takes at least one window, one stage and one implementation")
+    memories = _memories(options, names) if options.memory else {}
+    synthesizer = _load(options, stages=stages)
+    shape = _shape(options)
+    counts = {"repeats": options.repeats, "warm": options.warm}
+    report = bench_model(
+        synthesizer, names, stages, **counts, **shape, on_part=lambda part: print(part, file=sys.stderr)
+    )
     rows = tuple(msgspec.structs.replace(row, memory=memories.get(row.name)) for row in report.implementations)
     return msgspec.structs.replace(report, implementations=rows)
 
 
-def _model_options(options: argparse.Namespace, **changes: object) -> ModelBenchOptions:
+def _implementations(options: argparse.Namespace) -> list[str]:
     names = [ENGINES[name] for name in options.engine or ["torch"]]
     if options.peer is not None:
         names += ["diffusers", "diffusers compiled"] if options.compiled else ["diffusers"]
-    stated = {
-        "height": options.height,
-        "width": options.width,
-        "steps": options.steps,
-        "guidance": None if options.guidance is None else tuple(options.guidance),
-        "repeats": options.repeats,
-        "warm": options.warm,
-        "stages": tuple(stage for stage in STAGES if stage in options.stages.split(",")),
-        "implementations": tuple(names),
-    }
-    return ModelBenchOptions(**(stated | changes))
+    return names
+
+
+def _stages(options: argparse.Namespace) -> list[str]:
+    return [stage for stage in STAGES if stage in options.stages.split(",")]
+
+
+def _shape(options: argparse.Namespace) -> dict:
+    guidance = None if options.guidance is None else tuple(options.guidance)
+    return {"height": options.height, "width": options.width, "steps": options.steps, "guidance": guidance}
 
 
 def _load(options: argparse.Namespace, **more: object) -> object:
@@ -142,16 +147,16 @@ def _load(options: argparse.Namespace, **more: object) -> object:
     return load_measured(options.weights, device=options.device, dtype=options.dtype, **more)
 
 
-def _memories(options: argparse.Namespace, chosen: ModelBenchOptions) -> dict[str, MemoryFigures]:
+def _memories(options: argparse.Namespace, names: list[str]) -> dict[str, MemoryFigures]:
     """By implementation, each in a fresh process: a peak does not come down."""
     with tempfile.TemporaryDirectory(prefix="gcd-bench-") as folder:
         words = _without_json(sys.argv[1:])
         if options.weights.startswith("random:"):
             weights = Path(folder) / "random.safetensors"
-            save_random(options.weights, weights, chosen.stages)
+            save_random(options.weights, weights, _stages(options))
             words += ["--weights", str(weights)]
         found = {}
-        for name in chosen.implementations:
+        for name in names:
             command = [sys.executable, __file__, *words, _MEMORY_OF, name]
             done = subprocess.run(command, stdout=subprocess.PIPE, check=True)
             found[name] = msgspec.json.decode(done.stdout.splitlines()[-1], type=MemoryFigures)
@@ -160,10 +165,7 @@ def _memories(options: argparse.Namespace, chosen: ModelBenchOptions) -> dict[st
 
 def own_memory(options: argparse.Namespace, name: str) -> MemoryFigures:
     """The most this process holds while it does one window of an implementation."""
-    without_camera = options.peer is not None
-    chosen = _model_options(
-        options, implementations=(name,), repeats=1, warm=0, without_camera=without_camera, count=False
-    )
+    once = {"repeats": 1, "warm": 0, "count": False, "bare": options.peer is not None}
     done, peak = threading.Event(), {"resident": 0, "private": 0}
 
     def watch() -> None:
@@ -177,7 +179,7 @@ def own_memory(options: argparse.Namespace, name: str) -> MemoryFigures:
     watcher.start()
     try:
         synthesizer = _load(options)
-        bench_model(synthesizer, chosen)
+        bench_model(synthesizer, [name], _stages(options), **once, **_shape(options))
     finally:
         done.set()
         watcher.join()

@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean
 
-from gcd_model import SOLVERS, RenderOptions, Sampler, Schedule, load_synthesizer, sampler_of
+from gcd_model import RenderOptions, Sampler, Schedule, load_synthesizer, sampler_of
+from gcd_model.clip import SOLVERS
 from gcd_train.baselines import Prediction
 from gcd_train.evaluation import SynthesizedViews, lead, summed_up
 from gcd_train.evaluation.choosing import Choice

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from msgspec.structs import replace
 
-from gcd_model import FAMILIES, SVD_14, NonFiniteError, RenderOptions, SourceFeatures, Traits, View
+from gcd_model import FAMILIES, NonFiniteError, RenderOptions, SourceFeatures, Traits, View
+from gcd_model.config import SVD_14
 from gcd_node.config import ControlConfig, ModelSection, NodeConfig, PublishConfig, ViewConfig
 from gcd_node.control import ControlServer
 from gcd_node.errors import NodeError, SourceAbsentError, SourceLostError

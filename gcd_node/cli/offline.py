@@ -249,8 +249,7 @@ OnnxFolder = Annotated[
 Checkpoint = Annotated[
     str, Option(help="A checkpoint, a diffusers folder, package:NAME, or random:FAMILY (noise).", show_default=False)
 ]
-Half = Annotated[bool, _narrow("--fp16", help="Half precision, for GPUs; decoder and plane mix stay float32.")]
-EightBits = Annotated[bool, _narrow("--int8", help="Weights of eight bits, computed in float32; as above.")]
+Half = Annotated[bool, _narrow("--fp16", help="Half precision, for GPUs; the decoder stays float32.")]
 GraphHeight = Annotated[int | None, Option(help="Instead of the trained height; the graphs take no other.")]
 GraphWidth = Annotated[int | None, Option(help="Instead of the trained width; the graphs take no other.")]
 Adapter = Annotated[Path | None, Option("--adapter", help="Low-rank adapter trained on these weights.")]
@@ -261,7 +260,6 @@ def export(
     onnx: OnnxFolder,
     weights: Checkpoint,
     fp16: Half = False,
-    int8: EightBits = False,
     height: GraphHeight = None,
     width: GraphWidth = None,
     family: FamilyOption = None,
@@ -274,9 +272,7 @@ def export(
 
     `gcd-node synthesize --weights DIR` and `[model] weights` take the folder. Needs the extra `onnx`.
     """
-    if fp16 and int8:
-        raise UsageError("--fp16 and --int8 exclude each other; leave one out")
-    precision: ExportPrecision = "float16" if fp16 else "int8" if int8 else "float32"
+    precision: ExportPrecision = "float16" if fp16 else "float32"
     with _progress("loading") as advance:
         manifest = export_weights(
             weights,

@@ -58,7 +58,7 @@ def convert(
     layout: Annotated[
         Literal["gcd-node", "gcd-ckpt"], Option(help="Our .safetensors, or the .ckpt of the released code.")
     ] = "gcd-node",
-    dtype: Annotated[str | None, Option(help="float32, bfloat16, float16 or int8; else as stored.")] = None,
+    dtype: Annotated[str | None, Option(help="float32, bfloat16 or float16; else as stored.")] = None,
     family: FamilyOption = None,
     head_width: HeadWidth = None,
     image_heads: ImageHeads = None,

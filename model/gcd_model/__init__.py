@@ -7,18 +7,12 @@
 The node imports from here only. Source: Van Hoorick et al., "Generative Camera Dolly", ECCV 2024.
 """
 
-from gcd_model.checkpoints import WeightsReport, convert_weights, inspect_weights
-from gcd_model.clip import QUALITIES, SOLVERS, Augmentation, Clip, Quality, RenderOptions, SolverName, View
-from gcd_model.colours import hatched, palette
+from gcd_model.clip import Augmentation, Clip, Quality, RenderOptions, SolverName, View
+from gcd_model.colours import hatched
 from gcd_model.conditioning import SourceFeatures
-from gcd_model.config import (
-    DRIVING_CLASSES,
-    PLAIN_SMALL,
-    SMALL,
-    SVD_14,
-    ModelConfig,
-    SemanticClass,
-)
+from gcd_model.config import ModelConfig
+from gcd_model.diffusion import Sampler, Schedule, sampler_of
+from gcd_model.engines.onnx_export import ExportPrecision, Manifest, is_export
 from gcd_model.errors import (
     Cancelled,
     CheckpointError,
@@ -32,7 +26,6 @@ from gcd_model.errors import (
     ViewFixedError,
     ViewRangeError,
 )
-from gcd_model.families import FAMILIES, LIVE_LENS_DEG, Family, ViewLimits
 from gcd_model.geometry import (
     CameraMount,
     DeltaFit,
@@ -42,53 +35,22 @@ from gcd_model.geometry import (
     SphericalDelta,
     Trajectory,
     center_crop_box,
-    driving_trajectory,
-    fitted_trajectory,
     nearest_delta,
     pose_trajectory,
-    spherical_trajectory,
 )
 from gcd_model.live.ego_motion import require_motion
 from gcd_model.live.synthesizer import visibility_of
-from gcd_model.loading import ENGINES, EngineName, default_precision, load_synthesizer
-from gcd_model.measuring import (
-    IMPLEMENTATIONS,
-    STAGES,
-    Difference,
-    Implementation,
-    ImplementationName,
-    MemoryFigures,
-    ModelBench,
-    ModelBenchOptions,
-    StageFigures,
-    StageName,
-    bench_model,
-    load_measured,
-    save_random,
-)
-from gcd_model.onnx_export import is_export
-from gcd_model.onnx_manifest import ExportPrecision, Manifest
-from gcd_model.onnx_source import export_weights
-from gcd_model.quality import Sampler, sampler_of
-from gcd_model.schedule import Schedule
-from gcd_model.settings import explain_settings_error
-from gcd_model.small_files import decode_json, decode_toml, printable, read_json, read_small
+from gcd_model.loading import EngineName, default_precision, export_weights, load_synthesizer
+from gcd_model.small_files import decode_toml, explain_settings_error, printable, read_json, read_small
 from gcd_model.synthesizer import FrameSynthesizer, Synthesizer, ViewSynthesizer, synthesize
 from gcd_model.traits import ASSUMED_SOURCE, Traits
+from gcd_model.weights.families import FAMILIES, LIVE_LENS_DEG, Family
+from gcd_model.weights.load import WeightsReport, convert_weights, inspect_weights
 
 __all__ = [
     "ASSUMED_SOURCE",
-    "DRIVING_CLASSES",
-    "ENGINES",
     "FAMILIES",
-    "IMPLEMENTATIONS",
     "LIVE_LENS_DEG",
-    "PLAIN_SMALL",
-    "QUALITIES",
-    "SMALL",
-    "SOLVERS",
-    "STAGES",
-    "SVD_14",
     "Augmentation",
     "CameraMount",
     "Cancelled",
@@ -96,19 +58,13 @@ __all__ = [
     "Clip",
     "DeltaFit",
     "DeviceMemoryError",
-    "Difference",
     "EngineName",
     "ExportPrecision",
     "Family",
     "FileError",
     "FrameSynthesizer",
-    "Implementation",
-    "ImplementationName",
     "Intrinsics",
     "Manifest",
-    "MemoryFigures",
-    "ModelBench",
-    "ModelBenchOptions",
     "ModelConfig",
     "ModelError",
     "NonFiniteError",
@@ -119,48 +75,36 @@ __all__ = [
     "RenderOptions",
     "Sampler",
     "Schedule",
-    "SemanticClass",
     "ShapeError",
     "SolverName",
     "SourceFeatures",
     "Spherical",
     "SphericalDelta",
-    "StageFigures",
-    "StageName",
     "Synthesizer",
     "Traits",
     "Trajectory",
     "View",
     "ViewFixedError",
-    "ViewLimits",
     "ViewRangeError",
     "ViewSynthesizer",
     "WeightsReport",
-    "bench_model",
     "center_crop_box",
     "convert_weights",
-    "decode_json",
     "decode_toml",
     "default_precision",
-    "driving_trajectory",
     "explain_settings_error",
     "export_weights",
-    "fitted_trajectory",
     "hatched",
     "inspect_weights",
     "is_export",
-    "load_measured",
     "load_synthesizer",
     "nearest_delta",
-    "palette",
     "pose_trajectory",
     "printable",
     "read_json",
     "read_small",
     "require_motion",
     "sampler_of",
-    "save_random",
-    "spherical_trajectory",
     "synthesize",
     "visibility_of",
 ]

@@ -17,7 +17,7 @@ SolverName = Literal["euler", "dpmpp_2m"]
 SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
 
 Quality = Literal["exact", "fast", "fastest"]
-"""How much of a checkpoint's own sampling is kept, see `quality`."""
+"""How much of a checkpoint's own sampling is kept, see `sampler_of`."""
 QUALITIES: tuple[Quality, ...] = get_args(Quality)
 
 Guidance: TypeAlias = tuple[float, float]

@@ -1,14 +1,12 @@
 """The parts every network here is built of: residual block, attention, feed-forward, up-sampling."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Generic, TypeVar, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-
-from gcd_model.frugal import REUSED_FLOATS, added, by_rows, frugal, rows_at_once, silu
 
 Kept = TypeVar("Kept")
 Layer = TypeVar("Layer", bound=nn.Module)
@@ -140,23 +138,15 @@ class ResBlock(nn.Module):
 
     def residual(self, x: Tensor, embedding: Tensor | None) -> Tensor:
         """The branch beside the skip connection. embedding broadcasts over x after the first convolution."""
-        h = self.conv1(silu(self.norm1(x)))
+        h = self.conv1(F.silu(self.norm1(x)))
         if embedding is not None:
-            h = added(h, embedding)
-        return self.conv2(silu(self.norm2(h)))
+            h = h + embedding
+        return self.conv2(F.silu(self.norm2(h)))
 
     def forward(self, x: Tensor, embedding: Tensor | None = None) -> Tensor:
         """x: [N, C, H, W] -> [N, C', H, W]. embedding: [N, C', 1, 1]."""
-        at_once = rows_at_once(x, x.shape[1:].numel())
-        if at_once >= len(x):
-            return self._few(x, embedding)
-        pieces = x.split(at_once)
-        embeddings = [None] * len(pieces) if embedding is None else embedding.expand(len(x), -1, -1, -1).split(at_once)
-        return torch.cat([self._few(*few) for few in zip(pieces, embeddings, strict=True)])
-
-    def _few(self, x: Tensor, embedding: Tensor | None) -> Tensor:
         skip = x if self.skip is None else self.skip(x)
-        return added(self.residual(x, embedding), skip)
+        return self.residual(x, embedding) + skip
 
 
 class FrameConv(nn.Conv3d):
@@ -193,9 +183,6 @@ class Attention(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """x: [N, L, C]."""
-        return by_rows(self._few, x, 3 * x.shape[1:].numel())
-
-    def _few(self, x: Tensor) -> Tensor:
         query, key, value = (self._split(layer(x)) for layer in (self.query, self.key, self.value))
         mixed = F.scaled_dot_product_attention(query, key, value)  # [N, heads, L, C/heads]
         return self.out(mixed.transpose(1, 2).flatten(2))
@@ -228,19 +215,8 @@ class FeedForward(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """x: [..., C]."""
-        rows = x.reshape(-1, x.shape[-1])
-        return by_rows(self._few, rows, self.contract.in_features).view_as(x)
-
-    def _few(self, x: Tensor) -> Tensor:
-        value, gate = self._halves(x)
-        gated = F.gelu(gate)
-        return self.contract(gated.mul_(value) if frugal(x) else value * gated)
-
-    def _halves(self, x: Tensor) -> Iterable[Tensor]:
-        if not frugal(x) or type(self.expand) is not nn.Linear:  # an adapter computes more than its weight says
-            return self.expand(x).chunk(2, dim=-1)
-        halves = zip(self.expand.weight.chunk(2), self.expand.bias.chunk(2), strict=True)
-        return (F.linear(x, weight, bias) for weight, bias in halves)
+        value, gate = self.expand(x).chunk(2, dim=-1)
+        return self.contract(value * F.gelu(gate))
 
 
 class Downsample(nn.Module):
@@ -270,14 +246,6 @@ class Upsample(Derived[Tensor]):
         super().__init__()
         self.conv = nn.Conv2d(channels, channels, 3, padding=1)
 
-    def keep(self) -> None:
-        """Unless they are large and on a CPU: there they are folded for each call, a hundredth of a full-size step, and
-        0.2 GB less is held."""
-        weight = self.conv.weight
-        folded = 4 * 4 * weight[..., 0, 0].numel()
-        if weight.device.type != "cpu" or folded <= REUSED_FLOATS:
-            super().keep()
-
     def derive(self) -> Tensor:
         """Kernels by output phase: [2, 2, C, C, 2, 2]."""
         weight = self.conv.weight
@@ -286,24 +254,15 @@ class Upsample(Derived[Tensor]):
 
     def forward(self, x: Tensor) -> Tensor:
         """x: [N, C, H, W] -> [N, C, 2H, 2W]."""
+        return F.pixel_shuffle(torch.stack([phase for _, phase in self.phases(x)], dim=2).flatten(1, 2), 2)
+
+    def phases(self, x: Tensor) -> Iterator[tuple[tuple[int, int], Tensor]]:
+        """Even and odd rows and columns of the result, [N, C, H, W] each, and which they are."""
         height, width = x.shape[-2:]
         kernels, padded = self.derived(), F.pad(x, (1, 1, 1, 1))
-        phases = (
-            F.conv2d(padded[..., a : a + height + 1, b : b + width + 1], kernels[a, b], self.conv.bias)
-            for a in (0, 1)
-            for b in (0, 1)
-        )
-        return _interleaved(phases) if frugal(x) else F.pixel_shuffle(torch.stack([*phases], dim=2).flatten(1, 2), 2)
-
-
-def _interleaved(phases: Iterator[Tensor]) -> Tensor:
-    """Four maps [N, C, H, W] for even and odd rows and columns, one at a time, as one of twice the size."""
-    first = next(phases)
-    whole = first.new_empty(*first.shape[:2], 2 * first.shape[2], 2 * first.shape[3])
-    whole[..., ::2, ::2] = first
-    for (row, column), phase in zip(((0, 1), (1, 0), (1, 1)), phases, strict=True):
-        whole[..., row::2, column::2] = phase
-    return whole
+        for a, b in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            window = padded[..., a : a + height + 1, b : b + width + 1]
+            yield (a, b), F.conv2d(window, kernels[a, b], self.conv.bias)
 
 
 def phase_kernels(weight: Tensor) -> Tensor:

@@ -3,26 +3,26 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, Unpack, get_args
 
 import msgspec
 import torch
 
-from gcd_model.checkpoints import load_adapted, load_weights, read_adapter
 from gcd_model.config import SMALL
-from gcd_model.engine import Engine
+from gcd_model.engines.onnx import load_export
+from gcd_model.engines.onnx_export import ExportPrecision, Manifest, Report, export_onnx, is_export, require_onnx
+from gcd_model.engines.torch import Engine
 from gcd_model.errors import CheckpointError, OptionError
-from gcd_model.examination import Options
-from gcd_model.families import LIVE, Family, family_named
 from gcd_model.live.config import LIVE_TINY
 from gcd_model.live.synthesizer import LiveSynthesizer
 from gcd_model.live.view import LiveNetworks
 from gcd_model.networks import LoadedWeights, Networks, random_networks, weights_digest
-from gcd_model.onnx_export import is_export
-from gcd_model.onnx_loading import load_export
-from gcd_model.own_format import FULL_PRECISION, precision
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
+from gcd_model.weights.card import FULL_PRECISION, precision
+from gcd_model.weights.examine import Options, Told
+from gcd_model.weights.families import LIVE, Family, family_named
+from gcd_model.weights.load import load_adapted, load_weights, read_adapter
 
 EngineName = Literal["torch", "cuda", "onnxruntime"]
 """What can compute networks; see `Engine`."""
@@ -35,26 +35,23 @@ PACKAGED = Path(__file__).parent / "weights"
 def load_synthesizer(
     source: str | Path,
     *,
-    family: str | None = None,
     device: str = "auto",
     dtype: str | None = None,
-    head_width: int | None = None,
-    image_heads: int | None = None,
-    frames: int | None = None,
     adapter: str | Path | None = None,
     engine: EngineName | None = None,
     providers: Sequence[str] = (),
+    **told: Unpack[Told],
 ) -> Synthesizer | LiveSynthesizer:
     """A checkpoint, ready to run.
 
     Args:
         source: a path; `package:NAME`, weights that ship with the package; or `random:FAMILY`, small random networks
             whose views are noise. The folder of an export is run by onnxruntime, anything else by torch.
-        family: see `load_weights`. device: "auto" (CUDA where there is one), "cpu", "cuda" or "cuda:N".
+        device: "auto" (CUDA where there is one), "cpu", "cuda" or "cuda:N".
         dtype: "float32", "bfloat16" or "float16"; else float32 on the CPU, bfloat16 on CUDA. The VAE decoder
             stays float32 (on CUDA torch may use TF32 in its convolutions, see torch.backends.cudnn). The live model
             computes in bfloat16 also on a CPU that multiplies in it (Intel AMX).
-        head_width, image_heads, frames: see `load_weights`.
+        told: family, head_width, image_heads, frames, see `Options`.
         adapter: file of a low-rank adapter that was trained on these weights; family and path are then the adapter's.
         engine: what computes the networks: "torch" as they are, or "cuda", compiled and as CUDA graphs, for a GPU; it
             settles the decoder's precision itself, see `CudaOptions`. "onnxruntime" runs the folder of an export,
@@ -65,45 +62,48 @@ def load_synthesizer(
         OptionError: an option is unknown or contradicts the checkpoint.
     """
     if is_export(source):
-        _require_export_options(source, engine, (family, dtype, head_width, image_heads, frames, adapter))
+        _require_export_options(source, engine, (*told.values(), dtype, adapter))
         return load_export(source, device=device, providers=providers)
     _require_no_export_options(source, engine, providers)
     place = _place(device, dtype, engine or "torch")
-    loaded = loaded_weights(
-        source, family=family, head_width=head_width, image_heads=image_heads, frames=frames, adapter=adapter
-    )
+    loaded = loaded_weights(source, adapter=adapter, **told)
     if isinstance(loaded.networks, LiveNetworks):
         return _live_synthesizer(loaded, loaded.networks, place, asked=dtype)
     return _synthesizer(loaded, place)
 
 
-def loaded_weights(
-    source: str | Path,
-    *,
-    family: str | None = None,
-    head_width: int | None = None,
-    image_heads: int | None = None,
-    frames: int | None = None,
-    adapter: str | Path | None = None,
-) -> LoadedWeights:
+def loaded_weights(source: str | Path, *, adapter: str | Path | None = None, **told: Unpack[Told]) -> LoadedWeights:
     """Weights by any name that `load_synthesizer` takes but an export's; arguments and errors are its."""
     kind, _, name = str(source).partition(":")
     if isinstance(source, str) and kind == "random":
-        _require_no_overrides(source, family, head_width, image_heads)
-        loaded = random_weights(name, frames=frames)
+        if any(option is not None for key, option in told.items() if key != "frames"):
+            raise OptionError(f"{source} takes neither family, head width nor image heads; leave them out")
+        loaded = random_weights(name, frames=told.get("frames"))
     else:
         path = packaged_weights(name) if isinstance(source, str) and kind == "package" else Path(source)
-        loaded = load_weights(
-            path,
-            family=family,
-            head_width=head_width,
-            image_heads=image_heads,
-            frames=frames,
-            ask_family=adapter is None,
-        )
-    if adapter is not None:
-        loaded = load_adapted(loaded, read_adapter(adapter))
-    return loaded
+        loaded = load_weights(path, ask_family=adapter is None, **told)
+    return loaded if adapter is None else load_adapted(loaded, read_adapter(adapter))
+
+
+def export_weights(
+    source: str | Path,
+    out: str | Path,
+    *,
+    precision: ExportPrecision = "float32",
+    height: int | None = None,
+    width: int | None = None,
+    adapter: str | Path | None = None,
+    overwrite: bool = False,
+    progress: Report | None = None,
+    **told: Unpack[Told],
+) -> Manifest:
+    """Write every network of a checkpoint as an ONNX graph; arguments and errors as `loaded_weights` and `export_onnx`
+    have them."""
+    require_onnx()
+    loaded = loaded_weights(source, adapter=adapter, **told)
+    return export_onnx(
+        loaded, out, precision=precision, height=height, width=width, overwrite=overwrite, progress=progress
+    )
 
 
 def placed_synthesizer(loaded: LoadedWeights, *, device: str = "auto", dtype: str | None = None) -> Synthesizer:
@@ -147,11 +147,6 @@ def _random_networks(family: Family, frames: int | None) -> Networks | LiveNetwo
     unet = SMALL.unet if family.camera != "none" else msgspec.structs.replace(SMALL.unet, camera_width=0)
     config = msgspec.structs.replace(SMALL, camera=family.camera, unet=unet, frames=frames or SMALL.frames)
     return random_networks(config, seed=0)
-
-
-def _require_no_overrides(source: str, *given: object) -> None:
-    if any(option is not None for option in given):
-        raise OptionError(f"{source} takes neither family, head width nor image heads; leave them out")
 
 
 def _require_export_options(source: str | Path, engine: EngineName | None, given: Sequence[object]) -> None:
@@ -237,7 +232,7 @@ def _synthesizer(loaded: LoadedWeights, place: _Place) -> Synthesizer:
 
 
 def _cuda_engine(networks: Networks) -> Engine:
-    from gcd_model.cuda_engine import CudaEngine  # torch.compile takes seconds to import
+    from gcd_model.engines.cuda import CudaEngine  # torch.compile takes seconds to import
 
     return CudaEngine(networks)
 

@@ -11,20 +11,19 @@ from torch import Tensor, nn
 from gcd_model.conditioning import CameraEmbedder
 from gcd_model.config import ModelConfig
 from gcd_model.errors import CheckpointError
-from gcd_model.families import Family
 from gcd_model.image_encoder import ImageEncoder
 from gcd_model.live.config import LiveConfig
 from gcd_model.live.view import LiveNetworks
-from gcd_model.own_format import NO_DIFFUSION
 from gcd_model.unet import VideoUNet
 from gcd_model.vae import Encoder, TemporalDecoder
-from gcd_model.weights_report import Layout
+from gcd_model.weights.card import NO_DIFFUSION, Card, Layout
+from gcd_model.weights.families import Family
 
 
 class Networks(nn.Module):
     """U-Net, camera embedder, image tower and autoencoders.
 
-    Attribute names are ours; `checkpoints.py` knows the published ones. With a shared VAE the target encoder is
+    Attribute names are ours; `weights/names.py` knows the published ones. With a shared VAE the target encoder is
     also the condition encoder.
     """
 
@@ -52,7 +51,7 @@ class LoadedWeights:
 
     family: None if nobody could tell. move_time: frame in which the goal pose is reached.
     sha256_12: first 12 digits of `digest`. uncertainty_scale: see `Traits`. layout: of the file.
-    carried: leftovers of a published file that its next owner may want, by published name; see `gcd_layout.CARRIED`.
+    carried: leftovers of a published file that its next owner may want, by published name; see `CARRIED`.
     """
 
     name: str
@@ -71,6 +70,19 @@ class LoadedWeights:
         if isinstance(self.networks, LiveNetworks):
             raise CheckpointError(f"{self.name} {NO_DIFFUSION}")
         return self.networks
+
+    @property
+    def card(self) -> Card:
+        """What a file made of them says about itself."""
+        return Card(
+            name=self.name,
+            config=self.networks.config,
+            family=None if self.family is None else self.family.name,
+            move_time=self.move_time,
+            trained=self.trained,
+            origin=self.sha256_12,
+            uncertainty_scale=self.uncertainty_scale,
+        )
 
 
 @overload

@@ -9,22 +9,18 @@ import torch
 from torch import Tensor
 
 from gcd_model.clip import Augmentation, Clip, RenderOptions, View
-from gcd_model.conditioning import (
-    Conditioning,
-    SourceFeatures,
-    condition_latents,
-    condition_tokens,
-    micro_conditioning,
-)
-from gcd_model.decoding import Finish, Pictures, decode
-from gcd_model.engine import Engine, TorchEngine
+from gcd_model.colours import nearest_classes
+from gcd_model.conditioning import Conditioning, SourceFeatures, condition_latents, condition_tokens, micro_conditioning
+from gcd_model.config import SemanticClass
+from gcd_model.diffusion import Schedule, unit_noise
+from gcd_model.engines.cpu import arrange
+from gcd_model.engines.torch import Engine, TorchEngine
 from gcd_model.errors import DeviceMemoryError, NonFiniteError, OptionError, ShapeError
 from gcd_model.geometry import Trajectory
 from gcd_model.layers import prepare
 from gcd_model.networks import Networks
-from gcd_model.noise import unit_noise
-from gcd_model.schedule import Schedule
 from gcd_model.traits import Traits
+from gcd_model.vae import to_pixels
 
 Given = ParamSpec("Given")
 Made = TypeVar("Made")
@@ -94,6 +90,102 @@ def out_of_memory_is_our_error(method: Callable[Given, Made]) -> Callable[Given,
     return guarded
 
 
+# --- tensors on their way from a GPU to the host ---------------------------------------------------------------------
+
+
+class Download:
+    """A copy of a tensor on the host that may still be arriving.
+
+    From a GPU it goes through pinned memory on a stream of its own; on a CPU it is the tensor itself.
+    """
+
+    def __init__(self, source: Tensor) -> None:
+        """Begin, as soon as the device has made the tensor. It must not be written to any more."""
+        self._held, self._arrived = source, None
+        if source.is_cuda:
+            self._held, self._arrived = _begun(source)
+
+    def result(self) -> Tensor:
+        """The copy, once it is there."""
+        if self._arrived is not None:
+            self._arrived.synchronize()
+        return self._held
+
+
+def _begun(source: Tensor) -> tuple[Tensor, torch.cuda.Event]:
+    side = torch.cuda.Stream(source.device)
+    side.wait_stream(torch.cuda.current_stream(source.device))
+    with torch.cuda.stream(side):
+        held = torch.empty(source.shape, dtype=source.dtype, pin_memory=True)
+        held.copy_(source, non_blocking=True)
+        source.record_stream(side)  # or its memory could be given away before it is read
+        arrived = torch.cuda.Event(blocking=True)
+        arrived.record(side)
+    return held, arrived
+
+
+# --- from latents to pictures ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Pictures:
+    """One view on the CPU: pixels [S, T, 3, H, W], RGB; classes uint8 [S, T, H, W] or None.
+
+    pixels: float32 in [0, 1], or whole levels, uint8 in 0..255. finite: what was decoded held neither NaN nor Inf.
+    """
+
+    pixels: Tensor
+    classes: Tensor | None
+    finite: bool
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Coming:
+    """A decoded clip that may still be arriving. finite: bool, on the device."""
+
+    pixels: Download
+    classes: Download | None
+    finite: Tensor
+
+
+def decode(engine: Engine, latents: Tensor, painted: tuple[SemanticClass, ...], *, as_levels: bool) -> list[Pictures]:
+    """Decode view by view, one clip at a time; while one is decoded, the one before it arrives on the CPU.
+
+    latents: [V, S, T, C, h, w], unscaled: V views, S samples of each.
+    """
+    views = [[_decoded_clip(engine, clip, painted, as_levels=as_levels) for clip in view] for view in latents]
+    return [_arrived(clips) for clips in views]
+
+
+def _decoded_clip(engine: Engine, latents: Tensor, painted: tuple[SemanticClass, ...], *, as_levels: bool) -> _Coming:
+    """latents: [T, C, h, w]. Pixels [T, 3, H, W] and class ids [T, H, W]."""
+    decoded = engine.decode(latents)
+    pixels = to_pixels(decoded)
+    return _Coming(
+        pixels=Download(whole_levels(pixels) if as_levels else pixels),
+        classes=Download(nearest_classes(pixels, painted)) if painted else None,
+        finite=decoded.isfinite().all(),
+    )
+
+
+def whole_levels(pixels: Tensor) -> Tensor:
+    """[0, 1] -> uint8 in 0..255, the nearest level."""
+    return (pixels * 255).round().to(torch.uint8)
+
+
+def _arrived(clips: list[_Coming]) -> Pictures:
+    """The samples of one view."""
+    classes = [clip.classes.result() for clip in clips if clip.classes is not None]
+    return Pictures(
+        pixels=torch.stack([clip.pixels.result() for clip in clips]),
+        classes=torch.stack(classes) if classes else None,
+        finite=all(clip.finite.item() for clip in clips),
+    )
+
+
+# --- the door ------------------------------------------------------------------------------------------------------
+
+
 class Synthesizer:
     """A checkpoint ready to run.
 
@@ -106,7 +198,9 @@ class Synthesizer:
         self._config = networks.config
         networks.requires_grad_(False)
         prepare(networks)
-        self._engine: Engine = TorchEngine(networks) if engine is None else engine
+        if engine is None:
+            arrange(networks)
+        self._engine: Engine = engine or TorchEngine(networks)
 
     @property
     def traits(self) -> Traits:
@@ -151,7 +245,6 @@ class Synthesizer:
     def render(
         self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
     ) -> list[View]:
-        """See ViewSynthesizer."""
         options = RenderOptions() if options is None else options
         self._check_lengths(features, trajectories)
         buckets = [self._bucket(path, options) for path in trajectories]
@@ -231,8 +324,8 @@ class Synthesizer:
         )
 
     def _decode(self, job: "_Job", latents: Tensor) -> list[Pictures]:
-        finish = Finish(painted=self._traits.painted_classes, whole_levels=job.options.whole_levels)
-        pictures = decode(self._engine, latents / self._config.vae.scale, finish)
+        painted, as_levels = self._traits.painted_classes, job.options.whole_levels
+        pictures = decode(self._engine, latents / self._config.vae.scale, painted, as_levels=as_levels)
         if not all(view.finite for view in pictures):
             raise NonFiniteError(f"{self._traits.name} decoded to NaN or Inf; the weights are damaged")
         return pictures

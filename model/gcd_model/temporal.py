@@ -7,7 +7,6 @@ import torch
 from torch import Tensor, nn
 
 from gcd_model.layers import Attention, Derived, FeedForward, ResBlock, TokenAttention, embedding_mlp, sinusoid, zeroed
-from gcd_model.mapped import let_go
 
 
 class TemporalShare(Derived[Tensor]):
@@ -83,11 +82,6 @@ class FramePositions(Derived[Tensor]):
         super().__init__()
         self.channels, self.frames = channels, frames
         self.mlp = embedding_mlp(channels, 4 * channels, channels)
-
-    def keep(self) -> None:
-        """The table; its weights are read no more."""
-        super().keep()
-        let_go(self.mlp)
 
     def derive(self) -> Tensor:
         """The table, [T, C]."""

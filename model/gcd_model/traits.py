@@ -10,7 +10,6 @@ from torch import Tensor
 
 from gcd_model.config import ModelConfig, SemanticClass
 from gcd_model.errors import OptionError, PoseError, ViewFixedError, ViewRangeError
-from gcd_model.families import Family
 from gcd_model.geometry import (
     CameraMount,
     DeltaFit,
@@ -27,7 +26,8 @@ from gcd_model.geometry import (
     spherical_trajectory,
 )
 from gcd_model.live.config import LiveConfig
-from gcd_model.own_format import NO_DIFFUSION
+from gcd_model.weights.card import NO_DIFFUSION
+from gcd_model.weights.families import Family
 
 _LOG = logging.getLogger(__name__)
 _TOLERATED_M, _TOLERATED_DEG = 1e-3, 0.05

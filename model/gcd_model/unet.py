@@ -7,12 +7,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gcd_model.config import UNetConfig
-from gcd_model.frugal import frugal, laid_out, rows_at_once, silu
 from gcd_model.layers import Downsample, Layers, Upsample, embedding_mlp, sinusoid, zeroed
-from gcd_model.mapped import let_go
 from gcd_model.temporal import TemporalShare, VideoResBlock, VideoTransformer
 
 
@@ -97,14 +96,11 @@ class Stage(nn.Module):
 
     def plan(self, embedding: Tensor, tokens: Tensor | None, frames: int) -> StagePlan:
         """embedding: [S, N, E]. tokens: [N', D], one per frame of the whole batch."""
-        plan = StagePlan(
+        return StagePlan(
             self.res.spatial.project(embedding),
             self.res.temporal.project(embedding),
             *self._crosses(tokens, frames),
         )
-        if frugal(embedding):
-            let_go(self.res.spatial.embed, self.res.temporal.embed)
-        return plan
 
     def _crosses(self, tokens: Tensor | None, frames: int) -> tuple[Tensor | None, Tensor | None]:
         if self.attention is None or tokens is None:
@@ -112,10 +108,7 @@ class Stage(nn.Module):
         spatial, temporal = self.attention.spatial.token, self.attention.temporal.token
         assert spatial is not None, "tokens were given to a U-Net without cross-attention"
         assert temporal is not None, "tokens were given to a U-Net without cross-attention"
-        crosses = spatial(tokens), temporal(tokens[::frames])  # across frames only the first frame's token counts
-        if frugal(tokens):
-            let_go(spatial.value, spatial.out, temporal.value, temporal.out)
-        return crosses
+        return spatial(tokens), temporal(tokens[::frames])  # across frames only the first frame's token counts
 
     def forward(self, x: Tensor, inputs: StageInputs, frames: int | None) -> Tensor:
         """x: [N, C, h, w] -> [N, C', h, w]. frames: None for unrelated frames."""
@@ -215,40 +208,26 @@ class VideoUNet(nn.Module):
             image_mode: leave out every layer across frames; the rows are then unrelated frames, any number of them.
         Returns:
             [B*T, C, h, w].
-
-        Clips that are large together go through it one after the other: nothing of one is held for the next.
         """
         frames = None if image_mode else self.frames
-        clips = 1 if frames is None else len(latents) // frames
-        widest = self.stem.out_channels * latents.shape[-2:].numel()
-        if clips == 1 or rows_at_once(latents, widest) >= len(latents):
-            return self._together(latents, condition, inputs, frames)
-        each = zip(*(stage.split(clips) for stage in inputs), strict=True)
-        parts = zip(latents.chunk(clips), condition.chunk(clips), each, strict=True)
-        return torch.cat([self._together(*part, frames) for part in parts])
-
-    def _together(
-        self, latents: Tensor, condition: Tensor, inputs: Sequence[StageInputs], frames: int | None
-    ) -> Tensor:
         inputs_left = iter(inputs)
-        x = laid_out(self.stem(torch.cat([latents, condition], dim=1)))
+        x = self.stem(torch.cat([latents, condition], dim=1))
         skips = [x]
         for level in self.down:
             for stage in level.stages:
                 x = stage(x, next(inputs_left), frames)
                 skips.append(x)
             if level.down is not None:
-                x = laid_out(level.down(x))
+                x = level.down(x)
                 skips.append(x)
         for stage in self.middle:
             x = stage(x, next(inputs_left), frames)
         for level in self.up:
             for stage in level.stages:
-                x = torch.cat([x, skips.pop()], dim=1)  # so that nobody holds the two any more
-                x = stage(x, next(inputs_left), frames)
+                x = stage(torch.cat([x, skips.pop()], dim=1), next(inputs_left), frames)
             if level.up is not None:
-                x = laid_out(level.up(x))
-        return self.conv_out(silu(self.norm_out(x))).contiguous()
+                x = level.up(x)
+        return self.conv_out(F.silu(self.norm_out(x)))
 
     def start_apart(self) -> None:
         """Make all transformers across frames the identity too: for learning from single frames first, then clips."""

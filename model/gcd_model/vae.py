@@ -8,7 +8,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gcd_model.config import VAEConfig
-from gcd_model.frugal import silu
 from gcd_model.layers import Downsample, FrameConv, Layers, ResBlock, Upsample, zeroed
 from gcd_model.temporal import TemporalShare, VideoResBlock
 
@@ -93,7 +92,7 @@ class Encoder(nn.Module):
         """frames: [N, 3, H, W] in [-1, 1]."""
         x = frames if self.patch == 1 else F.pixel_unshuffle(frames, self.patch)
         x = self.middle(self.levels(self.stem(x)))
-        moments = self.conv_out(silu(self.norm_out(x)))
+        moments = self.conv_out(F.silu(self.norm_out(x)))
         if self.linear is not None:
             straight = self.linear(frames)  # [N, C, h, w], of the mean; the log-variance gets none
             moments = moments + F.pad(straight, (0, 0, 0, 0, 0, straight.shape[1]))
@@ -168,7 +167,7 @@ class TemporalDecoder(nn.Module):
         x = self.middle_out(self.middle_attention(x), frames)
         for level in self.levels:
             x = level(x, frames)
-        x = self.conv_out(silu(self.norm_out(x)))
+        x = self.conv_out(F.silu(self.norm_out(x)))
         if frames is not None:
             video = x.unflatten(0, (-1, frames)).transpose(1, 2)  # [B, 3 * patch^2, T, H / patch, W / patch]
             x = self.mix_frames(video).transpose(1, 2).flatten(0, 1)

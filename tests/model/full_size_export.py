@@ -14,9 +14,8 @@ import torch
 from torch import nn
 
 from gcd_model.config import SVD_14
+from gcd_model.engines.onnx_export import step_graph, write_graph
 from gcd_model.networks import empty_networks
-from gcd_model.onnx_export import write_graph
-from gcd_model.onnx_graphs import step_graph
 
 SMALL = 64
 """Numbers that make a tensor worth a place beside the graph: 256 bytes. Below are constants of shapes and shares."""

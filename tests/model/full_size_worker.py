@@ -27,6 +27,7 @@ from torch import Tensor, nn
 
 from gcd_model.conditioning import micro_conditioning
 from gcd_model.config import SVD_14
+from gcd_model.engines.cpu import arrange
 from gcd_model.layers import prepare
 from gcd_model.unet import VideoUNet
 
@@ -68,6 +69,7 @@ def _ours(weights: dict[str, Tensor]) -> Step:
         unet = VideoUNet(config, FRAMES)
     unet.load_state_dict(from_diffusers_unet(weights, unet), assign=True)
     prepare(unet)
+    arrange(unet)
 
     def step(latents: Tensor, tokens: Tensor) -> Tensor:
         vector = micro_conditioning(*MICRO, config.vector_width).expand(FRAMES, -1)

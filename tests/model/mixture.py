@@ -5,8 +5,7 @@ from torch import Tensor
 
 from gcd_model.clip import SolverName
 from gcd_model.config import SamplingConfig
-from gcd_model.noise import edm_sigmas
-from gcd_model.sampler import sample, solver_steps
+from gcd_model.diffusion import edm_sigmas, sample, solver_steps
 
 PUBLISHED = SamplingConfig()
 CENTRES = draw(24, 32, seed=2).double()

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from gcd_model.config import ImageEncoderConfig, UNetConfig, VAEConfig
 from gcd_model.unet import VideoUNet
-from gcd_model.weight_names import GCD_UNET, Form, Levels, diffusers_source, gcd_source
+from gcd_model.weights.names import GCD_UNET, Form, Levels, diffusers_source, gcd_source
 
 
 def levels_of(

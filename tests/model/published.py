@@ -14,12 +14,12 @@ from safetensors.torch import load_file, save_file
 from small_models import randomise
 from torch import Tensor
 
-from gcd_model.architecture import Naming
-from gcd_model.checkpoints import load_weights
 from gcd_model.config import ImageEncoderConfig, ModelConfig, UNetConfig, VAEConfig
 from gcd_model.errors import CheckpointError
 from gcd_model.networks import Networks
-from gcd_model.weight_names import Levels, Source, diffusers_source, gcd_source
+from gcd_model.weights.infer import Naming
+from gcd_model.weights.load import load_weights
+from gcd_model.weights.names import Levels, Source, diffusers_source, gcd_source
 
 MANIFEST = Path(__file__).parents[2].parent / "shared" / "spec" / "checkpoint-manifest.json.gz"
 

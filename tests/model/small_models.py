@@ -14,10 +14,10 @@ from gcd_model.config import (
     UNetConfig,
     VAEConfig,
 )
-from gcd_model.families import DRIVING_SEMANTIC, KUBRIC90
 from gcd_model.networks import Networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
+from gcd_model.weights.families import DRIVING_SEMANTIC, KUBRIC90
 
 UNET = UNetConfig(
     width=64,

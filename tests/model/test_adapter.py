@@ -8,13 +8,12 @@ import torch
 from published import SMALL_GCD, filled, fixed_view, shared_vae, write_diffusers, write_gcd, write_svd
 from small_models import draw
 
-from gcd_model.adapter import Adapter, adapted, base_digest
-from gcd_model.carry_over import DIFFUSION, carried_over, unshared
-from gcd_model.checkpoints import convert_weights, load_adapted, load_weights, read_adapter
 from gcd_model.errors import CheckpointError
 from gcd_model.loading import load_synthesizer
-from gcd_model.own_format import Card
-from gcd_model.weights_export import write_adapter
+from gcd_model.weights.adapter import DIFFUSION, Adapter, adapted, base_digest, carried_over, unshared
+from gcd_model.weights.card import Card
+from gcd_model.weights.load import convert_weights, load_adapted, load_weights, read_adapter
+from gcd_model.weights.save import write_adapter
 
 LAYER = "unet.middle.0.attention.spatial.attention.query"
 RANK, ALPHA = 3, 6.0
@@ -123,12 +122,6 @@ def test_a_model_without_camera_gives_all_but_the_camera() -> None:
     state = filled(FIXED).state_dict()
     assert set(over.weights) == set(state)
     assert all(over.weights[name] is not None and torch.equal(over.weights[name], state[name]) for name in state)
-
-
-def test_another_control_starts_its_camera_anew_and_no_control_leaves_it_out() -> None:
-    assert len(carried_over(filled(), SMALL_GCD).fresh) == 0
-    assert carried_over(filled(), FIXED).fresh == ()
-    assert set(carried_over(filled(), FIXED).weights) == set(filled(FIXED).state_dict())
 
 
 def test_from_scratch_keeps_autoencoders_and_image_tower_alone() -> None:

@@ -11,24 +11,22 @@ import torch
 from published import (
     SMALL_GCD,
     assert_same_weights,
-    diffusers_parts,
     filled,
     fixed_view,
     gcd_state,
     refused,
     shared_vae,
     split_in_shards,
-    stem_of,
     write_diffusers,
     write_gcd,
     write_lightning,
     write_svd,
 )
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor
 
-from gcd_model.checkpoints import digest, inspect_weights, load_weights
 from gcd_model.networks import Networks
+from gcd_model.weights.load import digest, inspect_weights, load_weights
 
 UNET = "model.diffusion_model"
 CONV = f"{UNET}.input_blocks.1.0.in_layers.2.weight"
@@ -68,13 +66,6 @@ def test_a_float16_variant_keeps_its_precision_until_asked(tmp_path: Path) -> No
         torch.testing.assert_close(tensor, wanted[name].half(), rtol=0, atol=0, msg=name)
 
 
-def test_full_precision_is_preferred_to_its_float16_variant(tmp_path: Path) -> None:
-    folder = write_diffusers(tmp_path / "model")
-    for part, state in diffusers_parts().items():
-        save_file({k: v.half() for k, v in state.items()}, folder / part / f"{stem_of(part)}.fp16.safetensors")
-    assert load_weights(folder).networks.unet.stem.weight.dtype == torch.float32
-
-
 def test_a_sharded_part_is_put_together(tmp_path: Path) -> None:
     folder = split_in_shards(write_diffusers(tmp_path / "model") / "unet")
     assert_same_weights(load_weights(folder.parent).networks, filled(shared_vae(SMALL_GCD)))
@@ -86,11 +77,6 @@ def test_a_part_written_as_a_pickle_loads_too(tmp_path: Path) -> None:
     torch.save(load_file(whole), whole.with_suffix(".bin"))
     whole.unlink()
     assert_same_weights(load_weights(folder).networks, filled(shared_vae(SMALL_GCD)))
-
-
-def test_a_plain_dictionary_of_tensors_counts_as_a_state(tmp_path: Path) -> None:
-    torch.save(gcd_state(filled()), tmp_path / "weights.pt")
-    assert_same_weights(load_weights(tmp_path / "weights.pt").networks, filled())
 
 
 def test_the_layout_is_told_by_content_not_by_suffix(tmp_path: Path) -> None:
@@ -174,18 +160,6 @@ def test_missing_weights_are_counted_and_the_first_five_named(tmp_path: Path) ->
     assert len(names) > 5
     total = len(filled().state_dict())
     assert message.startswith(f"{len(names)} of {total} weights are missing, first: {', '.join(names[:5])}. Nothing")
-
-
-def test_unexpected_weights_are_counted_and_the_first_five_named(tmp_path: Path) -> None:
-    extra = {f"{UNET}.control.{i}": torch.zeros(1) for i in range(7)}
-    message = refused(changed(tmp_path, lambda state: state.update(extra)))
-    assert message.startswith(f"7 unexpected names, first: {', '.join(list(extra)[:5])}. Nothing")
-
-
-def test_misshapen_weights_are_counted_and_both_shapes_given(tmp_path: Path) -> None:
-    message = refused(changed(tmp_path, lambda state: state.update({CONV: torch.zeros(32, 32, 1, 1)})))
-    assert f"1 of {len(filled().state_dict())} weights are misshapen" in message
-    assert f"{CONV} wants [32, 32, 3, 3], got [32, 32, 1, 1]" in message
 
 
 def test_all_that_does_not_fit_is_said_at_once(tmp_path: Path) -> None:

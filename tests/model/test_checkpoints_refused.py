@@ -22,7 +22,7 @@ from published import (
 )
 from safetensors.torch import save_file
 
-from gcd_model.checkpoints import inspect_weights, load_weights
+from gcd_model.weights.load import inspect_weights, load_weights
 
 UNET = "model.diffusion_model"
 CONV = f"{UNET}.input_blocks.1.0.in_layers.2.weight"
@@ -167,14 +167,6 @@ def test_what_is_no_checkpoint_is_named_with_a_remedy(tmp_path: Path, content: b
     if name.endswith(".safetensors") and content.startswith(b"PK"):
         said = "rename it to .ckpt"
     assert said in refused(path)
-
-
-def test_files_of_the_old_format_are_refused_by_name(tmp_path: Path) -> None:
-    path = tmp_path / "old.ckpt"
-    torch.save({"state_dict": gcd_state(filled())}, path, _use_new_zipfile_serialization=False)
-    message = refused(path)
-    assert "old format" in message
-    assert "torch.save" in message
 
 
 def test_zips_of_another_kind_are_refused(tmp_path: Path) -> None:

@@ -11,15 +11,14 @@ import torch
 from small_models import TINY, random_clip, relative_error, tiny_synthesizer
 
 from gcd_model.clip import RenderOptions
-from gcd_model.compiled_regions import twin
-from gcd_model.cuda_engine import CudaEngine, CudaOptions
+from gcd_model.engines.cuda import CudaEngine, CudaOptions, twin
 from gcd_model.geometry import SphericalDelta
 from gcd_model.synthesizer import Synthesizer
 
 _ONE_REGION = """
 import json, torch
 from pathlib import Path
-from gcd_model.compiled_regions import compile_regions, keep_compiled
+from gcd_model.engines.cuda import compile_regions, keep_compiled
 from gcd_model.layers import ResBlock
 keep_compiled(Path({folder!r}))
 block = ResBlock(8, 8, groups=4, eps=1e-6).eval().to({device!r})

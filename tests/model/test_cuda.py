@@ -11,15 +11,13 @@ from small_models import TINY, TINY_DRIVING, random_clip, relative_error, tiny_d
 
 from gcd_model.clip import RenderOptions, View
 from gcd_model.config import SVD_14, ModelConfig
-from gcd_model.cuda_engine import CudaEngine, CudaOptions
-from gcd_model.download import Download
+from gcd_model.engines.cuda import CudaEngine, CudaOptions
 from gcd_model.errors import Cancelled
-from gcd_model.families import KUBRIC90
 from gcd_model.geometry import SphericalDelta
-from gcd_model.measuring.subject import still_clip
 from gcd_model.networks import random_networks
-from gcd_model.synthesizer import Synthesizer
+from gcd_model.synthesizer import Download, Synthesizer
 from gcd_model.traits import Traits
+from gcd_model.weights.families import KUBRIC90
 
 pytestmark = [
     pytest.mark.gpu,
@@ -206,7 +204,7 @@ def test_a_full_size_window_equals_plain_torch_within_bfloat16_and_ten_gigabytes
     for module in networks.children():
         module.to("cuda", torch.bfloat16)
     networks.decoder.float()
-    clip, path = still_clip(14, 256, 384, 12.0), traits.plan_view(SphericalDelta(azimuth_deg=30.0))
+    clip, path = random_clip(SVD_14), traits.plan_view(SphericalDelta(azimuth_deg=30.0))
     options = RenderOptions(steps=2)
     plain = Synthesizer(networks, traits)
     features = plain.encode(clip)

@@ -1,15 +1,11 @@
 """When the decoder may compute in bfloat16."""
 
-import math
-
 import pytest
 import torch
 from small_models import TINY, tiny_synthesizer
 from torch import nn
 
-from gcd_model.compiled_regions import twin
-from gcd_model.cuda_engine import CudaEngine, CudaOptions
-from gcd_model.decoder_check import checked_decoder, drifting_clip, psnr_db
+from gcd_model.engines.cuda import CudaEngine, CudaOptions, checked_decoder, twin
 from gcd_model.networks import Networks
 
 
@@ -43,12 +39,6 @@ def test_a_decoder_whose_pictures_change_stays_in_float32(networks: Networks) ->
     assert choice.decoder is networks.decoder
 
 
-def test_a_decoder_that_overflows_stays_in_float32(networks: Networks) -> None:
-    with torch.no_grad():
-        networks.decoder.stem.weight.fill_(math.inf)
-    assert checked_decoder(networks).psnr_db == 0
-
-
 @pytest.mark.parametrize(("faint", "dtype"), [(True, torch.bfloat16), (False, torch.float32)])
 def test_the_engine_takes_the_decoder_that_was_chosen(networks: Networks, faint: bool, dtype: torch.dtype) -> None:
     if faint:
@@ -58,17 +48,3 @@ def test_the_engine_takes_the_decoder_that_was_chosen(networks: Networks, faint:
     assert taken.decoder.stem.weight.dtype == dtype
     assert networks.decoder.stem.weight.dtype == torch.float32
     assert engine.decode(torch.zeros(TINY.frames, 4, 2, 2)).dtype == torch.float32
-
-
-def test_the_test_clip_moves_and_stays_in_range() -> None:
-    clip = drifting_clip(3, 32, 64)
-    assert clip.shape == (3, 3, 32, 64)
-    assert clip.abs().max() <= 1
-    assert torch.equal(clip[1], clip[0].roll(1, dims=-1))
-    assert clip.std() > 0.1
-
-
-def test_psnr_is_that_of_pictures_in_zero_to_one() -> None:
-    assert psnr_db(torch.full((4,), 0.6), torch.full((4,), 0.5)) == pytest.approx(20.0, abs=1e-4)
-    assert psnr_db(torch.ones(3), torch.ones(3)) == math.inf
-    assert psnr_db(torch.full((3,), math.nan), torch.ones(3)) == 0

@@ -14,10 +14,6 @@ def max180(azimuth_deg: float, elevation_deg: float, high: float = 255.0) -> int
     return motion_bucket(delta, max_azimuth_deg=180.0, max_elevation_deg=60.0, high=high)
 
 
-def test_the_motion_number_does_not_care_for_direction() -> None:
-    assert {max90(a, e) for a in (-40.0, 40.0) for e in (-20.0, 20.0)} == {max90(40.0, 20.0)}
-
-
 def test_the_motion_number_is_255_only_with_both_angles_at_their_largest() -> None:
     assert max90(90.0, 30.0) == max180(180.0, 60.0) == 255
     assert max90(90.0, 0.0) == max180(180.0, 0.0) == 242
@@ -34,11 +30,6 @@ def test_the_recorded_denominators_of_the_motion_number() -> None:
     assert max90(1.0, 0.0, high=94.868e6) == pytest.approx(1e6, rel=1e-5)
     assert max180(1.0, 0.0, high=189.737e6) == pytest.approx(1e6, rel=1e-5)
     assert max90(30.0, 15.0) == 90
-
-
-def test_the_motion_number_starts_at_its_low_end() -> None:
-    still = SphericalDelta(radius_m=-1.0)
-    assert motion_bucket(still, max_azimuth_deg=90.0, max_elevation_deg=30.0, low=100.0, high=200.0) == 100
 
 
 def test_the_motion_number_needs_a_largest_angle() -> None:

@@ -29,16 +29,16 @@ from gcd_model import (
     SphericalDelta,
     View,
     convert_weights,
-    driving_trajectory,
     inspect_weights,
     load_synthesizer,
     visibility_of,
 )
-from gcd_model.checkpoints import load_weights
+from gcd_model.geometry import driving_trajectory
 from gcd_model.live.config import LIVE_TINY
 from gcd_model.live.synthesizer import LiveSynthesizer, save_live
 from gcd_model.live.view import LiveNetworks
 from gcd_model.networks import random_networks
+from gcd_model.weights.load import load_weights
 
 
 @pytest.fixture(scope="module")

@@ -38,13 +38,6 @@ def test_a_checkpoint_with_extra_condition_channels_wants_exactly_those(channels
     assert synthesizer.render(features, [path(synthesizer)])[0].samples.isfinite().all()
 
 
-def test_one_autoencoder_may_serve_both_source_and_target_frames() -> None:
-    shared = msgspec.structs.replace(TINY, vae=msgspec.structs.replace(TINY.vae, shared=True))
-    synthesizer = tiny_synthesizer(shared)
-    assert synthesizer.networks.condition_encoder is synthesizer.networks.target_encoder
-    assert synthesize(synthesizer, random_clip(), path(synthesizer)).samples.isfinite().all()
-
-
 def test_a_model_without_image_tower_has_no_tokens_and_still_renders() -> None:
     unet = msgspec.structs.replace(TINY.unet, context_width=None)
     synthesizer = tiny_synthesizer(msgspec.structs.replace(TINY, unet=unet, image_encoder=None))

@@ -3,8 +3,8 @@
 import torch
 
 from gcd_model import Clip, load_synthesizer
-from gcd_model.checkpoints import inspect_weights
 from gcd_model.loading import PACKAGED
+from gcd_model.weights.load import inspect_weights
 
 WEIGHTS = PACKAGED / "live-small.safetensors"
 MEGABYTES = 16

@@ -2,7 +2,7 @@
 
 import pytest
 
-from gcd_model.provenance import Provenance, combined, told_by_name, told_by_yaml
+from gcd_model.weights.families import Provenance, combined, told_by_name, told_by_yaml
 
 NAMES = [
     ("kubric_gradual_max90", "kubric90", 13),

@@ -1,7 +1,6 @@
 """The sampler: noise levels, preconditioning, guidance, Euler steps, and the whole of it against a plain reference."""
 
 import math
-import threading
 from collections.abc import Callable
 from itertools import pairwise
 
@@ -13,9 +12,16 @@ from torch.testing import assert_close
 
 from gcd_model.clip import SOLVERS, SolverName
 from gcd_model.config import SamplingConfig
-from gcd_model.errors import Cancelled
-from gcd_model.noise import edm_sigmas, guidance_scale, preconditioning, unit_noise
-from gcd_model.sampler import guided, multistep_steps, sample, solver_steps
+from gcd_model.diffusion import (
+    edm_sigmas,
+    guidance_scale,
+    guided,
+    multistep_steps,
+    preconditioning,
+    sample,
+    solver_steps,
+    unit_noise,
+)
 
 PUBLISHED = SamplingConfig()
 
@@ -63,25 +69,12 @@ def test_a_network_that_predicts_v_exactly_makes_the_denoiser_exact(sigma: float
     assert_close(c.c_skip * noisy + c.c_out * v, clean, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("sigma", [0.6, 80.0])
-def test_a_network_that_predicts_the_clean_sample_is_the_denoiser(sigma: float) -> None:
-    level = torch.tensor(sigma, dtype=torch.float64)
-    ours, published = preconditioning(level, "x0"), preconditioning(level)
-    assert (ours.c_skip.item(), ours.c_out.item()) == (0.0, 1.0)
-    assert (ours.c_in, ours.c_noise) == (published.c_in, published.c_noise)
-
-
 def test_preconditioning_has_the_published_coefficients() -> None:
     c = preconditioning(torch.tensor([3.0], dtype=torch.float64))
     assert c.c_skip.item() == pytest.approx(1 / 10)
     assert c.c_out.item() == pytest.approx(-3 / math.sqrt(10))
     assert c.c_in.item() == pytest.approx(1 / math.sqrt(10))
     assert c.c_noise.item() == pytest.approx(0.25 * math.log(3))
-
-
-def test_noisy_input_has_unit_variance_after_c_in() -> None:
-    for sigma in edm_sigmas(PUBLISHED, 25)[:-1]:
-        assert (preconditioning(sigma).c_in ** 2 * (1 + sigma**2)).item() == pytest.approx(1.0)
 
 
 def test_guidance_rises_linearly_from_the_first_frame_to_the_last() -> None:
@@ -98,22 +91,6 @@ def test_guidance_moves_each_frame_away_from_the_unconditional_prediction_by_its
     assert_close(result[:, 0], unconditional[:, 0])
     assert_close(result[:, 1], conditional[:, 1])
     assert_close(result[:, 2], 2.5 * conditional[:, 2] - 1.5 * unconditional[:, 2])
-
-
-def test_euler_reaches_a_constant_prediction_exactly() -> None:
-    target = draw(3).double()
-    sigmas = edm_sigmas(PUBLISHED, 7)
-    assert_close(follow(lambda _x, _i: target, draw(3, seed=1).double() * 700, sigmas), target)
-
-
-@pytest.mark.parametrize("slope", [0.0, 0.3, 0.9])
-def test_euler_follows_the_closed_form_for_a_denoiser_that_scales(slope: float) -> None:
-    sigmas = edm_sigmas(PUBLISHED, 25)
-    start = draw(4).double()
-    factor = 1.0
-    for sigma, following in pairwise(sigmas.tolist()):
-        factor *= slope + (1 - slope) * following / sigma
-    assert_close(follow(lambda x, _i: slope * x, start, sigmas), start * factor)
 
 
 @pytest.mark.parametrize(("solver", "order", "bound"), [("euler", 1, 0.02), ("dpmpp_2m", 2, 0.0005)])
@@ -156,27 +133,6 @@ def test_every_step_of_a_solver_weighs_its_terms_to_one_and_the_last_leaves_no_n
     assert [step.keep + step.new + step.before for step in made] == pytest.approx([1.0] * steps)
     assert (made[-1].keep, made[-1].before) == (0.0, 0.0)
     assert made[0].before == 0.0
-
-
-def test_progress_counts_every_step_once() -> None:
-    seen: list[tuple[int, int]] = []
-    steps = solver_steps("euler", edm_sigmas(PUBLISHED, 4))
-    sample(lambda x, _i: x, draw(2), steps, progress=lambda done, total: seen.append((done, total)))
-    assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
-
-
-def test_a_cancelled_run_stops_before_the_next_network_evaluation() -> None:
-    stop, evaluations = threading.Event(), list[int]()
-
-    def denoise(x: Tensor, i: int) -> Tensor:
-        evaluations.append(i)
-        if i == 1:
-            stop.set()
-        return x
-
-    with pytest.raises(Cancelled, match="before step 3 of 5"):
-        sample(denoise, draw(2), solver_steps("euler", edm_sigmas(PUBLISHED, 5)), cancel=stop)
-    assert evaluations == [0, 1]
 
 
 def test_unit_noise_is_fixed_by_seed_and_stream_and_differs_between_them() -> None:

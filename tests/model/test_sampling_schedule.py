@@ -9,10 +9,9 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from gcd_model.clip import RenderOptions
-from gcd_model.engine import TorchEngine
+from gcd_model.diffusion import Schedule
 from gcd_model.errors import OptionError
 from gcd_model.geometry import SphericalDelta
-from gcd_model.schedule import Schedule
 from gcd_model.synthesizer import Synthesizer, synthesize
 from gcd_model.unet import StageInputs
 
@@ -27,12 +26,6 @@ def synthesizer() -> Synthesizer:
 def latents(synthesizer: Synthesizer, options: RenderOptions) -> Tensor:
     path = synthesizer.traits.plan_view(SphericalDelta(azimuth_deg=30.0))
     return synthesize(synthesizer, random_clip(), path, replace(options, steps=STEPS)).latents
-
-
-def test_as_it_is_a_schedule_is_the_checkpoints_own() -> None:
-    schedule = Schedule.of(TINY)
-    assert (len(schedule.steps), schedule.branches, schedule.evaluations) == (3, 2, 6)
-    assert schedule.guided == (True, True, True)
 
 
 def test_guidance_applies_within_its_interval_alone() -> None:
@@ -79,34 +72,7 @@ def test_unguided_steps_of_a_guided_run_equal_those_of_an_unguided_one(synthesiz
     assert_close(latents(synthesizer, ones), latents(synthesizer, RenderOptions(guidance=(1.0, 1.0))))
 
 
-def test_the_multistep_solver_is_nearer_to_many_steps_than_euler_is(synthesizer: Synthesizer) -> None:
-    path = synthesizer.traits.plan_view(SphericalDelta(azimuth_deg=30.0))
-
-    def drawn(steps: int, options: RenderOptions) -> Tensor:
-        return synthesize(synthesizer, random_clip(), path, replace(options, steps=steps)).latents
-
-    truth = drawn(100, RenderOptions(solver="dpmpp_2m"))
-    plain, second = (drawn(25, RenderOptions(solver=name)) for name in ("euler", "dpmpp_2m"))
-    assert (second - truth).norm() < 0.5 * (plain - truth).norm()
-
-
 @pytest.mark.parametrize("interval", [(2.0, 1.0), (-1.0, 1.0), (float("nan"), 1.0)])
 def test_an_interval_that_is_none_is_refused(interval: tuple[float, float]) -> None:
     with pytest.raises(OptionError, match="guidance_interval goes from a noise level up to another"):
         RenderOptions(guidance_interval=interval)
-
-
-def test_another_engine_computes_the_networks_of_a_synthesizer() -> None:
-    plain = tiny_synthesizer()
-
-    class Louder(TorchEngine):
-        """A stand-in whose pictures are all white."""
-
-        def decode(self, latents: Tensor) -> Tensor:
-            return torch.ones_like(super().decode(latents))
-
-    louder = Synthesizer(plain.networks, plain.traits, Louder(plain.networks))
-    path = plain.traits.plan_view(SphericalDelta(azimuth_deg=30.0))
-    ours, theirs = (synthesize(each, random_clip(), path) for each in (plain, louder))
-    assert theirs.video.min() == 1.0
-    assert torch.equal(ours.latents, theirs.latents)

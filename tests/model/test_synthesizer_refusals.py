@@ -106,12 +106,6 @@ def test_without_a_family_the_motion_number_must_be_given() -> None:
     assert view.motion_bucket == 127.0
 
 
-@pytest.mark.parametrize("fps", [0.0, -1.0, float("inf"), float("nan")])
-def test_a_clip_needs_a_positive_finite_frame_rate(fps: float) -> None:
-    with pytest.raises(OptionError, match="positive number"):
-        Clip(video=torch.zeros(2, 3, 8, 8), fps=fps)
-
-
 def test_features_of_another_kind_are_not_joined() -> None:
     latents = torch.zeros(2, 4, 1, 1)
     plain = SourceFeatures(tokens=None, latents=latents, extra=None, fps=12.0, augmentation=0.02)

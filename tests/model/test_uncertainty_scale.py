@@ -10,10 +10,10 @@ from safetensors.torch import save_file
 from small_models import TINY, random_clip, tiny_synthesizer, tiny_traits
 
 from gcd_model import RenderOptions, SphericalDelta, Synthesizer, convert_weights, inspect_weights, load_synthesizer
-from gcd_model.checkpoints import load_weights, save_weights
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.networks import random_networks
-from gcd_model.own_format import Card
+from gcd_model.weights.card import Card
+from gcd_model.weights.load import load_weights, save_weights
 
 CARD = Card(name="small", config=TINY, family="kubric90", move_time=13, uncertainty_scale=1.75)
 
@@ -29,10 +29,6 @@ def test_a_card_survives_the_round_trip() -> None:
     for scale in (1.75, 0.1 + 0.2, 31.0, None):
         card = replace(CARD, uncertainty_scale=scale)
         assert Card.from_metadata(card.to_metadata()) == card
-
-
-def test_without_a_scale_the_metadata_is_as_it_was() -> None:
-    assert not any("uncertainty" in key for key in replace(CARD, uncertainty_scale=None).to_metadata())
 
 
 def test_the_scale_comes_with_the_weights(file: Path) -> None:

@@ -86,10 +86,6 @@ def test_the_parameters_that_see_more_than_one_frame_are_as_many_as_published(fu
     assert sum(temporal) == 656_076_838
 
 
-def test_height_and_width_must_be_multiples_of_64_at_full_size() -> None:
-    assert SVD_14.size_factor == 64
-
-
 # --- what is computed once ---------------------------------------------------------------------------------------
 
 

@@ -1,6 +1,5 @@
 """Published names: a bijection, at full size and at others, and the facts the manifest's shapes cannot tell."""
 
-from dataclasses import replace
 from functools import lru_cache
 
 import msgspec
@@ -8,12 +7,20 @@ import pytest
 import torch
 from published import SMALL_GCD, diffusers_manifest, fixed_view, manifest, shared_vae, taken_apart
 
-from gcd_model.architecture import Hints, Naming, Shapes, diffusers_levels, gcd_levels, infer_config
 from gcd_model.config import SVD_14, ModelConfig, UNetConfig
 from gcd_model.errors import CheckpointError
-from gcd_model.matching import Match, match_weights
 from gcd_model.networks import empty_networks
-from gcd_model.weight_names import Form, Levels, Source, assembled, diffusers_source, gcd_source
+from gcd_model.weights.infer import (
+    Hints,
+    Match,
+    Naming,
+    Shapes,
+    diffusers_levels,
+    gcd_levels,
+    infer_config,
+    match_weights,
+)
+from gcd_model.weights.names import Form, Levels, Source, assembled, diffusers_source, gcd_source
 
 UNET = "model.diffusion_model"
 SVD_FIXED = fixed_view(SVD_14)
@@ -280,10 +287,3 @@ def test_further_condition_channels_are_told_by_the_stem() -> None:
     shapes = published_shapes(SMALL_GCD, gcd_source) | {f"{UNET}.input_blocks.0.0.weight": (32, 11, 3, 3)}
     config = infer_config(shapes, gcd_source, gcd_levels(shapes), Hints())
     assert config.extra_condition_channels == 3
-
-
-def test_levels_of_a_config_are_those_of_its_names() -> None:
-    shapes = published_shapes(DEEP, gcd_source)
-    found = gcd_levels(shapes)
-    assert replace(found, attention=DEEP.unet.attention) == Levels.of(DEEP)
-    assert len(found.attention) == 3

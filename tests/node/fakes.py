@@ -12,10 +12,7 @@ from msgspec.structs import replace as struct_replace
 
 from gcd_client.protocol import EndMessage, OriginHeader, StatusTopic, ViewMessage
 from gcd_model import (
-    DRIVING_CLASSES,
     FAMILIES,
-    PLAIN_SMALL,
-    SMALL,
     Augmentation,
     Clip,
     RenderOptions,
@@ -26,6 +23,7 @@ from gcd_model import (
     ViewSynthesizer,
     load_synthesizer,
 )
+from gcd_model.config import DRIVING_CLASSES, PLAIN_SMALL, SMALL
 from gcd_node.config import NodeConfig, parse_config
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.inference import WindowReport

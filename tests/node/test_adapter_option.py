@@ -6,11 +6,11 @@ import pytest
 import torch
 from tiny_weights import write_tiny
 
-from gcd_model.adapter import Adapter, base_digest
-from gcd_model.checkpoints import load_weights
 from gcd_model.errors import CheckpointError
-from gcd_model.own_format import Card
-from gcd_model.weights_export import write_adapter
+from gcd_model.weights.adapter import Adapter, base_digest
+from gcd_model.weights.card import Card
+from gcd_model.weights.load import load_weights
+from gcd_model.weights.save import write_adapter
 from gcd_node.check import check_launch
 from gcd_node.config import NodeConfig, parse_config
 from gcd_node.session import load_model

@@ -121,7 +121,8 @@ def test_several_samples_come_with_a_picture_of_where_they_differ(clip: Path, tm
 
 
 def test_poses_near_the_sphere_are_taken(clip: Path, tmp_path: Path) -> None:
-    from gcd_model import ASSUMED_SOURCE, SphericalDelta, spherical_trajectory
+    from gcd_model import ASSUMED_SOURCE, SphericalDelta
+    from gcd_model.geometry import spherical_trajectory
 
     path = spherical_trajectory(ASSUMED_SOURCE, SphericalDelta(azimuth_deg=20.0), frames=14, move_time=13)
     np.save(tmp_path / "poses.npy", path.source_from_target.numpy())

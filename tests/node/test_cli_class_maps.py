@@ -11,7 +11,8 @@ import torch
 from fakes import FakeSynthesizer, live_traits
 from tiny_weights import HEIGHT, WIDTH, write_tiny
 
-from gcd_model import DRIVING_CLASSES, CameraMount
+from gcd_model import CameraMount
+from gcd_model.config import DRIVING_CLASSES
 from gcd_node.cli import offline as cli_offline
 from gcd_node.cli.main import run_app
 from gcd_node.image_io import write_video

@@ -21,12 +21,6 @@ threads = 1
 """
 
 
-def test_two_precisions_exclude_each_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["export", "--weights", "random:driving", "--onnx", str(tmp_path / "out"), "--fp16", "--int8"]
-    assert run_app(command) == 64
-    assert "--fp16 and --int8 exclude each other" in capsys.readouterr().err
-
-
 def test_an_export_over_a_folder_of_mine_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("onnxscript", reason="needs the extra `onnx`")
     assert run_app(["export", "--weights", "random:driving", "--onnx", str(tmp_path), "--overwrite"]) == 64

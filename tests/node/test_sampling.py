@@ -2,7 +2,8 @@
 
 from typing import get_args, get_type_hints
 
-from gcd_model import QUALITIES, SOLVERS, RenderOptions
+from gcd_model import RenderOptions
+from gcd_model.clip import QUALITIES, SOLVERS
 from gcd_node.config import ModelSection
 from gcd_node.stream_context import drawing_options
 

@@ -4,10 +4,10 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from gcd_model import DRIVING_CLASSES, PLAIN_SMALL
-from gcd_model.checkpoints import save_weights
+from gcd_model.config import DRIVING_CLASSES, PLAIN_SMALL
 from gcd_model.networks import random_networks
-from gcd_model.own_format import Card
+from gcd_model.weights.card import Card
+from gcd_model.weights.load import save_weights
 
 HEIGHT, WIDTH = 64, 96
 UNET = replace(PLAIN_SMALL.unet, width=16, head_width=16, embedding_width=32)

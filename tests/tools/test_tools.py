@@ -31,6 +31,16 @@ def test_a_model_is_measured_with_its_memory_and_shown_again(tmp_path: Path) -> 
 
 
 @pytest.mark.timeout(600)
+def test_diffusers_computes_the_same_window_on_the_same_weights(tmp_path: Path) -> None:
+    out = tmp_path / "b.json"
+    size = ["--height", "64", "--width", "64", "--steps", "2", "--repeats", "1", "--warm", "0", "--threads", "1"]
+    ran("bench_model.py", "--weights", "random:kubric90", *size, "--peer", "diffusers", "--json", str(out))
+    (difference,) = json.loads(out.read_text())["report"]["differences"]
+    assert difference["latents"] < 1e-4
+    assert difference["pictures"] < 1e-4
+
+
+@pytest.mark.timeout(600)
 def test_a_short_soak_ends_with_nothing_left_behind(tmp_path: Path) -> None:
     command = [sys.executable, str(TOOLS / "soak.py"), "--hours", "0.004", "--json", str(tmp_path / "soak.json")]
     subprocess.run(command, capture_output=True, text=True, check=False)  # 1 if it is too short to settle

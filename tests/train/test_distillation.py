@@ -10,12 +10,12 @@ from test_training_run import assert_same
 from tiny_driving import smaller
 from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips
 
-from gcd_model import SVD_14, Clip, RenderOptions, Synthesizer, Traits, load_synthesizer
-from gcd_model.checkpoints import load_weights, read_adapter, save_weights
-from gcd_model.config import DRIVING_CLASSES
-from gcd_model.families import FAMILIES
+from gcd_model import Clip, RenderOptions, Synthesizer, Traits, load_synthesizer
+from gcd_model.config import DRIVING_CLASSES, SVD_14
 from gcd_model.networks import Networks, random_networks
-from gcd_model.own_format import Card
+from gcd_model.weights.card import Card
+from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.load import load_weights, read_adapter, save_weights
 from gcd_train.batches import PixelBatches
 from gcd_train.checkpoint import load_state
 from gcd_train.datasets.clip_source import to_network

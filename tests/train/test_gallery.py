@@ -19,7 +19,6 @@ from typer.testing import CliRunner
 
 from gcd_model import (
     FAMILIES,
-    SMALL,
     Augmentation,
     CameraMount,
     Clip,
@@ -32,6 +31,7 @@ from gcd_model import (
     ViewRangeError,
     load_synthesizer,
 )
+from gcd_model.config import SMALL
 from gcd_train.cli.gallery import gallery_command
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.gallery import ViewRecipe, WindowChoice, Windowed, find_videos, read_windows, view_window

@@ -11,11 +11,11 @@ from torch import Tensor
 from torch.testing import assert_close
 from typer.testing import CliRunner
 
-from gcd_model.adapter import adapted, base_digest
-from gcd_model.checkpoints import load_adapted, load_weights, read_adapter, save_weights
 from gcd_model.config import SVD_14
 from gcd_model.networks import Networks, empty_networks, random_networks
-from gcd_model.own_format import Card
+from gcd_model.weights.adapter import adapted, base_digest
+from gcd_model.weights.card import Card
+from gcd_model.weights.load import load_adapted, load_weights, read_adapter, save_weights
 from gcd_train.checkpoint import load_state
 from gcd_train.cli.main import app
 from gcd_train.errors import RecipeError

@@ -9,8 +9,8 @@ from tiny_world import FRAMES, TinyClips, tiny_recipe
 from torch import Tensor
 from torch.testing import assert_close
 
+from gcd_model.diffusion import preconditioning
 from gcd_model.networks import Networks, random_networks
-from gcd_model.noise import preconditioning
 from gcd_train.batches import PixelBatches
 from gcd_train.datasets.clip_source import to_network
 from gcd_train.draws import Draws

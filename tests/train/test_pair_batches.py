@@ -12,8 +12,9 @@ import torch
 from tiny_scenes4d import DRIVING_POSES, write_driving, write_kubric
 from torch.testing import assert_close
 
-from gcd_model import FAMILIES, SMALL, ModelConfig
+from gcd_model import FAMILIES, ModelConfig
 from gcd_model.conditioning import micro_conditioning, relative_pose_features, spherical_features
+from gcd_model.config import SMALL
 from gcd_model.geometry import pose_trajectory
 from gcd_model.networks import Networks, random_networks
 from gcd_train.datasets.clip_frames import FrameSampling

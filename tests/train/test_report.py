@@ -10,11 +10,11 @@ import pytest
 from driving_plane import PlaneClips, without_learning
 from typer.testing import CliRunner
 
-from gcd_model.checkpoints import save_weights
 from gcd_model.config import PLAIN_SMALL
 from gcd_model.geometry import SphericalDelta
 from gcd_model.networks import random_networks
-from gcd_model.own_format import Card
+from gcd_model.weights.card import Card
+from gcd_model.weights.load import save_weights
 from gcd_train.baselines import CopySource, MajorityMap, fit_statistics
 from gcd_train.cli.main import app
 from gcd_train.errors import RunError

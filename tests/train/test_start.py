@@ -8,12 +8,11 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from gcd_model.checkpoints import save_weights
 from gcd_model.config import ModelConfig
-from gcd_model.gcd_layout import gcd_state
 from gcd_model.networks import Networks, empty_networks, random_networks
-from gcd_model.own_format import Card
-from gcd_model.weights_export import write_published
+from gcd_model.weights.card import Card
+from gcd_model.weights.load import save_weights
+from gcd_model.weights.save import gcd_state, write_published
 from gcd_train.draws import Draws
 from gcd_train.errors import RecipeError
 from gcd_train.model_setup import model_config

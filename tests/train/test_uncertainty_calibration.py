@@ -14,8 +14,8 @@ from typer import Typer
 from typer.testing import CliRunner
 
 from gcd_model import View, load_synthesizer
-from gcd_model.checkpoints import inspect_weights
 from gcd_model.geometry import CameraMount, driving_trajectory
+from gcd_model.weights.load import inspect_weights
 from gcd_train.baselines import CameraPair, Prediction, SourceClip
 from gcd_train.cli.calibrate import calibrate_command
 from gcd_train.errors import DataError

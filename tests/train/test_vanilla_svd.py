@@ -10,9 +10,10 @@ import torch
 from driving_plane import PlaneClips
 from test_start import given, write
 
-from gcd_model import SVD_14, CheckpointError, RenderOptions, Traits, Trajectory, View
+from gcd_model import CheckpointError, RenderOptions, Traits, Trajectory, View
 from gcd_model.clip import Augmentation, Clip
 from gcd_model.conditioning import SourceFeatures
+from gcd_model.config import SVD_14
 from gcd_model.geometry import CameraMount
 from gcd_model.networks import empty_networks
 from gcd_train.baselines import BaselineSettings, CameraPair, SourceClip, VanillaSVD, build, described

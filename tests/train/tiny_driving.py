@@ -4,11 +4,10 @@ from pathlib import Path
 
 import msgspec
 
-from gcd_model import PLAIN_SMALL
-from gcd_model.checkpoints import save_weights
-from gcd_model.config import ModelConfig
+from gcd_model.config import PLAIN_SMALL, ModelConfig
 from gcd_model.networks import random_networks
-from gcd_model.own_format import Card
+from gcd_model.weights.card import Card
+from gcd_model.weights.load import save_weights
 
 FRAMES, HEIGHT, WIDTH = 4, 32, 64
 

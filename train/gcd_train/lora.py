@@ -16,10 +16,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gcd_model.adapter import DOWN, UP, Adapter, added
 from gcd_model.layers import Attention, FeedForward, TokenAttention
 from gcd_model.networks import Networks
-from gcd_model.own_format import Card
+from gcd_model.weights.adapter import DOWN, UP, Adapter, added
+from gcd_model.weights.card import Card
 from gcd_train.engine.parallel import whole
 from gcd_train.recipe import LoraRecipe
 

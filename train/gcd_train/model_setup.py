@@ -6,11 +6,11 @@ import msgspec
 import torch
 from torch import nn
 
-from gcd_model import FAMILIES, SMALL, SVD_14, Family, ModelConfig
-from gcd_model.config import DRIVING_CLASSES, PLAIN_SMALL, CameraControl
+from gcd_model import FAMILIES, Family, ModelConfig
+from gcd_model.config import DRIVING_CLASSES, PLAIN_SMALL, SMALL, SVD_14, CameraControl
 from gcd_model.errors import OptionError
-from gcd_model.gcd_layout import gcd_state
 from gcd_model.networks import Networks, empty_networks
+from gcd_model.weights.save import gcd_state
 from gcd_train.checkpoint import require_identity
 from gcd_train.engine.states import newest_weights
 from gcd_train.errors import RecipeError, RunError

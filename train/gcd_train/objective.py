@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from gcd_model.conditioning import CameraEmbedder
 from gcd_model.config import Prediction
+from gcd_model.diffusion import preconditioning
 from gcd_model.networks import Networks
-from gcd_model.noise import preconditioning
 from gcd_model.unet import VideoUNet
 from gcd_train.draws import Draws
 from gcd_train.loop import StepLoss

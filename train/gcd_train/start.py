@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from gcd_model import ModelConfig
-from gcd_model.carry_over import DIFFUSION, carried_over
-from gcd_model.checkpoints import load_weights
 from gcd_model.errors import CheckpointError
 from gcd_model.loading import packaged_weights
 from gcd_model.networks import LoadedWeights, Networks
+from gcd_model.weights.adapter import DIFFUSION, carried_over
+from gcd_model.weights.load import load_weights
 from gcd_train.errors import RecipeError
 from gcd_train.recipe import ModelRecipe
 
@@ -51,7 +51,7 @@ def start_networks(recipe: ModelRecipe, config: ModelConfig, seed: int) -> Netwo
 
 
 def carried_leftovers(recipe: ModelRecipe) -> Mapping[str, Tensor]:
-    """Weights of the file training started from that nothing here uses; see gcd_model.gcd_layout."""
+    """Weights of the file training started from that nothing here uses; see gcd_model.weights.save."""
     return {} if recipe.weights is None else loaded_base(recipe.weights).carried
 
 

@@ -9,9 +9,9 @@ import msgspec
 import torch
 
 from gcd_model import ModelConfig
-from gcd_model.adapter import Adapter, base_digest
 from gcd_model.networks import Networks
-from gcd_model.own_format import Card
+from gcd_model.weights.adapter import Adapter, base_digest
+from gcd_model.weights.card import Card
 from gcd_train.batches import BatchMaker, BatchSource, EncodedBatches, PixelBatches
 from gcd_train.datasets.clip_source import ClipSource
 from gcd_train.datasets.latents import EncodedClips

@@ -1,10 +1,9 @@
 """Poses, spherical cameras, camera paths and the pinhole: plain geometry, no network."""
 
-from gcd_model.geometry.mount import CameraMount
-from gcd_model.geometry.orbit import Orbit
 from gcd_model.geometry.pinhole import Intrinsics, center_crop_box
 from gcd_model.geometry.pose import (
     RIGID_TOLERANCE,
+    CameraMount,
     invert_rigid,
     look_at,
     pose_from_axes,
@@ -27,6 +26,7 @@ from gcd_model.geometry.trajectory import (
     DRIVING_SOURCE_POSITION,
     DRIVING_SOURCE_TARGET,
     Interpolation,
+    Orbit,
     Trajectory,
     driving_trajectory,
     fitted_trajectory,

@@ -10,9 +10,7 @@ from torch import Tensor
 
 from gcd_model.clip import Augmentation, Clip, RenderOptions, View
 from gcd_model.conditioning import SourceFeatures, SourceGeometry
-from gcd_model.decoding import whole_levels
 from gcd_model.errors import Cancelled, NonFiniteError, ShapeError
-from gcd_model.families import LIVE
 from gcd_model.geometry import CameraMount, Intrinsics, Trajectory
 from gcd_model.live.splat import splat, unproject
 from gcd_model.live.view import (
@@ -24,10 +22,11 @@ from gcd_model.live.view import (
     LiveNetworks,
     LiveView,
 )
-from gcd_model.own_format import Card, Entry
-from gcd_model.synthesizer import out_of_memory_is_our_error
+from gcd_model.synthesizer import out_of_memory_is_our_error, whole_levels
 from gcd_model.traits import Traits
-from gcd_model.weights_export import own_content, write_safetensors
+from gcd_model.weights.card import Card, Entry
+from gcd_model.weights.families import LIVE
+from gcd_model.weights.save import own_content, write_safetensors
 
 _SEED_STEP, _SEEDS = 0x9E3779B97F4A7C15, 1 << 63  # neighbouring seeds of samples would meet those of other windows
 

@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gcd_model import palette
-from gcd_model.colours import nearest_classes
+from gcd_model.colours import nearest_classes, palette
 from gcd_model.config import SemanticClass
 from gcd_train.baselines.predictor import Prediction, SourceClip
 from gcd_train.datasets.clip_source import Bytes

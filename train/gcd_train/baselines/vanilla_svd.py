@@ -19,8 +19,8 @@ from gcd_model import (
     load_synthesizer,
     pose_trajectory,
 )
+from gcd_model.diffusion import unit_noise
 from gcd_model.loading import packaged_weights
-from gcd_model.noise import unit_noise
 from gcd_train.baselines.predictor import Prediction, SourceClip
 from gcd_train.datasets.clip_source import to_network
 from gcd_train.errors import DataError

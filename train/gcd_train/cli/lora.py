@@ -29,9 +29,9 @@ def merge(
 ) -> None:
     """Join an adapter with its base to plain weights. OUT appears whole or not at all."""
     with errors_shown():
-        from gcd_model.checkpoints import load_adapted, load_weights, read_adapter, save_weights
-        from gcd_model.own_format import Card, precision
-        from gcd_model.weights_export import write_published
+        from gcd_model.weights.card import Card, precision
+        from gcd_model.weights.load import load_adapted, load_weights, read_adapter, save_weights
+        from gcd_model.weights.save import write_published
 
         wanted = None if dtype is None else precision(dtype)
         start = load_weights(base, ask_family=False)

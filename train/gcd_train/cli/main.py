@@ -7,7 +7,8 @@ from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
-from gcd_model import FAMILIES, PLAIN_SMALL, SMALL, SVD_14, Family, ModelConfig
+from gcd_model import FAMILIES, Family, ModelConfig
+from gcd_model.config import PLAIN_SMALL, SMALL, SVD_14
 from gcd_train.cli import bench, generate, lerobot, lora
 from gcd_train.cli.cache import cache
 from gcd_train.cli.calibrate import calibrate_command

@@ -10,9 +10,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gcd_model.adapter import Adapter, base_digest
 from gcd_model.networks import Networks
-from gcd_model.own_format import Card
+from gcd_model.weights.adapter import Adapter, base_digest
+from gcd_model.weights.card import Card
 from gcd_train.batches import BatchSource, EncodedBatches, PixelBatches
 from gcd_train.datasets.latents import EncodedClips
 from gcd_train.distillation.paired import PairedTask

@@ -8,9 +8,8 @@ from torch import Tensor, nn
 
 from gcd_model import ModelConfig
 from gcd_model.clip import RenderOptions
+from gcd_model.diffusion import Schedule, sample
 from gcd_model.networks import Networks
-from gcd_model.sampler import sample
-from gcd_model.schedule import Schedule
 from gcd_train.batches import BatchSource
 from gcd_train.distillation.recipe import BatchRecipe, PairedRecipe
 from gcd_train.distillation.sample_losses import SampleLoss

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor, nn
 
 from gcd_model import ModelConfig
-from gcd_model.checkpoints import load_weights
 from gcd_model.image_encoder import ImageEncoder, clip_pixels
 from gcd_model.loading import packaged_weights, random_weights
 from gcd_model.networks import Networks, weights_digest
-from gcd_model.own_format import precision
 from gcd_model.vae import Encoder, Posterior
+from gcd_model.weights.card import precision
+from gcd_model.weights.load import load_weights
 from gcd_train.errors import RecipeError
 
 

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gcd_model import SemanticClass, palette
+from gcd_model.colours import palette
+from gcd_model.config import SemanticClass
 
 
 def picture(video: Tensor) -> Tensor:

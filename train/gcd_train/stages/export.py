@@ -8,12 +8,12 @@ from pathlib import Path
 from torch import Tensor
 
 from gcd_model import ModelError
-from gcd_model.adapter import Adapter
-from gcd_model.checkpoints import load_weights, save_weights
-from gcd_model.families import Family
 from gcd_model.networks import Networks
-from gcd_model.own_format import Card, precision
-from gcd_model.weights_export import write_adapter, write_published
+from gcd_model.weights.adapter import Adapter
+from gcd_model.weights.card import Card, precision
+from gcd_model.weights.families import Family
+from gcd_model.weights.load import load_weights, save_weights
+from gcd_model.weights.save import write_adapter, write_published
 from gcd_train.errors import RunError
 from gcd_train.recipe import ExportRecipe
 from gcd_train.run_folder import RunFolder

@@ -1,0 +1,229 @@
+"""An export run by onnxruntime, behind the same interface as torch.
+
+Guidance, solver and all that lies between graphs stay in torch; one clip goes through a graph at a time. onnxruntime is
+imported when the first export is loaded.
+"""
+
+import importlib.util
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from gcd_model.clip import RenderOptions
+from gcd_model.conditioning import Conditioning, camera_features
+from gcd_model.config import ModelConfig
+from gcd_model.diffusion import Schedule, planned_denoiser, sample
+from gcd_model.engines.onnx_export import read_manifest
+from gcd_model.errors import DeviceMemoryError, ModelError, OptionError
+from gcd_model.geometry import Trajectory
+from gcd_model.image_encoder import clip_pixels
+from gcd_model.networks import empty_networks
+from gcd_model.synthesizer import Synthesizer
+from gcd_model.traits import Traits
+from gcd_model.unet import StageInputs, StagePlan, UNetPlan
+from gcd_model.weights.card import Card
+from gcd_model.weights.families import family_named
+
+CPU_PROVIDER, CUDA_PROVIDER = "CPUExecutionProvider", "CUDAExecutionProvider"
+TENSORRT_PROVIDER = "TensorrtExecutionProvider"
+_MISSING = "an export needs onnxruntime, which is not installed: pip install 'gcd-node[onnx]'"
+_MEMORY_WORDS = ("failed to allocate", "bad allocation", "out of memory")
+
+Provider = tuple[str, dict[str, str]]
+"""One of onnxruntime's execution providers, by its own name and options."""
+
+
+def load_export(folder: str | Path, *, device: str = "auto", providers: Sequence[str] = ()) -> Synthesizer:
+    """An export, ready to run. Its synthesizer's networks are empty: the weights are in the graphs.
+
+    Args:
+        device: "auto" and "cpu" mean the CPU, "cuda" or "cuda:N" onnxruntime's CUDA provider.
+        providers: onnxruntime's execution providers by its own names, best first, instead of what `device` means.
+    Raises:
+        CheckpointError: the folder is damaged. OptionError: onnxruntime or a provider is not there.
+    """
+    folder, manifest = Path(folder), read_manifest(folder)
+    card = Card.from_metadata(manifest.card)
+    chosen = provider_options(device, providers, folder / "tensorrt", half=manifest.precision == "float16")
+    files = {name: folder / record.files[0].name for name, record in manifest.graphs.items()}
+    traits = Traits(
+        name=card.name,
+        config=card.config,
+        family=None if card.family is None else family_named(card.family),
+        move_time=card.move_time,
+        sha256_12=manifest.sha256_12,
+        precision=manifest.precision,
+        device="cpu",
+        trained=card.trained,
+        uncertainty_scale=card.uncertainty_scale,
+    )
+    return Synthesizer(empty_networks(card.diffusion), traits, OnnxEngine(Sessions(files, chosen), card.diffusion))
+
+
+def provider_options(device: str, names: Sequence[str], cache: Path, *, half: bool) -> list[Provider]:
+    """As onnxruntime takes them; the CPU's comes last. cache: where TensorRT keeps what it has built. half: whether it
+    may compute in float16."""
+    kind, _, index = device.partition(":")
+    if kind not in ("auto", "cpu", "cuda") or (index and not (index.isdecimal() and kind == "cuda")):
+        raise OptionError(f"device must be auto, cpu, cuda or cuda:N, got {device!r}")
+    names = tuple(names) or ((CUDA_PROVIDER,) if kind == "cuda" else ())
+    options: dict[str, dict[str, str]] = {CUDA_PROVIDER: {"device_id": index or "0"}}
+    if TENSORRT_PROVIDER in names:
+        cache.mkdir(exist_ok=True)
+        options[TENSORRT_PROVIDER] = {
+            "device_id": index or "0",
+            "trt_fp16_enable": str(half),
+            "trt_engine_cache_enable": "True",
+            "trt_engine_cache_path": str(cache),
+        }
+    return [*((name, options.get(name, {})) for name in names if name != CPU_PROVIDER), (CPU_PROVIDER, {})]
+
+
+class Graphs(Protocol):
+    """The graphs of one export, ready to run."""
+
+    def run(self, name: str, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """One run. inputs: in the graph's order."""
+        ...
+
+
+class OnnxEngine:
+    """The networks of an export, clip by clip. Source: `Engine`."""
+
+    def __init__(self, graphs: Graphs, config: ModelConfig) -> None:
+        self._graphs, self._config = graphs, config
+        self._backbone = OnnxBackbone(graphs, config.frames)
+        self.like = torch.zeros(())
+        """See Engine: float32 on the CPU; onnxruntime copies to its own device."""
+
+    def tokens(self, frames: Tensor) -> Tensor | None:
+        tower = self._config.image_encoder
+        if tower is None:
+            return None
+        return self._frame_by_frame("image_encoder", clip_pixels(frames.to(self.like), tower.image_size))
+
+    def condition_mean(self, frames: Tensor) -> Tensor:
+        """See Engine. Raises OptionError for another size than the export's."""
+        height, width = self._config.height, self._config.width
+        if tuple(frames.shape[-2:]) != (height, width):
+            size = "x".join(map(str, frames.shape[-2:]))
+            raise OptionError(
+                f"this export takes frames of {height}x{width} alone, got {size}; "
+                "export it again with --height and --width"
+            )
+        return self._frame_by_frame("condition_encoder", frames.to(self.like))
+
+    def camera(self, path: Trajectory) -> Tensor | None:
+        """See Engine; the features themselves, as the linear map that follows is part of a graph."""
+        control = self._config.camera
+        return None if control == "none" else camera_features(control, path)
+
+    def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
+        denoiser = planned_denoiser(self._backbone, given, schedule)
+        return sample(denoiser, start, schedule.steps, progress=options.progress, cancel=options.cancel)
+
+    def decode(self, latents: Tensor) -> Tensor:
+        return self._graphs.run("decoder", latents)[0]
+
+    def _frame_by_frame(self, name: str, frames: Tensor) -> Tensor:
+        return torch.cat([self._graphs.run(name, frame)[0] for frame in frames.split(1)])
+
+
+class OnnxBackbone:
+    """The U-Net as graphs. Its plan has one entry for all stages, side by side. Source: `Backbone`."""
+
+    def __init__(self, graphs: Graphs, frames: int) -> None:
+        self._graphs, self._frames = graphs, frames
+
+    def plan(self, labels: Tensor, given: Conditioning) -> UNetPlan:
+        rows = [given.vector] if given.camera is None else [given.vector, given.camera]
+        clips = list(zip(*(each.split(self._frames) for each in rows), strict=True))
+        steps = [self._joined([("embeddings", label, *clip) for clip in clips]) for label in labels.float().split(1)]
+        spatial, temporal = (torch.stack(each) for each in zip(*steps, strict=True))
+        crosses: Sequence[Tensor | None] = (None, None)
+        if given.tokens is not None:
+            crosses = self._joined([("crosses", clip) for clip in given.tokens.split(self._frames)])
+        return UNetPlan((StagePlan(spatial, temporal, crosses[0], crosses[1]),), given.branches)
+
+    def predict(self, rows: Tensor, condition: Tensor, inputs: tuple[StageInputs, ...]) -> Tensor:
+        (stage,) = inputs
+        parts = [rows, condition, stage.spatial_embedding, stage.temporal_embedding]
+        clips = [each.split(self._frames) for each in parts]
+        if stage.spatial_cross is not None and stage.temporal_cross is not None:
+            clips += [stage.spatial_cross.split(self._frames), stage.temporal_cross.split(1)]
+        return torch.cat([self._graphs.run("step", *clip)[0] for clip in zip(*clips, strict=True)])
+
+    def _joined(self, runs: Sequence[tuple[Any, ...]]) -> tuple[Tensor, ...]:
+        made = [self._graphs.run(*run) for run in runs]
+        return tuple(torch.cat(each) for each in zip(*made, strict=True))
+
+
+class _Session(nn.Module):
+    """A graph as a layer of torch, so that whatever looks between layers looks between graphs, too."""
+
+    def __init__(self, session: Any) -> None:
+        super().__init__()
+        self.session = session
+        self.names = [each.name for each in session.get_inputs()]
+
+    def forward(self, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        """One run on the CPU's tensors."""
+        arrays = {name: each.detach().cpu().contiguous().numpy() for name, each in zip(self.names, inputs, strict=True)}
+        return tuple(torch.from_numpy(array) for array in self.session.run(None, arrays))
+
+
+class Sessions:
+    """Graphs in onnxruntime's hands. Source: `Graphs`."""
+
+    def __init__(self, files: dict[str, Path], providers: Sequence[Provider] = ((CPU_PROVIDER, {}),)) -> None:
+        """Raises: OptionError if onnxruntime or a provider is not there; ModelError if it refuses a graph."""
+        if importlib.util.find_spec("onnxruntime") is None:
+            raise OptionError(_MISSING)
+        import onnxruntime
+
+        available = onnxruntime.get_available_providers()
+        absent = [name for name, _ in providers if name not in available]
+        if absent:
+            raise OptionError(
+                f"onnxruntime has no {absent[0]} here, only {', '.join(available)}; "
+                "install a build that has it, or leave the provider out"
+            )
+        self._sessions = {name: _Session(_session(onnxruntime, path, providers)) for name, path in files.items()}
+
+    def run(self, name: str, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """See Graphs. Raises: DeviceMemoryError, ModelError."""
+        try:
+            return self._sessions[name](inputs)
+        except Exception as error:
+            if not type(error).__module__.startswith("onnxruntime"):
+                raise
+            raise _ours(error, name) from error
+
+
+def _session(runtime: Any, path: Path, providers: Sequence[Provider]) -> Any:
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # waiting threads leave others the cores
+    try:
+        session = runtime.InferenceSession(str(path), options, providers=list(providers))
+    except Exception as error:
+        raise _ours(error, path.stem) from error
+    refused = [name for name, _ in providers if name not in session.get_providers()]
+    if refused:
+        raise OptionError(
+            f"onnxruntime has {refused[0]} but could not start it for {path.name}; its libraries are not installed, "
+            "or do not fit this machine"
+        )
+    return session
+
+
+def _ours(error: Exception, graph: str) -> ModelError:
+    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    if any(words in reason.lower() for words in _MEMORY_WORDS):
+        return DeviceMemoryError(f"{graph}: {reason} Render smaller frames, or a smaller model")
+    return ModelError(f"onnxruntime cannot run {graph}: {reason}; export it again with this version")

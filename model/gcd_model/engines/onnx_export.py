@@ -1,0 +1,400 @@
+"""A checkpoint as a folder of ONNX graphs with a manifest. An exporter, so it opens files; also reads what it wrote.
+
+Every graph takes one clip or one frame, of fixed size: guidance branches, views and samples are further runs. What does
+not depend on the pixels comes from graphs of its own, all stages side by side in one tensor. Needs the extra `onnx`.
+"""
+
+import hashlib
+import importlib.util
+import logging
+import os
+import shutil
+import warnings
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import torch
+from torch import Tensor, nn
+
+from gcd_model.config import CAMERA_FEATURES
+from gcd_model.errors import CheckpointError, FileError, OptionError
+from gcd_model.layers import Layers, prepare
+from gcd_model.networks import LoadedWeights, Networks
+from gcd_model.small_files import decode_json, read_small
+from gcd_model.temporal import SpatialBlock, TemporalBlock
+from gcd_model.unet import StageInputs, VideoUNet
+from gcd_model.weights.card import FULL_PRECISION, Card
+from gcd_model.weights.load import digest
+
+MANIFEST = "manifest.json"
+"""The file that makes a folder an export."""
+FORMAT = "gcd-onnx-1"
+OPSET = 20
+"""Of the ONNX operators: what TensorRT 10 and onnxruntime 1.20 know."""
+APART_ABOVE = 1 << 30  # bytes of weights beside a graph instead of in it; one file of ONNX holds 2 GiB at most
+_ANY_SIZE = 1 << 62
+_SUMS = ["InstanceNormalization", "LayerNormalization", "ReduceMean", "ReduceSum", "Softmax", "Resize"]
+"""Sums over many numbers, which half precision would lose or overflow in."""
+
+ExportPrecision = Literal["float32", "float16"]
+"""How weights are stored and computed with; inputs and outputs are float32 in any case."""
+Report = Callable[[str, int, int], None]
+"""Called with (graph that is next, graphs done, graphs)."""
+
+# --- graphs --------------------------------------------------------------------------------------------------------
+
+
+class Embeddings(nn.Module):
+    """Noise level [1], micro-conditioning [T, V] and camera features [T, F], projected for every stage of the U-Net."""
+
+    def __init__(self, unet: VideoUNet, camera: nn.Linear | None) -> None:
+        super().__init__()
+        self.unet, self.camera = unet, camera
+
+    def forward(self, label: Tensor, vector: Tensor, camera: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Spatial and temporal, [T, sum of C] each."""
+        features = None if self.camera is None or camera is None else self.camera(camera)
+        stages = self.unet.plan(label, vector, features, None).stages
+        spatial = torch.cat([stage.spatial_embedding[0] for stage in stages], dim=1)
+        return spatial, torch.cat([stage.temporal_embedding[0] for stage in stages], dim=1)
+
+
+class Crosses(nn.Module):
+    """What the image tokens [T, D] add in every transformer of the U-Net."""
+
+    def __init__(self, unet: VideoUNet) -> None:
+        super().__init__()
+        attending = [stage.attention for stage in unet.all_stages() if stage.attention is not None]
+        self.spatial = _token_layers(attention.spatial for attention in attending)
+        self.temporal = _token_layers(attention.temporal for attention in attending)
+
+    def forward(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
+        """[T, sum of C] and, of the first frame alone, [1, sum of C]."""
+        spatial = torch.cat([layer(tokens) for layer in self.spatial], dim=1)
+        return spatial, torch.cat([layer(tokens[:1]) for layer in self.temporal], dim=1)
+
+
+def _token_layers(blocks: Iterable[SpatialBlock | TemporalBlock]) -> Layers[nn.Module]:
+    return Layers[nn.Module](block.token for block in blocks if block.token is not None)
+
+
+class Step(nn.Module):
+    """One evaluation of the U-Net over one clip; what follows the pixels comes from `Embeddings` and `Crosses`."""
+
+    def __init__(self, unet: VideoUNet) -> None:
+        super().__init__()
+        self.unet = unet
+        self.widths = [stage.res.spatial.norm2.num_channels for stage in unet.all_stages()]
+        self.crossed = [
+            width if stage.attention is not None and stage.attention.spatial.token is not None else 0
+            for width, stage in zip(self.widths, unet.all_stages(), strict=True)
+        ]
+
+    def forward(
+        self, latents: Tensor, condition: Tensor, spatial: Tensor, temporal: Tensor, *crosses: Tensor
+    ) -> Tensor:
+        """latents: [T, C, h, w] -> the same shape."""
+        embeddings = (each.split(self.widths, dim=1) for each in (spatial, temporal))
+        added = [self._by_stage(each) for each in crosses] or [[None] * len(self.widths)] * 2
+        inputs = [StageInputs(*stage) for stage in zip(*embeddings, *added, strict=True)]
+        return self.unet(latents, condition, inputs)
+
+    def _by_stage(self, cross: Tensor) -> Sequence[Tensor | None]:
+        parts = iter(cross.split([width for width in self.crossed if width], dim=1))
+        return [next(parts) if width else None for width in self.crossed]
+
+
+class _Function(nn.Module):
+    def __init__(self, module: nn.Module, compute: Callable[[Any, Tensor], Tensor]) -> None:
+        super().__init__()
+        self.module, self.compute = module, compute
+
+    def forward(self, x: Tensor) -> Tensor:
+        """What is computed of a module and one tensor."""
+        return self.compute(self.module, x)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Graph:
+    """One graph to export. inputs: by name, of the sizes it will always have; their values do not matter."""
+
+    name: str
+    module: nn.Module
+    inputs: dict[str, Tensor]
+    outputs: tuple[str, ...]
+
+
+def graphs(networks: Networks) -> Iterator[Graph]:
+    """Every graph of a checkpoint, at the size its config states."""
+    config, tower = networks.config, networks.image_encoder
+    frames, height, width, factor = config.frames, config.height, config.width, config.vae.down_factor
+    if tower is not None:
+        pixels = torch.zeros(1, 3, tower.config.image_size, tower.config.image_size)
+        yield _graph("image_encoder", tower, {"pixels": pixels}, "token")
+        tokens = torch.zeros(frames, tower.config.output_width)
+        yield _graph("crosses", Crosses(networks.unet), {"tokens": tokens}, "spatial_cross", "temporal_cross")
+    encoder = _Function(networks.condition_encoder, lambda encoder, frame: encoder(frame).mean)
+    yield _graph("condition_encoder", encoder, {"frames": torch.zeros(1, 3, height, width)}, "latents")
+    inputs = {"label": torch.zeros(1), "vector": torch.zeros(frames, config.unet.vector_width)}
+    if networks.camera is not None:
+        inputs["camera"] = torch.zeros(frames, CAMERA_FEATURES[config.camera])
+    camera = None if networks.camera is None else networks.camera.proj
+    yield _graph("embeddings", Embeddings(networks.unet, camera), inputs, "spatial_embedding", "temporal_embedding")
+    yield step_graph(networks)
+    decoder = _Function(networks.decoder, lambda decoder, latents: decoder(latents, frames))
+    latents = torch.zeros(frames, config.vae.latent_channels, height // factor, width // factor)
+    yield _graph("decoder", decoder, {"latents": latents}, "pictures")
+
+
+def step_graph(networks: Networks) -> Graph:
+    """The U-Net alone, which is most of what there is to export."""
+    config, unet, step = networks.config, networks.config.unet, Step(networks.unet)
+    frames, factor = config.frames, config.vae.down_factor
+    size = (config.height // factor, config.width // factor)
+    inputs = {
+        "latents": torch.zeros(frames, unet.latent_channels, *size),
+        "condition": torch.zeros(frames, unet.condition_channels, *size),
+        "spatial_embedding": torch.zeros(frames, sum(step.widths)),
+        "temporal_embedding": torch.zeros(frames, sum(step.widths)),
+    }
+    if networks.image_encoder is not None:
+        inputs["spatial_cross"] = torch.zeros(frames, sum(step.crossed))
+        inputs["temporal_cross"] = torch.zeros(1, sum(step.crossed))
+    return _graph("step", step, inputs, "prediction")
+
+
+def _graph(name: str, module: nn.Module, inputs: dict[str, Tensor], *outputs: str) -> Graph:
+    prepare(module)
+    return Graph(name=name, module=module, inputs=inputs, outputs=outputs)
+
+
+# --- what an export says about itself ------------------------------------------------------------------------------
+
+
+class TensorRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One input or output of a graph."""
+
+    name: str
+    shape: tuple[int, ...]
+    dtype: str = "float32"
+
+
+class FileRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One file of the folder. sha256: see `digest`."""
+
+    name: str
+    size: int
+    sha256: str
+
+
+class GraphRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One graph. files: the graph first, then what it keeps its weights in beside it, if any."""
+
+    files: tuple[FileRecord, ...]
+    precision: ExportPrecision
+    inputs: tuple[TensorRecord, ...]
+    outputs: tuple[TensorRecord, ...]
+
+
+class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A whole export.
+
+    card: as in the metadata of our weight files; the config's height and width are the export's.
+    source: 12 digits that name the weights it was made from. exporter: versions it was made with, for people.
+    """
+
+    format: str
+    card: dict[str, str]
+    source: str
+    precision: ExportPrecision
+    opset: int
+    exporter: str
+    graphs: dict[str, GraphRecord]
+
+    @property
+    def sha256_12(self) -> str:
+        """Twelve digits that name what is computed: of the weights, the precision and the size."""
+        config = Card.from_metadata(self.card).config
+        identity = f"{FORMAT} {self.source} {self.precision} {config.height}x{config.width}"
+        return hashlib.sha256(identity.encode()).hexdigest()[:12]
+
+
+def is_export(path: str | Path) -> bool:
+    """Whether a path is the folder of an export."""
+    return os.path.lexists(Path(path) / MANIFEST)
+
+
+def read_manifest(folder: str | Path) -> Manifest:
+    """What an export says about itself; every file it names is there, whole and as it was written.
+
+    Raises: CheckpointError if not.
+    """
+    folder = Path(folder)
+    try:
+        manifest = decode_json(read_small(folder / MANIFEST), Manifest)
+        if manifest.format != FORMAT:
+            raise FileError(f"has format {manifest.format!r}, this version reads {FORMAT!r}")
+        for file in (file for graph in manifest.graphs.values() for file in graph.files):
+            path = folder / file.name
+            if Path(file.name).name != file.name or not path.is_file():
+                raise CheckpointError(f"{folder}: lacks its file {file.name}; export it again")
+            if path.stat().st_size != file.size or digest((path,)) != file.sha256:
+                raise CheckpointError(
+                    f"{folder}: its file {file.name} is not the one that was written; copy or export it again"
+                )
+    except FileError as error:
+        raise CheckpointError(f"{folder}: its {MANIFEST} {error}; export it again") from error
+    except OSError as error:
+        raise CheckpointError(f"{folder}: cannot be read: {error.strerror or error}; export it again") from error
+    return manifest
+
+
+# --- exporting -----------------------------------------------------------------------------------------------------
+
+
+def export_onnx(
+    loaded: LoadedWeights,
+    out: str | Path,
+    *,
+    precision: ExportPrecision = "float32",
+    height: int | None = None,
+    width: int | None = None,
+    overwrite: bool = False,
+    apart_above: int = APART_ABOVE,
+    progress: Report | None = None,
+) -> Manifest:
+    """Write every network of a checkpoint as a graph.
+
+    Args:
+        loaded: weights on the CPU; they are widened to float32 first. precision: the decoder stays float32.
+        height, width: pixels, instead of the trained size; graphs take this size alone.
+        apart_above: weights of more bytes lie in a file beside the graph.
+    Raises:
+        OptionError: `out` exists and `overwrite` is not set or is no export; the size does not fit; the extra is
+            missing. CheckpointError: it cannot be written.
+    """
+    require_onnx()
+    networks = _at_size(loaded, height, width)
+    records: dict[str, GraphRecord] = {}
+    with _whole_folder(Path(out), overwrite=overwrite) as folder:
+        wanted = list(graphs(networks))
+        for graph in wanted:
+            if progress is not None:
+                progress(graph.name, len(records), len(wanted))
+            own: ExportPrecision = "float32" if graph.name in FULL_PRECISION else precision
+            records[graph.name] = write_graph(graph, folder, own, apart_above=apart_above)
+        manifest = Manifest(
+            format=FORMAT,
+            card=loaded.card.to_metadata(),
+            source=loaded.sha256_12,
+            precision=precision,
+            opset=OPSET,
+            exporter=f"torch {torch.__version__}, onnx {version('onnx')}, onnxscript {version('onnxscript')}",
+            graphs=records,
+        )
+        (folder / MANIFEST).write_bytes(msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n")
+    return manifest
+
+
+def require_onnx() -> None:
+    """Raises OptionError unless what exports is installed."""
+    if any(importlib.util.find_spec(name) is None for name in ("onnx", "onnxscript", "onnxruntime")):
+        raise OptionError("ONNX needs the extra `onnx`: pip install 'gcd-node[onnx]'")
+
+
+def _at_size(loaded: LoadedWeights, height: int | None, width: int | None) -> Networks:
+    """The networks in float32, with the size they are exported for as their config's."""
+    networks = loaded.diffusion
+    config, factor = networks.config, networks.config.size_factor
+    height, width = height or config.height, width or config.width
+    if height % factor or width % factor:
+        raise OptionError(f"height and width must be multiples of {factor} for {loaded.name}, got {height}x{width}")
+    networks.config = msgspec.structs.replace(config, height=height, width=width)
+    return networks.requires_grad_(False).float()
+
+
+def write_graph(
+    graph: Graph, folder: Path, precision: ExportPrecision = "float32", *, apart_above: int = APART_ABOVE
+) -> GraphRecord:
+    """Export one graph into a folder. Returns what the manifest says of it."""
+    import onnx_ir
+
+    model = _exported(graph)
+    apart = sum(tensor.nbytes for tensor in graph.module.state_dict().values()) > apart_above
+    path, beside = folder / f"{graph.name}.onnx", folder / f"{graph.name}.onnx.data"
+    onnx_ir.save(model, path, external_data=beside.name if apart else None)
+    if precision == "float16":
+        _halve(path, beside, apart=apart)
+    files = (path, *(each for each in [beside] if each.exists()))
+    return GraphRecord(
+        files=tuple(FileRecord(name=f.name, size=f.stat().st_size, sha256=digest((f,))) for f in files),
+        precision=precision,
+        inputs=tuple(TensorRecord(name=each.name, shape=tuple(map(int, each.shape))) for each in model.graph.inputs),
+        outputs=tuple(TensorRecord(name=each.name, shape=tuple(map(int, each.shape))) for each in model.graph.outputs),
+    )
+
+
+def _halve(path: Path, beside: Path, *, apart: bool) -> None:
+    """Rewrite a graph's file in half precision, but for its sums."""
+    import onnx
+    from onnxruntime.transformers.float16 import convert_float_to_float16
+
+    model: Any = convert_float_to_float16(onnx.load(path), keep_io_types=True, op_block_list=_SUMS)
+    nodes, there = list(model.graph.node), set[str]()
+    del model.graph.node[:]
+    for node in nodes:  # the converter casts a value once for each of its readers, every time under the same name
+        if there.isdisjoint(node.output):
+            model.graph.node.append(node)
+        there.update(node.output)
+    beside.unlink(missing_ok=True)
+    onnx.save(model, path, save_as_external_data=apart, location=beside.name)
+
+
+def _exported(graph: Graph) -> Any:
+    """The graph as `onnx_ir` holds it: what its weights alone determine is computed, and no path of ours is in it."""
+    from onnxscript import optimizer
+
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it speaks of packages we do not need
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            graph.module,
+            tuple(graph.inputs.values()),
+            dynamo=True,
+            verbose=False,
+            input_names=list(graph.inputs),
+            output_names=list(graph.outputs),
+            opset_version=OPSET,
+        )
+    assert program is not None
+    model = program.model
+    optimizer.fold_constants(model, input_size_limit=_ANY_SIZE, output_size_limit=_ANY_SIZE)
+    optimizer.remove_unused_nodes(model)
+    for node in model.graph.all_nodes():
+        node.metadata_props.clear()  # file names and lines of this machine
+    return model
+
+
+@contextmanager
+def _whole_folder(out: Path, *, overwrite: bool) -> Generator[Path]:
+    """A folder that appears under its name only once it is complete."""
+    if not out.parent.is_dir():
+        raise OptionError(f"{out}: there is no folder {out.parent}; make it first")
+    if out.exists() and not (overwrite and is_export(out)):
+        raise OptionError(f"{out} exists; give another name, or allow an export to be overwritten")
+    partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
+    try:
+        partial.mkdir()
+        yield partial
+        if out.exists():
+            shutil.rmtree(out)
+        partial.rename(out)
+    except OSError as error:
+        raise CheckpointError(f"{out}: cannot be written: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)

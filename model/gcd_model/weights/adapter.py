@@ -1,0 +1,223 @@
+"""Low-rank adapters: what a finetuning adds to the weights of a base model, kept apart from them. Opens nothing.
+
+    weight = base weight + alpha / rank * up @ down
+
+Source: Hu et al. 2022, "LoRA: Low-Rank Adaptation of Large Language Models", section 4.1.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Self
+
+import msgspec
+import torch
+from torch import Tensor
+
+from gcd_model.config import ModelConfig
+from gcd_model.errors import CheckpointError, FileError
+from gcd_model.networks import Networks, empty_networks, weights_digest
+from gcd_model.small_files import decode_json
+from gcd_model.weights.card import Card
+
+ADAPTER_KEY = "gcd.adapter"
+"""Metadata that only adapter files have."""
+
+DOWN, UP = ".down", ".up"
+"""Endings of an adapted layer's two factors, after the layer's own name."""
+
+_MOST_ALPHA = 1e6  # anything near the end of float32 makes weights infinite
+
+
+class _Facts(msgspec.Struct, frozen=True, kw_only=True):
+    rank: Annotated[int, msgspec.Meta(ge=1)]
+    alpha: Annotated[float, msgspec.Meta(ge=-_MOST_ALPHA, le=_MOST_ALPHA)]
+    base: str
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Adapter:
+    """What is added to a base model.
+
+    base: `base_digest` of the weights it was trained on. card: of base and adapter together.
+    tensors: `LAYER.down` [rank, in] and `LAYER.up` [out, rank] of linear layers, and whole weights that replace the
+        base's under their own names, such as the camera embedder.
+    """
+
+    rank: int
+    alpha: float
+    base: str
+    card: Card
+    tensors: Mapping[str, Tensor]
+
+    def to_metadata(self) -> dict[str, str]:
+        """As safetensors metadata: text to text."""
+        facts = _Facts(rank=self.rank, alpha=self.alpha, base=self.base)
+        return self.card.to_metadata() | {ADAPTER_KEY: msgspec.json.encode(facts).decode()}
+
+    @classmethod
+    def of_file(cls, metadata: Mapping[str, str], tensors: Mapping[str, Tensor]) -> Self:
+        """Raises CheckpointError if it is no adapter, or damaged."""
+        if ADAPTER_KEY not in metadata:
+            raise CheckpointError(
+                "is no adapter; wanted is a file that `gcd-train train` wrote with model.train = lora"
+            )
+        try:
+            facts = decode_json(metadata[ADAPTER_KEY], _Facts)
+        except FileError as error:
+            raise CheckpointError(f"its metadata {error}; export the adapter again") from error
+        card = Card.from_metadata(metadata)
+        return cls(rank=facts.rank, alpha=facts.alpha, base=facts.base, card=card, tensors=tensors)
+
+
+def base_digest(weights: Mapping[str, Tensor]) -> str:
+    """Twelve digits that name the U-Net an adapter stands on, whatever layout it lies in; float32 values count.
+
+    The camera embedder does not: an adapter may bring its own.
+    """
+    counted = {
+        name: tensor.float() for name, tensor in weights.items() if name.startswith("unet.") and not _is_camera(name)
+    }
+    return weights_digest(counted)
+
+
+def adapted(networks: Networks, adapter: Adapter) -> Networks:
+    """Base and adapter as plain networks, in the base's precision.
+
+    Raises:
+        CheckpointError: the adapter was trained on another base, or does not fit it.
+    """
+    digest = base_digest(networks.state_dict())
+    if digest != adapter.base:
+        raise CheckpointError(
+            f"the adapter stands on the base {adapter.base}, these weights are {digest}; give the file it was "
+            "trained from"
+        )
+    config = adapter.card.diffusion
+    base = carried_over(networks, config)
+    state = merged(base.weights, adapter)
+    lacking = [name for name in base.fresh if name not in state]
+    if lacking:
+        raise CheckpointError(f"{len(lacking)} weights are neither in the base nor in the adapter, first: {lacking[0]}")
+    result = empty_networks(config)
+    result.load_state_dict(state, assign=True, strict=True)
+    return result
+
+
+def merged(weights: Mapping[str, Tensor], adapter: Adapter) -> dict[str, Tensor]:
+    """Plain weights: the factors added in float32, whole weights put in place. Raises CheckpointError as `adapted`."""
+    state, scale = dict(weights), adapter.alpha / adapter.rank
+    layers = {name.removesuffix(UP) for name in adapter.tensors if name.endswith(UP)}
+    for layer in layers:
+        weight, up, down = (_found(source, f"{layer}{end}") for source, end in _parts(state, adapter.tensors))
+        if weight.shape != (up.shape[0], down.shape[1]) or up.shape[1] != down.shape[0]:
+            raise CheckpointError(
+                f"{layer} is {list(weight.shape)}, its factors are {list(up.shape)} and {list(down.shape)}"
+            )
+        state[f"{layer}.weight"] = added(weight, up, down, scale)
+    whole = {name: tensor for name, tensor in adapter.tensors.items() if not name.endswith((UP, DOWN))}
+    known = empty_networks(adapter.card.diffusion).state_dict()
+    for name, tensor in whole.items():
+        if name not in known or known[name].shape != tensor.shape:
+            raise CheckpointError(f"the adapter holds {name} {list(tensor.shape)}, which the model does not have")
+    return state | whole
+
+
+def added(weight: Tensor, up: Tensor, down: Tensor, scale: float) -> Tensor:
+    """weight + scale * up @ down, computed in float32, in the weight's precision."""
+    return torch.addmm(weight.float(), up.float(), down.float(), alpha=scale).to(weight.dtype)
+
+
+def _parts(state: Mapping[str, Tensor], factors: Mapping[str, Tensor]) -> tuple[tuple[Mapping[str, Tensor], str], ...]:
+    return (state, ".weight"), (factors, UP), (factors, DOWN)
+
+
+def _found(source: Mapping[str, Tensor], name: str) -> Tensor:
+    if name not in source:
+        raise CheckpointError(f"{name} is missing: the adapter does not belong to this model, or is damaged")
+    return source[name]
+
+
+def _is_camera(name: str) -> bool:
+    return name.startswith(CAMERA)
+
+
+# --- weights of one model as the start of another --------------------------------------------------------------------
+
+
+CAMERA = ("camera.", "unet.embed_camera.")
+"""How names of the camera embedder and of its MLP in the U-Net begin."""
+
+DIFFUSION = ("unet.", "camera.")
+"""What the paper's "from scratch" leaves at random: the U-Net and the camera embedder."""
+
+_ENCODER, _SECOND_ENCODER, _QUANT = "target_encoder.", "own_condition_encoder.", "target_encoder.quant."
+
+
+@dataclass(frozen=True, slots=True)
+class CarriedOver:
+    """weights: by our names, as they are stored. fresh: names of the new model that nothing was found for."""
+
+    weights: dict[str, Tensor]
+    fresh: tuple[str, ...]
+
+
+def carried_over(networks: Networks, config: ModelConfig, *, anew: tuple[str, ...] = ()) -> CarriedOver:
+    """What a model of that config takes over from these networks.
+
+    Args:
+        anew: beginnings of names that are to start anew, whatever is there.
+    Raises:
+        CheckpointError: they are of another architecture; names the first weights that are missing, superfluous or
+            of another shape.
+    """
+    given: Mapping[str, Tensor] = networks.state_dict()
+    if networks.config.vae.shared and not config.vae.shared:
+        given = unshared(given)
+    if networks.config.camera != config.camera:
+        anew = (*anew, *CAMERA)
+    wanted = empty_networks(config).state_dict()
+    fresh = tuple(name for name in wanted if name.startswith(anew))
+    weights = {name: tensor for name, tensor in given.items() if not name.startswith(anew)}
+    _require_fit(weights, {name: tensor for name, tensor in wanted.items() if not name.startswith(anew)})
+    return CarriedOver(weights, fresh)
+
+
+def _require_fit(given: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> None:
+    missing = [name for name in wanted if name not in given]
+    unknown = [name for name in given if name not in wanted]
+    misshapen = [
+        f"{name} wants {list(wanted[name].shape)}, got {list(tensor.shape)}"
+        for name, tensor in given.items()
+        if name in wanted and tensor.shape != wanted[name].shape
+    ]
+    faults = [
+        f"{len(names)} weights are {what}, first: {names[0]}"
+        for what, names in (("missing", missing), ("superfluous", unknown), ("misshapen", misshapen))
+        if names
+    ]
+    if faults:
+        raise CheckpointError(f"holds another model than is wanted: {'; '.join(faults)}")
+
+
+def unshared(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Weights of a model whose one encoder serves all frames, as those of a model with two; the same functions.
+
+    The published target encoder has no 1x1 convolution at its end: it is multiplied into the last one before it. The
+    condition encoder keeps it.
+    """
+    encoder = {name: tensor for name, tensor in weights.items() if name.startswith(_ENCODER)}
+    others = {name: tensor for name, tensor in weights.items() if name not in encoder}
+    second = {name.replace(_ENCODER, _SECOND_ENCODER, 1): tensor for name, tensor in encoder.items()}
+    target = {name: tensor for name, tensor in encoder.items() if not name.startswith(_QUANT)}
+    target |= _folded(encoder)
+    return others | target | second
+
+
+def _folded(encoder: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The encoder's last convolution and the 1x1 convolution after it, as one; multiplied in double precision."""
+    names = [f"{_ENCODER}conv_out.{leaf}" for leaf in ("weight", "bias")]
+    weight, bias = (encoder[name] for name in names)
+    mix, shift = (encoder[f"{_QUANT}{leaf}"].double() for leaf in ("weight", "bias"))
+    mix = mix[:, :, 0, 0]
+    folded = torch.einsum("om,mihw->oihw", mix, weight.double())
+    return {names[0]: folded.to(weight.dtype), names[1]: (mix @ bias.double() + shift).to(bias.dtype)}

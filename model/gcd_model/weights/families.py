@@ -1,0 +1,266 @@
+"""What a checkpoint's names and shapes cannot tell: limits, rates, motion, the fixed path.
+
+A family is how a checkpoint was trained.
+"""
+
+import re
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import msgspec
+
+from gcd_model.config import CameraControl, ModelConfig, SamplingConfig
+from gcd_model.errors import CheckpointError, OptionError
+from gcd_model.geometry import Interpolation, Spherical
+from gcd_model.live.config import LiveConfig
+
+FamilyName = Literal["kubric90", "kubric180", "driving", "driving-semantic", "manipulation", "svd", "live"]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ViewLimits:
+    """How far a target camera may stand from the source camera, and where at all.
+
+    Source: Van Hoorick et al. 2024 (GCD), section 4; elevation as in the released configurations.
+    """
+
+    azimuth_deg: float
+    elevation_deg: float
+    radius_m: float = 3.0
+    absolute_elevation_deg: tuple[float, float] = (0.0, 50.0)
+    absolute_radius_m: tuple[float, float] = (12.0, 18.0)
+
+    def allowed(self, source: Spherical | None) -> dict[str, tuple[float, float]]:
+        """Intervals of the three differences; narrower when it is known where the source stands."""
+        elevation, radius = (-self.elevation_deg, self.elevation_deg), (-self.radius_m, self.radius_m)
+        if source is not None:
+            elevation = _within(elevation, self.absolute_elevation_deg, source.elevation_deg)
+            radius = _within(radius, self.absolute_radius_m, source.radius_m)
+        return {
+            "azimuth_deg": (-self.azimuth_deg, self.azimuth_deg),
+            "elevation_deg": elevation,
+            "radius_m": radius,
+        }
+
+
+def _within(relative: tuple[float, float], absolute: tuple[float, float], at: float) -> tuple[float, float]:
+    return max(relative[0], absolute[0] - at), min(relative[1], absolute[1] - at)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Family:
+    """How a group of checkpoints was trained.
+
+    camera: control the checkpoints have; relative poses may stand in for angles and radius.
+    rates: trained frames per second, empty if any. fps: the default label.
+    hfov_deg: trained horizontal field of view. height, width: trained size in pixels.
+    motion_bucket: the constant the network was told, None where the formula gives it.
+    """
+
+    name: FamilyName
+    camera: CameraControl
+    limits: ViewLimits | None = None
+    rates: tuple[float, ...]
+    fps: float
+    hfov_deg: float | None
+    height: int = 256
+    width: int = 384
+    interpolation: Interpolation = "linear"
+    motion_bucket: float | None = None
+    pose_units: Literal["m", "scene"] = "scene"
+    output: Literal["rgb", "semantic"] = "rgb"
+
+
+KUBRIC90 = Family(
+    name="kubric90",
+    camera="spherical",
+    limits=ViewLimits(azimuth_deg=90.0, elevation_deg=30.0),
+    rates=(6.0, 8.0, 12.0, 24.0),
+    fps=12.0,
+    hfov_deg=53.13,
+)
+KUBRIC180 = replace(KUBRIC90, name="kubric180", limits=ViewLimits(azimuth_deg=180.0, elevation_deg=60.0))
+DRIVING = Family(
+    name="driving",
+    camera="none",
+    rates=(5.0, 10.0),
+    fps=10.0,
+    hfov_deg=85.0,
+    interpolation="sine",
+    motion_bucket=127.0,
+    pose_units="m",
+)
+DRIVING_SEMANTIC = replace(DRIVING, name="driving-semantic", output="semantic")
+MANIPULATION = Family(
+    name="manipulation",
+    camera="relative_pose",
+    rates=(),
+    fps=10.0,
+    hfov_deg=None,
+    motion_bucket=127.0,
+    pose_units="m",
+)
+"""Ours: a camera anywhere about a robot's cell, told as a rigid transform."""
+SVD = Family(name="svd", camera="none", rates=(), fps=7.0, hfov_deg=None, height=576, width=1024, motion_bucket=127.0)
+LIVE = Family(
+    name="live",
+    camera="relative_pose",
+    rates=(),
+    fps=10.0,
+    hfov_deg=None,
+    height=128,
+    width=192,
+    motion_bucket=127.0,
+    pose_units="m",
+)
+"""Ours: see `gcd_model.live`; any rigid pose, any lens of LIVE_LENS_DEG."""
+LIVE_LENS_DEG = (40.0, 120.0)
+"""Horizontal fields of view of the live model's training."""
+
+_ALL = (KUBRIC90, KUBRIC180, DRIVING, DRIVING_SEMANTIC, MANIPULATION, SVD, LIVE)
+
+FAMILIES: dict[str, Family] = {family.name: family for family in _ALL}
+
+
+def family_named(name: str) -> Family:
+    """The family of that name. Raises OptionError for another."""
+    if name not in FAMILIES:
+        raise OptionError(f"no family is called {name!r}; there are {', '.join(get_args(FamilyName))}")
+    return FAMILIES[name]
+
+
+# --- the family of a checkpoint, by its name or the yaml beside it ---------------------------------------------------
+
+
+SVD_GUIDANCE = (1.0, 2.5)
+"""Guidance of the first and last frame Stable Video Diffusion was published with; GCD uses 1.0 to 1.5."""
+_LONGEST_LINE = 1000
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Provenance:
+    """What is told about a checkpoint besides its weights; None where nothing is.
+
+    move_time: frame in which the goal pose is reached. frames: T. told_by: who named the family.
+    """
+
+    family: FamilyName | None = None
+    move_time: int | None = None
+    frames: int | None = None
+    told_by: str | None = None
+
+
+_PUBLISHED: tuple[tuple[str, Provenance], ...] = (
+    (r"kubric_gradual_max90", Provenance(family="kubric90", move_time=13)),
+    (r"kubric_direct_max90", Provenance(family="kubric90", move_time=0)),
+    (r"kubric_gradual_max180", Provenance(family="kubric180", move_time=13)),
+    (r"kubric_direct_max180", Provenance(family="kubric180", move_time=0)),
+    (r"pardom_gradual_rgb", Provenance(family="driving", move_time=13)),
+    (r"pardom_direct_rgb", Provenance(family="driving", move_time=0)),
+    (r"pardom_gradual_semantic", Provenance(family="driving-semantic", move_time=13)),
+    (r"pardom_direct_semantic", Provenance(family="driving-semantic", move_time=0)),
+    (r"^(svd|stable-video-diffusion-img2vid)$", Provenance(family="svd")),
+    (r"^(svd_xt|stable-video-diffusion-img2vid-xt)$", Provenance(family="svd", frames=25)),
+)
+
+
+def told_by_name(stem: str) -> Provenance:
+    """Family of a published file name without suffix, also with something added; the base models' names only whole."""
+    for pattern, told in _PUBLISHED:
+        if re.search(pattern + r"(?!\d)", stem.lower()):
+            return replace(told, told_by="file name")
+    return Provenance()
+
+
+def told_by_yaml(text: str) -> Provenance:
+    """Family by the numbers of a training configuration: angle ranges, move time, the driving views.
+
+    Only `key: value` lines with numbers are looked at, lists on one line or one item a line; nothing is executed.
+    """
+    lines = (line.rstrip() for line in text.splitlines())  # searching takes the square of a line's length, or of a gap
+    text = "\n".join(line for line in lines if 0 < len(line) <= _LONGEST_LINE)
+    move_time = re.search(r"^[ \t-]*move_time\s*:\s*(\d{1,4})\s*(#.*)?$", text, re.MULTILINE)
+    family = _family_of_ranges(text) or _family_of_views(text)
+    return Provenance(
+        family=family,
+        move_time=None if move_time is None else int(move_time[1]),
+        told_by=None if family is None else "yaml",
+    )
+
+
+def _family_of_ranges(text: str) -> FamilyName | None:
+    """By the largest azimuth difference; the elevation must not speak against it."""
+    azimuth, elevation = _largest_difference(text, "azimuth"), _largest_difference(text, "elevation")
+    families: dict[float, tuple[FamilyName, float]] = {90.0: ("kubric90", 30.0), 180.0: ("kubric180", 60.0)}
+    if azimuth not in families:
+        return None
+    family, expected = families[azimuth]
+    return family if elevation in (None, expected) else None
+
+
+def _largest_difference(text: str, angle: str) -> float | None:
+    """Half the width of the first range symmetric about zero under a key that names the angle."""
+    number = r"(-?\d+(?:\.\d*)?(?:[eE][+-]?\d+)?)"
+    inline = rf"\[\s*{number}\s*,\s*{number}\s*\]"
+    block = rf"(?:#.*)?\n\s*-\s*{number}\s*\n\s*-\s*{number}\s*(?:\n|$)"
+    for found in re.finditer(
+        rf"^[ \t-]*[\w.]*{angle}\w*\s*:\s*(?:{inline}|{block})", text, re.MULTILINE | re.IGNORECASE
+    ):
+        low, high = (float(value) for value in found.groups() if value is not None)
+        if low == -high and high > 0:
+            return high
+    return None
+
+
+def _family_of_views(text: str) -> FamilyName | None:
+    """The driving checkpoints look from above the road; their target is colour or classes."""
+    if re.search(r"pardom|parallel_?domain|ego_forward|topdown", text, re.IGNORECASE) is None:
+        return None
+    semantic = re.search(r"^[ \t-]*\w*modality\w*\s*:[\['\"\s]*segm", text, re.MULTILINE | re.IGNORECASE)
+    return "driving" if semantic is None else "driving-semantic"
+
+
+def combined(*told: Provenance) -> Provenance:
+    """Each fact from the first that knows it; who names the family first is named."""
+    return Provenance(
+        family=next((p.family for p in told if p.family is not None), None),
+        move_time=next((p.move_time for p in told if p.move_time is not None), None),
+        frames=next((p.frames for p in told if p.frames is not None), None),
+        told_by=next((p.told_by for p in told if p.family is not None), None),
+    )
+
+
+def checked_family(told: Provenance, config: ModelConfig | LiveConfig) -> Family | None:
+    """The family, if it can be: steered weights need a steered family, fixed ones a fixed one, the live model its own.
+
+    Relative poses may stand in for angles and radius.
+    Raises: CheckpointError on a contradiction, OptionError for an unknown name.
+    """
+    if told.family is None:
+        return None
+    family = family_named(told.family)
+    live = family is LIVE, isinstance(config, LiveConfig)
+    if live[0] != live[1]:
+        raise CheckpointError(
+            f"family {family.name} (told by: {told.told_by}) and these weights do not belong together: one is the live "
+            "model, the other is not; leave --family out"
+        )
+    if (family.camera == "none") != (config.camera == "none"):
+        raise CheckpointError(
+            f"family {family.name} (told by: {told.told_by}) wants camera control {family.camera!r}, "
+            f"the weights have {config.camera!r}; name another with --family"
+        )
+    return family
+
+
+def at_trained_size(config: ModelConfig, family: Family | None) -> ModelConfig:
+    """The config of published weights with the size and guidance of their family."""
+    if family is None:
+        return config
+    guidance = SVD_GUIDANCE if family.name == "svd" else SamplingConfig().guidance
+    return msgspec.structs.replace(
+        config,
+        height=family.height,
+        width=family.width,
+        sampling=msgspec.structs.replace(config.sampling, guidance=guidance),
+    )

@@ -1,0 +1,265 @@
+"""Graphs of one clip each give what the networks give in one batch; and what is refused of exports."""
+
+from pathlib import Path
+
+import msgspec
+import pytest
+import torch
+from msgspec import structs
+from small_models import TINY, random_clip, relative_error, tiny_synthesizer
+from torch import Tensor
+
+from gcd_model.clip import RenderOptions
+from gcd_model.engines.onnx import (
+    CPU_PROVIDER,
+    TENSORRT_PROVIDER,
+    OnnxEngine,
+    Sessions,
+    provider_options,
+)
+from gcd_model.engines.onnx_export import (
+    FORMAT,
+    MANIFEST,
+    FileRecord,
+    GraphRecord,
+    Manifest,
+    export_onnx,
+    graphs,
+    is_export,
+    read_manifest,
+)
+from gcd_model.errors import CheckpointError, DeviceMemoryError, ModelError, OptionError
+from gcd_model.geometry import SphericalDelta
+from gcd_model.loading import load_synthesizer
+from gcd_model.networks import empty_networks
+from gcd_model.synthesizer import Synthesizer
+from gcd_model.weights.card import Card
+from gcd_model.weights.families import KUBRIC90
+from gcd_model.weights.load import LoadedWeights, digest
+
+
+class TorchGraphs:
+    """The graphs before they are exported, held to the sizes they would have."""
+
+    def __init__(self, synthesizer: Synthesizer) -> None:
+        self.graphs = {graph.name: graph for graph in graphs(synthesizer.networks)}
+        self.runs: list[str] = []
+
+    def run(self, name: str, *inputs: Tensor) -> tuple[Tensor, ...]:
+        graph = self.graphs[name]
+        self.runs.append(name)
+        assert [each.shape for each in inputs] == [each.shape for each in graph.inputs.values()], name
+        made = graph.module(*inputs)
+        return made if isinstance(made, tuple) else (made,)
+
+
+def engined(synthesizer: Synthesizer) -> tuple[Synthesizer, TorchGraphs]:
+    """The same model, clip by clip."""
+    found, config = TorchGraphs(synthesizer), synthesizer.traits.config
+    return Synthesizer(empty_networks(config), synthesizer.traits, OnnxEngine(found, config)), found
+
+
+def test_views_samples_and_branches_are_runs_of_one_graph() -> None:
+    torched = tiny_synthesizer()
+    ours, found = engined(torched)
+    paths = [torched.traits.plan_view(SphericalDelta(azimuth_deg=angle)) for angle in (10.0, -20.0)]
+    options = RenderOptions(seed=1, steps=2, guidance=(1.0, 2.0), guidance_interval=(0.0, 1.0), samples=2)
+    features, expected_features = (each.encode(random_clip()) for each in (ours, torched))
+    assert relative_error(features.latents, expected_features.latents) < 1e-5
+    for view, expected in zip(
+        ours.render(features, paths, options), torched.render(expected_features, paths, options), strict=True
+    ):
+        assert relative_error(view.latents, expected.latents) < 1e-5
+        assert relative_error(view.video, expected.video) < 1e-5
+    assert found.runs.count("step") == 4 + 8, "2 views of 2 samples, without guidance at the first level, with it then"
+    assert found.runs.count("image_encoder") == found.runs.count("condition_encoder") == TINY.frames
+    assert found.runs.count("decoder") == 4
+
+
+def test_another_size_than_the_exports_is_refused() -> None:
+    ours, _ = engined(tiny_synthesizer())
+    with pytest.raises(OptionError, match="32x64 alone, got 64x64"):
+        ours.encode(random_clip(structs.replace(TINY, height=64)))
+
+
+# --- onnxruntime ---------------------------------------------------------------------------------------------------
+
+
+def one_graph(tmp_path: Path, operator: str = "Add") -> dict[str, Path]:
+    """A file with one operator of two inputs [2]."""
+    onnx = pytest.importorskip("onnx", reason="needs the extra `onnx`")
+    pytest.importorskip("onnxruntime", reason="needs the extra `onnx`")
+    names = ("first", "second", "sum")
+    values = [onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [2]) for name in names]
+    nodes = [onnx.helper.make_node(operator, ["first", "second"], ["sum"])]
+    graph = onnx.helper.make_graph(nodes, "one", values[:2], values[2:])
+    opset = [onnx.helper.make_opsetid("", 20)]
+    onnx.save(onnx.helper.make_model(graph, opset_imports=opset, ir_version=9), tmp_path / "decoder.onnx")
+    return {"decoder": tmp_path / "decoder.onnx"}
+
+
+def test_tensors_go_in_by_order_and_whoever_looks_between_layers_looks_between_graphs(tmp_path: Path) -> None:
+    sessions, seen = Sessions(one_graph(tmp_path)), []
+    hook = torch.nn.modules.module.register_module_forward_pre_hook(lambda module, _: seen.append(module))
+    try:
+        (made,) = sessions.run("decoder", torch.tensor([1.0, 2.0]), torch.tensor([[10.0, 0.0], [20.0, 0.0]])[:, 0])
+    finally:
+        hook.remove()
+    assert made.tolist() == [11.0, 22.0]
+    assert len(seen) == 1
+
+
+def test_what_onnxruntime_refuses_is_our_error_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ModelError) as raised:
+        Sessions(one_graph(tmp_path)).run("decoder", torch.zeros(3), torch.zeros(3))
+    assert len(str(raised.value).splitlines()) == 1
+    with pytest.raises(ModelError):
+        Sessions(one_graph(tmp_path, "NoSuchOperator"))
+
+
+def test_running_out_of_memory_is_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sessions = Sessions(one_graph(tmp_path))
+    from onnxruntime.capi.onnxruntime_pybind11_state import RuntimeException
+
+    def full(*_: object) -> None:
+        raise RuntimeException("[ONNXRuntimeError] : 6 : Failed to allocate memory for requested buffer of size 9")
+
+    monkeypatch.setattr(sessions._sessions["decoder"], "session", type("Full", (), {"run": full})())
+    with pytest.raises(DeviceMemoryError):
+        sessions.run("decoder", torch.zeros(2), torch.zeros(2))
+
+
+def test_an_absent_provider_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match=f"has no {TENSORRT_PROVIDER} here, only .*{CPU_PROVIDER}"):
+        Sessions(one_graph(tmp_path), [(TENSORRT_PROVIDER, {})])
+
+
+def test_the_cpu_comes_last_and_tensorrt_keeps_what_it_built(tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    chosen = provider_options("cuda:1", (TENSORRT_PROVIDER, CPU_PROVIDER), cache, half=True)
+    assert [name for name, _ in chosen] == [TENSORRT_PROVIDER, CPU_PROVIDER]
+    assert chosen[0][1] == {
+        "device_id": "1",
+        "trt_fp16_enable": "True",
+        "trt_engine_cache_enable": "True",
+        "trt_engine_cache_path": str(cache),
+    }
+    with pytest.raises(OptionError, match="device must be"):
+        provider_options("cpu:1", (), cache, half=False)
+
+
+# --- what an export says about itself -------------------------------------------------------------------------------
+
+
+def manifest(*files: FileRecord, height: int = TINY.height) -> Manifest:
+    card = Card(name="tiny", config=structs.replace(TINY, height=height), family="kubric90", move_time=2)
+    return Manifest(
+        format=FORMAT,
+        card=card.to_metadata(),
+        source="0123456789ab",
+        precision="float32",
+        opset=20,
+        exporter="a test",
+        graphs={"decoder": GraphRecord(files=files, precision="float32", inputs=(), outputs=())},
+    )
+
+
+def an_export(folder: Path, name: str = "decoder.onnx") -> Path:
+    """A folder with one file that is a graph by name."""
+    (folder / name).write_bytes(b"a graph")
+    record = FileRecord(name=name, size=7, sha256=digest((folder / name,)))
+    (folder / MANIFEST).write_bytes(msgspec.json.encode(manifest(record)))
+    return folder
+
+
+def test_the_digest_names_weights_precision_and_size_and_nothing_else() -> None:
+    stated = manifest()
+    assert stated.sha256_12 == structs.replace(stated, exporter="another", opset=21).sha256_12
+    others = (
+        structs.replace(stated, source="ba9876543210"),
+        structs.replace(stated, precision="float16"),
+        manifest(height=64),
+    )
+    assert len({stated.sha256_12, *(other.sha256_12 for other in others)}) == 4
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"{",
+        b"{}",
+        msgspec.json.encode(manifest()).replace(FORMAT.encode(), b"gcd-onnx-9"),
+        msgspec.json.encode(manifest()).replace(b'"opset"', b'"opzet"'),
+    ],
+)
+def test_a_manifest_that_cannot_be_used_is_refused(tmp_path: Path, text: bytes) -> None:
+    (tmp_path / MANIFEST).write_bytes(text)
+    with pytest.raises(CheckpointError, match="export it again"):
+        read_manifest(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"A graph", b"a gra", None])
+def test_whole_folders_are_read_and_damaged_ones_are_not(tmp_path: Path, content: bytes | None) -> None:
+    folder = an_export(tmp_path)
+    assert is_export(folder)
+    assert read_manifest(folder).graphs["decoder"].files[0].size == 7
+    (folder / "decoder.onnx").unlink()
+    if content is not None:
+        (folder / "decoder.onnx").write_bytes(content)
+    with pytest.raises(CheckpointError, match=r"its file decoder\.onnx"):
+        read_manifest(folder)
+
+
+def test_a_manifest_names_no_file_outside_its_folder(tmp_path: Path) -> None:
+    (tmp_path / "export").mkdir()
+    with pytest.raises(CheckpointError, match="lacks its file"):
+        read_manifest(an_export(tmp_path / "export", "../secret"))
+
+
+# --- loading, exporting --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options", [{"family": "driving"}, {"dtype": "float16"}, {"frames": 14}, {"engine": "torch"}, {"engine": "cuda"}]
+)
+def test_an_export_says_all_of_itself_and_torch_does_not_run_it(tmp_path: Path, options: dict[str, object]) -> None:
+    with pytest.raises(OptionError, match="is an export"):
+        load_synthesizer(an_export(tmp_path), **options)
+
+
+@pytest.mark.parametrize("options", [{"engine": "onnxruntime"}, {"providers": ("CPUExecutionProvider",)}])
+def test_onnxruntime_runs_nothing_but_exports(options: dict[str, object]) -> None:
+    with pytest.raises(OptionError, match="gcd-node export --weights random:kubric90"):
+        load_synthesizer("random:kubric90", **options)
+
+
+def tiny_weights() -> LoadedWeights:
+    networks = tiny_synthesizer().networks
+    return LoadedWeights(
+        name="tiny", networks=networks, family=KUBRIC90, move_time=2, trained=False, sha256_12="0" * 12
+    )
+
+
+@pytest.mark.parametrize(("out", "options"), [("mine", {}), ("mine", {"overwrite": True}), ("no/where", {})])
+def test_nothing_is_written_over_that_is_no_export_or_into_nowhere(
+    tmp_path: Path, out: str, options: dict[str, bool]
+) -> None:
+    (tmp_path / "mine").mkdir()
+    with pytest.raises(OptionError):
+        export_onnx(tiny_weights(), tmp_path / out, **options)
+    assert [path.name for path in tmp_path.rglob("*")] == ["mine"]
+
+
+def test_a_size_the_network_cannot_take_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="must be multiples of 8 for tiny, got 36x64"):
+        export_onnx(tiny_weights(), tmp_path / "export", height=36)
+
+
+def test_an_export_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("gcd_model.engines.onnx_export.write_graph", full)
+    with pytest.raises(CheckpointError, match="No space left on device"):
+        export_onnx(tiny_weights(), tmp_path / "export")
+    assert list(tmp_path.iterdir()) == []
