@@ -7,25 +7,25 @@ from driving_plane import STAGE_SOURCE, PlaneClips, plane_clip, without_learning
 from torch.testing import assert_close
 
 from gcd_model.geometry import CameraMount, SphericalDelta, spherical_trajectory, to_pose
-from gcd_train.baselines import (
+from gcd_train.datasets.paired import PairedClip
+from gcd_train.errors import DataError
+from gcd_train.evaluation.clips import source_side
+from gcd_train.evaluation.metrics import psnr
+from gcd_train.evaluation.predictors import (
     CameraPair,
     CopySource,
-    DepthReprojection,
     GroundHomography,
     MajorityMap,
     MeanTarget,
+    SourceClip,
     TargetStatistics,
     fit_statistics,
+    pixel_rays,
+    plane_homography,
     to_pictures,
+    to_pixels,
 )
-from gcd_train.baselines.cameras import pixel_rays, to_pixels
-from gcd_train.baselines.depth_reprojection import splat
-from gcd_train.baselines.ground_homography import plane_homography
-from gcd_train.baselines.predictor import SourceClip
-from gcd_train.datasets.paired import PairedClip
-from gcd_train.errors import DataError
-from gcd_train.evaluation import source_side
-from gcd_train.metrics import psnr
+from gcd_train.evaluation.reprojection import DepthReprojection, splat
 
 FRAMES, HEIGHT, WIDTH = 5, 64, 96
 MARK, MARK_CLASS = -1.0, 12

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gcd_model.errors import ShapeError
-from gcd_train.metrics import (
+from gcd_train.evaluation.metrics import (
     NO_CLASS,
     class_iou,
     commonest_classes,

@@ -12,28 +12,18 @@ from made_records import note, record
 from tiny_driving import write_untrained
 from typer.testing import CliRunner
 
-from gcd_train.baselines import (
-    BaselineSettings,
-    CopySource,
-    Prediction,
-    Predictor,
-    SavedFrames,
-    SourceClip,
-    build,
-    fit_statistics,
-    to_pictures,
-)
-from gcd_train.cli.evaluate import gpu_seats
 from gcd_train.cli.main import app
 from gcd_train.datasets.paired import PairedClips
 from gcd_train.errors import DataError, RecipeError, RunError
-from gcd_train.evaluation import ClipWork, HeldOutClip, PairedSet, RunKeeper, folder_name, measure_all, read_run
+from gcd_train.evaluation.baselines import BaselineSettings, build
+from gcd_train.evaluation.clips import HeldOutClip, PairedSet, chosen, identity_of
 from gcd_train.evaluation.kept_frames import KeptViews, png
+from gcd_train.evaluation.measure import predicted_and_measured
 from gcd_train.evaluation.methods import of_baselines
-from gcd_train.evaluation.paired_set import chosen, identity_of
-from gcd_train.evaluation.run import predicted_and_measured
-from gcd_train.evaluation.spread import GIVE_UP_AFTER, Account
-from gcd_train.reports.material import Run, gather
+from gcd_train.evaluation.predictors import CopySource, Prediction, Predictor, SourceClip, fit_statistics, to_pictures
+from gcd_train.evaluation.runner import GIVE_UP_AFTER, Account, ClipWork, assign_gpus, measure_all
+from gcd_train.evaluation.saved_frames import SavedFrames
+from gcd_train.evaluation.store import RunKeeper, folder_name, read_run
 
 
 @dataclass
@@ -135,13 +125,6 @@ def test_lines_beside_each_other_keep_each_others_methods_before_there_is_a_reco
     assert list(read_run(tmp_path)[0].methods) == ["a", "b"]
 
 
-def test_frames_are_known_again_by_what_they_are_and_not_by_their_place(tmp_path: Path) -> None:
-    keeper = RunKeeper(tmp_path)
-    keeper.begin(note(methods={"flat": {"frames in": "p/flat", "digest": "1"}}))
-    keeper.keep(record("flat", "k"))
-    assert keeper.begin(note(methods={"flat": {"frames in": "q", "digest": "1"}})).methods["flat"]["frames in"] == "q"
-
-
 @pytest.mark.parametrize(
     ("other", "said"),
     [
@@ -196,8 +179,26 @@ def test_a_clip_that_cannot_be_read_is_named_and_the_others_are_measured(tmp_pat
 def test_a_method_that_fails_takes_nothing_from_the_others(tmp_path: Path) -> None:
     account = finished(tmp_path, pairs(2), Counting(refused=["plane-00000000"]), CopySource())
     assert account.failures == {"plane-00000000, counting": "no frames for plane-00000000"}
-    assert "copy_source/plane-00000000.json" in records_in(tmp_path)
-    assert "counting/plane-00000000.json" not in records_in(tmp_path)
+    assert {"copy_source/plane-00000000.json", "counting/plane-00000001.json"} <= set(records_in(tmp_path))
+    assert set(account.records) == {
+        ("copy_source", "plane-00000000"),
+        ("copy_source", "plane-00000001"),
+        ("counting", "plane-00000001"),
+    }
+
+
+def test_nothing_to_measure_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError):
+        finished(tmp_path, PairedSet(clips=PlaneClips.make(1, frames=2), identity="plane"), CopySource())
+
+
+def test_rows_of_the_contact_sheet_are_kept_and_drawn_again_only_where_they_lack(tmp_path: Path) -> None:
+    method = Counting()
+    for sheet in (("plane-00000000",), ("plane-00000000", "plane-00000001")) * 2:
+        work = ClipWork(folder=tmp_path, clips=pairs(2), makers={"counting": lambda: method}, sheet=sheet)
+        *_, account = measure_all(work)
+        assert account.failures == {}
+    assert method.met == ["plane-00000000", "plane-00000001", "plane-00000001"]
 
 
 def test_a_run_in_which_nothing_goes_right_gives_up(tmp_path: Path) -> None:
@@ -220,10 +221,10 @@ def written(folder: Path, count: int, first_seed: int = 0) -> PairedClips:
 def test_workers_take_gpus_in_turn_unless_one_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     each = [{"CUDA_VISIBLE_DEVICES": "0"}, {"CUDA_VISIBLE_DEVICES": "1"}, {"CUDA_VISIBLE_DEVICES": "2"}]
-    assert list(gpu_seats("auto", 3)) == list(gpu_seats("cuda", 3)) == each
-    assert gpu_seats("cpu", 3) == gpu_seats("cuda:1", 3) == gpu_seats("auto", 1) == gpu_seats("auto", 0) == ()
+    assert list(assign_gpus("auto", 3)) == list(assign_gpus("cuda", 3)) == each
+    assert assign_gpus("cpu", 3) == assign_gpus("cuda:1", 3) == assign_gpus("auto", 1) == assign_gpus("auto", 0) == ()
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5, GPU-3a")
-    assert [seat["CUDA_VISIBLE_DEVICES"] for seat in gpu_seats("auto", 2)] == ["5", "GPU-3a"]
+    assert [seat["CUDA_VISIBLE_DEVICES"] for seat in assign_gpus("auto", 2)] == ["5", "GPU-3a"]
 
 
 @pytest.mark.slow
@@ -257,13 +258,6 @@ def test_kept_frames_are_predictions_that_score_the_same(tmp_path: Path) -> None
     assert np.array_equal((read.video * 255).round().byte().permute(0, 2, 3, 1).numpy(), clip.seen.source)
 
 
-def test_only_the_last_frame_is_kept_where_that_is_asked(tmp_path: Path) -> None:
-    work = ClipWork(folder=tmp_path, clips=pairs(1), makers={"copy_source": CopySource}, views="last")
-    *_, account = measure_all(work)
-    assert account.done == 1
-    assert {path.name for path in (tmp_path / "views").rglob("*.png")} == {"0003.png"}
-
-
 def pictures_in(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted((folder / "views").rglob("*.png"))}
 
@@ -293,14 +287,6 @@ def test_the_identity_follows_the_pictures_and_not_the_place(tmp_path: Path) -> 
     assert identity_of(clips) == identity_of(written(tmp_path / "b", 2))
     assert identity_of(clips) != identity_of(chosen(clips, limit=1))
     assert identity_of(clips) != identity_of(written(tmp_path / "c", 2, first_seed=1))
-
-
-def test_a_limit_counts_scenes_and_a_split_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    clips = written(tmp_path, 4)
-    assert len(chosen(clips, limit=3)) == 3
-    assert [chosen(clips, scenes={("driving", 2)}).scene(0)] == [("driving", 2)]
-    with pytest.raises(DataError, match="none of the 4 clips"):
-        chosen(clips, scenes={("driving", 9)})
 
 
 def evaluated(folder: Path, *options: str) -> tuple[int, str]:
@@ -449,36 +435,3 @@ def test_vanilla_svd_takes_weights_that_make_a_video_out_of_a_picture(tmp_path: 
     assert method.told == told
     with pytest.raises(RecipeError, match="is of the family driving"):
         of_baselines(["vanilla_svd"], replace(settings, svd=str(write_untrained(tmp_path))), "nothing")
-
-
-def test_a_baseline_tells_no_more_than_it_uses_so_that_runs_go_together(tmp_path: Path) -> None:
-    PlaneClips.make(1).write(tmp_path / "data")
-    PlaneClips.make(2).write(tmp_path / "train", first_seed=5)
-    lines = (
-        ["--methods", "copy_source,reproject_rgbd"],
-        ["--methods", "copy_source,reproject_rgbd,mean_target", "--train", str(tmp_path / "train"), "--samples", "3"],
-    )
-    for number, options in enumerate(lines):
-        code, said = evaluated(tmp_path, *options, "--out", str(tmp_path / str(number)))
-        assert code == 0, said
-    (one,) = gather([Run.read(tmp_path / each) for each in "01"])
-    assert [method.name for method in one.methods] == ["copy_source", "reproject_rgbd", "mean_target"]
-    assert one.method("copy_source").details == {"baseline": "copy_source"}
-    assert set(one.method("mean_target").details) == {"baseline", "means of"}
-
-
-def test_weights_of_vanilla_svd_are_told_where_they_lie_whoever_stands_where(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    PlaneClips.make(1).write(tmp_path / "data")
-    met: list[BaselineSettings] = []
-
-    def noted(names: object, settings: BaselineSettings, trained_on: str) -> tuple[()]:
-        met.append(settings)
-        return ()
-
-    monkeypatch.setattr("gcd_train.evaluation.plan.of_baselines", noted)
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "svd.safetensors").touch()
-    evaluated(tmp_path, "--methods", "vanilla_svd", "--svd", "svd.safetensors")
-    assert [each.svd for each in met] == [str(tmp_path / "svd.safetensors")]

@@ -34,9 +34,8 @@ from gcd_model import (
 )
 from gcd_train.cli.gallery import gallery_command
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.gallery import ViewRecipe, WindowChoice, Windowed, find_videos, read_windows, view_window
-from gcd_train.gallery.real_video import fitted, kept_share
-from gcd_train.gallery.viewed import mounted
+from gcd_train.look.gallery import ViewRecipe, mounted, view_window
+from gcd_train.look.real_video import WindowChoice, Windowed, find_videos, fitted, kept_share, read_windows
 
 T, H, W = 4, 32, 64
 REAL = Path(os.environ.get("GCD_REAL_VIDEOS", "no folder of videos"))
@@ -169,7 +168,8 @@ def test_what_is_no_video_is_refused_by_name(tmp_path: Path, content: bytes, sai
 def test_the_decoder_prints_no_lines_of_its_own(tmp_path: Path) -> None:
     broken = tmp_path / "broken.mp4"
     broken.write_bytes(b"\0\0\0\x18ftypmp42" + b"\0" * 64)
-    code = f"from gcd_train.gallery import find_videos; find_videos([__import__('pathlib').Path({str(broken)!r})])[0]"
+    code = "from pathlib import Path; from gcd_train.look.real_video import find_videos; "
+    code += f"find_videos([Path({str(broken)!r})])[0]"
     done = subprocess.run(
         [sys.executable, "-c", f"{code}.measured()"],
         capture_output=True,

@@ -10,21 +10,22 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from gcd_model.geometry import Intrinsics, Spherical, Trajectory, relative_pose, to_pose
-from gcd_train.baselines import CameraPair, SourceClip
-from gcd_train.baselines.hexplane import HexPlane
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.hexplane import (
-    Camera,
+from gcd_train.evaluation.hexplane import (
+    SPACE,
+    TIME,
     HexField,
     HexPlanes,
     HexPlaneSettings,
-    PosedPicture,
     SceneBounds,
-    learn,
+    nearest_to_axes,
+    render,
+    resampled,
+    sampled,
+    weights,
 )
-from gcd_train.hexplane.bounds import nearest_to_axes
-from gcd_train.hexplane.planes import SPACE, TIME, sampled
-from gcd_train.hexplane.rendering import render, resampled, weights
+from gcd_train.evaluation.hexplane_learning import Camera, HexPlane, PosedPicture, learn
+from gcd_train.evaluation.predictors import CameraPair, SourceClip
 from gcd_train.scene_view import SceneView
 
 LENS = Intrinsics.from_hfov(53.0, 24, 16)

@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 from gcd_model.errors import ShapeError
 from gcd_train.errors import DataError
-from gcd_train.metrics import Lpips
+from gcd_train.evaluation.lpips import Lpips
 
 VGG_PLAN = (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512)
 VGG_COMPARED, ALEX_COMPARED = (3, 8, 15, 22, 29), (1, 4, 7, 9, 11)

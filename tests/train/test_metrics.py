@@ -8,7 +8,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch.testing import assert_close
 
 from gcd_model.errors import ShapeError
-from gcd_train.metrics import (
+from gcd_train.evaluation.metrics import (
     diversity,
     frame_change,
     gradient_magnitude,

@@ -11,24 +11,18 @@ from driving_plane import PlaneClips, plane_clip
 
 from gcd_model.config import SemanticClass
 from gcd_model.geometry import CameraMount
-from gcd_train.baselines import (
+from gcd_train.errors import DataError, RecipeError
+from gcd_train.evaluation.baselines import (
     BaselineSettings,
-    CameraPair,
     ClassesAlone,
-    Prediction,
-    ReprojectRgbd,
-    ReprojectSemd,
-    SourceClip,
     baseline_names,
     build,
     described,
-    fit_statistics,
-    to_pictures,
     usual_baselines,
 )
-from gcd_train.baselines.published_reprojection import source_views
-from gcd_train.errors import DataError, RecipeError
-from gcd_train.metrics import NO_CLASS
+from gcd_train.evaluation.metrics import NO_CLASS
+from gcd_train.evaluation.predictors import CameraPair, Prediction, SourceClip, fit_statistics, to_pictures
+from gcd_train.evaluation.reprojection import ReprojectRgbd, ReprojectSemd, source_views
 from gcd_train.pointcloud import visibility
 from gcd_train.scene_view import SceneView
 

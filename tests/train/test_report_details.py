@@ -9,17 +9,16 @@ import pytest
 from made_records import FRAMES, note, record, region
 from typer.testing import CliRunner
 
-from gcd_train.baselines import FROM_EXACT_CLASSES, BaselineSettings, build
 from gcd_train.cli.main import app
-from gcd_train.evaluation.keeping import RunKeeper
-from gcd_train.evaluation.record import ClipRecord
-from gcd_train.reports import Choices, Measured, Run, all_plots, differences, gather, main_tables, make_report
-from gcd_train.reports.comparison import to_markdown as differences_told
-from gcd_train.reports.drawing import draw
-from gcd_train.reports.failures import worst_clips
-from gcd_train.reports.figure_tables import frames_csv, region_table
-from gcd_train.reports.galleries import Strip, caption, write_sheet
-from gcd_train.reports.table import to_markdown
+from gcd_train.evaluation.baselines import FROM_EXACT_CLASSES, BaselineSettings, build
+from gcd_train.evaluation.comparison import differences, worst_clips
+from gcd_train.evaluation.comparison import differences_markdown as differences_told
+from gcd_train.evaluation.galleries import Strip, caption, write_sheet
+from gcd_train.evaluation.plots import all_plots, draw
+from gcd_train.evaluation.report import Choices, make_report
+from gcd_train.evaluation.runs import Run, gather
+from gcd_train.evaluation.store import ClipRecord, RunKeeper
+from gcd_train.evaluation.tables import Measured, frames_csv, main_tables, region_table, to_markdown
 
 COUNTS = [(0, 0, 9), (1, 0, 1)]
 
@@ -179,7 +178,7 @@ def test_what_is_counted_has_ticks_at_whole_numbers(
         axes = figure.axes[0]  # pyright: ignore[reportAttributeAccessIssue, reportUnknownMemberType, reportUnknownVariableType]
         ticks.extend(map(float, axes.get_xticks()))  # pyright: ignore[reportUnknownMemberType, reportUnknownArgumentType]
 
-    monkeypatch.setattr("gcd_train.reports.drawing.save", kept_ticks)
+    monkeypatch.setattr("gcd_train.evaluation.plots.save", kept_ticks)
     draw(plot, tmp_path / "plot.png")
     assert ticks == ([2.0, 3.0, 4.0] if name == "by_frame" else [4.0])
 

@@ -7,10 +7,9 @@ import msgspec
 import pytest
 from made_records import FRAMES, note, record, region
 
-from gcd_train.evaluation.keeping import RunKeeper
-from gcd_train.evaluation.record import ClipRecord, RegionRecord
-from gcd_train.reports import Choices, EvaluatedSet, Run, gather, make_report
-from gcd_train.reports.goals import Goal, on_the_same_goals
+from gcd_train.evaluation.report import Choices, make_report
+from gcd_train.evaluation.runs import EvaluatedSet, Goal, Run, gather, on_the_same_goals
+from gcd_train.evaluation.store import ClipRecord, RegionRecord, RunKeeper
 
 Change = tuple[float, float, float]
 AHEAD: Change = (30.0, 5.0, 0.0)

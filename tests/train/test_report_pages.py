@@ -2,7 +2,6 @@
 
 import csv
 import json
-import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,28 +15,14 @@ from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
 from gcd_train.errors import RunError
-from gcd_train.evaluation.keeping import RunKeeper
-from gcd_train.evaluation.record import ClipRecord, RunNote
-from gcd_train.evaluation.tallies import Selection
-from gcd_train.reports import (
-    PAPER_TABLES,
-    Choices,
-    Interval,
-    Measured,
-    Run,
-    all_plots,
-    difference,
-    differences,
-    drawn,
-    gather,
-    main_tables,
-    make_report,
-    row_label,
-    worst_clips,
-)
-from gcd_train.reports.curves import angle_bins
-from gcd_train.reports.intervals import scene_weights
-from gcd_train.reports.table import Cell, Row, Table, to_csv, to_markdown
+from gcd_train.evaluation.comparison import differences, worst_clips
+from gcd_train.evaluation.paper import PAPER_TABLES, row_label
+from gcd_train.evaluation.plots import all_plots, angle_bins
+from gcd_train.evaluation.report import Choices, make_report
+from gcd_train.evaluation.runs import Run, gather
+from gcd_train.evaluation.statistics import Interval
+from gcd_train.evaluation.store import ClipRecord, RunKeeper, RunNote
+from gcd_train.evaluation.tables import Cell, Measured, Row, Table, main_tables, to_csv, to_markdown
 
 WEIGHTS = {"weights": "0123456789ab", "steps": "4"}
 SCENES = 6
@@ -70,54 +55,6 @@ def measured(*methods: Sequence[ClipRecord], **told: object) -> Measured:
 
 
 # --- intervals ----------------------------------------------------------------------------------------------------
-
-
-def test_every_draw_takes_as_many_scenes_as_there_are_and_the_same_seed_takes_the_same() -> None:
-    weights = scene_weights(7, draws=50, seed=1)
-    assert weights.shape == (50, 7)
-    np.testing.assert_array_equal(weights.sum(axis=1), 7.0)
-    np.testing.assert_array_equal(weights, scene_weights(7, draws=50, seed=1))
-    assert not np.array_equal(weights, scene_weights(7, draws=50, seed=2))
-
-
-def test_an_interval_of_a_mean_is_that_of_a_plain_bootstrap() -> None:
-    found = drawn(records("a"), Selection(), seed=4).interval("psnr_db")
-    scenes = 18.125 + np.arange(SCENES)
-    random = np.random.default_rng(0)
-    plain = scenes[random.integers(0, SCENES, size=(20_000, SCENES))].mean(axis=1)
-    assert found.value == pytest.approx(scenes.mean())
-    assert (found.low, found.high) == pytest.approx(tuple(np.quantile(plain, [0.025, 0.975])), abs=0.1)
-
-
-def test_intervals_of_pooled_classes_lie_around_the_figure_of_all() -> None:
-    clips = [
-        record("a", f"s{scene}", regions={"all": region(counts=[(0, 0, 50), (1, 1, 10 + scene), (1, 0, 9)])})
-        for scene in range(5)
-    ]
-    found = drawn(clips, Selection()).interval("miou_common")
-    assert found.low < found.value < found.high
-    assert found.value == pytest.approx((250 / 295 + 60 / 105) / 2)
-
-
-def test_a_difference_is_paired_so_a_constant_lead_has_a_narrow_interval() -> None:
-    first, other = (drawn(records(name, shift), Selection()) for name, shift in (("a", 0.5), ("b", 0.0)))
-    apart = difference(first, other, "psnr_db")
-    assert (apart.value, apart.low, apart.high) == pytest.approx((0.5, 0.5, 0.5))
-    assert apart.off_zero
-    assert first.interval("psnr_db").high - first.interval("psnr_db").low > 1.0
-
-
-def test_swapping_the_two_turns_a_difference_round() -> None:
-    first, other = (drawn(records(name, shift), Selection(), seed=2) for name, shift in (("a", 0.5), ("b", 0.0)))
-    there, back = difference(first, other, "ssim"), difference(other, first, "ssim")
-    assert (there.value, there.low, there.high) == pytest.approx((-back.value, -back.high, -back.low))
-
-
-def test_one_scene_has_no_bounds_and_no_claim() -> None:
-    found = drawn(records("a")[:2], Selection()).interval("psnr_db")
-    assert found.value == pytest.approx(18.125)
-    assert math.isnan(found.low)
-    assert not found.off_zero
 
 
 # --- tables -------------------------------------------------------------------------------------------------------

@@ -10,9 +10,10 @@ import torch
 from driving_plane import PlaneClips
 
 from gcd_model.geometry import CameraMount
-from gcd_train.baselines import CameraPair, SavedFrames, SourceClip, find_draws, to_pictures
 from gcd_train.datasets.skips import FileFault
 from gcd_train.errors import DataError
+from gcd_train.evaluation.predictors import CameraPair, SourceClip, to_pictures
+from gcd_train.evaluation.saved_frames import SavedFrames, find_draws
 
 FRAMES, HEIGHT, WIDTH = 3, 32, 48
 KEY = "scn02900.sample_02"

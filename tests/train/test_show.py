@@ -19,11 +19,10 @@ from typer.testing import CliRunner
 from gcd_train.cli.main import app
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.layouts.scene_writer import SceneFormat, write_scene
+from gcd_train.look.clip import SKY_M, UNKNOWN, UNSEEN, Footage, depth_colours, depth_ticks, instance_colour
+from gcd_train.look.open_scene import open_scene
+from gcd_train.look.scene_clip import ShowOptions
 from gcd_train.scenes.pair_world import DEPTH_UNIT_M, World
-from gcd_train.show.clips import ShowOptions
-from gcd_train.show.colours import SKY_M, UNKNOWN, depth_colours, depth_ticks, instance_colour
-from gcd_train.show.footage import UNSEEN, Footage
-from gcd_train.show.open_scene import open_scene
 
 FRAMES = 4
 

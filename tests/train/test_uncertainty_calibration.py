@@ -16,7 +16,6 @@ from typer.testing import CliRunner
 from gcd_model import View, load_synthesizer
 from gcd_model.checkpoints import inspect_weights
 from gcd_model.geometry import CameraMount, driving_trajectory
-from gcd_train.baselines import CameraPair, Prediction, SourceClip
 from gcd_train.cli.calibrate import calibrate_command
 from gcd_train.errors import DataError
 from gcd_train.evaluation.calibration import (
@@ -30,6 +29,7 @@ from gcd_train.evaluation.calibration import (
     miscoverage,
 )
 from gcd_train.evaluation.clips import HeldOutClip
+from gcd_train.evaluation.predictors import CameraPair, Prediction, SourceClip
 
 T, H, W = 4, 48, 64
 

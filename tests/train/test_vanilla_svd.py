@@ -15,8 +15,10 @@ from gcd_model.clip import Augmentation, Clip
 from gcd_model.conditioning import SourceFeatures
 from gcd_model.geometry import CameraMount
 from gcd_model.networks import empty_networks
-from gcd_train.baselines import BaselineSettings, CameraPair, SourceClip, VanillaSVD, build, described
 from gcd_train.errors import DataError, RecipeError
+from gcd_train.evaluation.baselines import BaselineSettings, build, described
+from gcd_train.evaluation.predictors import CameraPair, SourceClip
+from gcd_train.evaluation.svd import VanillaSVD
 
 SIZE = (16, 32)
 """As small as the networks can halve."""

@@ -7,24 +7,17 @@ from functools import lru_cache, partial
 from pathlib import Path
 
 from gcd_model import RenderOptions, ViewSynthesizer, inspect_weights, load_synthesizer, sampler_of
-from gcd_model.config import CameraControl, SemanticClass
+from gcd_model.config import SemanticClass
 from gcd_model.loading import packaged_weights
-from gcd_train.baselines import (
-    DEPTH_ON_MEAN,
-    REPROJECT_RGBD,
-    REPROJECT_SEMD,
-    VANILLA_SVD,
-    BaselineSettings,
-    Predictor,
-    SavedFrames,
-    build,
-    described,
-    usual_baselines,
-)
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.evaluation.record import FRAMES_IN
-from gcd_train.evaluation.spread import Maker
-from gcd_train.evaluation.synthesized import ClipFacts, SynthesizedViews
+from gcd_train.evaluation.baselines import DEPTH_ON_MEAN, BaselineSettings, build, described, usual_baselines
+from gcd_train.evaluation.model_views import ClipFacts, SynthesizedViews
+from gcd_train.evaluation.predictors import Predictor
+from gcd_train.evaluation.reprojection import REPROJECT_RGBD, REPROJECT_SEMD
+from gcd_train.evaluation.runner import Maker
+from gcd_train.evaluation.saved_frames import SavedFrames
+from gcd_train.evaluation.store import FRAMES_IN
+from gcd_train.evaluation.svd import VANILLA_SVD
 
 HEXPLANE = "hexplane_"
 """What the name of every HexPlane begins with; the number of its views follows."""
@@ -42,28 +35,6 @@ class Method:
     name: str
     make: Maker
     told: dict[str, str]
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Form:
-    """The form of clips, to be sent to other processes without the clips; see `ClipFacts`."""
-
-    frames: int
-    height: int
-    width: int
-    camera: CameraControl
-    classes: tuple[SemanticClass, ...]
-
-    @classmethod
-    def of(cls, clips: ClipFacts) -> "Form":
-        """Of some clips."""
-        return cls(
-            frames=clips.frames,
-            height=clips.height,
-            width=clips.width,
-            camera=clips.camera,
-            classes=tuple(clips.classes),
-        )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -198,11 +169,11 @@ def _of_weights(weights: Weights, clips: ClipFacts, options: RenderOptions) -> M
     }
     if used.guidance_interval is not None:
         told["guided from"] = "{:g} to {:g}".format(*used.guidance_interval)
-    return Method(name=made.name, make=partial(_synthesized, weights, Form.of(clips), options), told=told)
+    return Method(name=made.name, make=partial(_synthesized, weights, options, made.painted), told=told)
 
 
-def _synthesized(weights: Weights, form: Form, options: RenderOptions) -> Predictor:
-    return SynthesizedViews.of(weights.open(), form, options)
+def _synthesized(weights: Weights, options: RenderOptions, painted: tuple[SemanticClass, ...]) -> Predictor:
+    return SynthesizedViews(synthesizer=weights.open(), options=options, painted=painted)
 
 
 @lru_cache(maxsize=1)

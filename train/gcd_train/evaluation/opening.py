@@ -9,6 +9,7 @@ from typing import Literal, TypeAlias
 
 import msgspec
 
+from gcd_model import Traits
 from gcd_model.geometry import CameraMount
 from gcd_model.small_files import read_small
 from gcd_train.datasets.clip_frames import CLIP, DRIVING_FRAMES, KUBRIC_FRAMES, FrameSampling
@@ -21,9 +22,8 @@ from gcd_train.datasets.trajectories import DrivingSampling, OrbitSampling, Samp
 from gcd_train.datasets.view_pairs import ViewPairs
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.choosing import Choice, pairs_of_split, wanted_scenes
-from gcd_train.evaluation.clips import EvaluationSet
-from gcd_train.evaluation.paired_set import PairedSet, chosen
-from gcd_train.evaluation.protocols import (
+from gcd_train.evaluation.clips import EvaluationSet, PairedSet, chosen
+from gcd_train.evaluation.protocol import (
     AS_PLANNED,
     CLIPS,
     SAMPLES,
@@ -33,15 +33,19 @@ from gcd_train.evaluation.protocols import (
     ListedControls,
     ProtocolName,
     ReleasedControl,
+    controlled,
+    orbit_notes,
+    require_cameras,
 )
-from gcd_train.evaluation.scene_checks import controlled, orbit_notes, require_cameras
-from gcd_train.evaluation.scene_set import SceneSet
+from gcd_train.evaluation.scene_clips import SceneSet
 from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
 
 DataKind: TypeAlias = Literal["pairs", "kubric4d", "parallel_domain4d"]
 """What a folder holds."""
 
 _DIGITS = 12
+_NEAR_DEG = 90.0
+"""Families that were trained up to this azimuth have goals drawn up to it, others up to 180 degrees."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -69,13 +73,20 @@ class SceneCuts:
     height: int = 256
     width: int = 384
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Opened:
-    """Clips to be measured. notes: what of the split or list is not there, and what is odd, line by line."""
-
-    clips: EvaluationSet
-    notes: tuple[str, ...] = ()
+    @classmethod
+    def suiting(cls, model: Traits | None) -> "SceneCuts":
+        """As the weights were trained; the usual ones without weights."""
+        if model is None:
+            return cls()
+        family, config = model.family, model.config
+        return cls(
+            far=family is not None and family.limits is not None and family.limits.azimuth_deg > _NEAR_DEG,
+            gradual=model.move_time > 0,
+            semantic=family is not None and family.output == "semantic",
+            frames=config.frames,
+            height=config.height,
+            width=config.width,
+        )
 
 
 def data_kind(folders: Sequence[Path]) -> DataKind:
@@ -99,8 +110,10 @@ def _kind(names: Sequence[str]) -> DataKind:
     return "pairs"
 
 
-def open_pairs(folders: Sequence[Path], choice: Choice, mount: CameraMount | None) -> Opened:
-    """Pairs of the folders.
+def open_pairs(
+    folders: Sequence[Path], choice: Choice, mount: CameraMount | None
+) -> tuple[EvaluationSet, tuple[str, ...]]:
+    """Pairs of the folders; and what of the split is not there, line by line.
 
     Args:
         mount: what everybody is told of the source camera of driving clips; None for the usual one.
@@ -118,14 +131,12 @@ def open_pairs(folders: Sequence[Path], choice: Choice, mount: CameraMount | Non
     wanted = None
     if choice.split is not None:
         wanted = pairs_of_split(choice.split, scenes, notes)
-    return Opened(
-        clips=PairedSet.of(chosen(clips, scenes=wanted, limit=choice.limit), declared=_declared(mount, clips)),
-        notes=tuple(notes.plain_lines()),
-    )
+    some = chosen(clips, scenes=wanted, limit=choice.limit)
+    return PairedSet.of(some, declared=_declared(mount, clips)), tuple(notes.plain_lines())
 
 
-def open_scenes(folder: Path, choice: Choice, cuts: SceneCuts) -> Opened:
-    """Whole scenes, in either layout.
+def open_scenes(folder: Path, choice: Choice, cuts: SceneCuts) -> tuple[EvaluationSet, tuple[str, ...]]:
+    """Whole scenes, in either layout; and what of the list is not there or is odd, line by line.
 
     Raises:
         DataError: no scene is left, or a list or a control list cannot be read. RecipeError: options that contradict
@@ -161,7 +172,7 @@ def open_scenes(folder: Path, choice: Choice, cuts: SceneCuts) -> Opened:
         identity=_identity(folder, scenes, cuts),
         semantic=cuts.semantic,
     )
-    return Opened(clips=clips, notes=(*notes.plain_lines(), *odd))
+    return clips, (*notes.plain_lines(), *odd)
 
 
 def _odd(controls: ClipControls, scenes: Sequence[str], cuts: SceneCuts) -> tuple[str, ...]:
