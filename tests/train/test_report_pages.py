@@ -2,7 +2,6 @@
 
 import csv
 import json
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -20,9 +19,8 @@ from gcd_train.evaluation.paper import PAPER_TABLES, row_label
 from gcd_train.evaluation.plots import all_plots, angle_bins
 from gcd_train.evaluation.report import Choices, make_report
 from gcd_train.evaluation.runs import Run, gather
-from gcd_train.evaluation.statistics import Interval
 from gcd_train.evaluation.store import ClipRecord, RunKeeper, RunNote
-from gcd_train.evaluation.tables import Cell, Measured, Row, Table, main_tables, to_csv, to_markdown
+from gcd_train.evaluation.tables import Measured, main_tables, to_csv, to_markdown
 
 WEIGHTS = {"weights": "0123456789ab", "steps": "4"}
 SCENES = 6
@@ -85,34 +83,6 @@ def test_without_weights_for_lpips_its_column_says_so() -> None:
     assert cells == {"a": "no weights given", "b": "0.250 [0.250, 0.250]"}
 
 
-def test_a_row_says_how_many_of_the_clips_it_has_and_what_it_was_given() -> None:
-    main, _ = main_tables(measured(records("a"), records("oracle", privileged=True)[:5]))
-    assert [(row.method, row.clips) for row in main.rows] == [("a", "12 of 12"), ("oracle *", "5 of 12")]
-    assert re.match(r"Frames 2-\d+ of 12 clips of 6 scenes\.", main.notes[0])
-
-
-def test_figures_of_the_table_are_of_its_frames() -> None:
-    clip = record("a", regions={"all": region((100.0, 10.0, 20.0, 30.0))})
-    main, last = main_tables(measured([clip]))
-    assert [str(table.rows[0].cells[0]) for table in (main, last)] == ["20.00", "30.00"]
-
-
-def test_clips_of_our_own_with_classes_have_columns_for_both() -> None:
-    counted = [
-        record("a", f"s{n}", regions={"all": region((20.0,) * 4, counts=[(0, 0, 9), (1, 0, 1)])}) for n in (1, 2)
-    ]
-    main, _ = main_tables(measured(counted, kind="driving", classes=("sky", "road")))
-    assert main.headings == ("PSNR all", "SSIM all", "LPIPS all", "mIoU all")
-    assert str(main.rows[0].cells[3]) == "0.450 [0.450, 0.450]"
-
-
-def test_pixels_that_nobody_knows_are_unknown_in_a_table_of_the_paper() -> None:
-    _, main = main_tables(measured(records("gradual-90", occluded=None), kind="kubric", protocol="released"))
-    (row,) = [row for row in main.rows if row.method]
-    assert [str(cell) for cell in row.cells[3:]] == ["unknown", "unknown"]
-    assert "Unknown" in main.notes[1]
-
-
 def test_a_released_run_also_has_its_own_figures_over_all_frames(tmp_path: Path) -> None:
     for protocol in ("released", "paper"):
         keeper = RunKeeper(tmp_path / protocol)
@@ -139,14 +109,6 @@ def test_a_released_run_also_has_its_own_figures_over_all_frames(tmp_path: Path)
     assert not (tmp_path / "other" / "tables" / "all_frames.csv").exists()
 
 
-def test_a_table_with_regions_says_that_lpips_has_none() -> None:
-    main, last = main_tables(measured(records("a")))
-    assert any("LPIPS is over all pixels alone" in line for line in main.notes)
-    assert "LPIPS is over all pixels alone" in to_markdown(last)
-    whole = main_tables(measured(records("a", occluded=None)))[0]
-    assert not any("LPIPS" in line for line in whole.notes)
-
-
 @pytest.mark.parametrize(
     ("method", "details", "table", "label"),
     [
@@ -168,21 +130,6 @@ def test_a_method_finds_its_row(method: str, details: Mapping[str, str], table: 
     found = row_label(method, details, PAPER_TABLES[table])
     assert found == label
     assert found is None or any(row.label == found for row in PAPER_TABLES[table].rows)
-
-
-def test_a_user_may_say_where_a_method_stands() -> None:
-    of = measured(records("mine"), kind="kubric", protocol="paper")
-    placed = Measured(of=of.of, rows={"mine": "DynIBaR"})
-    table = main_tables(placed)[1]
-    assert [row.method for row in table.rows if row.label == "DynIBaR"] == ["mine"]
-
-
-def test_what_the_paper_does_not_have_stands_below() -> None:
-    table = main_tables(measured(records("copy_source"), kind="driving", protocol="released"))[0]
-    assert [(row.label, row.method) for row in table.below] == [("not in the paper", "copy_source")]
-    assert not any(row.method for row in table.rows)
-    line = to_markdown(table).splitlines().index(f"| {' | '.join(['———'] * 9)} |")
-    assert "copy_source" in to_markdown(table).splitlines()[line + 1]
 
 
 def test_the_papers_tables_hold_all_it_prints() -> None:
@@ -209,13 +156,6 @@ def test_the_means_that_the_papers_text_tells_follow_from_its_rows_and_are_measu
     assert str(some.rows[-1].cells[0]) == "not run"
 
 
-def test_a_bar_in_a_name_breaks_no_table() -> None:
-    cell = Cell(figure=Interval(value=1.0, low=0.5, high=1.5))
-    table = Table(name="t", title="T", headings=("x",), rows=(Row(label="a|b", cells=(cell,)),))
-    assert "| a\\|b |  |  | 1.00 [0.50, 1.50] |" in to_markdown(table)
-    assert lines(to_csv(table))[0]["x low"] == "0.5"
-
-
 # --- differences --------------------------------------------------------------------------------------------------
 
 
@@ -233,23 +173,11 @@ def test_a_claim_is_made_only_where_zero_lies_outside() -> None:
     assert back["a", "PSNR all"].verdict == "worse"
 
 
-def test_less_lpips_is_better() -> None:
-    of = measured(records("a", lpips=0.2), records("b", lpips=0.3))
-    (found,) = [each for each in differences(of, of.of.method("a")) if each.column.figure == "lpips"]
-    assert (found.apart.value, found.verdict) == (pytest.approx(-0.1), "better")
-
-
 def test_methods_are_compared_on_the_clips_that_both_have() -> None:
     of = measured(records("a"), records("b", 1.0)[3:])
     found = differences(of, of.of.method("a"))
     assert {each.clips for each in found} == {9}
     assert found[0].apart.value == pytest.approx(-1.0)
-
-
-def test_a_method_that_was_not_run_is_no_lead() -> None:
-    of = measured(records("a"))
-    with pytest.raises(RunError, match="no method is called 'c'"):
-        of.of.method("c")
 
 
 # --- runs ---------------------------------------------------------------------------------------------------------
@@ -262,13 +190,6 @@ def test_runs_on_the_same_clips_make_one_set_and_others_their_own() -> None:
     sets = gather([one, other, two])
     assert [[method.name for method in each.methods] for each in sets] == [["a", "b"], ["a"]]
     assert sets[0].method("a").folder == Path("one")
-
-
-def test_two_methods_of_one_name_are_refused() -> None:
-    one = run(note(methods={"a": WEIGHTS}), records("a"), folder="one")
-    two = run(note(methods={"a": {"weights": "other"}}), records("a"), folder="two")
-    with pytest.raises(RunError, match="a is another method in one than in two"):
-        gather([one, two])
 
 
 def test_a_method_measured_with_lpips_in_one_run_and_frames_that_were_moved_stay_one_method() -> None:
@@ -286,13 +207,6 @@ def test_a_method_measured_with_lpips_in_one_run_and_frames_that_were_moved_stay
     vgg, alex = (run(note(methods={"a": {"lpips": name}}), records("a"), folder=name) for name in ("vgg", "alex"))
     with pytest.raises(RunError, match="measure it alike in both"):
         gather([vgg, alex])
-
-
-def test_a_clip_is_as_fast_as_its_record_says_else_as_its_run() -> None:
-    (told,) = gather(
-        [run(note(methods={"a": WEIGHTS}), (msgspec.structs.replace(record("a", "x"), fps=6.0), record("a", "y")))]
-    )
-    assert (told.fps("x"), told.fps("y")) == (6.0, 10.0)
 
 
 def test_the_same_clips_measured_in_another_way_are_refused() -> None:
@@ -342,13 +256,6 @@ def test_similarity_is_shown_over_the_views_that_hexplane_is_given() -> None:
         ("HexPlane, occluded", [1.0, 8.0]),
     ]
     assert [level.name for level in plot.levels] == ["a, all"]
-
-
-def test_one_path_for_all_has_no_angles_and_its_frames_begin_with_the_second() -> None:
-    fixed = [record("a", f"s{number}") for number in range(3)]
-    (plot,) = all_plots(measured(fixed))
-    assert plot.name == "by_frame"
-    assert [point.x for point in plot.curves[0].points] == [2, 3, 4]
 
 
 def test_the_worst_clips_are_named_with_who_does_best_there() -> None:

@@ -21,7 +21,14 @@ from gcd_train.evaluation.choosing import Choice, public_split, public_split_nam
 from gcd_train.evaluation.clips import EvaluationSet
 from gcd_train.evaluation.opening import SceneCuts, data_kind, fingerprint, open_scenes, usual_samples
 from gcd_train.evaluation.plan import EvaluateOptions, planned
-from gcd_train.evaluation.protocol import PAPER_SOURCE, RELEASED_SOURCE, DrawnControls, FrameBounds, ReleasedControl
+from gcd_train.evaluation.protocol import (
+    PAPER_SOURCE,
+    RELEASED_SOURCE,
+    DrawnControls,
+    FrameBounds,
+    ListedControls,
+    released_controls,
+)
 from gcd_train.evaluation.store import read_run
 from gcd_train.layouts.manifest import MANIFEST, SceneManifest
 
@@ -79,7 +86,9 @@ def test_a_scene_has_the_same_clips_whatever_others_there_are_and_another_seed_h
 
 
 def test_the_released_script_makes_one_clip_of_its_own_angles() -> None:
-    control = ReleasedControl(orbit=True, bounds=FrameBounds(skip=4)).control("scn02900", "sample_00", 60)
+    control = ListedControls(
+        controls=released_controls(["scn02900"], orbit=True), clips=1, bounds=FrameBounds(skip=4)
+    ).control("scn02900", "sample_00", 60)
     assert control.start == RELEASED_SOURCE
     assert control.goal == Spherical(azimuth_deg=50.0, elevation_deg=25.0, radius_m=15.0)
     assert (control.frame_start, control.frame_skip) == (0, 4)

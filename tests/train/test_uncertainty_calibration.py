@@ -74,20 +74,6 @@ def test_an_honest_deviation_holds_what_it_says_at_every_level() -> None:
     assert [coverage(counts, level) for level in LEVELS] == pytest.approx(LEVELS, abs=0.015)
 
 
-def test_an_interval_holds_more_the_wider_it_is() -> None:
-    counts = spread_by(1.0).counts["all"]
-    held = [coverage(counts, 0.5, scale) for scale in (0.0001, 0.1, 0.5, 1.0, 2.0, 1000.0)]
-    assert held == sorted(held)
-    assert held[0] < 0.001
-    assert held[-1] == 1.0
-
-
-def test_a_half_as_wide_interval_holds_what_tables_of_the_normal_say() -> None:
-    counts = spread_by(2.0).counts["all"]
-    assert coverage(counts, 0.9) == pytest.approx(0.589, abs=0.015)  # P(|N| < 1.645 / 2)
-    assert coverage(counts, 0.5) == pytest.approx(0.264, abs=0.015)  # P(|N| < 0.674 / 2)
-
-
 def test_the_deviation_is_that_of_a_view() -> None:
     samples = torch.rand(3, T, 3, H, W, generator=torch.Generator().manual_seed(1))
     path = driving_trajectory(frames=T, move_time=T - 1)
@@ -129,8 +115,10 @@ def test_samples_that_do_not_differ_have_no_scale() -> None:
     same = torch.full((T, 3, H, W), 0.3)
     counts = distances(held_out(same + 0.1), drawn(same, same)).counts["all"]
     assert coverage(counts, 0.95, 1e6) == 0.0
-    with pytest.raises(DataError, match="the samples are all the same"):
+    with pytest.raises(DataError):
         best_scale(counts)
+    with pytest.raises(DataError):
+        calibrate([spread_by(1.0), spread_by(1.0, seed=1)])  # of one scene
 
 
 def test_one_draw_gives_no_interval() -> None:
@@ -146,11 +134,6 @@ def test_the_scale_of_one_half_is_reported_on_the_other() -> None:
     assert found.regions["all"].miscoverage < 0.01  # these need no scale
     assert found.regions["all"].miscoverage_scaled > 0.2
     assert list(found.regions) == ["all"]
-
-
-def test_one_scene_is_not_enough() -> None:
-    with pytest.raises(DataError, match="2 wanted, got 1"):
-        calibrate([spread_by(1.0), spread_by(1.0, seed=1)])
 
 
 # --- the command ------------------------------------------------------------------------------------------------------

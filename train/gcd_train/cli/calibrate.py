@@ -40,13 +40,7 @@ def calibrate_command(
     """Measure how often the truth lies within the intervals of the samples, and the scale that makes it as meant."""
     with errors_shown():
         from gcd_model import RenderOptions, convert_weights, load_synthesizer
-        from gcd_train.evaluation.calibration import (
-            CalibrationNote,
-            calibrate,
-            stored_line,
-            warnings,
-            write_calibration,
-        )
+        from gcd_train.evaluation.calibration import CalibrationNote, calibrate, write_calibration
         from gcd_train.evaluation.choosing import Choice
         from gcd_train.evaluation.model_views import SynthesizedViews
         from gcd_train.evaluation.plots import require_matplotlib
@@ -75,10 +69,13 @@ def calibrate_command(
         text = write_calibration(note, out)
         if path is not None and store is not None:
             convert_weights(path, store, uncertainty_scale=found.scale)
-            _say(stored_line(note, store))
+            _say(
+                f"{store} holds the scale {found.scale:.3g}: for {samples} samples in {note.steps} steps, and scenes "
+                "like these; with other --samples it is wrong"
+            )
     echo(text)
-    for line in warnings(note):
-        _say(f"warning: {line}")
+    if note.warning:
+        _say(f"warning: {note.warning}")
     written = f"{out}/calibration.json, calibration.md and reliability.png" + ("" if store is None else f", {store}")
     _say(f"wrote {written}")
 

@@ -1,4 +1,13 @@
-"""How far the deviation over samples can be trusted"""
+"""How much the deviation over samples can be trusted: how often the truth lies within the intervals that it gives.
+
+A pixel's interval at a level such as 90 % is, for each of its colours,
+
+    mean over samples ± z * scale * deviation,   z = 1.645 at 90 %: the normal quantile of (1 + level) / 2
+
+with the one deviation that a view has for each pixel (`View.std`, the mean over the colours). About the mean, because
+that is the best guess samples give, and the deviation is taken about it; a single sample lies farther from the truth.
+The first frame is left out: there the target camera of a gradual path stands where the source camera does.
+"""
 
 import zlib
 from collections.abc import Mapping, Sequence
@@ -14,14 +23,18 @@ from torch import Tensor
 
 from gcd_train.errors import DataError
 from gcd_train.evaluation.clips import HeldOutClip
+from gcd_train.evaluation.plots import new_figure, save
 from gcd_train.evaluation.predictors import Prediction, to_pictures
+from gcd_train.evaluation.statistics import FIRST_MEASURED
 from gcd_train.evaluation.store import Region, write_whole
+from gcd_train.evaluation.tables import markdown_rows
 
 LEVELS = tuple(round(0.05 * step, 2) for step in range(1, 20))
 """Shares of pixels that intervals are meant to hold, 5 % to 95 %."""
-
-FIRST_MEASURED = 1
-"""Frames before this one, counted from 0, are not measured."""
+STATED = (0.5, 0.9)
+"""Levels that tables show."""
+FEW_SCENES = 10
+"""Of fewer, no claim can rest on what was found."""
 
 Counts = NDArray[np.int64]
 """How many colours of pixels lie how many deviations from the truth: [_BINS], in equal steps of the logarithm."""
@@ -29,6 +42,7 @@ Counts = NDArray[np.int64]
 _LOWEST, _HIGHEST, _PER_OCTAVE = -20, 40, 48  # powers of two; what lies beyond stands in the first and the last bin
 _BINS = (_HIGHEST - _LOWEST) * _PER_OCTAVE + 2
 _HALVINGS = 60
+_COLOURS: dict[Region, str] = {"all": "#1f4e9c", "visible": "#2c8a4b", "occluded": "#c0392b"}
 
 
 class Reliability(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -50,7 +64,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     """What was found on held-out scenes.
 
     scale: what the deviation has to be multiplied with. fitted: scenes it was chosen on. reported: the other half, on
-    which `regions` were measured; "visible" and "occluded" are missing where nobody knows what the source camera saw.
+    which `regions` were measured; "visible" and "occluded" are missing where it is unknown what the source camera saw.
     """
 
     scale: float
@@ -58,6 +72,36 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     reported: tuple[str, ...]
     levels: tuple[float, ...]
     regions: dict[Region, Reliability]
+
+
+class CalibrationNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a calibration holds for, and what it found; `calibration.json`.
+
+    weights, sha256_12: of the model. data: folders. data_identity: digest of the clips. clips: measured. unreadable:
+    clips that could not be read, with the reason. samples, steps, seed: of the sampler.
+    """
+
+    weights: str
+    sha256_12: str
+    data: tuple[str, ...]
+    data_identity: str
+    clips: int
+    unreadable: tuple[str, ...]
+    samples: int
+    steps: int
+    seed: int
+    found: Calibration
+
+    @property
+    def scenes(self) -> int:
+        """How many there were."""
+        return len(self.found.fitted) + len(self.found.reported)
+
+    @property
+    def warning(self) -> str:
+        """What the scale should not be trusted for; empty for nothing."""
+        few = f"Measured on {_scenes(self.scenes)}: of fewer than {FEW_SCENES} no claim can rest on this scale."
+        return few if self.scenes < FEW_SCENES else ""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -76,16 +120,23 @@ def distances(clip: HeldOutClip, prediction: Prediction) -> Distances:
 
     Raises: DataError for fewer than two draws, or draws without pictures.
     """
-    drawn = _draws(prediction)[:, FIRST_MEASURED:]
+    videos = [draw.video for draw in prediction.draws if draw.video is not None]
+    if len(videos) < 2:
+        raise DataError(f"intervals want 2 or more draws of a picture, got {len(videos)}; give more --samples")
+    drawn = torch.stack(videos).float().cpu()[:, FIRST_MEASURED:]
     truth = to_pictures(clip.target)[FIRST_MEASURED:]
     spread = np.random.default_rng(zlib.crc32(clip.key.encode())).random(truth.shape, np.float32)
     truth = truth + (torch.from_numpy(spread) - 0.5) / 255.0
     far = (truth - drawn.mean(dim=0)).abs() / deviation(drawn)[:, None]  # [T-1, 3, H, W]; no deviation: infinitely far
-    places = _places(far)
-    counts: dict[Region, Counts] = {"all": _counted(places)}
+    exact = (far.nan_to_num(nan=0.0, posinf=torch.inf).log2() - _LOWEST) * _PER_OCTAVE + 1
+    places = exact.clamp(0, _BINS - 1).floor().long()  # NaN (0 / 0) is no distance at all
+    parts: dict[Region, Tensor] = {"all": places}
     if clip.visible is not None:
         seen = torch.from_numpy(clip.visible[FIRST_MEASURED:])[:, None].expand_as(places)
-        counts |= {"visible": _counted(places[seen]), "occluded": _counted(places[~seen])}
+        parts |= {"visible": places[seen], "occluded": places[~seen]}
+    counts: dict[Region, Counts] = {
+        name: np.bincount(part.flatten().numpy(), minlength=_BINS).astype(np.int64) for name, part in parts.items()
+    }
     return Distances(scene=clip.scene, counts=counts)
 
 
@@ -115,15 +166,19 @@ def best_scale(counts: Counts) -> float:
 
     Raises: DataError where no scale does, because most samples do not differ at all.
     """
-    low, high = float(_LOWEST), float(_HIGHEST)  # powers of two
-    if not _lacking(counts, 2.0**low) > 0 > _lacking(counts, 2.0**high):
+
+    def lacking(power: float) -> float:
+        return float(np.mean([level - coverage(counts, level, 2.0**power) for level in LEVELS]))
+
+    low, high = float(_LOWEST), float(_HIGHEST)
+    if not lacking(low) > 0 > lacking(high):
         raise DataError(
             "no scale makes intervals of this deviation hold what they should: the samples are all the same; "
             "check that the model draws, and that --samples is 2 or more"
         )
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        low, high = (middle, high) if _lacking(counts, 2.0**middle) > 0 else (low, middle)
+        low, high = (middle, high) if lacking(middle) > 0 else (low, middle)
     return float(2.0 ** ((low + high) / 2))
 
 
@@ -135,83 +190,26 @@ def calibrate(clips: Sequence[Distances]) -> Calibration:
     scenes = sorted({clip.scene for clip in clips})
     if len(scenes) < 2:
         raise DataError(f"a scale is chosen on half of the scenes and tried on the others: 2 wanted, got {len(scenes)}")
+
+    def summed(chosen: Sequence[str], region: Region) -> Counts:
+        each = [clip.counts[region] for clip in clips if clip.scene in chosen and region in clip.counts]
+        return np.sum(each, axis=0) if each else np.zeros(_BINS, np.int64)
+
     fitted, reported = tuple(scenes[::2]), tuple(scenes[1::2])
-    scale = best_scale(_summed(clips, fitted, "all"))
-    regions: dict[Region, Reliability] = {}
-    for region in clips[0].counts:
-        counts = _summed(clips, reported, region)
-        if counts.any():
-            regions[region] = _reliability(counts, scale)
+    scale = best_scale(summed(fitted, "all"))
+    by_region: dict[Region, Counts] = {region: summed(reported, region) for region in clips[0].counts}
+    regions: dict[Region, Reliability] = {
+        region: Reliability(
+            colours=int(counts.sum()),
+            held=tuple(coverage(counts, level) for level in LEVELS),
+            held_scaled=tuple(coverage(counts, level, scale) for level in LEVELS),
+            miscoverage=miscoverage(counts),
+            miscoverage_scaled=miscoverage(counts, scale),
+        )
+        for region, counts in by_region.items()
+        if counts.any()
+    }
     return Calibration(scale=scale, fitted=fitted, reported=reported, levels=LEVELS, regions=regions)
-
-
-def _reliability(counts: Counts, scale: float) -> Reliability:
-    return Reliability(
-        colours=int(counts.sum()),
-        held=tuple(coverage(counts, level) for level in LEVELS),
-        held_scaled=tuple(coverage(counts, level, scale) for level in LEVELS),
-        miscoverage=miscoverage(counts),
-        miscoverage_scaled=miscoverage(counts, scale),
-    )
-
-
-def _draws(prediction: Prediction) -> Tensor:
-    """[S, T, 3, H, W]."""
-    videos = [draw.video for draw in prediction.draws if draw.video is not None]
-    if len(videos) < 2:
-        raise DataError(f"intervals want 2 or more draws of a picture, got {len(videos)}; give more --samples")
-    return torch.stack(videos).float().cpu()
-
-
-def _places(far: Tensor) -> Tensor:
-    """The bin of each distance; the first and the last take what lies beyond, NaN (0 / 0) is no distance at all."""
-    exact = (far.nan_to_num(nan=0.0, posinf=torch.inf).log2() - _LOWEST) * _PER_OCTAVE + 1
-    return exact.clamp(0, _BINS - 1).floor().long()
-
-
-def _counted(places: Tensor) -> Counts:
-    return np.bincount(places.flatten().numpy(), minlength=_BINS).astype(np.int64)
-
-
-def _lacking(counts: Counts, scale: float) -> float:
-    """How much less is held than should be, on the mean over LEVELS; falls as the scale rises."""
-    return float(np.mean([level - coverage(counts, level, scale) for level in LEVELS]))
-
-
-def _summed(clips: Sequence[Distances], scenes: Sequence[str], region: Region) -> Counts:
-    total = np.zeros(_BINS, np.int64)
-    for clip in clips:
-        if clip.scene in scenes and region in clip.counts:
-            total += clip.counts[region]
-    return total
-
-
-STATED = (0.5, 0.9)
-"""Levels that tables show."""
-
-FEW_SCENES = 10
-"""Of fewer, no claim can rest on what was found."""
-
-_COLOURS: dict[Region, str] = {"all": "#1f4e9c", "visible": "#2c8a4b", "occluded": "#c0392b"}
-
-
-class CalibrationNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a calibration holds for, and what it found; `calibration.json`.
-
-    weights, sha256_12: of the model. data: folders. data_identity: digest of the clips. clips: measured. unreadable:
-    clips that could not be read, with the reason. samples, steps, seed: of the sampler.
-    """
-
-    weights: str
-    sha256_12: str
-    data: tuple[str, ...]
-    data_identity: str
-    clips: int
-    unreadable: tuple[str, ...]
-    samples: int
-    steps: int
-    seed: int
-    found: Calibration
 
 
 def write_calibration(note: CalibrationNote, folder: Path) -> str:
@@ -219,69 +217,49 @@ def write_calibration(note: CalibrationNote, folder: Path) -> str:
 
     Raises: RunError if they cannot be written, RenderError without matplotlib.
     """
-    text = calibration_text(note)
+    text = _text(note)
     write_whole(folder / "calibration.json", msgspec.json.format(msgspec.json.encode(note), indent=1))
     write_whole(folder / "calibration.md", text.encode())
-    write_plot(note.found, folder / "reliability.png")
+    _write_plot(note.found, folder / "reliability.png")
     return text
 
 
-def calibration_text(note: CalibrationNote) -> str:
+def _text(note: CalibrationNote) -> str:
     """Markdown: one row for each kind of pixel."""
     found = note.found
-    head = [f"{_percent(level)} interval holds | with the scale" for level in STATED]
-    columns = ["pixels", *head, "mean absolute miscoverage | with the scale"]
+    head = ["pixels", *(f"{100 * level:.0f} % interval holds | with the scale" for level in STATED)]
+    columns = " | ".join([*head, "mean absolute miscoverage | with the scale"]).split(" | ")
+    rows: list[list[str]] = []
+    for region, of in found.regions.items():
+        places = [LEVELS.index(level) for level in STATED]
+        held = [f"{100 * share:.0f} %" for place in places for share in (of.held[place], of.held_scaled[place])]
+        rows.append([region, *held, f"{of.miscoverage:.3f}", f"{of.miscoverage_scaled:.3f}"])
     lines = [
         f"# Calibration of {note.weights}",
         "",
         f"Weights {note.sha256_12}, {note.samples} samples, steps {note.steps}, seed {note.seed}; {note.clips} clips "
-        f"({note.data_identity}) of {_scenes(len(found.fitted) + len(found.reported))} in {', '.join(note.data)}.",
+        f"({note.data_identity}) of {_scenes(note.scenes)} in {', '.join(note.data)}.",
         "",
         f"**Scale {found.scale:.3g}**, chosen on {_scenes(len(found.fitted))}; the table is of the other "
         f"{len(found.reported)}.",
         "",
-        *(f"{line}\n" for line in warnings(note)),
-        f"| {' | '.join(columns)} |",
-        "|" + " --- |" * (2 * len(STATED) + 3),
-        *(_row(region, found.regions[region]) for region in found.regions),
-        *(f"\nNot read: {told}" for told in note.unreadable),
+        *([f"{note.warning}\n"] if note.warning else []),
+        *markdown_rows(columns, rows),
+        *(f"\nNot read: {why}" for why in note.unreadable),
     ]
     return "\n".join(lines) + "\n"
 
 
-def warnings(note: CalibrationNote) -> tuple[str, ...]:
-    """What the scale should not be trusted for, line by line."""
-    scenes = len(note.found.fitted) + len(note.found.reported)
-    if scenes >= FEW_SCENES:
-        return ()
-    return (f"Measured on {_scenes(scenes)}: of fewer than {FEW_SCENES} no claim can rest on this scale.",)
-
-
-def stored_line(note: CalibrationNote, file: Path) -> str:
-    """What a scale that was stored holds for; the file keeps the number alone."""
-    return (
-        f"{file} holds the scale {note.found.scale:.3g}: for {note.samples} samples in {note.steps} steps, and scenes "
-        "like these; with other --samples it is wrong"
-    )
-
-
-def write_plot(found: Calibration, out: Path) -> None:
-    """What intervals hold over what they are meant to hold, with the scale and without.
-
-    Raises: RenderError without matplotlib.
-    """
-    from gcd_train.evaluation.plots import new_figure, save
-
+def _write_plot(found: Calibration, out: Path) -> None:
+    """What intervals hold over what they are meant to hold, with the scale and without."""
     figure = new_figure(6.0, 5.6)
     axes = figure.add_axes((0.12, 0.11, 0.84, 0.8))
     axes.plot([0, 100], [0, 100], color="#999999", linewidth=1)
     levels = [100 * level for level in found.levels]
     for region, of in found.regions.items():
-        colour = _COLOURS[region]
-        axes.plot(
-            levels, [100 * held for held in of.held], "--", color=colour, linewidth=1, label=f"{region}, as drawn"
-        )
-        scaled = [100 * held for held in of.held_scaled]
+        colour, scaled = _COLOURS[region], [100 * held for held in of.held_scaled]
+        held = [100 * held for held in of.held]
+        axes.plot(levels, held, "--", color=colour, linewidth=1, label=f"{region}, as drawn")
         axes.plot(levels, scaled, "o-", color=colour, markersize=3.5, label=f"{region}, times {found.scale:.3g}")
     axes.set(xlim=(0, 100), ylim=(0, 100), xlabel="interval is meant to hold, %", ylabel="held, % of colours")
     axes.set_title("How often the truth lies within the interval", fontsize=10.5)
@@ -290,17 +268,5 @@ def write_plot(found: Calibration, out: Path) -> None:
     save(figure, out)
 
 
-def _row(region: Region, of: Reliability) -> str:
-    cells: list[str] = [region]
-    for level in STATED:
-        place = LEVELS.index(level)
-        cells += [_percent(of.held[place]), _percent(of.held_scaled[place])]
-    return f"| {' | '.join([*cells, f'{of.miscoverage:.3f}', f'{of.miscoverage_scaled:.3f}'])} |"
-
-
 def _scenes(count: int) -> str:
     return f"{count} scene" + "s" * (count != 1)
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %"

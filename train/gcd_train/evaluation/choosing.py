@@ -4,7 +4,6 @@ import difflib
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import get_args
 
@@ -42,10 +41,13 @@ class PublicSplit:
 
 def public_split_names() -> tuple[str, ...]:
     """All there are, by name."""
-    worlds = {
-        file.name.removesuffix(".json"): _read(file) for file in _folder().iterdir() if file.name.endswith(".json")
-    }
-    return tuple(sorted(f"{stem}-{part}" for stem, world in worlds.items() for part in world.parts))
+    return tuple(sorted(f"{stem}-{part}" for stem, world in _worlds().items() for part in world.parts))
+
+
+def _worlds() -> dict[str, _World]:
+    """By the name of their file."""
+    found = [file for file in (files("gcd_train") / "splits_public").iterdir() if file.name.endswith(".json")]
+    return {file.name.removesuffix(".json"): msgspec.json.decode(file.read_bytes(), type=_World) for file in found}
 
 
 def public_split(name: str) -> PublicSplit:
@@ -57,17 +59,9 @@ def public_split(name: str) -> PublicSplit:
             f"no split is called {name!r}, and it is no file; {meant}there are {', '.join(public_split_names())}"
         )
     stem, _, part = name.rpartition("-")
-    world = _read(_folder() / f"{stem}.json")
+    world = _worlds()[stem]
     runs = tuple(range(first, first + count) for first, count in world.parts[part])
     return PublicSplit(name=name, world=world.world, runs=runs)
-
-
-def _folder() -> Traversable:
-    return files("gcd_train") / "splits_public"
-
-
-def _read(file: Traversable) -> _World:
-    return msgspec.json.decode(file.read_bytes(), type=_World)
 
 
 _PARTS: dict[str, Part] = {part: part for part in get_args(Part)}

@@ -12,20 +12,20 @@ from torch import Tensor
 
 from gcd_model.errors import ShapeError
 
+NO_CLASS = 255
+"""Id of pixels that belong to no class, unless an ontology has 256: not counted in targets, wrong in predictions."""
+
+_VOID_NAMES = frozenset({"void", "unlabelled", "unlabeled"})
+_SMALLEST_ERROR = 1e-10  # equal pictures score 100 dB, so that means stay finite
+_WINDOW, _BORDER = 7, 3  # pixels
+_SAMPLE = _WINDOW**2 / (_WINDOW**2 - 1)
+_C1, _C2 = 0.01**2, 0.03**2
+
 
 def require_same_shape(first: Tensor, second: Tensor) -> None:
     """Raises ShapeError unless a view and its target have one shape."""
     if first.shape != second.shape:
         raise ShapeError(f"view and target must have one shape, got {list(first.shape)} and {list(second.shape)}")
-
-
-def require_mask(mask: Tensor, frames: int, height: int, width: int) -> None:
-    """Raises ShapeError unless a mask has one truth value for each pixel of each frame."""
-    if tuple(mask.shape) != (frames, height, width):
-        raise ShapeError(f"a mask must be [T, H, W] = [{frames}, {height}, {width}], got {list(mask.shape)}")
-
-
-_SMALLEST_ERROR = 1e-10  # equal pictures score 100 dB, so that means stay finite
 
 
 def psnr(views: Tensor, targets: Tensor) -> Tensor:
@@ -35,45 +35,38 @@ def psnr(views: Tensor, targets: Tensor) -> Tensor:
 
 
 def masked_psnr(views: Tensor, targets: Tensor, mask: Tensor) -> Tensor:
-    """`psnr` with the squared error averaged over the pixels of a mask and all colours, dB: [T]; NaN where it is empty.
-
-    Args:
-        mask: bool [T, H, W].
-    """
+    """`psnr` with the squared error averaged over the pixels of a mask and all colours: [T]; NaN where it is empty."""
     require_same_shape(views, targets)
     return _to_db(masked_mean(((views - targets) ** 2).mean(dim=1), mask))
+
+
+def _to_db(error: Tensor) -> Tensor:
+    """Mean squared error of pictures in [0, 1] as a signal-to-noise ratio; NaN stays NaN."""
+    return -10.0 * torch.log10(error.clamp(min=_SMALLEST_ERROR))
 
 
 def diversity(draws: Tensor, mask: Tensor | None = None) -> Tensor:
     """How far apart several draws of one view are: population standard deviation over draws, mean over the frame: [T].
 
     Args:
-        draws: [S, T, 3, H, W]. mask: bool [T, H, W], the pixels that count; NaN where it is empty. None for all.
-    Raises:
-        ShapeError: there are fewer than two draws.
+        draws: [S, T, 3, H, W], S at least 2. mask: the pixels that count; NaN where it is empty. None for all.
     """
-    if draws.ndim != 5 or len(draws) < 2:
-        raise ShapeError(f"diversity wants two draws or more, [S, T, 3, H, W], got {list(draws.shape)}")
     spread = draws.std(dim=0, correction=0).mean(dim=1)  # [T, H, W]
     return spread.mean(dim=(1, 2)) if mask is None else masked_mean(spread, mask)
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     """Mean over a mask's pixels of each frame: values and mask [T, H, W] -> [T]; NaN where the mask is empty."""
-    require_mask(mask, *values.shape)
+    if mask.shape != values.shape:
+        raise ShapeError(f"a mask must be [T, H, W] = {list(values.shape)}, got {list(mask.shape)}")
     return torch.where(mask, values, 0.0).sum(dim=(1, 2)) / mask.sum(dim=(1, 2))
 
 
-def gradient_magnitude(pictures: Tensor) -> Tensor:
-    """Mean of `gradient_map` over each frame: [T].
-
-    A view's over its target's is the gradient energy: 1 is as sharp as the target, below is blurred, above is noisy.
-    """
-    return gradient_map(pictures).mean(dim=(1, 2))
-
-
 def gradient_map(pictures: Tensor) -> Tensor:
-    """Length of the Sobel gradient at each pixel, mean over colours, in brightness per pixel: [T, H, W]."""
+    """Length of the Sobel gradient at each pixel, mean over colours, in brightness per pixel: [T, H, W].
+
+    A view's mean over its target's is the gradient energy: 1 is as sharp as the target, below blurred, above noisy.
+    """
     gradient = spatial_gradient(pictures, mode="sobel", order=1, normalized=True)  # [T, 3, 2, H, W]
     across, down = gradient.unbind(dim=2)
     return torch.hypot(across, down).mean(dim=1)  # a norm over two of five dimensions takes ten times as long
@@ -87,48 +80,39 @@ def frame_change(pictures: Tensor) -> Tensor:
     return (pictures[1:] - pictures[:-1]).abs().mean(dim=(1, 2, 3))
 
 
-def _to_db(error: Tensor) -> Tensor:
-    """Mean squared error of pictures in [0, 1] as a signal-to-noise ratio; NaN stays NaN."""
-    return -10.0 * torch.log10(error.clamp(min=_SMALLEST_ERROR))
-
-
-_WINDOW = 7
-_BORDER = _WINDOW // 2
-_PIXELS = _WINDOW**2
-_SAMPLE = _PIXELS / (_PIXELS - 1)
-_C1, _C2 = 0.01**2, 0.03**2
-
-
-def ssim(views: Tensor, targets: Tensor) -> Tensor:
-    """Structural similarity of each frame, mean over pixels and colours: [T], at most 1.
-
-    Raises:
-        ShapeError: shapes differ, or a picture is smaller than the window of 7 pixels.
-    """
-    return ssim_map(views, targets).mean(dim=(1, 2)).to(views.dtype)
-
-
-def masked_ssim(views: Tensor, targets: Tensor, mask: Tensor) -> Tensor:
-    """Structural similarity of each frame over the pixels of a mask that lie well inside it: [T]; NaN for none.
-
-    Args:
-        mask: bool [T, H, W]; see `window_mask` for what is left of it.
-    Raises:
-        ShapeError: as in `ssim`.
-    """
-    return masked_mean(ssim_map(views, targets), window_mask(mask)).to(views.dtype)
-
-
 def ssim_map(views: Tensor, targets: Tensor) -> Tensor:
     """Structural similarity around each pixel that has a whole window, mean over colours: float64 [T, H-6, W-6].
 
-    Raises:
-        ShapeError: as in `ssim`.
+    As scikit-image defines it by default: windows of 7 x 7 pixels of equal weight, sample covariances (N - 1), K1 =
+    0.01, K2 = 0.03 and a data range of 1. Differences of nearly equal squares are taken, so it is done in float64.
+
+    Raises: ShapeError: shapes differ, or a picture is smaller than the window.
+    Source: Wang et al. 2004, Eq. 13.
     """
     require_same_shape(views, targets)
     if min(views.shape[-2:]) < _WINDOW:
         raise ShapeError(f"SSIM wants pictures of at least {_WINDOW} pixels a side, got {list(views.shape[-2:])}")
     return torch.stack([_likeness(*both) for both in zip(views.double(), targets.double(), strict=True)])
+
+
+def _likeness(view: Tensor, target: Tensor) -> Tensor:
+    """`ssim_map` of one frame, [3, H, W] each; of a whole clip at once it takes half as long again."""
+    mean_a, mean_b = _window_mean(view), _window_mean(target)
+    both, squares = mean_a * mean_b, mean_a**2 + mean_b**2
+    covariance = _SAMPLE * (_window_mean(view * target) - both)
+    variances = _SAMPLE * (_window_mean(view * view + target * target) - squares)
+    return ((2 * both + _C1) * (2 * covariance + _C2) / ((squares + _C1) * (variances + _C2))).mean(dim=0)
+
+
+def _window_mean(values: Tensor) -> Tensor:
+    """Mean of each whole window: [C, H, W] -> [C, H-6, W-6]; sums of seven as 4 + 2 + 1, along each axis."""
+    for axis in (-1, -2):
+        long = values.shape[axis]
+        pairs = values.narrow(axis, 0, long - 1) + values.narrow(axis, 1, long - 1)
+        fours = pairs.narrow(axis, 0, long - 3) + pairs.narrow(axis, 2, long - 3)
+        count = long - _WINDOW + 1
+        values = fours.narrow(axis, 0, count) + pairs.narrow(axis, 4, count) + values.narrow(axis, 6, count)
+    return values / _WINDOW**2
 
 
 def window_mask(mask: Tensor) -> Tensor:
@@ -140,37 +124,6 @@ def window_mask(mask: Tensor) -> Tensor:
         middle, beside = mask[..., 1:-1, 1:-1], mask[..., 1:-1, :-2] & mask[..., 1:-1, 2:]
         mask = middle & beside & mask[..., :-2, 1:-1] & mask[..., 2:, 1:-1]
     return mask
-
-
-def _likeness(view: Tensor, target: Tensor) -> Tensor:
-    """`ssim_map` of one frame, [3, H, W] each; of a whole clip at once it takes half as long again."""
-    mean_a, mean_b = _window_mean(view), _window_mean(target)
-    both = mean_a * mean_b
-    squares = mean_a**2 + mean_b**2
-    covariance = _SAMPLE * (_window_mean(view * target) - both)
-    variances = _SAMPLE * (_window_mean(view * view + target * target) - squares)
-    likeness = (2 * both + _C1) * (2 * covariance + _C2) / ((squares + _C1) * (variances + _C2))
-    return likeness.mean(dim=0)
-
-
-def _window_mean(values: Tensor) -> Tensor:
-    """Mean of each whole window: [C, H, W] -> [C, H-6, W-6]."""
-    return _window_sum(_window_sum(values, -1), -2) / _PIXELS
-
-
-def _window_sum(values: Tensor, axis: int) -> Tensor:
-    """Sums of seven neighbours along an axis, as 4 + 2 + 1: half the additions of one after the other."""
-    long = values.shape[axis]
-    pairs = values.narrow(axis, 0, long - 1) + values.narrow(axis, 1, long - 1)
-    fours = pairs.narrow(axis, 0, long - 3) + pairs.narrow(axis, 2, long - 3)
-    count = long - _WINDOW + 1
-    return fours.narrow(axis, 0, count) + pairs.narrow(axis, 4, count) + values.narrow(axis, 6, count)
-
-
-NO_CLASS = 255
-"""Id of pixels that belong to no class, unless an ontology has 256: not counted in targets, wrong in predictions."""
-
-_VOID_NAMES = frozenset({"void", "unlabelled", "unlabeled"})
 
 
 def void_ids(names: Sequence[str]) -> tuple[int, ...]:
@@ -202,10 +155,10 @@ def majority_classes(classes: Tensor, height: int, width: int, count: int) -> Te
     if rows % height or columns % width:
         raise ShapeError(f"a grid must divide the class map: wanted {height}x{width} from {rows}x{columns}")
     flat = classes.reshape(-1, rows, columns)
-    cell = (rows // height, columns // width)
     there = torch.bincount(flat.flatten(), minlength=count)[:count] > 0
     there[0] = True  # what a cell becomes that none of the classes is in
     labels = there.nonzero()[:, 0]
+    cell = (rows // height, columns // width)
     shares = torch.stack([F.avg_pool2d((flat == label).float(), cell) for label in labels.tolist()])
     return labels[shares.argmax(dim=0)].to(torch.uint8).reshape(*leading, height, width)
 
@@ -233,9 +186,7 @@ def frame_confusions(predicted: Tensor, target: Tensor, count: int, mask: Tensor
     """
     require_same_shape(predicted, target)
     counted = _of_a_class(target, count)
-    if mask is not None:
-        require_mask(mask, *target.shape)
-        counted = counted & mask
+    counted = counted if mask is None else counted & mask
     said, true = predicted[counted], target[counted]
     known = _of_a_class(said, count)
     _require_known(said[known], true, count)
@@ -262,30 +213,9 @@ def class_iou(confusion: Tensor) -> Tensor:
     return both / (confusion.sum(dim=0)[: len(confusion)] + confusion.sum(dim=1) - both)
 
 
-def commonest_classes(pixels: Tensor, count: int) -> tuple[int, ...]:
-    """Ids of the classes with most target pixels, most first, the lower id of two as common; absent ones never.
-
-    Args:
-        pixels: [K], of all evaluated targets together. count: how many at most.
-    """
-    order = pixels.argsort(descending=True, stable=True)[:count]
-    return tuple(label for label in order.tolist() if pixels[label] > 0)
-
-
-def mean_iou(confusion: Tensor, classes: Sequence[int] | None = None) -> float:
-    """Mean over the classes that are predicted or there; NaN if none is.
-
-    Args:
-        confusion: of a whole set, for the paper's figure. classes: ids to average over, as the ten `commonest_classes`
-            of the paper; None for all.
-    """
-    iou = class_iou(confusion)
-    return float((iou if classes is None else iou[list(classes)]).nanmean())
-
-
-def pixel_accuracy(confusion: Tensor) -> float:
-    """Share of pixels whose class is right; NaN for no pixels."""
-    return float(confusion.diagonal().sum().double() / confusion.sum())
+def mean_iou(confusion: Tensor) -> float:
+    """Mean over the classes that are predicted or there, of the confusions of a whole set; NaN if none is."""
+    return float(class_iou(confusion).nanmean())
 
 
 def _of_a_class(labels: Tensor, count: int) -> Tensor:

@@ -18,7 +18,7 @@ from gcd_train.datasets.kubric4d import Kubric4D
 from gcd_train.datasets.paired import PairedClips
 from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
 from gcd_train.datasets.skips import Skips
-from gcd_train.datasets.trajectories import DrivingSampling, OrbitSampling, Sampling
+from gcd_train.datasets.trajectories import DrivingSampling, OrbitSampling
 from gcd_train.datasets.view_pairs import ViewPairs
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.choosing import Choice, pairs_of_split, wanted_scenes
@@ -32,9 +32,9 @@ from gcd_train.evaluation.protocol import (
     FrameBounds,
     ListedControls,
     ProtocolName,
-    ReleasedControl,
     controlled,
     orbit_notes,
+    released_controls,
     require_cameras,
 )
 from gcd_train.evaluation.scene_clips import SceneSet
@@ -44,6 +44,7 @@ DataKind: TypeAlias = Literal["pairs", "kubric4d", "parallel_domain4d"]
 """What a folder holds."""
 
 _DIGITS = 12
+_SMALL_BYTES = 4 << 20
 _NEAR_DEG = 90.0
 """Families that were trained up to this azimuth have goals drawn up to it, others up to 180 degrees."""
 
@@ -91,23 +92,24 @@ class SceneCuts:
 
 def data_kind(folders: Sequence[Path]) -> DataKind:
     """What the folders hold. Raises DataError for nothing that is known, or several folders of scenes."""
-    found = _kind(_names(folders[0]))
-    if found != "pairs" and len(folders) > 1:
+    try:
+        names = [path.name for path in folders[0].iterdir()]
+    except OSError as error:
+        raise DataError(f"{folders[0]} cannot be read ({error}); give a folder with pairs or with scenes") from error
+    if any(kubric4d_names.scene_number(name) is not None for name in names):
+        found: DataKind = "kubric4d"
+    elif any(parallel_domain4d_names.scene_number(name) is not None for name in names):
+        found = "parallel_domain4d"
+    else:
+        return "pairs"
+    if len(folders) > 1:
         raise DataError(f"scenes are taken from one folder, got {len(folders)}; give one --data, or pairs")
     return found
 
 
 def usual_samples(folders: Sequence[Path], protocol: ProtocolName) -> int:
-    """Draws of each view where nobody says how many. Raises DataError as `data_kind`."""
+    """Draws of each view by default. Raises DataError as `data_kind`."""
     return 1 if data_kind(folders) == "pairs" else SAMPLES[protocol]
-
-
-def _kind(names: Sequence[str]) -> DataKind:
-    if any(kubric4d_names.scene_number(name) is not None for name in names):
-        return "kubric4d"
-    if any(parallel_domain4d_names.scene_number(name) is not None for name in names):
-        return "parallel_domain4d"
-    return "pairs"
 
 
 def open_pairs(
@@ -144,12 +146,14 @@ def open_scenes(folder: Path, choice: Choice, cuts: SceneCuts) -> tuple[Evaluati
     """
     folder = folder.resolve()  # processes may stand elsewhere
     orbits, notes = data_kind([folder]) == "kubric4d", Skips(logged=False)
-    whole = _kubric(folder, cuts) if orbits else _driving(folder, cuts)
-    controls = _controls(cuts, orbits=orbits)
+    whole = _dataset(folder, cuts, orbits=orbits)
+    controls = _controls(cuts, whole.scenes, orbits=orbits)
     scenes = wanted_scenes(folder, whole.scenes, choice, notes)
     scenes = controlled(scenes, controls, cuts.controls, folder, notes)[: choice.limit]
     data = whole.only(scenes)
-    odd = _odd(controls, scenes, cuts) if orbits else ()
+    odd: tuple[str, ...] = ()
+    if orbits and cuts.controls is not None and isinstance(controls, ListedControls):
+        odd = orbit_notes(controls, scenes, cuts.controls)
     require_cameras(data)
     pairs = ViewPairs(
         data,
@@ -175,14 +179,6 @@ def open_scenes(folder: Path, choice: Choice, cuts: SceneCuts) -> tuple[Evaluati
     return clips, (*notes.plain_lines(), *odd)
 
 
-def _odd(controls: ClipControls, scenes: Sequence[str], cuts: SceneCuts) -> tuple[str, ...]:
-    """See `orbit_notes`; only a list can be odd."""
-    if cuts.controls is None or not isinstance(controls, ListedControls):
-        return ()
-    chosen = [(scene, name) for scene in scenes for name in controls.names(scene)]
-    return orbit_notes(controls.controls, chosen, cuts.controls)
-
-
 def _declared(mount: CameraMount | None, clips: PairedClips) -> CameraMount | None:
     """None where there is no vehicle."""
     if clips.camera == "none":
@@ -192,26 +188,16 @@ def _declared(mount: CameraMount | None, clips: PairedClips) -> CameraMount | No
     return None
 
 
-def _kubric(folder: Path, cuts: SceneCuts) -> Kubric4D:
+def _dataset(folder: Path, cuts: SceneCuts, *, orbits: bool) -> Kubric4D | ParallelDomain4D:
+    names = kubric4d_names.CAMERAS if orbits else parallel_domain4d_names.CAMERAS
+    if not orbits:
+        return ParallelDomain4D.open(folder, cameras=cuts.cameras or names, classes=cuts.semantic)
     if cuts.semantic:
         raise RecipeError("Kubric-4D has no classes: leave out --modality semantic")
-    cameras = cuts.cameras or kubric4d_names.CAMERAS
-    return Kubric4D.open(folder, cameras=cameras, published=cuts.protocol == "released")
+    return Kubric4D.open(folder, cameras=cuts.cameras or names, published=cuts.protocol == "released")
 
 
-def _driving(folder: Path, cuts: SceneCuts) -> ParallelDomain4D:
-    cameras = cuts.cameras or parallel_domain4d_names.CAMERAS
-    return ParallelDomain4D.open(folder, cameras=cameras, classes=cuts.semantic)
-
-
-def _names(folder: Path) -> list[str]:
-    try:
-        return [path.name for path in folder.iterdir()]
-    except OSError as error:
-        raise DataError(f"{folder} cannot be read ({error}); give a folder with pairs or with scenes") from error
-
-
-def _controls(cuts: SceneCuts, *, orbits: bool) -> ClipControls:
+def _controls(cuts: SceneCuts, scenes: Sequence[str], *, orbits: bool) -> ClipControls:
     clips = CLIPS[cuts.protocol] if cuts.clips is None else cuts.clips
     if cuts.controls is not None:
         if cuts.protocol == "paper" and cuts.bounds != AS_PLANNED:
@@ -221,33 +207,22 @@ def _controls(cuts: SceneCuts, *, orbits: bool) -> ClipControls:
             )
         return ListedControls(controls=read_controls(cuts.controls), clips=clips, bounds=cuts.bounds)
     if cuts.protocol == "released":
-        return ReleasedControl(orbit=orbits, bounds=cuts.bounds)
-    return DrawnControls(
-        seed=cuts.seed,
-        clips=clips,
-        frames=_frames(cuts, orbits=orbits),
-        orbit=_orbit(cuts) if orbits else None,
-        bounds=cuts.bounds,
-    )
+        return ListedControls(controls=released_controls(scenes, orbit=orbits), clips=clips, bounds=cuts.bounds)
+    sampling = _sampling(cuts, orbits=orbits)
+    orbit = sampling if isinstance(sampling, OrbitSampling) else None
+    return DrawnControls(seed=cuts.seed, clips=clips, frames=sampling.frames, orbit=orbit, bounds=cuts.bounds)
 
 
-def _frames(cuts: SceneCuts, *, orbits: bool) -> FrameSampling:
+def _sampling(cuts: SceneCuts, *, orbits: bool) -> OrbitSampling | DrivingSampling:
+    """How goals, first frames and strides are drawn."""
     usual = KUBRIC_FRAMES if orbits else DRIVING_FRAMES
-    return FrameSampling(clip=cuts.frames, strides=usual.strides, latest_start=usual.latest_start)
-
-
-def _orbit(cuts: SceneCuts) -> OrbitSampling:
+    frames = FrameSampling(clip=cuts.frames, strides=usual.strides, latest_start=usual.latest_start)
+    if not orbits:
+        return DrivingSampling(gradual=cuts.gradual, frames=frames)
     azimuth_deg, elevation_deg = (180.0, 60.0) if cuts.far else (90.0, 30.0)
     return OrbitSampling(
-        max_azimuth_deg=azimuth_deg,
-        max_elevation_deg=elevation_deg,
-        gradual=cuts.gradual,
-        frames=_frames(cuts, orbits=True),
+        max_azimuth_deg=azimuth_deg, max_elevation_deg=elevation_deg, gradual=cuts.gradual, frames=frames
     )
-
-
-def _sampling(cuts: SceneCuts, *, orbits: bool) -> Sampling:
-    return _orbit(cuts) if orbits else DrivingSampling(gradual=cuts.gradual, frames=_frames(cuts, orbits=False))
 
 
 def _identity(folder: Path, scenes: Sequence[str], cuts: SceneCuts) -> str:
@@ -260,10 +235,6 @@ def _identity(folder: Path, scenes: Sequence[str], cuts: SceneCuts) -> str:
     return digest.hexdigest()[:_DIGITS]
 
 
-_TOLD_BY = ".json"
-_SMALL_BYTES = 4 << 20
-
-
 def fingerprint(folder: Path) -> bytes:
     """Digest of the names and sizes of all files below, and of what small JSON files say.
 
@@ -273,31 +244,20 @@ def fingerprint(folder: Path) -> bytes:
     Raises:
         DataError: the folder or a file cannot be read.
     """
-    digest = hashlib.sha256()
+    digest, found = hashlib.sha256(), dict[str, Path]()
+
+    def passed_on(error: OSError) -> None:
+        raise error
+
     try:
-        for name, size in sorted(_files(folder)):
+        for place, folders, names in os.walk(folder, onerror=passed_on, followlinks=True):
+            folders[:] = [name for name in folders if not name.startswith(".")]
+            paths = [Path(place) / name for name in names if not name.startswith(".")]
+            found |= {path.relative_to(folder).as_posix(): path for path in paths}
+        for name, size in sorted((name, path.stat().st_size) for name, path in found.items()):
             digest.update(f"{name} {size}\n".encode())
-            if name.endswith(_TOLD_BY) and size <= _SMALL_BYTES and (folder / name).is_file():
-                digest.update(hashlib.sha256((folder / name).read_bytes()).digest())
+            if name.endswith(".json") and size <= _SMALL_BYTES and found[name].is_file():
+                digest.update(hashlib.sha256(found[name].read_bytes()).digest())
     except OSError as error:
         raise DataError(f"{folder} cannot be read ({error}); look at the scene, or leave it out with --list") from error
     return digest.digest()
-
-
-def _files(folder: Path) -> list[tuple[str, int]]:
-    """Names below the folder, with slashes, and bytes."""
-    found: list[tuple[str, int]] = []
-    for place, folders, names in os.walk(folder, onerror=_passed_on, followlinks=True):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        here = Path(place)
-        found += [
-            ((here / name).relative_to(folder).as_posix(), (here / name).stat().st_size)
-            for name in names
-            if not name.startswith(".")
-        ]
-    return found
-
-
-def _passed_on(error: OSError) -> None:
-    """`os.walk` keeps errors to itself unless it is told not to."""
-    raise error

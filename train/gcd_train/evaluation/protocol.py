@@ -6,13 +6,12 @@ Released: the first clip of each scene's controls, or the script's own angles; f
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, Protocol, TypeAlias
 
 import numpy as np
 
-from gcd_model.errors import PoseError
 from gcd_model.geometry import Spherical, SphericalDelta
 from gcd_train.datasets.clip_frames import FrameSampling
 from gcd_train.datasets.controls import Control, Controls
@@ -63,12 +62,10 @@ class FrameBounds:
 
     def of(self, control: Control) -> Control:
         """The control with these."""
-        return Control(
-            name=control.name,
+        return replace(
+            control,
             frame_start=control.frame_start if self.start is None else self.start,
             frame_skip=control.frame_skip if self.skip is None else self.skip,
-            start=control.start,
-            goal=control.goal,
         )
 
 
@@ -131,7 +128,7 @@ class DrawnControls:
             frame_start=start,
             frame_skip=skip,
             start=None if change is None else self.source,
-            goal=None if change is None else _goal(self.source, change),
+            goal=None if change is None else self.source + change,
         )
 
     def strides(self, scene: str, /) -> Sequence[int]:
@@ -149,43 +146,16 @@ class DrawnControls:
         return numbers[0] if start is None else start, stride
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ReleasedControl:
+def released_controls(scenes: Sequence[str], *, orbit: bool) -> Controls:
     """The one clip of each scene that the released script makes without a control list. orbit: False in driving."""
-
-    orbit: bool
-    bounds: FrameBounds
-
-    def names(self, scene: str, /) -> Sequence[str]:
-        """One."""
-        del scene
-        return ("sample_00",)
-
-    def control(self, scene: str, name: str, frames: int, /) -> Control:
-        """The same for every scene."""
-        del scene, frames
-        goal = _goal(RELEASED_SOURCE, RELEASED_CHANGE)
-        return self.bounds.of(
-            Control(
-                name=name,
-                frame_start=RELEASED_START,
-                frame_skip=RELEASED_SKIP,
-                start=RELEASED_SOURCE if self.orbit else None,
-                goal=goal if self.orbit else None,
-            )
-        )
-
-    def strides(self, scene: str, /) -> Sequence[int]:
-        """One."""
-        del scene
-        return (RELEASED_SKIP if self.bounds.skip is None else self.bounds.skip,)
-
-
-def _goal(source: Spherical, change: SphericalDelta) -> Spherical:
-    try:
-        return source + change
-    except PoseError as error:
-        raise DataError(f"no camera can stand at the goal: {error}") from error
+    control = Control(
+        name="sample_00",
+        frame_start=RELEASED_START,
+        frame_skip=RELEASED_SKIP,
+        start=RELEASED_SOURCE if orbit else None,
+        goal=RELEASED_SOURCE + RELEASED_CHANGE if orbit else None,
+    )
+    return dict.fromkeys(scenes, (control,))
 
 
 def _number(scene: str) -> int:
@@ -233,51 +203,32 @@ def require_cameras(data: Dataset4D) -> None:
         else:
             return
     if faults:
+        few = len(data.cameras) <= _NAMED
+        cameras = f"the cameras {', '.join(data.cameras)}" if few else f"its {len(data.cameras)} cameras"
         raise DataError(
-            f"none of {len(faults)} scenes can be opened with {_cameras(data.cameras)}: {faults[0]}; name those there "
-            "are with --camera"
+            f"none of {len(faults)} scenes can be opened with {cameras}: {faults[0]}; name those there are with "
+            "--camera"
         ) from faults[0]
 
 
-def _cameras(names: Sequence[str]) -> str:
-    few = f"the cameras {', '.join(names)}"
-    return few if len(names) <= _NAMED else f"its {len(names)} cameras"
-
-
-def orbit_notes(controls: Controls, chosen: Sequence[tuple[str, str]], listed: Path) -> tuple[str, ...]:
+def orbit_notes(controls: ListedControls, scenes: Sequence[str], listed: Path) -> tuple[str, ...]:
     """What is odd in the cameras of an orbit's control list, in words.
 
-    Args:
-        chosen: scene and name of each control that is used.
-    Raises:
-        DataError: one has no cameras: the list is for driving.
+    Raises: DataError: a control has no cameras: the list is for driving.
     """
-    each = [(scene, control) for scene, control in _of(controls, chosen)]
-    for scene, control in each:
+    chosen = [(scene, each) for scene in scenes for each in controls.controls[scene][: controls.clips]]
+    below: list[str] = []
+    for scene, control in chosen:
         if control.start is None or control.goal is None:
             raise DataError(
                 f"{listed}: {scene}, {control.name} has no spherical_start: it is a driving control, and these scenes "
                 "are seen along orbits; give Kubric-4D's controls"
             )
-    below = [(scene, control.name) for scene, control in each if _lowest(control) < 0]
+        if min(control.start.elevation_deg, control.goal.elevation_deg) < 0:
+            below.append(f"{scene}, {control.name}")
     if not below:
         return ()
-    first = ", ".join(below[0])
     return (
-        f"{listed}: {len(below)} of {len(each)} clips have a camera below the ground, first {first}; see its angles",
+        f"{listed}: {len(below)} of {len(chosen)} clips have a camera below the ground, first {below[0]}; see its "
+        "angles",
     )
-
-
-def _of(controls: Controls, chosen: Sequence[tuple[str, str]]) -> list[tuple[str, Control]]:
-    wanted = set(chosen)
-    return [
-        (scene, control)
-        for scene in dict.fromkeys(scene for scene, _ in chosen)
-        for control in controls[scene]
-        if (scene, control.name) in wanted
-    ]
-
-
-def _lowest(control: Control) -> float:
-    """Elevation in degrees."""
-    return min(camera.elevation_deg for camera in (control.start, control.goal) if camera is not None)

@@ -83,12 +83,12 @@ def make_report(folders: Sequence[Path], out: Path, choices: Choices | None = No
     for number, each in enumerate(sets, start=1):
         place = "." if len(sets) == 1 else f"{number}-{each.note.kind}-{each.note.modality}"
         pages.append("\n".join(_Writer(of=each, out=out, place=place, choices=choices).sections()))
-    joined = on_the_same_goals(sets)
-    for number, each in enumerate(joined.sets, start=1):
+    joined, notes = on_the_same_goals(sets)
+    for number, each in enumerate(joined, start=1):
         writer = _Writer(of=each, out=out, place=f"last-frame-{number}", choices=choices)
         pages.append("\n".join(writer.last_frames()))
-    if joined.notes:
-        pages.append("\n".join(["## What is not compared\n", *(f"- {note}" for note in joined.notes)]))
+    if notes:
+        pages.append("\n".join(["## What is not compared\n", *(f"- {note}" for note in notes)]))
     path = out / "report.md"
     write_whole(path, ("\n".join(pages).rstrip() + "\n").encode())
     return path

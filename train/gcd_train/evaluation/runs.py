@@ -1,12 +1,11 @@
 """Runs of evaluations put together: what was measured on the same clips stands in the same tables."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
 from pathlib import Path
 
 import msgspec
+import numpy as np
 
 from gcd_train.errors import RunError
 from gcd_train.evaluation.baselines import FROM_EXACT_CLASSES
@@ -133,53 +132,42 @@ def gather(runs: Sequence[Run]) -> tuple[EvaluatedSet, ...]:
     Raises:
         RunError: two runs on the same clips were made in other ways, or name two different methods alike.
     """
-    order = list(dict.fromkeys(run.note.data_identity for run in runs))
-    alike = sorted(runs, key=lambda run: order.index(run.note.data_identity))
-    groups = groupby(alike, key=lambda run: run.note.data_identity)
-    return tuple(_set(tuple(members)) for _, members in groups)
+    groups: dict[str, list[Run]] = {}
+    for run in runs:
+        groups.setdefault(run.note.data_identity, []).append(run)
+    return tuple(_set(tuple(members)) for members in groups.values())
 
 
 def _set(runs: tuple[Run, ...]) -> EvaluatedSet:
-    for run in runs[1:]:
-        _require_comparable(runs[0], run)
+    first = runs[0]
+    for run, name in ((run, name) for run in runs[1:] for name in COMPARABLE):
+        was, now = getattr(first.note, name), getattr(run.note, name)
+        if was != now:
+            raise RunError(
+                f"{run.folder} has {name} {now}, {first.folder} has {was}, on the same clips; report them apart"
+            )
     found: dict[str, Method] = {}
     for run in runs:
-        for method in _methods(run):
-            other = found.setdefault(method.name, method)
-            if not _same_method(other.details, method.details):
+        records: dict[str, list[ClipRecord]] = {}
+        for record in run.records:
+            records.setdefault(record.method, []).append(record)
+        for name, own in records.items():
+            details = run.note.methods.get(name, {})
+            method = Method(name=name, details=details, folder=run.folder, records=tuple(own))
+            other = found.setdefault(name, method)
+            if not _same_method(other.details, details):
                 raise RunError(
-                    f"{method.name} is another method in {other.folder} than in {run.folder}: {other.details} and "
-                    f"{method.details}; measure it alike in both, give one another name, or report the runs apart"
+                    f"{name} is another method in {other.folder} than in {run.folder}: {other.details} and "
+                    f"{details}; measure it alike in both, give one another name, or report the runs apart"
                 )
-    return EvaluatedSet(note=runs[0].note, runs=runs, methods=tuple(found.values()))
+    return EvaluatedSet(note=first.note, runs=runs, methods=tuple(found.values()))
 
 
 def _same_method(first: Mapping[str, str], other: Mapping[str, str]) -> bool:
     """Whether two notes are of one method: frames from elsewhere are known by their content, wherever they lie, and
     LPIPS may have been left out of one of the two runs."""
-    kept = [{name: value for name, value in each.items() if name != FRAMES_IN} for each in (first, other)]
-    if any(LPIPS not in each for each in kept):
-        kept = [{name: value for name, value in each.items() if name != LPIPS} for each in kept]
-    return kept[0] == kept[1]
-
-
-def _require_comparable(first: Run, other: Run) -> None:
-    for name in COMPARABLE:
-        was, now = getattr(first.note, name), getattr(other.note, name)
-        if was != now:
-            raise RunError(
-                f"{other.folder} has {name} {now}, {first.folder} has {was}, on the same clips; report them apart"
-            )
-
-
-def _methods(run: Run) -> list[Method]:
-    by_name: dict[str, list[ClipRecord]] = {}
-    for record in run.records:
-        by_name.setdefault(record.method, []).append(record)
-    return [
-        Method(name=name, details=run.note.methods.get(name, {}), folder=run.folder, records=tuple(records))
-        for name, records in by_name.items()
-    ]
+    left_out = {FRAMES_IN} if LPIPS in first and LPIPS in other else {FRAMES_IN, LPIPS}
+    return all(first.get(name) == other.get(name) for name in (first.keys() | other.keys()) - left_out)
 
 
 _SAME_CHANGE = 0.01  # degrees and metres
@@ -201,42 +189,43 @@ class Goal:
         """Of one clip, from the records of any methods on it."""
         target: dict[str, Frames] = {}
         for record in records:
-            for name, values in _of_target(record).items():
-                target.setdefault(name, values)
+            target = {**_of_target(record), **target}
         return cls(change=records[0].change, target=target)
 
     def apart_from(self, other: "Goal", frames: Span = "last") -> str:
         """Why the two targets are not the same in these frames, in words; empty where they are."""
-        if not _same_change(self.change, other.change):
-            return f"the camera goes {_told(self.change)} and {_told(other.change)}"
+        both = (self.change, other.change)
+        near = self.change is not None and other.change is not None
+        near = near and bool(np.allclose(self.change or (), other.change or (), rtol=0.0, atol=_SAME_CHANGE))
+        if not near and both != (None, None):
+            return "the camera goes {} and {}".format(*map(_told, both))
         chosen, known = Selection(frames=frames).frame_slice(), self.target.keys() & other.target.keys()
         if not known and self.change is None:
             return "nobody knows whether the targets are the same"
-        same = all(_alike(self.target[name][chosen], other.target[name][chosen]) for name in known)
-        return "" if same else "the target's pictures differ: other moments, or another path"
+        for name in known:
+            values = [np.array(each.target[name][chosen], np.float64) for each in (self, other)]  # NaN for None
+            if (
+                values[0].shape != values[1].shape
+                or not np.isclose(*values, rtol=_SAME_FIGURE, atol=1e-9, equal_nan=True).all()
+            ):
+                return "the target's pictures differ: other moments, or another path"
+        return ""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Joined:
-    """sets: each put together from several whose clips end at the same goals. notes: what is not compared, and why."""
-
-    sets: tuple[EvaluatedSet, ...]
-    notes: tuple[str, ...]
-
-
-def on_the_same_goals(sets: Sequence[EvaluatedSet]) -> Joined:
+def on_the_same_goals(sets: Sequence[EvaluatedSet]) -> tuple[tuple[EvaluatedSet, ...], tuple[str, ...]]:
     """Sets with clips of one name that end at the same goal, put together, for figures of the last frame.
 
     A gradual and a direct path end at the same goal, so their last frames can be compared and no others. Clips of the
     same name that go elsewhere are left out. A method that several of the sets have is taken from the first.
+
+    Returns: the sets, each put together from several; and what is not compared, and why, line by line.
     """
     groups: list[list[EvaluatedSet]] = []
     notes: list[str] = []
     for each in sets:
         _place(each, groups, notes)
-    together = [group for group in groups if len(group) > 1]
-    notes += [note for group in together for note in _renamed(group)]
-    return Joined(sets=tuple(_put_together(group) for group in together), notes=tuple(notes))
+    together = [_put_together(group, notes) for group in groups if len(group) > 1]
+    return tuple(together), tuple(notes)
 
 
 def _place(each: EvaluatedSet, groups: list[list[EvaluatedSet]], notes: list[str]) -> None:
@@ -245,9 +234,16 @@ def _place(each: EvaluatedSet, groups: list[list[EvaluatedSet]], notes: list[str
         why = _compared(group[0], each)
         apart = {key: reason for key, reason in why.items() if reason}
         if apart:
-            notes.append(_not_compared(group[0], each, apart, len(why)))
+            first, other = (", ".join(dict.fromkeys(str(run.folder) for run in of.runs)) for of in (group[0], each))
+            key, reason = next(iter(apart.items()))
+            notes.append(
+                f"{first} and {other}: of {len(why)} clips of the same names {len(apart)} do not end at the same goal, "
+                f"so they are not compared. In {key} {reason}."
+            )
         if len(apart) < len(why):
-            group.append(_only(each, [key for key, reason in why.items() if not reason]))
+            wanted = why.keys() - apart.keys()
+            kept = [replace(m, records=tuple(r for r in m.records if r.key in wanted)) for m in each.methods]
+            group.append(replace(each, methods=tuple(method for method in kept if method.records)))
             return
     groups.append([each])
 
@@ -262,55 +258,26 @@ def _compared(first: EvaluatedSet, other: EvaluatedSet) -> dict[str, str]:
 
 def _goals(of: EvaluatedSet) -> dict[str, Goal]:
     by_key: dict[str, list[ClipRecord]] = {}
-    for method in of.methods:
-        for record in method.records:
-            by_key.setdefault(record.key, []).append(record)
+    for record in (record for method in of.methods for record in method.records):
+        by_key.setdefault(record.key, []).append(record)
     return {key: Goal.of(records) for key, records in by_key.items()}
 
 
-def _only(of: EvaluatedSet, keys: Sequence[str]) -> EvaluatedSet:
-    """Of these clips alone; a method that has none of them is left out."""
-    wanted = set(keys)
-    kept = [replace(m, records=tuple(each for each in m.records if each.key in wanted)) for m in of.methods]
-    return replace(of, methods=tuple(method for method in kept if method.records))
-
-
-def _put_together(sets: Sequence[EvaluatedSet]) -> EvaluatedSet:
+def _put_together(sets: Sequence[EvaluatedSet], notes: list[str]) -> EvaluatedSet:
+    """One set of all; methods that share a name and nothing else are noted, and only the first of each is kept."""
     methods: dict[str, Method] = {}
     for method in (method for each in sets for method in each.methods):
-        methods.setdefault(method.name, method)
-    data = tuple(folder for each in sets for folder in each.note.data)
-    return EvaluatedSet(
-        note=msgspec.structs.replace(sets[0].note, data=data),
-        runs=tuple(run for each in sets for run in each.runs),
-        methods=tuple(methods.values()),
-    )
-
-
-def _renamed(sets: Sequence[EvaluatedSet]) -> list[str]:
-    """Methods that share a name and nothing else: only the first of each is shown."""
-    first: dict[str, Method] = {}
-    notes: list[str] = []
-    for method in (method for each in sets for method in each.methods):
-        other = first.setdefault(method.name, method)
+        other = methods.setdefault(method.name, method)
         if other.details != method.details:
             notes.append(
                 f"{method.name} is another method in {method.folder} than in {other.folder}, and only the latter "
                 "stands in the table of both; rename one of the two to compare them"
             )
-    return notes
-
-
-def _not_compared(first: EvaluatedSet, other: EvaluatedSet, apart: Mapping[str, str], shared: int) -> str:
-    key, reason = next(iter(apart.items()))
-    return (
-        f"{_named(first)} and {_named(other)}: of {shared} clips of the same names {len(apart)} do not end at the same "
-        f"goal, so they are not compared. In {key} {reason}."
+    return EvaluatedSet(
+        note=msgspec.structs.replace(sets[0].note, data=tuple(folder for each in sets for folder in each.note.data)),
+        runs=tuple(run for each in sets for run in each.runs),
+        methods=tuple(methods.values()),
     )
-
-
-def _named(of: EvaluatedSet) -> str:
-    return ", ".join(str(folder) for folder in {run.folder: None for run in of.runs})
 
 
 def _of_target(record: ClipRecord) -> dict[str, Frames]:
@@ -331,24 +298,7 @@ def _mean_class(counted: Counted) -> float | None:
     return sum(true * count for true, _, count in counted) / pixels if pixels else None
 
 
-def _same_change(first: tuple[float, ...] | None, other: tuple[float, ...] | None) -> bool:
-    if first is None or other is None:
-        return first is other
-    return all(abs(one - two) <= _SAME_CHANGE for one, two in zip(first, other, strict=True))
-
-
-def _alike(first: Frames, other: Frames) -> bool:
-    return len(first) == len(other) and all(_equal(one, two) for one, two in zip(first, other, strict=True))
-
-
-def _equal(one: float | None, two: float | None) -> bool:
-    if one is None or two is None:
-        return one is two
-    return math.isclose(one, two, rel_tol=_SAME_FIGURE, abs_tol=1e-9)
-
-
 def _told(change: tuple[float, float, float] | None) -> str:
     if change is None:
         return "its fixed path"
-    azimuth, elevation, radius = change
-    return f"by azimuth {azimuth:+.1f}, elevation {elevation:+.1f}, radius {radius:+.1f}"
+    return "by azimuth {:+.1f}, elevation {:+.1f}, radius {:+.1f}".format(*change)
