@@ -13,7 +13,7 @@ from gcd_model.conditioning import SourceFeatures
 from gcd_model.config import DRIVING_CLASSES, SMALL, SemanticClass
 from gcd_model.geometry import CameraMount, Spherical, SphericalDelta, driving_trajectory, spherical_trajectory
 from gcd_train.errors import DataError
-from gcd_train.evaluation.clips import PairedSet, require_same_kind
+from gcd_train.evaluation.clips import PairedSet
 from gcd_train.evaluation.model_views import SynthesizedViews
 from gcd_train.evaluation.predictors import (
     CopySource,
@@ -25,7 +25,6 @@ from gcd_train.evaluation.predictors import (
     to_pictures,
     to_pixels,
 )
-from gcd_train.evaluation.statistics import Selection
 
 
 @dataclass
@@ -166,16 +165,6 @@ def test_iou_of_car_and_person_is_what_one_counts_by_hand() -> None:
     assert found.value("miou_full") == pytest.approx(expected)
 
 
-def test_flicker_is_the_views_change_over_the_targets() -> None:
-    clips = PlaneClips.make(1)
-    clip = clips[0]
-    for t, level in enumerate((0, 100, 110, 130)):  # changes by 10 and by 20; the first frame does not count
-        clip.target[t] = level
-    video = torch.tensor([0.9, 0.2, 0.2, 0.2 + 15 / 255]).view(4, 1, 1, 1).expand(4, 3, 32, 48)  # by 0 and by 15
-    (found,) = evaluated([Painted(video=video)], clips)
-    assert found.value("flicker") == pytest.approx(15 / 30)
-
-
 def test_a_model_gets_the_clip_in_its_own_range_and_its_shipped_settings() -> None:
     clips = PlaneClips.make(2)
     synthesizer = fake(clips)
@@ -232,14 +221,6 @@ def test_a_steered_model_goes_each_clips_own_way_from_where_its_source_stands() 
     assert found.class_iou().size == 0
 
 
-def test_a_model_that_moves_at_another_pace_than_the_clips_is_refused() -> None:
-    clips = PlaneClips.orbits(CHANGES)
-    synthesizer = fake(clips, classes=())
-    synthesizer.traits.move_time = 0
-    with pytest.raises(DataError, match="reaches its goal in frame 0"):
-        evaluated([SynthesizedViews.of(synthesizer, clips)], clips)
-
-
 def test_a_model_that_paints_classes_is_compared_by_its_class_map_alone() -> None:
     clips = PlaneClips.make(1)
     synthesizer = fake(clips)
@@ -265,17 +246,6 @@ def test_a_model_of_another_size_ontology_or_camera_is_refused() -> None:
         SynthesizedViews.of(fake(clips), PlaneClips.orbits(CHANGES))
 
 
-def test_training_clips_of_another_kind_are_refused() -> None:
-    clips = PlaneClips.make(1)
-    require_same_kind(clips, clips)
-    with pytest.raises(DataError, match="one kind"):
-        require_same_kind(PlaneClips.make(1, width=64), clips)
-    with pytest.raises(DataError, match="one kind"):
-        require_same_kind(replace(clips, classes=DRIVING_CLASSES[:3]), clips)
-    with pytest.raises(DataError, match="camera control"):
-        require_same_kind(replace(PlaneClips.orbits(CHANGES), classes=DRIVING_CLASSES), clips)
-
-
 def test_several_draws_are_measured_each_and_their_spread_is_told() -> None:
     clips = PlaneClips.make(1)
     synthesizer = fake(clips)
@@ -299,24 +269,10 @@ def test_a_model_of_another_pace_than_driving_clips_is_refused() -> None:
         SynthesizedViews.of(synthesizer, clips).predict(replace(seen, cameras=direct))
 
 
-def test_a_selection_of_frames_is_what_figures_are_of() -> None:
-    clips = PlaneClips.make(1)
-    rows = {
-        span: evaluated([CopySource()], clips, selection=Selection(frames=span))[0] for span in ("2-last", "last", 1)
-    }
-    assert rows["last"].value("psnr_db") == pytest.approx(rows["2-last"].value("last_psnr_db"))
-    assert rows[1].value("psnr_db") == pytest.approx(100.0)  # there both cameras stand at one place
-
-
 def visible_of(clips: PlaneClips, number: int = 0) -> np.ndarray:
     visible = PairedSet(clips=clips, identity="plane").clip(f"plane-{number:08d}").visible
     assert visible is not None
     return visible
-
-
-def test_where_both_cameras_are_one_everything_is_visible() -> None:
-    for clips in (PlaneClips.make(1), PlaneClips.orbits(CHANGES)):
-        assert visible_of(clips)[0].all()
 
 
 def test_on_a_plane_what_lies_in_the_source_picture_is_visible_and_nothing_else() -> None:
@@ -331,18 +287,3 @@ def test_on_a_plane_what_lies_in_the_source_picture_is_visible_and_nothing_else(
     ground = clip.target_depth[3] > 0
     assert 0.1 < inside[ground].mean() < 1.0
     assert (visible_of(clips)[3][ground] == inside[ground]).mean() > 0.99
-
-
-def test_what_something_else_stands_before_is_occluded() -> None:
-    clips = PlaneClips.orbits(CHANGES)
-    before = visible_of(clips)[3].mean()
-    clips.clips[0].source_depth[:] = 1.0  # a board right before the source camera
-    assert visible_of(clips)[3].mean() < 0.01 < before
-
-
-def test_a_clip_is_called_by_its_world_and_number() -> None:
-    pairs = PairedSet(clips=PlaneClips.make(2), identity="plane")
-    assert pairs.keys == ("plane-00000000", "plane-00000001")
-    assert pairs.clip("plane-00000001").key == pairs.clip("plane-00000001").seen.key == "plane-00000001"
-    with pytest.raises(DataError, match="there is no clip plane-7"):
-        pairs.clip("plane-7")

@@ -1,7 +1,7 @@
 """Runs that are kept: records, resuming, failures, processes, frames that are read back."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
@@ -9,18 +9,14 @@ import numpy as np
 import pytest
 from driving_plane import PlaneClips
 from made_records import note, record
-from tiny_driving import write_untrained
 from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
 from gcd_train.datasets.paired import PairedClips
-from gcd_train.errors import DataError, RecipeError, RunError
-from gcd_train.evaluation.baselines import BaselineSettings, build
+from gcd_train.errors import DataError, RunError
 from gcd_train.evaluation.clips import HeldOutClip, PairedSet, chosen, identity_of
 from gcd_train.evaluation.kept_frames import KeptViews, png
-from gcd_train.evaluation.measure import predicted_and_measured
-from gcd_train.evaluation.methods import of_baselines
-from gcd_train.evaluation.predictors import CopySource, Prediction, Predictor, SourceClip, fit_statistics, to_pictures
+from gcd_train.evaluation.predictors import CopySource, Prediction, Predictor, SourceClip, to_pictures
 from gcd_train.evaluation.runner import GIVE_UP_AFTER, Account, ClipWork, assign_gpus, measure_all
 from gcd_train.evaluation.saved_frames import SavedFrames
 from gcd_train.evaluation.store import RunKeeper, folder_name, read_run
@@ -330,60 +326,6 @@ def test_a_line_that_measured_nothing_can_be_corrected(tmp_path: Path, monkeypat
     assert list(read_run(tmp_path / "run")[0].methods) == ["copy_source", "none"]
 
 
-def test_what_is_wrong_is_said_before_training_clips_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    PlaneClips.make(1).write(tmp_path / "data")
-    PlaneClips.make(2).write(tmp_path / "train", first_seed=5)
-    means = ["--methods", "mean_target", "--train", str(tmp_path / "train")]
-    code, said = evaluated(tmp_path, *means)
-    assert code == 0, said
-
-    def unwanted(*_: object, **__: object) -> None:
-        pytest.fail("the means were worked out")
-
-    monkeypatch.setattr("gcd_train.evaluation.plan.fit_statistics", unwanted)
-    for options, words in (
-        (["--lpips", str(tmp_path / "nowhere")], "nowhere"),
-        (["--predictions", f"other={tmp_path / 'nowhere'}"], "is no folder"),
-        (["--seed", "4"], "seed was 0, is 4"),
-    ):
-        code, said = evaluated(tmp_path, *means, *options)
-        assert (code != 0, words in said) == (True, True), said
-
-
-def test_means_are_those_of_the_training_clips(tmp_path: Path) -> None:
-    held_out = PlaneClips.make(1).write(tmp_path / "data")
-    training = PlaneClips.make(2).write(tmp_path / "train", first_seed=5)
-    code, said = evaluated(tmp_path, "--methods", "mean_target", "--train", str(training))
-    assert code == 0, said
-    mean = build("mean_target", settings_of(PairedClips.open(training)))
-    clip = PairedSet.of(PairedClips.open(held_out))
-    _, wanted = predicted_and_measured(mean, clip.clip(clip.keys[0]), classes=clip.classes)
-    (record,) = read_run(tmp_path / "run")[1]
-    assert record.regions == wanted.regions
-
-
-def settings_of(training: PairedClips) -> BaselineSettings:
-    return BaselineSettings(
-        frames=training.frames,
-        height=training.height,
-        width=training.width,
-        classes=tuple(training.classes),
-        statistics=fit_statistics(training),
-    )
-
-
-def test_what_a_hexplane_learns_can_be_said_and_is_kept(tmp_path: Path) -> None:
-    PlaneClips.make(1).write(tmp_path / "data")
-    few = ["--methods", "hexplane_1", "--hexplane-updates", "2", "--hexplane-rays", "16", "--limit", "1"]
-    code, said = evaluated(tmp_path, *few)
-    assert code == 0, said
-    told, (record,) = read_run(tmp_path / "run")
-    assert (told.methods["hexplane_1"]["updates"], told.methods["hexplane_1"]["rays"]) == ("2", "16")
-    assert record.regions["all"].psnr_db is not None
-    code, said = evaluated(tmp_path, *few, "--hexplane-rays", "17")
-    assert (code != 0, "rays of hexplane_1 was 16, is 17" in said) == (True, True), said
-
-
 def test_frames_of_a_method_that_was_given_more_are_starred(tmp_path: Path) -> None:
     PlaneClips.make(1).write(tmp_path / "data")
     clip = PairedSet.of(PairedClips.open([tmp_path / "data"]))
@@ -426,12 +368,3 @@ def test_the_command_says_what_is_wrong(tmp_path: Path, options: list[str], code
     assert (found, words in said) == (code, True), said
     assert "Traceback" not in said
     assert not (tmp_path / "run" / "run.json").exists()
-
-
-def test_vanilla_svd_takes_weights_that_make_a_video_out_of_a_picture(tmp_path: Path) -> None:
-    settings = BaselineSettings(frames=4, height=32, width=48, samples=3, seed=5)
-    (method,) = of_baselines(["vanilla_svd"], replace(settings, svd="random:svd"), "nothing")
-    told = {"baseline": "vanilla_svd", "samples": "3", "seed": "5", "weights": "random:svd"}
-    assert method.told == told
-    with pytest.raises(RecipeError, match="is of the family driving"):
-        of_baselines(["vanilla_svd"], replace(settings, svd=str(write_untrained(tmp_path))), "nothing")

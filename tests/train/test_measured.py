@@ -137,23 +137,6 @@ def test_figures_of_each_draw_and_region_are_those_of_the_metrics() -> None:
         assert visible.ssim[number][:-1] == pytest.approx(inside.tolist(), abs=1e-6)
 
 
-def test_a_frame_without_visible_pixels_has_none_of_their_figures() -> None:
-    clip = held_out()
-    visible = record_of(clip, drawn(clip, 2)).regions["visible"]
-    assert visible.pixels[-1] == 0.0
-    assert [each[-1] for each in (*visible.psnr_db, *visible.ssim, visible.diversity)] == [None] * 5
-    assert visible.confusion[-1] == ()
-    assert None not in visible.diversity[:-1]
-
-
-def test_diversity_needs_two_draws() -> None:
-    clip = held_out()
-    assert record_of(clip, noisy(clip, 0)).regions["all"].diversity is None
-    same = replace(noisy(clip, 0), more=(noisy(clip, 0),))
-    assert record_of(clip, same).regions["all"].diversity == pytest.approx((0.0,) * FRAMES, abs=1e-7)
-    assert min(record_of(clip, drawn(clip, 2)).regions["occluded"].diversity) > 0.02
-
-
 def test_regions_are_left_out_where_nobody_knows_them() -> None:
     clip, unseen = held_out(), held_out(visible=False)
     short, long = record_of(unseen, noisy(clip, 0)), record_of(clip, noisy(clip, 0))
@@ -169,17 +152,6 @@ def test_a_method_that_only_names_classes_has_no_picture_figures() -> None:
     assert record.grid_confusion is not None
     assert len(record.step_target) == FRAMES - 1
     assert len(record.step_target) == FRAMES - 1
-
-
-def test_target_pixels_without_a_class_count_nowhere() -> None:
-    clip = held_out()
-    labels = clip.target_classes.copy()
-    labels[:, :10] = NO_CLASS  # five rows of the class grid, four of them and half of one in the sky
-    record = record_of(replace(clip, target_classes=labels), noisy(clip, 0))
-    pixels = [sum(count for _, _, count in frame) for frame in record.regions["all"].confusion]
-    cells = [sum(count for _, _, count in frame) for frame in record.grid_confusion]
-    assert pixels == [(HEIGHT - 10) * WIDTH] * FRAMES
-    assert cells == [(HEIGHT - 10) // 2 * WIDTH // 2] * FRAMES
 
 
 def test_void_is_not_counted_where_it_is_true_and_wrong_where_it_is_said() -> None:
@@ -221,14 +193,6 @@ def test_a_method_on_a_set_with_void_is_measured_without_it() -> None:
     _, record = predicted_and_measured(CopySource(), known, classes=names)
     assert record.regions["all"].confusion == (((1, 1, (HEIGHT - 8) * WIDTH),),) * FRAMES
     assert record.grid_confusion == (((1, 1, (HEIGHT - 8) * WIDTH // 4),),) * FRAMES
-
-
-def test_an_odd_row_does_not_stop_the_class_grid() -> None:
-    clip = held_out()
-    odd = replace(clip, target=clip.target[:, 1:], target_classes=clip.target_classes[:, 1:], visible=None)
-    whole = noisy(clip, 0)
-    record = record_of(odd, Prediction(video=whole.video[:, :, 1:], classes=whole.classes[:, 1:]))
-    assert sum(count for _, _, count in record.grid_confusion[0]) == (HEIGHT - 1) // 2 * WIDTH // 2
 
 
 def test_views_of_another_size_or_length_are_refused() -> None:

@@ -8,7 +8,7 @@ import pytest
 from made_records import FRAMES, note, record, region
 
 from gcd_train.evaluation.report import Choices, make_report
-from gcd_train.evaluation.runs import EvaluatedSet, Goal, Run, gather, on_the_same_goals
+from gcd_train.evaluation.runs import EvaluatedSet, Run, gather, on_the_same_goals
 from gcd_train.evaluation.store import ClipRecord, RegionRecord, RunKeeper
 
 Change = tuple[float, float, float]
@@ -70,34 +70,6 @@ def test_another_way_to_the_same_last_picture_is_joined() -> None:
     direct = clips("b", None, target=(5.0, 5.0, 5.0, 2.0))
     (joined,) = on_the_same_goals(sets(k0=[clips("a", None)], k1=[direct]))[0]
     assert [method.name for method in joined.methods] == ["a", "b"]
-
-
-def test_class_maps_alone_tell_whether_the_goal_is_the_same() -> None:
-    seen, same, other = (
-        [record(name, "s.0", regions={"all": region(counts=counts)})]
-        for name, counts in (
-            ("a", [(0, 0, 5), (1, 1, 5)]),
-            ("b", [(0, 1, 5), (1, 0, 5)]),
-            ("c", [(0, 0, 4), (1, 1, 6)]),
-        )
-    )
-    bare = [
-        [
-            msgspec.structs.replace(
-                of[0], regions={"all": msgspec.structs.replace(of[0].regions["all"], gradient_target=None)}
-            )
-        ]
-        for of in (seen, same, other)
-    ]
-    assert Goal.of(bare[0]).apart_from(Goal.of(bare[1])) == ""
-    assert Goal.of(bare[0]).apart_from(Goal.of(bare[2]))
-
-
-def test_two_methods_of_one_name_in_two_sets_are_told() -> None:
-    ours, theirs = (run(name, clips("a", AHEAD)) for name in ("k0", "k1"))
-    named = msgspec.structs.replace(theirs.note, methods={"a": {"weights": "other"}})
-    found = on_the_same_goals(gather([ours, Run(folder=theirs.folder, note=named, records=theirs.records)]))
-    assert "a is another method in k1 than in k0" in found[1][0]
 
 
 def test_a_report_of_other_goals_makes_no_claim_and_says_so(tmp_path: Path) -> None:

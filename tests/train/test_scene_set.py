@@ -19,8 +19,7 @@ from gcd_train.datasets.trajectories import OrbitSampling
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.choosing import Choice, public_split, public_split_names
 from gcd_train.evaluation.clips import EvaluationSet
-from gcd_train.evaluation.opening import SceneCuts, data_kind, fingerprint, open_scenes, usual_samples
-from gcd_train.evaluation.plan import EvaluateOptions, planned
+from gcd_train.evaluation.opening import SceneCuts, open_scenes
 from gcd_train.evaluation.protocol import (
     PAPER_SOURCE,
     RELEASED_SOURCE,
@@ -145,15 +144,6 @@ def test_cameras_that_no_scene_has_are_refused_at_once(kubric: Path, driving: Pa
             opened(root, replace(cuts, cameras=names or ("yaw-0", "nope")))
 
 
-def test_more_views_than_there_are_cameras_are_refused_at_once(kubric: Path) -> None:
-    def asked(names: str) -> EvaluateOptions:
-        return EvaluateOptions(data=[kubric], camera=VIEWS, frame_start=0, frame_skip=1, methods=[names])
-
-    assert len(planned(asked("hexplane_4")).methods) == 1
-    with pytest.raises(RecipeError, match="hexplane_9 wants 9 cameras, and these clips have 3 beside the source; give"):
-        planned(asked("copy_source,hexplane_9"))
-
-
 def test_rates_follow_the_strides(kubric: Path, tmp_path: Path) -> None:
     drawn = opened(kubric, replace(KUBRIC, bounds=FrameBounds(), protocol="paper"))
     assert (drawn.fps, tuple(drawn.rates)) == (24.0, (24.0, 12.0, 8.0, 6.0))
@@ -172,11 +162,6 @@ def test_a_source_that_is_a_camera_of_the_scene_has_its_own_depth(kubric: Path, 
     assert np.abs(seen.source_depth[0] - true.depth)[near].max() < 1e-3
     assert seen.points is not None
     assert [view.depth.shape for view in seen.points()] == [(32, 48)] * 3
-
-
-def test_scenes_are_drawn_as_often_as_the_protocol_says_and_pairs_once(kubric: Path, tmp_path: Path) -> None:
-    assert [usual_samples([kubric], protocol) for protocol in ("paper", "released")] == [4, 2]
-    assert usual_samples([tmp_path], "paper") == 1
 
 
 def test_bounds_win_over_controls_in_the_released_protocol_only(kubric: Path, tmp_path: Path) -> None:
@@ -235,14 +220,6 @@ def test_a_scene_of_ours_is_of_the_world_that_its_manifest_says(tmp_path: Path) 
             opened(tmp_path, KUBRIC, split=split)
 
 
-def test_a_split_file_of_parallel_domain_names_its_part(driving: Path, tmp_path: Path) -> None:
-    file = tmp_path / "split.json"
-    file.write_text(json.dumps({"train": ["a/scene_000005"], "val": [], "test": ["scene_000006"]}))
-    assert len(opened(driving, DRIVING, split=f"{file}:train").keys) == 4
-    with pytest.raises(DataError, match="no scene of the list or split"):
-        opened(driving, DRIVING, split=str(file))
-
-
 def test_the_identity_follows_the_files_and_neither_their_place_nor_their_times(kubric: Path, tmp_path: Path) -> None:
     first, copy = opened(kubric, KUBRIC).identity, tmp_path / "copy"
     shutil.copytree(kubric, copy)  # with times of its own
@@ -256,20 +233,6 @@ def test_the_identity_follows_the_files_and_neither_their_place_nor_their_times(
     told = next(copy.glob("scn02900/*.json"))
     told.write_bytes(told.read_bytes().replace(b"0", b"1", 1))  # of the same size
     assert opened(copy, KUBRIC).identity != first
-
-
-def test_what_begins_with_a_dot_is_no_part_of_a_scene_and_a_missing_one_is_named(tmp_path: Path) -> None:
-    (tmp_path / "a.json").write_text("{}")
-    bare = fingerprint(tmp_path)
-    (tmp_path / ".DS_Store").write_text("where icons lie")
-    (tmp_path / ".cache").mkdir()
-    (tmp_path / ".cache" / "thumb.png").write_text("small")
-    assert fingerprint(tmp_path) == bare
-    (tmp_path / "b").mkdir()
-    (tmp_path / "a.json").rename(tmp_path / "b" / "a.json")
-    assert fingerprint(tmp_path) != bare
-    with pytest.raises(DataError, match="nowhere cannot be read"):
-        fingerprint(tmp_path / "nowhere")
 
 
 def test_public_splits_of_a_world_share_no_scene() -> None:
@@ -341,32 +304,6 @@ def test_a_driving_clip_has_the_forward_cameras_own_depth_and_classes(driving: P
     assert clip.visible[0].mean() > 0.95
     assert clip.seen.points is not None
     assert [view.rgb.shape for view in clip.seen.points()] == [(36, 48, 3)] * 3
-
-
-def test_a_direct_path_is_at_its_goal_from_the_first_frame_on(driving: Path) -> None:
-    for gradual, arrives in ((True, 2), (False, 0)):
-        clip = opened(driving, replace(DRIVING, gradual=gradual)).clip("scene_000005.sample_00")
-        assert clip.seen.cameras.trajectory.at_goal.index(True) == arrives
-
-
-def test_a_missing_file_is_named_with_its_clip(kubric: Path, tmp_path: Path) -> None:
-    write_kubric(tmp_path, 7, frames=3)
-    clips = opened(tmp_path, replace(KUBRIC, frames=2))
-    (tmp_path / "scn00007" / "frames_p0_v2" / "rgba_00001.png").unlink()
-    with pytest.raises(DataError, match="rgba_00001"):
-        clips.clip("scn00007.sample_00")
-
-
-def test_what_a_folder_holds_is_seen_by_its_names(kubric: Path, driving: Path, tmp_path: Path) -> None:
-    assert (data_kind([kubric]), data_kind([driving]), data_kind([tmp_path])) == (
-        "kubric4d",
-        "parallel_domain4d",
-        "pairs",
-    )
-    with pytest.raises(DataError, match="one folder"):
-        data_kind([kubric, driving])
-    with pytest.raises(DataError, match="cannot be read"):
-        data_kind([tmp_path / "nowhere"])
 
 
 @pytest.mark.slow

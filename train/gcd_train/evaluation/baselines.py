@@ -2,9 +2,8 @@
 
 import difflib
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import TypeAlias
 
 import torch
 
@@ -15,9 +14,8 @@ from gcd_train.evaluation.hexplane_learning import HexPlane
 from gcd_train.evaluation.metrics import NO_CLASS
 from gcd_train.evaluation.predictors import (
     CopySource,
+    Fixed,
     GroundHomography,
-    MajorityMap,
-    MeanTarget,
     Prediction,
     Predictor,
     SourceClip,
@@ -78,9 +76,6 @@ class BaselineSettings:
         return TargetStatistics(mean=black, majority=nothing if self.classes else None)
 
 
-Builder: TypeAlias = Callable[[BaselineSettings], Predictor]
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ClassesAlone:
     """A predictor whose pictures do not count, as the targets are class maps."""
@@ -105,7 +100,7 @@ class ClassesAlone:
 
 def baseline_names(*, hexplane: Sequence[int] = HEXPLANE_VIEWS) -> tuple[str, ...]:
     """All there are, in the order of the tables. hexplane: numbers of views that are listed."""
-    return (*_BUILDERS, *(f"hexplane_{views}" for views in hexplane))
+    return (*_NAMES, *(f"hexplane_{views}" for views in hexplane))
 
 
 def build(name: str, settings: BaselineSettings) -> Predictor:
@@ -116,27 +111,34 @@ def build(name: str, settings: BaselineSettings) -> Predictor:
         CheckpointError: vanilla SVD's weights cannot be used.
     """
     views = _HEXPLANE.fullmatch(name)
-    if name not in _BUILDERS and not views:
+    if name not in _NAMES and not views:
         near = difflib.get_close_matches(name, baseline_names(), n=1)
         meant = f"did you mean {near[0]}? " if near else ""
         raise RecipeError(f"no baseline is called {name!r}; {meant}there are {', '.join(baseline_names())}")
     if settings.painted and (views or name in _PICTURES_ALONE):
         raise RecipeError(f"{name} makes no class maps, and these targets are class maps; leave it out")
-    made = _hexplane(int(views[1]), settings) if views else _BUILDERS[name](settings)
+    if views:
+        return HexPlane(views=int(views[1]), settings=settings.hexplane, seed=settings.seed, device=settings.device)
+    made = _made(name, settings)
     return ClassesAlone(inner=made) if settings.painted else made
 
 
-def described(name: str, settings: BaselineSettings) -> dict[str, str]:
-    """What a baseline is beyond its name and the draws, for the record of a run.
+def described(name: str, settings: BaselineSettings, trained_on: str = "nothing") -> dict[str, str]:
+    """What a baseline is and works with, for the record of a run: it is the same method wherever this is the same.
 
-    Vanilla SVD's weights, what a HexPlane learns, and what holes in class maps count as. Raises CheckpointError.
+    Args:
+        trained_on: identity of the training clips, "nothing" without.
+    Raises: CheckpointError for vanilla SVD's weights.
     """
-    if name == VANILLA_SVD and settings.svd is not None:
-        return {"weights": weights_named(settings.svd)}
-    if _HEXPLANE.fullmatch(name):
-        return {key: str(value) for key, value in asdict(settings.hexplane).items()}
+    told, hexplane, svd = {"baseline": name}, _HEXPLANE.fullmatch(name), name == VANILLA_SVD
+    told |= {"samples": str(settings.samples)} if svd else {}
+    told |= {"seed": str(settings.seed)} if svd or hexplane else {}
+    told |= {"means of": trained_on} if name in _OF_MEANS else {}
+    told |= {"published rounding": "yes"} if settings.published and name in (REPROJECT_RGBD, REPROJECT_SEMD) else {}
+    told |= {"weights": weights_named(settings.svd)} if svd and settings.svd is not None else {}
+    told |= {key: str(value) for key, value in asdict(settings.hexplane).items()} if hexplane else {}
     filled = settings.statistics is not None and name != REPROJECT_SEMD
-    return {"holes": "of no class"} if settings.classes and name in _WITH_HOLES and not filled else {}
+    return told | ({"holes": "of no class"} if settings.classes and name in _WITH_HOLES and not filled else {})
 
 
 def usual_baselines(settings: BaselineSettings) -> tuple[str, ...]:
@@ -148,58 +150,40 @@ def usual_baselines(settings: BaselineSettings) -> tuple[str, ...]:
         wanted -= {"majority_map", REPROJECT_SEMD}
     if settings.painted:
         wanted -= set(_PICTURES_ALONE)
-    return tuple(name for name in _BUILDERS if name in wanted)
+    return tuple(name for name in _NAMES if name in wanted)
 
 
-def _mean_target(settings: BaselineSettings) -> Predictor:
-    return MeanTarget(statistics=_trained(settings, "mean_target"))
-
-
-def _majority_map(settings: BaselineSettings) -> Predictor:
-    majority = _trained(settings, "majority_map").majority
-    if majority is None:
-        raise RecipeError("majority_map wants clips with class maps, got some without; leave it out")
-    return MajorityMap(majority=majority)
-
-
-def _depth_on_mean(settings: BaselineSettings) -> Predictor:
-    statistics = _trained(settings, DEPTH_ON_MEAN)
-    return DepthReprojection(fill=statistics, classes=len(settings.classes), name=DEPTH_ON_MEAN)
-
-
-def _reproject_semd(settings: BaselineSettings) -> Predictor:
-    if not settings.classes:
-        raise RecipeError(f"{REPROJECT_SEMD} wants clips with class maps, got some without; leave it out")
-    return ReprojectSemd(classes=settings.classes, published=settings.published)
-
-
-def _vanilla_svd(settings: BaselineSettings) -> Predictor:
-    if settings.svd is None:
-        raise RecipeError(f"{VANILLA_SVD} wants its weights: give the path of svd.safetensors")
-    opened = VanillaSVD.open(settings.svd, device=settings.device, dtype=settings.dtype)
-    return replace(opened, samples=settings.samples, seed=settings.seed)
-
-
-def _hexplane(views: int, settings: BaselineSettings) -> Predictor:
-    return HexPlane(views=views, settings=settings.hexplane, seed=settings.seed, device=settings.device)
-
-
-def _trained(settings: BaselineSettings, name: str) -> TargetStatistics:
-    if settings.statistics is None:
+def _made(name: str, settings: BaselineSettings) -> Predictor:
+    """Raises RecipeError where what it needs is not there."""
+    classes, trained = settings.classes, settings.statistics
+    if trained is None and name in ("mean_target", "majority_map", DEPTH_ON_MEAN):
         raise RecipeError(f"{name} wants training clips for its means: give --train FOLDER, or leave it out")
-    return settings.statistics
+    fill = settings.fill
+    if name in ("majority_map", REPROJECT_SEMD) and not (classes and fill.majority is not None):
+        raise RecipeError(f"{name} wants clips with class maps, got some without; leave it out")
+    if name == "majority_map":
+        return Fixed(name=name, prediction=Prediction(classes=fill.majority))
+    if name == VANILLA_SVD:
+        if settings.svd is None:
+            raise RecipeError(f"{VANILLA_SVD} wants its weights: give the path of svd.safetensors")
+        opened = VanillaSVD.open(settings.svd, device=settings.device, dtype=settings.dtype)
+        return replace(opened, samples=settings.samples, seed=settings.seed)
+    makers: dict[str, Callable[[], Predictor]] = {
+        "copy_source": CopySource,
+        "mean_target": lambda: Fixed(name=name, prediction=Prediction(video=fill.mean)),
+        "ground_homography": lambda: GroundHomography(fill=fill),
+        "depth_reprojection": lambda: DepthReprojection(fill=fill.constant, classes=len(classes)),
+        DEPTH_ON_MEAN: lambda: DepthReprojection(fill=fill, classes=len(classes), name=DEPTH_ON_MEAN),
+        REPROJECT_RGBD: lambda: ReprojectRgbd(published=settings.published),
+        REPROJECT_SEMD: lambda: ReprojectSemd(classes=classes, published=settings.published),
+    }
+    return makers[name]()
 
 
-_BUILDERS: Mapping[str, Builder] = {
-    "copy_source": lambda _: CopySource(),
-    "mean_target": _mean_target,
-    "majority_map": _majority_map,
-    "ground_homography": lambda settings: GroundHomography(fill=settings.fill),
-    "depth_reprojection": lambda s: DepthReprojection(fill=s.fill.constant, classes=len(s.classes)),
-    DEPTH_ON_MEAN: _depth_on_mean,
-    REPROJECT_RGBD: lambda settings: ReprojectRgbd(published=settings.published),
-    REPROJECT_SEMD: _reproject_semd,
-    VANILLA_SVD: _vanilla_svd,
-}
+_NAMES = (
+    *("copy_source", "mean_target", "majority_map", "ground_homography", "depth_reprojection", DEPTH_ON_MEAN),
+    *(REPROJECT_RGBD, REPROJECT_SEMD, VANILLA_SVD),
+)
+_OF_MEANS = ("mean_target", "majority_map", "ground_homography", "depth_reprojection", DEPTH_ON_MEAN)
 _WITH_HOLES = ("ground_homography", "depth_reprojection", REPROJECT_SEMD)
 _PICTURES_ALONE = ("mean_target", REPROJECT_RGBD, VANILLA_SVD)

@@ -25,7 +25,7 @@ from gcd_train.errors import DataError
 from gcd_train.evaluation.clips import HeldOutClip
 from gcd_train.evaluation.plots import new_figure, save
 from gcd_train.evaluation.predictors import Prediction, to_pictures
-from gcd_train.evaluation.statistics import FIRST_MEASURED
+from gcd_train.evaluation.statistics import FEW_SCENES, FIRST_MEASURED
 from gcd_train.evaluation.store import Region, write_whole
 from gcd_train.evaluation.tables import markdown_rows
 
@@ -33,8 +33,6 @@ LEVELS = tuple(round(0.05 * step, 2) for step in range(1, 20))
 """Shares of pixels that intervals are meant to hold, 5 % to 95 %."""
 STATED = (0.5, 0.9)
 """Levels that tables show."""
-FEW_SCENES = 10
-"""Of fewer, no claim can rest on what was found."""
 
 Counts = NDArray[np.int64]
 """How many colours of pixels lie how many deviations from the truth: [_BINS], in equal steps of the logarithm."""

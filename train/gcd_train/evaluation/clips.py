@@ -13,14 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_model.config import CameraControl, SemanticClass
-from gcd_model.geometry import CameraMount, Intrinsics, Trajectory
+from gcd_model.geometry import CameraMount, Trajectory
 from gcd_train.array_files import ZIP_FAULTS
 from gcd_train.datasets.clip_source import Bytes, ClipSource
 from gcd_train.datasets.paired import PairedClip, PairedClips
 from gcd_train.errors import DataError
-from gcd_train.evaluation.predictors import CameraPair, SourceClip
+from gcd_train.evaluation.predictors import FAR_M, CameraPair, SourceClip, own_views
 from gcd_train.pointcloud import depth_visibility
-from gcd_train.scene_view import SceneView
 
 SetKind: TypeAlias = Literal["kubric", "driving", "orbit"]
 """Which tables clips belong to: Kubric-4D and scenes in its layout, driving, or pairs seen along orbits."""
@@ -105,15 +104,6 @@ class HeldOutClips(ClipSource, ClipFacts, Protocol):
     def hfov_deg(self) -> float: ...
 
 
-class SizedClips(Protocol):
-    """Clips of one size."""
-
-    @property
-    def height(self) -> int: ...
-    @property
-    def width(self) -> int: ...
-
-
 def cameras_of(clips: HeldOutClips, number: int, declared: CameraMount | None = None) -> CameraPair:
     """Both cameras of a clip.
 
@@ -138,7 +128,7 @@ def source_side(clips: HeldOutClips, number: int, clip: PairedClip, declared: Ca
     )
 
 
-def class_grid(clips: SizedClips) -> tuple[int, int]:
+def class_grid(clips: ClipFacts) -> tuple[int, int]:
     """Height and width at which class maps are compared: half the pictures'."""
     return clips.height // 2, clips.width // 2
 
@@ -163,8 +153,6 @@ def names_of(classes: Sequence[SemanticClass]) -> str:
     return ", ".join(each.name for each in classes) or "none"
 
 
-_SKY_M = 1e4
-"""The sky has depth 0 in pairs. So far away both cameras see the same of it."""
 _DIGITS = 12
 
 
@@ -181,9 +169,21 @@ class PairedSet:
     identity: str
     declared: CameraMount | None = None
     picked: float = 0.0
+    kind: SetKind = field(init=False)
+    camera: CameraControl = field(init=False)
+    classes: Sequence[SemanticClass] = field(init=False)
+    frames: int = field(init=False)
+    height: int = field(init=False)
+    width: int = field(init=False)
+    fps: float = field(init=False)
+    rates: Sequence[float] = field(init=False)
     _numbers: dict[str, int] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        for name in ("camera", "classes", "frames", "height", "width", "fps"):
+            object.__setattr__(self, name, getattr(self.clips, name))
+        object.__setattr__(self, "kind", "driving" if self.camera == "none" else "orbit")
+        object.__setattr__(self, "rates", (self.fps,))
         object.__setattr__(self, "_numbers", {key: number for number, key in enumerate(_keys(self.clips))})
 
     @classmethod
@@ -201,46 +201,6 @@ class PairedSet:
     def keys(self) -> Sequence[str]:
         """Names, in the order of the clips."""
         return tuple(self._numbers)
-
-    @property
-    def kind(self) -> SetKind:
-        """Driving, or an orbit."""
-        return "driving" if self.camera == "none" else "orbit"
-
-    @property
-    def camera(self) -> CameraControl:
-        """How a network is told where the target camera goes."""
-        return self.clips.camera
-
-    @property
-    def classes(self) -> Sequence[SemanticClass]:
-        """The ontology; empty where there is none."""
-        return self.clips.classes
-
-    @property
-    def frames(self) -> int:
-        """T."""
-        return self.clips.frames
-
-    @property
-    def height(self) -> int:
-        """H."""
-        return self.clips.height
-
-    @property
-    def width(self) -> int:
-        """W."""
-        return self.clips.width
-
-    @property
-    def fps(self) -> float:
-        """Frames per second."""
-        return self.clips.fps
-
-    @property
-    def rates(self) -> Sequence[float]:
-        """One for all."""
-        return (self.fps,)
 
     def number(self, key: str, /) -> int:
         """Of the clip with this name. Raises DataError for another."""
@@ -289,32 +249,16 @@ def seen_too(clip: PairedClip, cameras: CameraPair, *, picked: float = 0.0) -> N
     """Which target pixels show what the source camera saw at the same time, bool [T, H, W]; sky and sky are the same.
 
     Args:
-        cameras: where the two really are. picked: see PairedSet.
+        cameras: where the two really are. picked: see PairedSet; the rays of a lens that is moved by it go through the
+            places where depth was taken, if they are counted as the pixels' middles.
     """
-    source, target = _picked_lens(cameras.source, picked), _picked_lens(cameras.target, picked)
-    poses = cameras.source_from_target.numpy()
-    return np.stack(
-        [
-            depth_visibility(
-                _view(clip.source[t], clip.source_depth[t], source), _far(clip.target_depth[t]), poses[t], target
-            )
-            for t in range(len(poses))
-        ]
+    source, target = (
+        replace(lens, cx=lens.cx - picked, cy=lens.cy - picked) for lens in (cameras.source, cameras.target)
     )
-
-
-def _view(rgb: Bytes, depth: NDArray[np.float32], lens: Intrinsics) -> SceneView:
-    """The source camera's, in its own frame."""
-    return SceneView(rgb=rgb, depth=_far(depth), classes=None, instances=None, world_from_camera=np.eye(4), lens=lens)
-
-
-def _far(depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.where(depth > 0, depth, np.float32(_SKY_M))
-
-
-def _picked_lens(lens: Intrinsics, picked: float) -> Intrinsics:
-    """The lens whose rays go through the places where depth was taken, if they are counted as the pixels' middles."""
-    return replace(lens, cx=lens.cx - picked, cy=lens.cy - picked)
+    views = own_views(clip.source, clip.source_depth, None, source)
+    depth = np.where(clip.target_depth > 0, clip.target_depth, np.float32(FAR_M))
+    poses = cameras.source_from_target.numpy()
+    return np.stack([depth_visibility(view, depth[t], poses[t], target) for t, view in enumerate(views)])
 
 
 def _keys(clips: HeldOutClips) -> list[str]:

@@ -1,6 +1,6 @@
 """Clips as pictures and videos: what came in, what each method made of it, what was there."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
@@ -9,17 +9,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gcd_model.config import SemanticClass
 from gcd_train.errors import DataError, RunError
+from gcd_train.evaluation.clips import HeldOutClip
+from gcd_train.evaluation.kept_frames import painted, png, read_row, shown_frames
+from gcd_train.evaluation.predictors import to_labels
 from gcd_train.evaluation.runs import EvaluatedSet, Method
 from gcd_train.evaluation.store import RunKeeper, write_whole
 
 Pictures = NDArray[np.uint8]
 
-SHOWN_FRAMES = 6
 _GAP, _MARGIN, _INK = 4, 140, (40, 40, 40)
 _LINE, _LETTERS, _FONT = 14, 20, cv2.FONT_HERSHEY_SIMPLEX
 _SCALE, _SMALL = 0.38, 0.3  # of captions; the small one where the other would be broken
-_HOLD_S = 0.7
+HOLD_S = 0.7
+"""How long a video shows its last frame."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -28,6 +32,11 @@ class Strip:
 
     name: str
     frames: dict[int, Pictures]
+
+    @classmethod
+    def of(cls, name: str, frames: Pictures) -> "Strip":
+        """All of [T, H, W, 3]."""
+        return cls(name=name, frames=dict(enumerate(frames)))
 
 
 def shown_clips(of: EvaluatedSet, methods: Sequence[Method], count: int) -> tuple[str, ...]:
@@ -48,16 +57,49 @@ def strips(methods: Sequence[Method], key: str) -> tuple[Strip, ...]:
     return tuple(strip for strip in every if strip.frames)
 
 
+def contact_rows(
+    clip: HeldOutClip, methods: Sequence[tuple[str, Path]], classes: Sequence[SemanticClass]
+) -> tuple[Strip, ...]:
+    """A clip's rows of the contact sheet: source, each method's picture and class map, the true ones.
+
+    Args:
+        methods: by name, each with the place of its rows, see `write_rows`. classes: the ontology, empty for none.
+    Raises: RunError if a row is damaged.
+    """
+    shown, width = shown_frames(len(clip.target)), clip.target.shape[2]
+    rows = [("source", clip.seen.source[shown])]
+    for name, place in methods:
+        files = {name: Path(f"{place}.png"), f"{name}: classes": Path(f"{place}.classes.png")}
+        rows += [(kind, read_row(file, width)) for kind, file in files.items() if file.exists()]
+    true = to_labels(clip.target_classes if classes else None)
+    rows += [] if true is None else [("true classes", painted(true[shown], classes))]
+    rows.append(("target", clip.target[shown]))
+    return tuple(Strip.of(kind, frames) for kind, frames in rows)
+
+
 def write_sheet(clips: Sequence[tuple[str, Sequence[Strip]]], out: Path) -> None:
-    """PNG of clips, one below the other, rows as `strips`, columns frames. Raises RunError."""
+    """PNG of clips, one below the other, each with its name; rows strips, columns frames. Raises RunError."""
     blocks = [_row(label, strip) for label, rows in clips for strip in rows]
     if not blocks:
         raise RunError(f"there is nothing to show in {out}; evaluate with --views all")
     width = max(block.shape[1] for block in blocks)
-    sheet = np.concatenate([_widened(block, width) for block in blocks])
-    done, data = cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))
-    assert done, "PNG takes any picture"
-    write_whole(out, data.tobytes())
+    sheet = [np.pad(block, ((0, 0), (0, width - block.shape[1]), (0, 0)), constant_values=255) for block in blocks]
+    write_whole(out, png(np.concatenate(sheet)))
+
+
+def write_mp4(frames: Iterable[Pictures], fps: float, out: Path) -> None:
+    """Pictures of one even size, as MPEG-4 part 2. Raises RunError if it cannot be written."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    video: cv2.VideoWriter | None = None
+    for frame in frames:
+        if video is None:
+            size = (frame.shape[1], frame.shape[0])
+            video = cv2.VideoWriter(str(out), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
+            if not video.isOpened():
+                raise RunError(f"{out} cannot be written; give a folder that takes files with --out")
+        video.write(frame[..., ::-1])
+    if video is not None:
+        video.release()
 
 
 def write_video(rows: Sequence[Strip], fps: float, out: Path) -> bool:
@@ -69,14 +111,7 @@ def write_video(rows: Sequence[Strip], fps: float, out: Path) -> bool:
     if len(moments) < 2:
         return False
     frames = [_beside(rows, moment) for moment in moments]
-    out.parent.mkdir(parents=True, exist_ok=True)
-    height, width = frames[0].shape[:2]
-    video = cv2.VideoWriter(str(out), cv2.VideoWriter.fourcc(*"mp4v"), max(fps, 1.0), (width, height))
-    if not video.isOpened():
-        raise RunError(f"{out} cannot be written; choose another --out")
-    for frame in [*frames, *frames[-1:] * round(_HOLD_S * fps)]:
-        video.write(frame[..., ::-1])
-    video.release()
+    write_mp4([*frames, *frames[-1:] * round(HOLD_S * fps)], max(fps, 1.0), out)
     return True
 
 
@@ -102,8 +137,7 @@ def _read(folder: Path) -> dict[int, Pictures]:
 
 def _row(label: str, strip: Strip) -> Pictures:
     numbers = sorted(strip.frames)
-    places = np.linspace(0, len(numbers) - 1, min(SHOWN_FRAMES, len(numbers))).round().astype(int)
-    pictures = [strip.frames[numbers[place]] for place in places]
+    pictures = [strip.frames[numbers[place]] for place in shown_frames(len(numbers))]
     lines = (*wrap(strip.name, _LETTERS), *wrap(label, _LETTERS))
     height = max(pictures[0].shape[0], max(3, len(lines)) * _LINE)
     margin = np.full((height + _GAP, _MARGIN, 3), 255, np.uint8)
@@ -172,7 +206,3 @@ def _named(text: Caption, lines: int, picture: Pictures) -> Pictures:
     for line, words in enumerate(text.lines, start=1 + lines - len(text.lines)):
         cv2.putText(strip, words, (2, _LINE * line - 1), _FONT, text.scale, _INK, 1, cv2.LINE_AA)
     return np.concatenate([strip, picture])
-
-
-def _widened(block: Pictures, width: int) -> Pictures:
-    return np.pad(block, ((0, 0), (0, width - block.shape[1]), (0, 0)), constant_values=255)

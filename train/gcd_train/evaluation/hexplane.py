@@ -3,14 +3,12 @@
 After Cao and Johnson 2023, "HexPlane: A Fast Representation for Dynamic Scenes".
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-
-from gcd_train.errors import RecipeError
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -37,13 +35,6 @@ class HexPlaneSettings:
     head_rate: float = 0.01
     smoothness: float = 0.03
     picture_width: int = 192
-
-    def __post_init__(self) -> None:
-        counts = (self.updates, self.rays, self.features, self.hidden, self.picture_width)
-        if min(counts) < 1 or min(self.coarse, self.fine) < 2:
-            raise RecipeError(f"HexPlane wants counts above 0 and 2 samples or more along a ray, got {self}")
-        if not self.sides or self.sides[0] < 2 or any(after <= before for before, after in pairwise(self.sides)):
-            raise RecipeError(f"sides of the planes rise from 2 or more cells, got {self.sides}")
 
 
 _INNER = 0.5
@@ -264,6 +255,18 @@ class Rays:
     def to(self, device: torch.device | str) -> "Rays":
         """The same rays on a device of torch."""
         return Rays(origins=self.origins.to(device), directions=self.directions.to(device), times=self.times.to(device))
+
+    def __getitem__(self, chosen: Tensor | slice) -> "Rays":
+        return Rays(origins=self.origins[chosen], directions=self.directions[chosen], times=self.times[chosen])
+
+    @classmethod
+    def together(cls, some: Sequence["Rays"]) -> "Rays":
+        """All of them."""
+        return cls(
+            origins=torch.cat([each.origins for each in some]),
+            directions=torch.cat([each.directions for each in some]),
+            times=torch.cat([each.times for each in some]),
+        )
 
 
 def render(field: HexField, rays: Rays, *, coarse: int, fine: int, generator: torch.Generator | None = None) -> Tensor:

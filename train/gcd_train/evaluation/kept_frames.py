@@ -1,8 +1,7 @@
 """Frames that a run keeps as PNG: for galleries, read back by `SavedFrames`, and for the contact sheet."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from textwrap import wrap
 from typing import Literal, TypeAlias
 
 import cv2
@@ -21,11 +20,8 @@ from gcd_train.evaluation.store import write_whole
 KeptViews: TypeAlias = Literal["none", "last", "all"]
 """Which frames are kept: none, the last of each clip, or all."""
 
-SHEET_FRAMES = (1, 4, 7, 10, 12, 14)
-"""Frames a contact sheet shows, counted from 1."""
-
-_GAP, _LABEL_WIDTH, _INK = 4, 132, (40, 40, 40)
-_LINE, _LETTERS = 14, 19  # pixels a line of a label, letters that fit in one
+SHOWN_FRAMES = 6
+"""Frames that a row of a sheet has at most."""
 
 
 def write_views(
@@ -67,67 +63,37 @@ def _wanted(which: KeptViews, frames: int) -> range:
 
 
 def write_rows(place: Path, prediction: Prediction, classes: Sequence[SemanticClass]) -> None:
-    """Write a method's rows of the contact sheet: `KEY.classes.png` where it has class maps, `KEY.png` of pictures.
+    """Keep what a method has on the contact sheet: `KEY.png` of its pictures, `KEY.classes.png` of its class maps.
 
     place: of both, without a suffix.
     """
     if prediction.classes is not None and classes:
-        write_whole(Path(f"{place}.classes.png"), png(_row(painted(prediction.classes, classes))))
+        write_whole(Path(f"{place}.classes.png"), png(_beside(painted(prediction.classes, classes))))
     if prediction.video is not None:
-        write_whole(Path(f"{place}.png"), png(_row(to_bytes(prediction.video))))
+        write_whole(Path(f"{place}.png"), png(_beside(to_bytes(prediction.video))))
 
 
 def has_rows(place: Path) -> bool:
     """Whether a method has any row at this place."""
-    return any(Path(place.as_posix() + suffix).exists() for suffix in (".png", ".classes.png"))
+    return any(Path(f"{place}{suffix}").exists() for suffix in (".png", ".classes.png"))
 
 
-def write_contact_sheet(
-    path: Path,
-    methods: Sequence[tuple[str, Sequence[Path]]],
-    clips: Iterable[tuple[str, HeldOutClip]],
-    *,
-    classes: Sequence[SemanticClass] = (),
-) -> None:
-    """PNG of some clips. Rows: source, each method's picture and class map, the true ones; columns: frames.
-
-    Args:
-        methods: from top to bottom, by name, each with the places of its rows (see `write_rows`), clip by clip.
-        clips: from top to bottom, each with what it is called. classes: the ontology, empty for none.
-    Raises: RunError if a row cannot be read, or the file cannot be written.
-    """
-    blocks: list[Bytes] = []
-    for number, (label, clip) in enumerate(clips):
-        rows = [("source", _row(clip.seen.source))]
-        for name, places in methods:
-            files = {name: f"{places[number]}.png", f"{name}: classes": f"{places[number]}.classes.png"}
-            rows += [(kind, _read(Path(file))) for kind, file in files.items() if Path(file).exists()]
-        true = to_labels(clip.target_classes if classes else None)
-        rows += [] if true is None else [("true classes", _row(painted(true, classes)))]
-        rows.append(("target", _row(clip.target)))
-        blocks += [np.concatenate([_label(kind, label, len(row)), row], axis=1) for kind, row in rows]
-        blocks.append(np.zeros((_GAP, blocks[-1].shape[1], 3), np.uint8))
-    write_whole(path, png(np.concatenate(blocks[:-1])))
-
-
-def _row(frames: Bytes) -> Bytes:
-    """Some frames side by side, a gap behind each."""
-    shown = [frames[number - 1] for number in SHEET_FRAMES if number <= len(frames)]
-    return np.concatenate([np.pad(each, ((0, 0), (0, _GAP), (0, 0)), constant_values=255) for each in shown], axis=1)
-
-
-def _read(path: Path) -> Bytes:
+def read_row(path: Path, width: int) -> Bytes:
+    """Frames [N, H, W, 3] of a row. Raises RunError if it is damaged."""
     picture = cv2.imread(str(path))
-    if picture is None:
+    if picture is None or picture.shape[1] % width:
         raise RunError(f"{path} is damaged; delete it, and run the same line again")
-    return np.ascontiguousarray(picture[..., ::-1]).astype(np.uint8)
+    rows = np.ascontiguousarray(picture[..., ::-1]).astype(np.uint8)
+    return rows.reshape(len(rows), -1, width, 3).swapaxes(0, 1)
 
 
-def _label(kind: str, clip: str, height: int) -> Bytes:
-    margin = np.full((height, _LABEL_WIDTH, 3), 255, np.uint8)
-    for line, text in enumerate((*wrap(kind, _LETTERS), *wrap(clip, _LETTERS))):
-        cv2.putText(margin, text, (4, _LINE * (1 + line)), cv2.FONT_HERSHEY_SIMPLEX, 0.38, _INK, 1, cv2.LINE_AA)
-    return margin
+def shown_frames(count: int) -> list[int]:
+    """Those of so many frames that a row of a sheet shows, evenly among them."""
+    return np.linspace(0, count - 1, min(SHOWN_FRAMES, count)).round().astype(int).tolist()
+
+
+def _beside(frames: Bytes) -> Bytes:
+    return np.concatenate([frames[t] for t in shown_frames(len(frames))], axis=1)
 
 
 def painted(labels: Tensor, classes: Sequence[SemanticClass]) -> Bytes:

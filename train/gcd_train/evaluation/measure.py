@@ -46,7 +46,10 @@ def measure(
     target, draws = to_pictures(clip.target), _pictures(prediction, f"{method} on {clip.key}")
     painted = _Painted.of(clip, prediction, classes, void)
     shown = None if draws is None else _Shown.of(draws, target)
-    masks = _masks(clip)
+    masks: dict[Region, Tensor | None] = {"all": None}
+    if clip.visible is not None:
+        visible = torch.from_numpy(clip.visible.copy())
+        masks |= {"visible": visible, "occluded": ~visible}
     return ClipRecord(
         method=method,
         privileged=privileged,
@@ -58,9 +61,9 @@ def measure(
         draws=len(prediction.draws),
         seconds=seconds,
         regions={region: _region(mask, target, shown, painted) for region, mask in masks.items()},
-        lpips=None if lpips is None or draws is None else _rows(lpips.of_draws(draws, target)),
-        step=None if draws is None else tuple(_numbers(metrics.frame_change(each)) for each in draws),
-        step_target=_numbers(metrics.frame_change(target)),
+        lpips=None if lpips is None or draws is None else tuple(map(_frames, lpips.of_draws(draws, target))),
+        step=None if draws is None else tuple(tuple(metrics.frame_change(each).tolist()) for each in draws),
+        step_target=tuple(metrics.frame_change(target).tolist()),
         grid_confusion=None if painted is None else _counted(painted.halved().confusion(None)),
     )
 
@@ -145,7 +148,7 @@ def _region(mask: Tensor | None, target: Tensor, shown: _Shown | None, painted: 
     """Figures on some pixels. mask: bool [T, H, W], or None for all."""
     share = torch.ones(len(target)) if mask is None else mask.double().mean(dim=(1, 2))
     return RegionRecord(
-        pixels=_numbers(share),
+        pixels=tuple(share.tolist()),
         psnr_db=None if shown is None else shown.psnr(mask),
         ssim=None if shown is None else shown.ssim(mask),
         diversity=None if shown is None else shown.diversity(mask),
@@ -158,14 +161,6 @@ def _region(mask: Tensor | None, target: Tensor, shown: _Shown | None, painted: 
 def _within(values: Tensor, mask: Tensor | None) -> Frames:
     """Mean of [T, H, W] over each frame, or over a mask of it."""
     return _frames(values.mean(dim=(1, 2)) if mask is None else metrics.masked_mean(values, mask))
-
-
-def _masks(clip: HeldOutClip) -> dict[Region, Tensor | None]:
-    """Occluded is what is not visible."""
-    if clip.visible is None:
-        return {"all": None}
-    visible = torch.from_numpy(clip.visible.copy())
-    return {"all": None, "visible": visible, "occluded": ~visible}
 
 
 def _pictures(prediction: Prediction, whose: str) -> Tensor | None:
@@ -189,29 +184,18 @@ def _alike(draws: list[Tensor | None], what: str) -> Tensor | None:
 
 def _counted(confusions: Tensor) -> tuple[Counted, ...]:
     """What occurs in each frame's matrix, [T, K, K + 1]."""
-    return tuple(_occurring(each) for each in confusions)
-
-
-def _occurring(confusion: Tensor) -> Counted:
-    places = confusion.nonzero()
-    pixels = confusion[places[:, 0], places[:, 1]]
-    return tuple(
-        (true, said if said < len(confusion) else metrics.NO_CLASS, count)
-        for (true, said), count in zip(places.tolist(), pixels.tolist(), strict=True)
-    )
-
-
-def _rows(values: Tensor) -> tuple[Frames, ...]:
-    return tuple(_frames(row) for row in values)
+    classes, frames = confusions.shape[1], list[Counted]()
+    for confusion in confusions:
+        places = confusion.nonzero()
+        pixels = confusion[places[:, 0], places[:, 1]].tolist()
+        pairs = zip(places.tolist(), pixels, strict=True)
+        frames.append(tuple((true, said if said < classes else metrics.NO_CLASS, n) for (true, said), n in pairs))
+    return tuple(frames)
 
 
 def _frames(values: Tensor) -> Frames:
     """NaN, where there was no pixel to measure, becomes None."""
-    return tuple(None if math.isnan(value) else value for value in _numbers(values))
-
-
-def _numbers(values: Tensor) -> tuple[float, ...]:
-    return tuple(values.tolist())
+    return tuple(None if math.isnan(value) else value for value in tuple(values.tolist()))
 
 
 def predicted_and_measured(

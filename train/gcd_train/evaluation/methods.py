@@ -10,10 +10,9 @@ from gcd_model import RenderOptions, ViewSynthesizer, inspect_weights, load_synt
 from gcd_model.config import SemanticClass
 from gcd_model.loading import packaged_weights
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.evaluation.baselines import DEPTH_ON_MEAN, BaselineSettings, build, described, usual_baselines
+from gcd_train.evaluation.baselines import BaselineSettings, build, described, usual_baselines
 from gcd_train.evaluation.model_views import ClipFacts, SynthesizedViews
 from gcd_train.evaluation.predictors import Predictor
-from gcd_train.evaluation.reprojection import REPROJECT_RGBD, REPROJECT_SEMD
 from gcd_train.evaluation.runner import Maker
 from gcd_train.evaluation.saved_frames import SavedFrames
 from gcd_train.evaluation.store import FRAMES_IN
@@ -23,8 +22,6 @@ HEXPLANE = "hexplane_"
 """What the name of every HexPlane begins with; the number of its views follows."""
 _SVD = "svd"
 """The family of image-to-video weights."""
-_OF_MEANS = ("mean_target", "majority_map", "ground_homography", "depth_reprojection", DEPTH_ON_MEAN)
-_ROUNDED = (REPROJECT_RGBD, REPROJECT_SEMD)
 _DIGITS = 12
 
 
@@ -81,7 +78,7 @@ def of_baselines(names: Sequence[str] | None, settings: BaselineSettings, traine
         Method(
             name=name,
             make=partial(build, name, settings),
-            told={"baseline": name, **_used(name, settings, trained_on), **described(name, settings)},
+            told=described(name, settings, trained_on),
         )
         for name in chosen
     )
@@ -119,14 +116,6 @@ def of_saved_frames(
             f"there are {', '.join(names) or 'none'}"
         )
     return methods
-
-
-def _used(name: str, settings: BaselineSettings, trained_on: str) -> dict[str, str]:
-    """What of all that baselines are told this one works with: it is the same method wherever that is the same."""
-    told = {"samples": str(settings.samples)} if name == VANILLA_SVD else {}
-    told |= {"seed": str(settings.seed)} if name == VANILLA_SVD or name.startswith(HEXPLANE) else {}
-    told |= {"means of": trained_on} if name in _OF_MEANS else {}
-    return told | ({"published rounding": "yes"} if settings.published and name in _ROUNDED else {})
 
 
 def _require_image_to_video(weights: str) -> None:

@@ -17,8 +17,8 @@ from gcd_train.errors import RecipeError
 from gcd_train.evaluation.baselines import BaselineSettings
 from gcd_train.evaluation.choosing import Choice
 from gcd_train.evaluation.clips import EvaluationSet, PairedSet, class_grid, identity_of, require_same_kind
+from gcd_train.evaluation.galleries import Strip, contact_rows, write_sheet
 from gcd_train.evaluation.hexplane import HexPlaneSettings
-from gcd_train.evaluation.kept_frames import write_contact_sheet
 from gcd_train.evaluation.lpips import Lpips
 from gcd_train.evaluation.methods import (
     Method,
@@ -209,9 +209,11 @@ class Plan:
 
     def write_sheet(self, path: Path, summary: Summary, keys: Sequence[str], keeper: RunKeeper) -> None:
         """The contact sheet of the first clips of a summary. Raises RunError."""
-        methods = [(name, [keeper.sheet_rows(name, key) for key in keys]) for name in _on_the_sheet(summary)]
-        clips = [(str(each), self.clips.clip(key)) for each, key in zip(summary.conditions.shots, keys, strict=False)]
-        write_contact_sheet(path, methods, clips, classes=self.clips.classes)
+        clips: list[tuple[str, tuple[Strip, ...]]] = []
+        for each, key in zip(summary.conditions.shots, keys, strict=False):
+            methods = [(name, keeper.sheet_rows(name, key)) for name in _on_the_sheet(summary)]
+            clips.append((str(each), contact_rows(self.clips.clip(key), methods, self.clips.classes)))
+        write_sheet(clips, path)
 
 
 def planned(options: EvaluateOptions) -> Plan:

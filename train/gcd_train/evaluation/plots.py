@@ -2,22 +2,22 @@
 
 import io
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gcd_train.errors import RenderError
+from gcd_train.evaluation.runs import Method
 from gcd_train.evaluation.statistics import FIRST_MEASURED, FigureName, Interval, Selection, bootstrap
 from gcd_train.evaluation.store import ClipRecord, Region
 from gcd_train.evaluation.tables import Cell, Measured, csv_text
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -81,6 +81,11 @@ class Curve:
     name: str
     points: tuple[Point, ...]
 
+    @classmethod
+    def of(cls, name: str, points: Iterable[Point]) -> "Curve":
+        """Of the points whose figure is known."""
+        return cls(name=name, points=tuple(point for point in points if point.y.known))
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Plot:
@@ -101,55 +106,86 @@ class Plot:
 def all_plots(measured: Measured) -> tuple[Plot, ...]:
     """All that the records are enough for."""
     made = (error_by_angle(measured), ssim_by_views(measured), psnr_by_frame(measured))
-    return tuple(plot for plot in made if plot is not None)
+    return tuple(plot for plot in made if plot.curves)
 
 
-def error_by_angle(measured: Measured) -> Plot | None:
-    """PSNR of the last frame over the angle that the camera has turned by, |azimuth|; None on one path for all.
+def error_by_angle(measured: Measured) -> Plot:
+    """PSNR of the last frame over the angle that the camera has turned by, |azimuth|; no curve on one path for all.
 
     Source: GCD, the study of angles in section 5: error against the rotation about the scene.
     """
-    curves = [
-        Curve(name=method.name, points=_angle_points(measured, method.records))
-        for method in measured.of.methods
-        if method.makes_pictures
-    ]
-    return _plot("psnr_by_angle", "Last frame, all pixels", "azimuth turned by, degrees", "PSNR, dB", curves, least=2)
+    curves: list[Curve] = []
+    for method in measured.of.methods:
+        turned = [(record, abs(record.change[0])) for record in method.records if record.change is not None]
+        groups: dict[float, list[ClipRecord]] = {}
+        for (record, _), place in zip(turned, angle_bins([angle for _, angle in turned]), strict=True):
+            groups.setdefault(place, []).append(record)
+        sums = {
+            place: bootstrap(groups[place], Selection(frames="last"), seed=measured.seed) for place in sorted(groups)
+        }
+        points = [Point(x=x, y=each.interval("psnr_db"), clips=len(groups[x])) for x, each in sums.items()]
+        curves.append(Curve.of(method.name, points))
+    return Plot(
+        name="psnr_by_angle",
+        title="Last frame, all pixels",
+        across="azimuth turned by, degrees",
+        up="PSNR, dB",
+        curves=tuple(curve for curve in curves if len(curve.points) > 1),
+    )
 
 
-def psnr_by_frame(measured: Measured) -> Plot | None:
+def psnr_by_frame(measured: Measured) -> Plot:
     """PSNR of each frame from the second on, all pixels; mIoU where there are only class maps."""
     pictures = [method for method in measured.of.methods if method.makes_pictures]
     name: FigureName = "psnr_db" if pictures else "miou_common"
-    curves: list[Curve] = []
-    for method in pictures or measured.of.methods:
-        found = [
-            Point(x=frame, y=measured.sums(method, Selection(frames=frame)).interval(name), clips=len(method.records))
-            for frame in range(FIRST_MEASURED + 1, measured.of.note.frames + 1)
-        ]
-        curves.append(Curve(name=method.name, points=tuple(point for point in found if point.y.known)))
-    up = "PSNR, dB" if pictures else "mIoU"
-    return _plot("by_frame", "Each frame, all pixels", "frame", up, curves, least=2, counted=True)
+    frames = range(FIRST_MEASURED + 1, measured.of.note.frames + 1)
+    curves = [
+        Curve.of(method.name, (_point(measured, method, Selection(frames=frame), name, frame) for frame in frames))
+        for method in pictures or measured.of.methods
+    ]
+    return Plot(
+        name="by_frame",
+        title="Each frame, all pixels",
+        across="frame",
+        up="PSNR, dB" if pictures else "mIoU",
+        curves=tuple(curve for curve in curves if len(curve.points) > 1),
+        counted=True,
+    )
 
 
-def ssim_by_views(measured: Measured) -> Plot | None:
-    """SSIM against the number of views that HexPlane is given; every other method as a level. None without HexPlane.
+def ssim_by_views(measured: Measured) -> Plot:
+    """SSIM over the number of views that HexPlane is given; every other method as a level. No curve without HexPlane.
 
     Source: GCD, section 5: how many input views a reconstruction needs to come near.
     """
-    hexplanes = {method.name: match for method in measured.of.methods if (match := _HEXPLANE.search(method.name))}
-    if not hexplanes:
-        return None
-    curves = [_views_curve(measured, hexplanes, region) for region in ("all", "occluded")]
-    levels = [
-        Curve(name=f"{method.name}, all", points=(_whole(measured, method.name, "all", 0.0),))
-        for method in measured.of.methods
-        if method.name not in hexplanes and method.makes_pictures
+    found = {method.name: _HEXPLANE.search(method.name) for method in measured.of.methods}
+    views = sorted((int(match[1]), name) for name, match in found.items() if match)
+    regions: tuple[Region, ...] = ("all", "occluded")
+    curves = [
+        Curve.of(
+            f"HexPlane, {region}",
+            (_point(measured, measured.of.method(name), Selection(region=region), "ssim", x) for x, name in views),
+        )
+        for region in regions
     ]
-    plot = _plot(
-        "ssim_by_views", "HexPlane, frames 2 to the last", "views given", "SSIM", curves, least=1, counted=True
+    levels = [
+        Curve(name=f"{method.name}, all", points=(_point(measured, method, Selection(), "ssim", 0.0),))
+        for method in measured.of.methods
+        if not found[method.name] and method.makes_pictures
+    ]
+    return Plot(
+        name="ssim_by_views",
+        title="HexPlane, frames 2 to the last",
+        across="views given",
+        up="SSIM",
+        curves=tuple(curve for curve in curves if curve.points),
+        levels=tuple(levels),
+        counted=True,
     )
-    return None if plot is None else replace(plot, levels=tuple(levels))
+
+
+def _point(measured: Measured, method: Method, selection: Selection, name: FigureName, x: float) -> Point:
+    return Point(x=x, y=measured.sums(method, selection).interval(name), clips=len(method.records))
 
 
 def curves_csv(plot: Plot) -> str:
@@ -170,43 +206,6 @@ def angle_bins(angles: Sequence[float]) -> list[float]:
     return [(np.floor(min(angle, 179.999) / ANGLE_STEP_DEG) + 0.5) * ANGLE_STEP_DEG for angle in angles]
 
 
-def _angle_points(measured: Measured, records: Sequence[ClipRecord]) -> tuple[Point, ...]:
-    turned = [(record, abs(record.change[0])) for record in records if record.change is not None]
-    groups: dict[float, list[ClipRecord]] = {}
-    for (record, _), place in zip(turned, angle_bins([angle for _, angle in turned]), strict=True):
-        groups.setdefault(place, []).append(record)
-    found = [
-        Point(
-            x=place,
-            y=bootstrap(groups[place], Selection(frames="last"), seed=measured.seed).interval("psnr_db"),
-            clips=len(groups[place]),
-        )
-        for place in sorted(groups)
-    ]
-    return tuple(point for point in found if point.y.known)
-
-
-def _views_curve(measured: Measured, hexplanes: Mapping[str, re.Match[str]], region: Region) -> Curve:
-    by_views = sorted((int(match[1]), name) for name, match in hexplanes.items())
-    found = [_whole(measured, name, region, float(views)) for views, name in by_views]
-    return Curve(name=f"HexPlane, {region}", points=tuple(point for point in found if point.y.known))
-
-
-def _whole(measured: Measured, name: str, region: Region, x: float) -> Point:
-    method = measured.of.method(name)
-    return Point(x=x, y=measured.sums(method, Selection(region=region)).interval("ssim"), clips=len(method.records))
-
-
-def _plot(
-    name: str, title: str, across: str, up: str, curves: Sequence[Curve], *, least: int, counted: bool = False
-) -> Plot | None:
-    """None where no curve has so many points."""
-    shown = tuple(curve for curve in curves if len(curve.points) >= least)
-    if not shown:
-        return None
-    return Plot(name=name, title=title, across=across, up=up, curves=shown, counted=counted)
-
-
 _SIZE_IN = (7.2, 4.4)
 _MOST_TICKS = 16
 _MARKS = ("o", "s", "^", "D", "v", "P", "X", "*")
@@ -215,46 +214,28 @@ _MARKS = ("o", "s", "^", "D", "v", "P", "X", "*")
 def draw(plot: Plot, out: Path) -> None:
     """One PNG: lines with 95 % intervals, levels dashed. Raises RenderError without matplotlib."""
     figure = new_figure(*_SIZE_IN)
+    from matplotlib.ticker import FixedLocator, MaxNLocator
+
     axes = figure.add_subplot()
     for number, curve in enumerate(plot.curves):
-        low, high = _bars(curve)
         x, y = [point.x for point in curve.points], [point.y.value for point in curve.points]
-        mark = _MARKS[number % len(_MARKS)]
-        axes.errorbar(
-            x, y, yerr=(low, high), marker=mark, color=_colour(number), markersize=4, capsize=2, linewidth=1.2,
-            elinewidth=0.7, label=curve.name,
-        )  # fmt: skip
+        bounds = np.array([(each.value - each.low, each.high - each.value) for each in (p.y for p in curve.points)])
+        yerr, mark = np.nan_to_num(bounds).clip(0.0).T, _MARKS[number % len(_MARKS)]
+        style: dict[str, Any] = {"marker": mark, "color": f"C{number % 10}", "markersize": 4, "linewidth": 1.2}
+        axes.errorbar(x, y, yerr=yerr, capsize=2, elinewidth=0.7, label=curve.name, **style)
     for number, level in enumerate(plot.levels, start=len(plot.curves)):
-        axes.axhline(level.points[0].y.value, linestyle="--", linewidth=1.0, color=_colour(number), label=level.name)
+        axes.axhline(level.points[0].y.value, linestyle="--", linewidth=1.0, color=f"C{number % 10}", label=level.name)
     axes.set_title(plot.title, fontsize=10, loc="left")
     axes.set_xlabel(plot.across)
     axes.set_ylabel(plot.up)
     if plot.counted:
-        _whole_ticks(axes, [point.x for curve in plot.curves for point in curve.points])
+        places = sorted({point.x for curve in plot.curves for point in curve.points})
+        few = len(places) <= _MOST_TICKS
+        axes.xaxis.set_major_locator(FixedLocator(places) if few else MaxNLocator(integer=True))
+        if len(places) == 1:
+            axes.set_xlim(places[0] - 1, places[0] + 1)
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
     figure.tight_layout()
     save(figure, out)
-
-
-def _whole_ticks(axes: "Axes", places: Sequence[float]) -> None:
-    """Ticks at whole numbers: where the points are, or, of many, at some between the first and the last."""
-    from matplotlib.ticker import FixedLocator, MaxNLocator
-
-    each = sorted(set(places))
-    axes.xaxis.set_major_locator(FixedLocator(each) if len(each) <= _MOST_TICKS else MaxNLocator(integer=True))
-    if len(each) == 1:
-        axes.set_xlim(each[0] - 1, each[0] + 1)
-
-
-def _bars(curve: Curve) -> tuple[list[float], list[float]]:
-    """How far the bounds lie below and above each point; nothing where nobody knows."""
-    low = [max(0.0, point.y.value - point.y.low) if point.y.low == point.y.low else 0.0 for point in curve.points]
-    high = [max(0.0, point.y.high - point.y.value) if point.y.high == point.y.high else 0.0 for point in curve.points]
-    return low, high
-
-
-def _colour(number: int) -> str:
-    """A colour of matplotlib's cycle of ten, over and over."""
-    return f"C{number % 10}"

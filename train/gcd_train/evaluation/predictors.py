@@ -111,6 +111,20 @@ class SourceClip:
     points: SourcePoints | None = None
 
 
+FAR_M = 1e4
+"""What a depth of 0, the sky, stands for: so far away both cameras see the same of it."""
+
+
+def own_views(source: Bytes, depth: NDArray[np.float32], classes: Bytes | None, lens: Intrinsics) -> list[SceneView]:
+    """The T views of a source camera in its own axes; the sky is far."""
+    far = np.where(depth > 0, depth, np.float32(FAR_M))
+    labels = [None] * len(far) if classes is None else classes
+    return [
+        SceneView(rgb=rgb, depth=z, classes=ids, instances=None, world_from_camera=np.eye(4), lens=lens)
+        for rgb, z, ids in zip(source, far, labels, strict=True)
+    ]
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Prediction:
     """A view as it is measured.
@@ -185,17 +199,13 @@ def fit_statistics(clips: ClipSource, *, progress: Callable[[int, int], None] | 
     votes = [np.zeros(clips.target_classes(0).shape, dtype=np.int32) for _ in clips.classes]  # K times [T, H, W]
     for index in range(len(clips)):
         total += to_pictures(clips.rgb(index)[1])
-        if votes:
-            _count(votes, clips.target_classes(index))
+        labels = clips.target_classes(index) if votes else None
+        for label, count in enumerate(votes):
+            count += labels == label
         if progress is not None:
             progress(index + 1, len(clips))
     majority = torch.from_numpy(np.stack(votes).argmax(axis=0).astype(np.uint8)) if votes else None
     return TargetStatistics(mean=(total / len(clips)).float(), majority=majority)
-
-
-def _count(votes: Sequence[np.ndarray[tuple[int, ...], np.dtype[np.int32]]], labels: Bytes) -> None:
-    for label, count in enumerate(votes):
-        count += labels == label
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -211,32 +221,17 @@ class CopySource:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class MeanTarget:
-    """The mean training target of each frame number, whatever the clip."""
+class Fixed:
+    """The same of every clip: the mean training target, or the commonest class of each pixel."""
 
-    statistics: TargetStatistics
-    name: str = "mean_target"
+    name: str
+    prediction: Prediction
     privileged: bool = False
 
     def predict(self, clip: SourceClip) -> Prediction:
         """See Predictor."""
-        return Prediction(video=self.statistics.mean)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class MajorityMap:
-    """The commonest class of each pixel of each frame number among training targets, whatever the clip.
-
-    majority: uint8 [T, H, W].
-    """
-
-    majority: Tensor
-    name: str = "majority_map"
-    privileged: bool = False
-
-    def predict(self, clip: SourceClip) -> Prediction:
-        """See Predictor."""
-        return Prediction(classes=self.majority)
+        del clip
+        return self.prediction
 
 
 _NEAREST_SOURCE_M = 0.1  # in front of the source camera
@@ -294,10 +289,7 @@ def ground_grid(cameras: CameraPair) -> tuple[Tensor, Tensor]:
     points = torch.einsum("tij,hwj->thwi", homography, rays)
     below = torch.einsum("ti,hwi->thw", normal, rays) / height_m[:, None, None]  # 1 / reach, positive on the ground
     ahead = points[..., 2] > _NEAREST_SOURCE_M * below.clamp(min=0.0)
-    grid = _sampling(to_pixels(points, cameras.source), cameras.source)
+    size = points.new_tensor([cameras.source.width, cameras.source.height])
+    grid = to_pixels(points, cameras.source) * 2 / size - 1
     seen = (below > 0) & ahead & (grid.abs() <= 1).all(dim=-1)
     return grid.nan_to_num().clamp(-2.0, 2.0).float(), seen
-
-
-def _sampling(pixels: Tensor, camera: Intrinsics) -> Tensor:
-    return pixels * 2 / pixels.new_tensor([camera.width, camera.height]) - 1

@@ -19,7 +19,7 @@ from gcd_train.evaluation.galleries import shown_clips, strips, write_sheet, wri
 from gcd_train.evaluation.paper import is_model, tables_for
 from gcd_train.evaluation.plots import all_plots, curves_csv, draw, require_matplotlib
 from gcd_train.evaluation.runs import EvaluatedSet, Method, Run, gather, on_the_same_goals
-from gcd_train.evaluation.statistics import Span
+from gcd_train.evaluation.statistics import FEW_SCENES, Span
 from gcd_train.evaluation.store import folder_name, write_whole
 from gcd_train.evaluation.tables import (
     STAR_OF_FIGURE,
@@ -34,9 +34,6 @@ from gcd_train.evaluation.tables import (
     to_csv,
     to_markdown,
 )
-
-FEWEST_SCENES = 10
-"""With fewer a report warns: the bootstrap knows no more scenes than it is given."""
 
 _SPANS: tuple[Span, ...] = ("2-last", "last")
 _RELEASED_SPANS: tuple[Span, ...] = ("all", *_SPANS)
@@ -144,12 +141,8 @@ def _note_lines(run: Run) -> list[str]:
         ("protocol", f"{note.protocol}, seed {note.seed}"),
         ("size", f"{note.frames} frames of {note.width}x{note.height} at {note.fps:g} fps"),
     )
-    rows = [[name, _details(details)] for name, details in note.methods.items()]
+    rows = [[name, ", ".join(f"{key} {value}" for key, value in told.items())] for name, told in note.methods.items()]
     return [*(f"- {name}: {told}" for name, told in facts), "", *markdown_rows(["method", "what it is"], rows)]
-
-
-def _details(details: Mapping[str, str]) -> str:
-    return ", ".join(f"{name} {value}" for name, value in details.items())
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -181,19 +174,15 @@ class _Writer:
         measured = Measured(of=self.of, seed=self.choices.seed, rows=self.choices.rows)
         yield f"## The last frame together: {self.of.title}\n"
         yield "Clips of the same names end at the same goals here, so their last frames are comparable and no others.\n"
-        yield from self._main_tables(measured, ("last",))
+        yield from map(self._table, main_tables(measured, ("last",)))
         yield from self._differences(measured, leads(self.of, self.choices), ("last",))
-
-    def _main_tables(self, measured: Measured, spans: Sequence[Span]) -> Iterator[str]:
-        for table in main_tables(measured, spans):
-            yield self._table(table)
 
     def _table(self, table: Table) -> str:
         self._write(f"tables/{table.name}.csv", to_csv(table))
         return f"{to_markdown(table)}\n{self._link(f'tables/{table.name}.csv')}\n"
 
     def _tables(self, measured: Measured) -> Iterator[str]:
-        yield from self._main_tables(measured, self.spans)
+        yield from map(self._table, main_tables(measured, self.spans))
         yield self._table(region_table(measured, self.spans[0]))
         self._write("tables/figures.csv", all_figures(measured))
         self._write("tables/frames.csv", frames_csv(measured))
@@ -222,7 +211,7 @@ class _Writer:
             )
         if any(each.starred for each in every):
             yield f"{STAR_OF_FIGURE}\n"
-        if every and self.of.scenes < FEWEST_SCENES:
+        if every and self.of.scenes < FEW_SCENES:
             yield f"Of {self.of.scenes} scenes alone: too few to rest a claim on, whatever is bold.\n"
 
     def _plots(self, measured: Measured) -> Iterator[str]:

@@ -24,21 +24,21 @@ _SAMPLE = re.compile(r"sample_(\d+)")
 _RELEASED = re.compile(r"(.+)_pred_s(\d+)")
 
 
-@dataclass(frozen=True, slots=True)
-class SavedDraw:
-    """One view of one clip on the disk. path: a folder of numbered pictures, or a video."""
+def read_draw(path: Path) -> list[Bytes]:
+    """RGB pictures, uint8 [H, W, 3] each, of a folder of numbered pictures, or of a video.
 
-    path: Path
+    Raises: FileFault for a damaged file; DataError for a folder whose pictures do not count up one by one.
+    """
+    if not path.is_dir():
+        return _video_frames(path)
+    found = sorted(_pictures(path), key=lambda each: int(each.stem))
+    numbers = [int(each.stem) for each in found]
+    if numbers != list(range(numbers[0], numbers[0] + len(numbers))) or numbers[0] > 1:
+        raise DataError(f"{path} holds frames {numbers}, one is missing or there twice; number them from 0 on")
+    return [read_colour(each) for each in found]
 
-    def frames(self) -> list[Bytes]:
-        """RGB pictures, uint8 [H, W, 3] each.
 
-        Raises: FileFault for a damaged file; DataError for a folder whose pictures do not count up one by one.
-        """
-        return [read_colour(path) for path in _numbered(self.path)] if self.path.is_dir() else _video_frames(self.path)
-
-
-def find_draws(folder: Path, key: str) -> list[SavedDraw]:
+def find_draws(folder: Path, key: str) -> list[Path]:
     """The draws of a clip, in order.
 
     A draw is a folder of pictures by number (`0000.png`, ...; also JPEG and WebP) or a video (`.mp4`), and stands at
@@ -62,25 +62,19 @@ def find_draws(folder: Path, key: str) -> list[SavedDraw]:
     return found
 
 
-def _ours(folder: Path, key: str) -> list[SavedDraw]:
+def _ours(folder: Path, key: str) -> list[Path]:
     place = folder / key
-    samples = _by_number(place, _SAMPLE)
-    if samples:
-        return [SavedDraw(samples[number]) for number in sorted(samples)]
-    return [SavedDraw(path) for path in (place, place.with_name(key + _VIDEO)) if _is_draw(path)][:1]
-
-
-def _by_number(folder: Path, pattern: re.Pattern[str]) -> dict[int, Path]:
-    """Draws in a folder by the number at the end of their name."""
-    found: dict[int, Path] = {}
-    for path in _entries(folder):
-        named = pattern.fullmatch(_name_of(path))
+    samples: dict[int, Path] = {}
+    for path in _entries(place):
+        named = _SAMPLE.fullmatch(_name_of(path))
         if named and _is_draw(path):
-            found.setdefault(int(named[named.re.groups]), path)
-    return found
+            samples.setdefault(int(named[1]), path)
+    if samples:
+        return [samples[number] for number in sorted(samples)]
+    return [path for path in (place, place.with_name(key + _VIDEO)) if _is_draw(path)][:1]
 
 
-def _released(folder: Path, key: str) -> list[SavedDraw]:
+def _released(folder: Path, key: str) -> list[Path]:
     by_prefix: dict[str, dict[int, Path]] = {}
     for path in _entries(folder):
         named = _RELEASED.fullmatch(_name_of(path))
@@ -88,7 +82,7 @@ def _released(folder: Path, key: str) -> list[SavedDraw]:
             by_prefix.setdefault(named[1], {}).setdefault(int(named[2]), path)
     if len(by_prefix) > 1:
         raise DataError(f"{folder} holds clip {key} several times: {', '.join(sorted(by_prefix))}; keep one")
-    return [SavedDraw(draws[number]) for draws in by_prefix.values() for number in sorted(draws)]
+    return [draws[number] for draws in by_prefix.values() for number in sorted(draws)]
 
 
 def _tells_of(prefix: str, key: str) -> bool:
@@ -114,15 +108,6 @@ def _is_draw(path: Path) -> bool:
 
 def _pictures(folder: Path) -> Sequence[Path]:
     return [path for path in folder.iterdir() if path.suffix in _PICTURES and path.stem.isdecimal()]
-
-
-def _numbered(folder: Path) -> list[Path]:
-    """Pictures by their number."""
-    found = sorted(_pictures(folder), key=lambda path: int(path.stem))
-    numbers = [int(path.stem) for path in found]
-    if numbers != list(range(numbers[0], numbers[0] + len(numbers))) or numbers[0] > 1:
-        raise DataError(f"{folder} holds frames {numbers}, one is missing or there twice; number them from 0 on")
-    return found
 
 
 def _video_frames(path: Path) -> list[Bytes]:
@@ -169,22 +154,23 @@ class SavedFrames:
             DataError: there is nothing for this clip, or something of another length or size; nothing is resized.
             FileFault: a file is damaged.
         """
-        draws = [self._prediction(_read(draw, clip)) for draw in find_draws(self.folder, clip.key)]
-        return replace(draws[0], more=tuple(draws[1:]))
+        videos = [_read(draw, clip) for draw in find_draws(self.folder, clip.key)]
+        first, *more = (
+            Prediction(classes=nearest_classes(video, self.painted)) if self.painted else Prediction(video=video)
+            for video in videos
+        )
+        return replace(first, more=tuple(more))
 
-    def _prediction(self, video: Tensor) -> Prediction:
-        return Prediction(classes=nearest_classes(video, self.painted)) if self.painted else Prediction(video=video)
 
-
-def _read(draw: SavedDraw, clip: SourceClip) -> Tensor:
+def _read(draw: Path, clip: SourceClip) -> Tensor:
     """float32 [T, 3, H, W] in [0, 1]. Raises DataError."""
-    frames, lens = draw.frames(), clip.cameras.target
+    frames, lens = read_draw(draw), clip.cameras.target
     if len(frames) != len(clip.source):
-        raise DataError(f"{draw.path} holds {len(frames)} frames, clip {clip.key} has {len(clip.source)}; save all")
+        raise DataError(f"{draw} holds {len(frames)} frames, clip {clip.key} has {len(clip.source)}; save all")
     for number, frame in enumerate(frames):
         if frame.shape != (lens.height, lens.width, 3):
             raise DataError(
-                f"{draw.path}: frame {number} is {frame.shape[1]} x {frame.shape[0]}, the target {lens.width} x "
+                f"{draw}: frame {number} is {frame.shape[1]} x {frame.shape[0]}, the target {lens.width} x "
                 f"{lens.height}; save them in that size"
             )
     return torch.cat([to_pictures(frame[None]) for frame in frames])

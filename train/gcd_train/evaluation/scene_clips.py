@@ -158,7 +158,7 @@ class SceneSet:
         return self._ontology.places[self._ontology.decode(self._ontology.encode(ids))]
 
     def _stacked(self, rows: Sequence[NDArray[Number]]) -> NDArray[Number]:
-        return np.stack([_nearest(row, self.width, self.height) for row in rows])
+        return np.stack([nearest_resized(row, self.width, self.height) for row in rows])
 
     def _others(self, scene: str, times: Sequence[int], count: int) -> Sequence[Sequence[SceneView]]:
         """See OtherViews. Far from the source and from each other, the farthest first."""
@@ -178,8 +178,8 @@ class SceneSet:
         classes = self._places_of(view.classes)
         return SceneView(
             rgb=trained_picture(view.rgb, self.width, self.height),
-            depth=_nearest(view.depth, self.width, self.height),
-            classes=None if classes is None else _nearest(classes, self.width, self.height),
+            depth=nearest_resized(view.depth, self.width, self.height),
+            classes=None if classes is None else nearest_resized(classes, self.width, self.height),
             instances=None,
             world_from_camera=view.world_from_camera,
             lens=trained_lens(view.lens, self.width, self.height),
@@ -195,7 +195,7 @@ def far_apart(places: NDArray[np.float64]) -> list[int]:
     return order
 
 
-def _nearest(values: NDArray[Number], width: int, height: int) -> NDArray[Number]:
+def nearest_resized(values: NDArray[Number], width: int, height: int) -> NDArray[Number]:
     """What must not be averaged, in the size and crop of `trained_picture`: [H, W] -> [height, width]."""
     left, top, across, along = center_crop_box(values.shape[1], values.shape[0], width / height)
     rows = top + ((np.arange(height) + 0.5) * along / height).astype(np.intp)

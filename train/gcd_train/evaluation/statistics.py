@@ -21,6 +21,8 @@ FIRST_MEASURED = 1
 COMMON_CLASSES = 10
 """Classes that the paper's mIoU is a mean over: the commonest of the evaluated targets."""
 DRAWS, COVERAGE = 10_000, 0.95
+FEW_SCENES = 10
+"""Of fewer, no claim can rest on what was found: the bootstrap knows no more scenes than it is given."""
 
 Span: TypeAlias = Literal["2-last", "last", "all"]
 """Which frames are measured."""

@@ -12,11 +12,11 @@ Files appear whole or not at all, so a run that was killed goes on where it stop
 import fcntl
 import os
 import re
-from collections.abc import Generator, Mapping
+from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TextIO, TypeAlias, get_args
+from typing import Literal, TypeAlias, get_args
 
 import msgspec
 
@@ -137,7 +137,12 @@ class RunKeeper:
         with (self.folder / ".in_use").open("a") as measuring:
             with (self.folder / ".begin").open("a") as turn:
                 fcntl.flock(turn, fcntl.LOCK_EX)
-                self.begin(note, alone=_nobody_else(measuring))
+                try:
+                    fcntl.flock(measuring, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    alone = True
+                except BlockingIOError:
+                    alone = False
+                self.begin(note, alone=alone)
                 fcntl.flock(measuring, fcntl.LOCK_SH)
             yield
 
@@ -155,9 +160,18 @@ class RunKeeper:
         path = self.folder / RUN_FILE
         if path.exists():
             found = _read_note(path)
-            found = self._with_records(found) if alone else found
+            if alone:
+                places = {name: self.folder / "records" / folder_name(name) for name in found.methods}
+                kept = {name: found.methods[name] for name, place in places.items() if any(place.glob("*.json"))}
+                found = msgspec.structs.replace(found, methods=kept)
             note = _joined(self.folder, found, note) if found.methods else note
-        _require_own_folders(note.methods)
+        owners: dict[str, str] = {}
+        for method in note.methods:
+            other = owners.setdefault(folder_name(method), method)
+            if other != method:
+                raise RunError(
+                    f"the methods {other!r} and {method!r} would share the folder {folder_name(method)}; rename one"
+                )
         write_whole(path, msgspec.json.format(msgspec.json.encode(note), indent=1))
         return note
 
@@ -180,15 +194,6 @@ class RunKeeper:
     def views(self, method: str, key: str) -> Path:
         """Where the frames of a method on a clip lie."""
         return self.folder / "views" / folder_name(method) / folder_name(key)
-
-    def _with_records(self, note: RunNote) -> RunNote:
-        """The note, reduced to methods that were measured on any clip."""
-        measured = {
-            name: told
-            for name, told in note.methods.items()
-            if any((self.folder / "records" / folder_name(name)).glob("*.json"))
-        }
-        return msgspec.structs.replace(note, methods=measured)
 
     def _record(self, method: str, key: str) -> Path:
         return self.folder / "records" / folder_name(method) / f"{folder_name(key)}.json"
@@ -219,14 +224,6 @@ def write_whole(path: Path, data: bytes) -> None:
         raise RunError(f"cannot write {path}: {error.strerror}; free some space, or choose another --out") from error
 
 
-def _nobody_else(measuring: TextIO) -> bool:
-    try:
-        fcntl.flock(measuring, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
-
-
 def _read_note(path: Path) -> RunNote:
     try:
         return read_json(path, RunNote)
@@ -246,7 +243,10 @@ def _joined(folder: Path, found: RunNote, new: RunNote) -> RunNote:
     differ = {name: (getattr(found, name), getattr(new, name)) for name in _SAME}
     differ[_PACKAGE] = (found.versions.get(_PACKAGE), new.versions.get(_PACKAGE))
     for method in found.methods.keys() & new.methods.keys():
-        differ |= _differences(method, found.methods[method], new.methods[method])
+        was, now = found.methods[method], new.methods[method]
+        names = dict.fromkeys([*was, *now])
+        names.pop(FRAMES_IN, None)  # the digest says if frames are the same
+        differ |= {f"{name} of {method}": (was.get(name, "not told"), now.get(name, "not told")) for name in names}
     told = [f"{name} was {_short(was)}, is {_short(now)}" for name, (was, now) in differ.items() if was != now]
     if told:
         raise RunError(
@@ -255,23 +255,6 @@ def _joined(folder: Path, found: RunNote, new: RunNote) -> RunNote:
     return msgspec.structs.replace(found, fps=new.fps, rates=new.rates, methods={**found.methods, **new.methods})
 
 
-def _differences(method: str, was: Mapping[str, str], now: Mapping[str, str]) -> dict[str, tuple[str, str]]:
-    names = [
-        name for name in dict.fromkeys([*was, *now]) if name != FRAMES_IN
-    ]  # the digest says if frames are the same
-    return {f"{name} of {method}": (was.get(name, "not told"), now.get(name, "not told")) for name in names}
-
-
 def _short(value: object) -> str:
     text = ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
     return text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"
-
-
-def _require_own_folders(methods: Mapping[str, object]) -> None:
-    places: dict[str, str] = {}
-    for method in methods:
-        other = places.setdefault(folder_name(method), method)
-        if other != method:
-            raise RunError(
-                f"the methods {other!r} and {method!r} would share the folder {folder_name(method)}; rename one"
-            )

@@ -38,17 +38,14 @@ class VanillaSVD:
     cropped, so that all of the target is measured.
 
     synthesizer: without camera control. size: height and width it works at, None for the weights' own (576 x 1024 of
-        the published). steps, guidance (of the last frame; the first has 1): None as published, 25 and 2.5, or as the
-        weights say that are ours. motion_bucket: as published. samples: draws of each clip. seed: all noise comes from
-        it and the clip's key.
+        the published). steps: None as the weights say. samples: draws of each clip. seed: all noise comes from it and
+        the clip's key.
     Source: Blattmann et al. 2023 (SVD); Van Hoorick et al. 2024 (GCD), section 5, "Vanilla SVD". Stretching is ours.
     """
 
     synthesizer: ViewSynthesizer
     size: tuple[int, int] | None = None
     steps: int | None = None
-    guidance: float | None = None
-    motion_bucket: float = MOTION_BUCKET
     samples: int = 1
     seed: int = 0
     name: str = VANILLA_SVD
@@ -104,12 +101,8 @@ class VanillaSVD:
     def _draw(self, features: SourceFeatures, key: str, number: int) -> Tensor:
         """One video, [T, 3, H, W] in [0, 1]: draws go one by one, as full size leaves no room for two."""
         still = torch.eye(4, dtype=torch.float64).repeat(features.frames, 1, 1)
-        options = RenderOptions(
-            steps=self.steps,
-            guidance=None if self.guidance is None else (1.0, self.guidance),
-            seed=self._seed(f"{key}#{number}"),
-            motion_bucket=self.motion_bucket,
-        )
+        seed = self._seed(f"{key}#{number}")
+        options = RenderOptions(steps=self.steps, seed=seed, motion_bucket=MOTION_BUCKET)
         (view,) = self.synthesizer.render(features, [pose_trajectory(still)], options)
         return view.video
 

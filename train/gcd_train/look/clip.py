@@ -7,6 +7,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gcd_model.geometry import Intrinsics
+from gcd_train.pointcloud import splat
+from gcd_train.scene_view import SceneView
+
 Bytes = NDArray[np.uint8]
 
 SKY_M = 250.0
@@ -51,9 +55,6 @@ def instance_colour(number: int) -> tuple[int, int, int]:
     lightness = (0.5, 0.62, 0.4)[number % 3]
     red, green, blue = colorsys.hls_to_rgb((number * _GOLDEN) % 1.0, lightness, 0.75)
     return round(255 * red), round(255 * green), round(255 * blue)
-
-
-Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -169,6 +170,11 @@ class Footage:
 
 UNSEEN = (255, 106, 0)
 """Colour of what the input camera did not see."""
+
+
+def splatted(view: SceneView, world_from_camera: NDArray[np.float64], lens: Intrinsics) -> Bytes:
+    """A view's points alone from another camera, u8 [H, W, 3]."""
+    return (splat([view], world_from_camera, lens).colour * 255).round().byte().cpu().numpy()
 
 
 def facts_of(footage: Footage) -> list[tuple[str, str]]:

@@ -7,13 +7,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from gcd_model import CameraMount, Clip, RenderOptions, SphericalDelta, Traits, Trajectory, View, ViewSynthesizer
-from gcd_model.colours import palette
 from gcd_train.datasets.clip_source import to_network
 from gcd_train.evaluation.galleries import Strip, write_sheet, write_video
+from gcd_train.evaluation.kept_frames import painted, to_bytes
 from gcd_train.evaluation.store import write_whole
 from gcd_train.look.real_video import Bytes, Windowed
 
@@ -80,7 +79,7 @@ def view_window(synthesizer: ViewSynthesizer, window: Windowed, recipe: ViewReci
     mount = mounted(traits, recipe, window.hfov_deg)
     features = synthesizer.encode(Clip(video=to_network(window.pictures), fps=window.fps, mount=mount))
     options = RenderOptions(samples=recipe.samples, steps=recipe.steps, seed=recipe.seed)
-    strips = [_strip("input", window.pictures)]
+    strips = [Strip.of("input", window.pictures)]
     for told, path in paths(traits, recipe, window.hfov_deg):
         (view,) = synthesizer.render(features, [path], options)
         strips += _view_strips(traits, told, view)
@@ -96,15 +95,14 @@ def write_viewed(viewed: Viewed, folder: Path) -> None:
 
 def _view_strips(traits: Traits, told: str, view: View) -> list[Strip]:
     strips = [
-        _strip(told if number == 0 else f"{told} sample {number + 1}", _to_bytes(sample))
+        Strip.of(told if number == 0 else f"{told} sample {number + 1}", to_bytes(sample))
         for number, sample in enumerate(view.samples)
     ]
     deviation, word = (view.uncertainty, "uncertainty") if view.uncertainty is not None else (view.std, "deviation")
     if deviation is not None:
-        strips.append(_strip(f"{word}, white {float(deviation.max()):.2g}", heat(deviation.numpy())))
+        strips.append(Strip.of(f"{word}, white {float(deviation.max()):.2g}", heat(deviation.numpy())))
     if view.classes is not None:
-        colours = palette(traits.classes)
-        strips.append(_strip("classes", colours[view.classes[0].long()].numpy()))
+        strips.append(Strip.of("classes", painted(view.classes[0], traits.classes)))
     return strips
 
 
@@ -112,14 +110,6 @@ def heat(values: NDArray[np.float32]) -> Bytes:
     """Numbers [T, H, W] as pictures [T, H, W, 3]: black is 0, the brightest is their largest."""
     grey = np.rint(values / max(float(values.max()), 1e-6) * 255).clip(0, 255).astype(np.uint8)
     return np.stack([np.asarray(cv2.applyColorMap(each, cv2.COLORMAP_INFERNO)[..., ::-1], np.uint8) for each in grey])
-
-
-def _strip(name: str, pictures: Bytes) -> Strip:
-    return Strip(name=name, frames=dict(enumerate(pictures)))
-
-
-def _to_bytes(video: torch.Tensor) -> Bytes:
-    return (video.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1).numpy()
 
 
 def _told(delta: SphericalDelta) -> str:

@@ -1,7 +1,7 @@
 """From a path to what is shown: which layout it is, and which clip; clips of pair shards."""
 
 import zipfile
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,9 @@ from gcd_train.datasets.paired import PairedClip, PairedClips
 from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
-from gcd_train.look.clip import SKY_M, Footage, LabelName, instance_colour
+from gcd_train.look.clip import SKY_M, Footage, LabelName, instance_colour, splatted
 from gcd_train.look.scene_clip import ShowOptions, dataset_clip
-from gcd_train.pointcloud import depth_visibility, splat
+from gcd_train.pointcloud import depth_visibility
 from gcd_train.scene_view import SceneView
 
 
@@ -38,14 +38,14 @@ def pair_clip(folder: Path, seed: int | None) -> Footage:
         for rgb, depth, pose in zip(clip.source, clip.source_depth, poses["source"], strict=True)
     ]
     targets = list(zip(views, clip.target_depth, poses["target"], strict=True))
-    setting = _setting(clips, index, poses)
-    return Footage(
-        title=f"pair shard, {clips.world.name} world{_scale(clips)}, seed {clip.seed}",
+    scale = " (1 m here is 1 dm)" if clips.world.name.startswith("tabletop") else ""
+    shown = Footage(
+        title=f"pair shard, {clips.world.name} world{scale}, seed {clip.seed}",
         layout=str(clips.places[index][0]),
-        path=setting.path,
-        frame_numbers=setting.frame_numbers,
+        path="the driving path, up and back\nat a sine pace",
+        frame_numbers=tuple(range(clips.frames)),
         fps=clips.fps,
-        scene_frames=setting.scene_frames,
+        scene_frames=clips.frames,
         scene_fps=clips.fps * clips.world.stride,
         cameras=tuple(poses),
         source_camera="source",
@@ -53,9 +53,7 @@ def pair_clip(folder: Path, seed: int | None) -> Footage:
         source=clip.source,
         target=clip.target,
         target_is="rendered exactly",
-        splat=np.stack(
-            [(splat([view], pose, lens).colour * 255).round().byte().cpu().numpy() for view, _, pose in targets]
-        ),
+        splat=np.stack([splatted(view, pose, lens) for view, _, pose in targets]),
         visible=np.stack([depth_visibility(view, depth, pose, lens) for view, depth, pose in targets]),
         visible_is="depths agree within 2 %",
         surface=(clip.target_depth > 0) & (clip.target_depth < SKY_M),
@@ -63,54 +61,28 @@ def pair_clip(folder: Path, seed: int | None) -> Footage:
         kind="class" if clips.classes else "instance",
         names=_names(clips, clip),
         depth=clip.source_depth,
-        world_from_source=setting.world_from_source,
-        world_from_target=setting.world_from_target,
-        look_at=setting.look_at,
-        world=setting.axes,
+        world_from_source=poses["source"],
+        world_from_target=poses["target"],
+        look_at=LOOK_AT if clips.mount is None else DRIVING_GOAL_TARGET,
+        world="world: z up, ground at z = 0",
     )
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Setting:
-    """What differs between a drive and an orbit; the fields are those of `Footage`."""
-
-    path: str
-    frame_numbers: tuple[int, ...]
-    scene_frames: int
-    world_from_source: NDArray[np.float64]
-    world_from_target: NDArray[np.float64]
-    look_at: tuple[float, float, float]
-    axes: str
-
-
-def _setting(clips: PairedClips, index: int, poses: dict[str, NDArray[np.float64]]) -> _Setting:
     if clips.mount is not None:
         vehicle_from_source = clips.mount.vehicle_from_camera.numpy()
-        return _Setting(
-            path="the driving path, up and back\nat a sine pace",
-            frame_numbers=tuple(range(clips.frames)),
-            scene_frames=clips.frames,
+        return replace(
+            shown,
             world_from_source=np.repeat(vehicle_from_source[None], clips.frames, axis=0),
             world_from_target=vehicle_from_source @ np.linalg.inv(poses["source"]) @ poses["target"],
-            look_at=DRIVING_GOAL_TARGET,
-            axes="vehicle: x ahead, y left, z up, ground at z = 0",
+            world="vehicle: x ahead, y left, z up, ground at z = 0",
         )
     orbit = clips.orbit(index)
     azimuth_deg, elevation_deg, radius_m = orbit.change
-    return _Setting(
+    return replace(
+        shown,
         path=f"{azimuth_deg:+.1f}\N{DEGREE SIGN} azimuth, {elevation_deg:+.1f}\N{DEGREE SIGN} elevation,\n"
         f"{radius_m:+.1f} m radius, gradual",
         frame_numbers=orbit.frame_numbers,
         scene_frames=orbit.frame_numbers[-1] + 1,
-        world_from_source=poses["source"],
-        world_from_target=poses["target"],
-        look_at=LOOK_AT,
-        axes="world: z up, ground at z = 0",
     )
-
-
-def _scale(clips: PairedClips) -> str:
-    return " (1 m here is 1 dm)" if clips.world.name.startswith("tabletop") else ""
 
 
 def _names(clips: PairedClips, clip: PairedClip) -> tuple[LabelName, ...]:
@@ -153,34 +125,23 @@ def open_scene(path: Path, options: ShowOptions, clip_seed: int | None = None) -
     if not path.is_dir():
         raise DataError(f"{path} is no folder; give a scene such as scn00000 or scene_000000, or pair shards")
     if kubric4d_names.scene_number(path.name) is not None:
-        return dataset_clip(_orbit_set(path), path.name, options)
+        # with the views that are there: to look at a scene not all are needed
+        every = enumerate(kubric4d_names.CAMERAS)
+        views = [camera for view, camera in every if kubric4d_names.metadata_path(path, view).exists()]
+        orbits = Kubric4D(path.parent, [path.name], cameras=views or kubric4d_names.CAMERAS, instances=True)
+        return dataset_clip(orbits, path.name, options)
     if parallel_domain4d_names.scene_number(path.name) is not None:
-        return dataset_clip(_driving_set(path), path.name, options)
+        cameras = [camera for camera in parallel_domain4d_names.CAMERAS if (path / "rgb" / camera).is_dir()]
+        classes = (path / "semantic_segmentation_2d").is_dir()
+        drives = ParallelDomain4D(
+            path.parent,
+            [path.name],
+            cameras=cameras or parallel_domain4d_names.CAMERAS,
+            classes=classes,
+            ontology=read_ontology(parallel_domain4d_names.ontology_folder(path)) if classes else None,
+        )
+        return dataset_clip(drives, path.name, options)
     raise DataError(_guess(path))
-
-
-def _orbit_set(path: Path) -> Kubric4D:
-    """With the views that are there: to look at a scene not all are needed."""
-    views = [
-        camera
-        for view, camera in enumerate(kubric4d_names.CAMERAS)
-        if kubric4d_names.metadata_path(path, view).exists()
-    ]
-    return Kubric4D(path.parent, [path.name], cameras=views or kubric4d_names.CAMERAS, instances=True)
-
-
-def _driving_set(path: Path) -> ParallelDomain4D:
-    """With the cameras that are there, and with classes where the scene has that layer."""
-    cameras = [camera for camera in parallel_domain4d_names.CAMERAS if (path / "rgb" / camera).is_dir()]
-    classes = (path / "semantic_segmentation_2d").is_dir()
-    ontology = read_ontology(parallel_domain4d_names.ontology_folder(path)) if classes else None
-    return ParallelDomain4D(
-        path.parent,
-        [path.name],
-        cameras=cameras or parallel_domain4d_names.CAMERAS,
-        classes=classes,
-        ontology=ontology,
-    )
 
 
 def _seed_of(path: Path, clip_seed: int | None) -> int | None:

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
 
 import msgspec
 import numpy as np
@@ -14,7 +13,6 @@ from gcd_model.geometry import (
     DRIVING_GOAL_TARGET,
     LOOK_AT,
     Intrinsics,
-    center_crop_box,
     from_pose,
     spherical_trajectory,
 )
@@ -25,10 +23,11 @@ from gcd_train.datasets.picture_files import MOST_TEXT, bytes_read
 from gcd_train.datasets.pictures_of_draws import trained_picture
 from gcd_train.datasets.trajectories import DRIVING, DRIVING_FRAMES, KUBRIC_FRAMES, MAX90, FrameSampling, generator
 from gcd_train.errors import DataError, RecipeError, RenderError
+from gcd_train.evaluation.scene_clips import nearest_resized
 from gcd_train.layouts import kubric4d_names
 from gcd_train.layouts.manifest import GEOMETRY, SceneManifest, read_manifest
-from gcd_train.look.clip import SKY_M, Bytes, Footage, LabelName, instance_colour
-from gcd_train.pointcloud import depth_visibility, published_picture, render_lens, splat, visibility
+from gcd_train.look.clip import SKY_M, Bytes, Footage, LabelName, instance_colour, splatted
+from gcd_train.pointcloud import depth_visibility, published_picture, render_lens, visibility
 from gcd_train.scene_view import SceneView
 from gcd_train.scenes.frozen import FrozenScene
 
@@ -121,8 +120,6 @@ def _thinned(view: SceneView, factor: int = 2) -> SceneView:
     return replace(view, rgb=rgb, depth=depth, classes=None, instances=None, lens=thin)
 
 
-Number = TypeVar("Number", bound=np.generic)
-
 _WIDTH = 384
 _SHAPE = 1.5  # of the trained pictures
 
@@ -140,15 +137,6 @@ class ShowOptions:
     exact: bool = True
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Path:
-    """world_from_source: f64 [4, 4]. world_from_target: f64 [T, 4, 4]. told: the path in words."""
-
-    world_from_source: NDArray[np.float64]
-    world_from_target: Poses
-    told: str
-
-
 def dataset_clip(data: Dataset4D, scene: str, options: ShowOptions) -> Footage:
     """A clip of a scene. Raises: FileFault naming the file that cannot be read, RecipeError for frames that are not."""
     before = bytes_read()
@@ -159,19 +147,21 @@ def dataset_clip(data: Dataset4D, scene: str, options: ShowOptions) -> Footage:
     size = (width, round(width / _SHAPE))
     lens = render_lens(views[0].lens, *size)
     pose = views[0].world_from_camera
-    path = _orbit(pose, len(numbers), options.seed) if on_sphere else _drive(len(numbers))
-    targets = target_pictures(data, scene, numbers, path.world_from_target, lens, exact=options.exact)
+    still, poses, told = _orbit(pose, len(numbers), options.seed) if on_sphere else _drive(len(numbers))
+    targets = target_pictures(data, scene, numbers, poses, lens, exact=options.exact)
     seen = [
         visibility(view, at, lens, width=size[0], height=size[1])
         if targets.depth is None
         else depth_visibility(view, targets.depth[number], at, lens)
-        for number, (view, at) in enumerate(zip(views, path.world_from_target, strict=True))
+        for number, (view, at) in enumerate(zip(views, poses, strict=True))
     ]
     labels, kind, names = _labels(data, scene, views, size)
+    depth = targets.depth
+    surface = np.ones_like(seen, np.bool_) if depth is None else (depth > 0) & (depth < SKY_M)
     return Footage(
         title=_title(data.folder(scene), "Kubric-4D" if on_sphere else "ParallelDomain-4D"),
         layout=str(data.folder(scene)),
-        path=path.told,
+        path=told,
         frame_numbers=numbers,
         fps=data.fps / stride,
         scene_frames=data.frames(scene),
@@ -182,16 +172,16 @@ def dataset_clip(data: Dataset4D, scene: str, options: ShowOptions) -> Footage:
         source=np.stack([trained_picture(view.rgb, *size) for view in views]),
         target=targets.colour,
         target_is=targets.told,
-        splat=np.stack([_splatted(view, at, lens) for view, at in zip(views, path.world_from_target, strict=True)]),
+        splat=np.stack([splatted(view, at, lens) for view, at in zip(views, poses, strict=True)]),
         visible=np.stack(seen),
         visible_is="published rule" if targets.depth is None else "depths agree within 2 %",
-        surface=np.ones_like(seen, np.bool_) if targets.depth is None else _is_surface(targets.depth),
+        surface=surface,
         labels=labels,
         kind=kind,
         names=names,
         depth=np.stack([nearest_resized(view.depth, *size) for view in views]),
-        world_from_source=np.repeat(path.world_from_source[None], len(numbers), axis=0),
-        world_from_target=path.world_from_target,
+        world_from_source=np.repeat(still[None], len(numbers), axis=0),
+        world_from_target=poses,
         look_at=LOOK_AT if on_sphere else DRIVING_GOAL_TARGET,
         world="world: z up, ground at z = 0" if on_sphere else "vehicle: x ahead, y left, z up, ground at z = 0",
         bytes_read=bytes_read() - before,
@@ -206,18 +196,6 @@ def _title(folder: Path, layout: str) -> str:
         return f"{folder.name}, {world} world{scale}, {layout} layout"
     except DataError:
         return f"{folder.name}, {layout} layout"
-
-
-def _is_surface(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    return (depth > 0) & (depth < SKY_M)
-
-
-def nearest_resized(picture: NDArray[Number], width: int, height: int) -> NDArray[Number]:
-    """Depth or ids [H, W] cropped and resized as `trained_picture` does colours, without mixing neighbours."""
-    left, top, across, along = center_crop_box(picture.shape[1], picture.shape[0], width / height)
-    rows = top + ((np.arange(height) + 0.5) * along / height).astype(np.intp)
-    columns = left + ((np.arange(width) + 0.5) * across / width).astype(np.intp)
-    return picture[rows[:, None], columns]
 
 
 def _frame_numbers(frames: int, sampling: FrameSampling, options: ShowOptions) -> tuple[tuple[int, ...], int]:
@@ -240,38 +218,28 @@ def _frame_numbers(frames: int, sampling: FrameSampling, options: ShowOptions) -
     )
 
 
-def _orbit(world_from_source: NDArray[np.float64], frames: int, seed: int) -> _Path:
-    """A path as training draws it (max90, gradual), from where the source camera really stands."""
+def _orbit(world_from_source: NDArray[np.float64], frames: int, seed: int) -> tuple[Poses, Poses, str]:
+    """The source's pose, the target's and the path in words: as training draws it (max90, gradual)."""
     import torch
 
     start = from_pose(torch.from_numpy(world_from_source))
     change = MAX90.change(generator(seed, 1), start)
     path = spherical_trajectory(start, change, frames=frames, move_time=frames - 1)
-    return _Path(
-        world_from_source=world_from_source,
-        world_from_target=world_from_source @ path.source_from_target.numpy(),
-        told=(
-            f"azimuth {change.azimuth_deg:+.1f}°, elevation {change.elevation_deg:+.1f}°,\n"
-            f"radius {change.radius_m:+.1f} m, from {start.azimuth_deg:.0f}°, {start.elevation_deg:.0f}°, "
-            f"{start.radius_m:.1f} m"
-        ),
+    told = (
+        f"azimuth {change.azimuth_deg:+.1f}°, elevation {change.elevation_deg:+.1f}°,\n"
+        f"radius {change.radius_m:+.1f} m, from {start.azimuth_deg:.0f}°, {start.elevation_deg:.0f}°, "
+        f"{start.radius_m:.1f} m"
     )
+    return world_from_source, world_from_source @ path.source_from_target.numpy(), told
 
 
-def _drive(frames: int) -> _Path:
-    """ParallelDomain-4D's path, gradual."""
+def _drive(frames: int) -> tuple[Poses, Poses, str]:
+    """The same of ParallelDomain-4D's path, gradual."""
     draw = replace(DRIVING, frames=FrameSampling(clip=frames, reach_last=True)).draw(generator(0, 0), frames, 1.0)
     from_x, _, from_z = draw.world_from_target[0, :3, 3]
     to_x, _, to_z = draw.world_from_target[-1, :3, 3]
-    return _Path(
-        world_from_source=draw.world_from_source,
-        world_from_target=draw.world_from_target,
-        told=f"up and back at a sine pace\nx {from_x:.1f} to {to_x:.1f} m, z {from_z:.2f} to {to_z:.2f} m",
-    )
-
-
-def _splatted(view: SceneView, world_from_camera: NDArray[np.float64], lens: Intrinsics) -> Bytes:
-    return (splat([view], world_from_camera, lens).colour * 255).round().byte().cpu().numpy()
+    told = f"up and back at a sine pace\nx {from_x:.1f} to {to_x:.1f} m, z {from_z:.2f} to {to_z:.2f} m"
+    return draw.world_from_source, draw.world_from_target, told
 
 
 def _labels(

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_train.errors import DataError
+from gcd_train.evaluation.galleries import HOLD_S, write_mp4
 from gcd_train.evaluation.plots import DPI, new_figure, save, to_pixels
 from gcd_train.look.clip import SKY_M, UNKNOWN, UNSEEN, Footage, depth_colours, depth_table, depth_ticks
 
@@ -290,30 +290,22 @@ def _swatch(side: "SubFigure", top: float, colour: tuple[int, int, int], name: s
     side.text(0.93, top, value, fontsize=7.5, color=INK, va="top", ha="right")
 
 
-Bytes = NDArray[np.uint8]
 _PANELS = 3
 _GAP, _NAME, _TOP, _BAR = 10, 26, 44, 44  # pixels
 _PLAYS = 2
-_HOLD_S = 0.7  # at the end of each play
 
 
 def write_video(footage: Footage, out: Path) -> None:
     """The clip at its own speed, twice over, as MP4 (MPEG-4 part 2).
 
-    Raises: RenderError without matplotlib, DataError if the file cannot be written.
+    Raises: RenderError without matplotlib, RunError if the file cannot be written.
     """
     rows = rows_of(footage)
     height, width = footage.source.shape[1:3]
     places = [_place(number, width, height) for number in range(len(rows))]
     page = _page(footage, rows, places)
-    hold = [footage.frames - 1] * round(_HOLD_S * footage.fps)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    video = cv2.VideoWriter(str(out), cv2.VideoWriter.fourcc(*"mp4v"), footage.fps, (page.shape[1], page.shape[0]))
-    if not video.isOpened():
-        raise DataError(f"{out} cannot be written; give a folder that takes files")
-    for moment in [*range(footage.frames), *hold] * _PLAYS:
-        video.write(_video_frame(footage, rows, places, page, moment)[..., ::-1])
-    video.release()
+    moments = [*range(footage.frames), *[footage.frames - 1] * round(HOLD_S * footage.fps)] * _PLAYS
+    write_mp4((_video_frame(footage, rows, places, page, moment) for moment in moments), footage.fps, out)
 
 
 def _place(number: int, width: int, height: int) -> tuple[int, int]:
