@@ -13,11 +13,10 @@ from pathlib import Path
 from statistics import mean
 
 from gcd_model import SOLVERS, RenderOptions, Sampler, Schedule, load_synthesizer, sampler_of
-from gcd_train.evaluation.choosing import Choice
 from gcd_train.evaluation.measure import predicted_and_measured
+from gcd_train.evaluation.methods import SynthesizedViews
 from gcd_train.evaluation.metrics import psnr
-from gcd_train.evaluation.model_views import SynthesizedViews
-from gcd_train.evaluation.opening import open_pairs
+from gcd_train.evaluation.opening import Choice, open_pairs
 from gcd_train.evaluation.predictors import Prediction
 from gcd_train.evaluation.statistics import lead
 from gcd_train.evaluation.summary import evaluation

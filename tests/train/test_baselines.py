@@ -108,14 +108,6 @@ def test_the_nearer_surface_hides_the_farther_one() -> None:
     assert torch.nonzero(covered).tolist() == [[20, 30]]
 
 
-def test_points_behind_the_camera_or_beside_the_picture_are_not_drawn() -> None:
-    camera = cameras().source
-    points = torch.tensor([[0.0, 0.0, -5.0], [50.0, 0.0, 5.0], [0.0, 0.0, 0.05]], dtype=torch.float64)
-    shown, covered = splat(torch.ones(1, 3), points, camera)
-    assert not covered.any()
-    assert not shown.any()
-
-
 def test_the_mean_target_is_by_pixel_and_frame_number() -> None:
     clips = PlaneClips.make(3)
     mean = fit_statistics(clips).mean
@@ -131,17 +123,6 @@ def test_the_majority_map_takes_the_commonest_class_of_each_pixel() -> None:
     majority = fit_statistics(clips).majority
     assert majority is not None
     assert (majority[1, 5, 7], majority[2, 3, 4]) == (9, usual)
-
-
-def test_constant_statistics_have_each_frames_mean_colour_and_commonest_class() -> None:
-    clips = PlaneClips.make(2)
-    statistics = fit_statistics(clips)
-    constant = statistics.constant
-    assert statistics.majority is not None
-    assert constant.majority is not None
-    assert_close(constant.mean[2, :, 0, 0], statistics.mean[2].mean(dim=(1, 2)))
-    assert constant.mean[1].flatten(1).std(dim=1).max() < 1e-6
-    assert constant.majority[3].unique().tolist() == [int(statistics.majority[3].flatten().mode().values)]
 
 
 def turned(azimuth_deg: float, elevation_deg: float = 0.0, radius_m: float = 0.0) -> SphericalDelta:

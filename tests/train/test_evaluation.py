@@ -14,7 +14,7 @@ from gcd_model.config import DRIVING_CLASSES, SMALL, SemanticClass
 from gcd_model.geometry import CameraMount, Spherical, SphericalDelta, driving_trajectory, spherical_trajectory
 from gcd_train.errors import DataError
 from gcd_train.evaluation.clips import PairedSet
-from gcd_train.evaluation.model_views import SynthesizedViews
+from gcd_train.evaluation.methods import SynthesizedViews
 from gcd_train.evaluation.predictors import (
     CopySource,
     GroundHomography,
@@ -180,17 +180,6 @@ def test_a_model_gets_the_clip_in_its_own_range_and_its_shipped_settings() -> No
     assert first.video.amin() < 0
     assert synthesizer.traits.asked == [None, None]
     assert synthesizer.steps == [None, None]
-
-
-def test_a_row_says_how_it_is_sampled_and_the_model_is_asked_so() -> None:
-    clips = PlaneClips.make(1)
-    synthesizer = fake(clips)
-    sampled = RenderOptions(
-        quality="fast", steps=4, solver="dpmpp_2m", guidance=(1.0, 2.5), guidance_interval=(0.5, 20.0)
-    )
-    (found,) = evaluated([SynthesizedViews.of(synthesizer, clips, sampled)], clips)
-    assert found.name == "fake-small (fast, 4 steps, dpmpp_2m, guidance 1 to 2.5, guided from 0.5 to 20)"
-    assert synthesizer.options == [sampled]
 
 
 def test_a_declared_mount_reaches_the_live_models_clip_and_the_baselines() -> None:

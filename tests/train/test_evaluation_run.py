@@ -15,7 +15,7 @@ from gcd_train.cli.main import app
 from gcd_train.datasets.paired import PairedClips
 from gcd_train.errors import DataError, RunError
 from gcd_train.evaluation.clips import HeldOutClip, PairedSet, chosen, identity_of
-from gcd_train.evaluation.kept_frames import KeptViews, png
+from gcd_train.evaluation.galleries import KeptViews, png
 from gcd_train.evaluation.predictors import CopySource, Prediction, Predictor, SourceClip, to_pictures
 from gcd_train.evaluation.runner import GIVE_UP_AFTER, Account, ClipWork, assign_gpus, measure_all
 from gcd_train.evaluation.saved_frames import SavedFrames
@@ -88,14 +88,6 @@ def test_names_become_file_names_and_two_methods_never_share_a_folder(tmp_path: 
     assert folder_name("../..") not in ("..", ".", "")
     with pytest.raises(RunError, match="would share the folder"):
         RunKeeper(tmp_path).begin(note(methods={"a b": {}, "a/b": {}}))
-
-
-def test_a_run_goes_on_with_more_methods_and_keeps_its_first_command(tmp_path: Path) -> None:
-    RunKeeper(tmp_path).begin(note(methods={"a": {"seed": "0"}}, command="first"))
-    RunKeeper(tmp_path).keep(record("a", "k"))
-    joined = RunKeeper(tmp_path).begin(note(methods={"b": {"seed": "0"}}, command="second"))
-    assert (joined.command, list(joined.methods)) == ("first", ["a", "b"])
-    assert read_run(tmp_path)[0] == joined
 
 
 def test_what_never_measured_anything_binds_nobody(tmp_path: Path) -> None:

@@ -91,12 +91,6 @@ def test_frames_come_at_the_highest_trained_rate(
     assert numbers(window) == expected
 
 
-def test_a_slow_video_keeps_its_own_rate_and_says_so(tmp_path: Path) -> None:
-    (window,) = windows_of(write_video(tmp_path / "a.avi", 5, 3.0), WindowChoice(count=1), "driving")
-    assert (window.fps, window.trained_rate) == (3.0, False)
-    assert numbers(window) == [0, 1, 2, 3]
-
-
 def test_windows_reach_from_the_start_to_the_end_and_do_not_overlap(tmp_path: Path) -> None:
     path = write_video(tmp_path / "a.avi", 20, 10.0)
     choice = WindowChoice(count=3, start_s=0.2)
@@ -135,13 +129,6 @@ def test_what_is_no_video_is_refused_by_name(tmp_path: Path, content: bytes, sai
     (tmp_path / "broken.mp4").write_bytes(content)
     with pytest.raises(DataError, match=rf"broken.mp4 {said}"):
         windows_of(tmp_path / "broken.mp4")
-
-
-def test_nothing_to_show_is_said(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="holds neither videos nor pictures"):
-        find_videos([tmp_path])
-    with pytest.raises(DataError, match="does not exist"):
-        find_videos([tmp_path / "absent"])
 
 
 # --- views ------------------------------------------------------------------------------------------------------------

@@ -14,11 +14,9 @@ from gcd_train.errors import DataError
 from gcd_train.evaluation.hexplane import (
     SPACE,
     TIME,
-    HexField,
     HexPlanes,
     HexPlaneSettings,
     SceneBounds,
-    render,
     resampled,
     sampled,
     weights,
@@ -183,19 +181,6 @@ def test_rays_go_through_the_middles_of_their_pixels() -> None:
     assert_close(rays.directions.norm(dim=-1), torch.ones(len(rays.directions)))
 
 
-def test_a_field_that_is_opaque_shows_the_colour_in_front_of_the_camera() -> None:
-    field = HexField(bounds(), FRAMES, TINY, torch.Generator().manual_seed(0))
-    with torch.no_grad():
-        field.density_head.bias.fill_(1e4)
-    rays = Camera(lens=LENS, world_from_camera=torch.eye(4), time=0.0).rays()
-    shown = render(field, rays, coarse=8, fine=8)
-    first = field.bounds.to_distance(
-        resampled(torch.linspace(0, 1, 9)[None], weights(torch.full((1, 8), 1e4)), 8, None)
-    )
-    near = rays.origins + first[0, :2].mean() * rays.directions
-    assert_close(shown, field.colour(field(near, rays.times)), rtol=0, atol=1e-3)
-
-
 def made(method: HexPlane) -> Tensor:
     """The held-out view, [T, 3, H, W]."""
     prediction = method.predict(source_clip()).video
@@ -228,11 +213,6 @@ def test_the_same_seed_learns_the_same_and_another_seed_something_else() -> None
     quick = HexPlane(settings=replace(TINY, updates=3), device="cpu")
     assert torch.equal(made(quick), made(quick))
     assert not torch.equal(made(quick), made(replace(quick, seed=1)))
-
-
-def test_a_view_has_the_size_that_was_asked_for_whatever_was_learnt() -> None:
-    narrow = replace(TINY, updates=1, picture_width=8)
-    assert made(HexPlane(settings=narrow, device="cpu")).shape == (FRAMES, 3, 16, 24)
 
 
 def test_a_clip_with_one_camera_is_refused_by_name() -> None:

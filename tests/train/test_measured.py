@@ -9,21 +9,13 @@ import torch
 from driving_plane import PlaneClips
 from torch import Tensor
 
-from gcd_model.config import SemanticClass
 from gcd_model.errors import NonFiniteError, ShapeError
 from gcd_model.geometry import CameraMount
 from gcd_train.evaluation.clips import HeldOutClip
 from gcd_train.evaluation.lpips import Lpips
-from gcd_train.evaluation.measure import measure, predicted_and_measured
-from gcd_train.evaluation.metrics import (
-    NO_CLASS,
-    masked_mean,
-    masked_psnr,
-    psnr,
-    ssim_map,
-    window_mask,
-)
-from gcd_train.evaluation.predictors import CameraPair, CopySource, Prediction, SourceClip, to_pictures
+from gcd_train.evaluation.measure import measure
+from gcd_train.evaluation.metrics import NO_CLASS, masked_mean, masked_psnr, psnr, ssim_map, window_mask
+from gcd_train.evaluation.predictors import CameraPair, Prediction, SourceClip, to_pictures
 from gcd_train.evaluation.statistics import class_counts
 from gcd_train.evaluation.store import ClipRecord, Counted
 from gcd_train.evaluation.summary import evaluation
@@ -182,17 +174,6 @@ def test_void_is_not_counted_where_it_is_true_and_wrong_where_it_is_said() -> No
     assert math.isnan(found.class_iou(full=True)[void])
     assert void not in class_counts([record], CLASSES).common
     assert found.value("miou_full") < 1.0
-
-
-def test_a_method_on_a_set_with_void_is_measured_without_it() -> None:
-    clip = held_out()
-    labels = np.full_like(clip.target_classes, 1)
-    labels[:, :8] = 2
-    names = [SemanticClass(name=name, colour=(label, 0, 0)) for label, name in enumerate(("Road", "Car", "Void"))]
-    known = replace(clip, target_classes=labels, seen=replace(clip.seen, source_classes=labels))
-    _, record = predicted_and_measured(CopySource(), known, classes=names)
-    assert record.regions["all"].confusion == (((1, 1, (HEIGHT - 8) * WIDTH),),) * FRAMES
-    assert record.grid_confusion == (((1, 1, (HEIGHT - 8) * WIDTH // 4),),) * FRAMES
 
 
 def test_views_of_another_size_or_length_are_refused() -> None:

@@ -11,13 +11,7 @@ from driving_plane import PlaneClips, plane_clip
 from gcd_model.config import SemanticClass
 from gcd_model.geometry import CameraMount
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.evaluation.baselines import (
-    BaselineSettings,
-    ClassesAlone,
-    build,
-    described,
-    usual_baselines,
-)
+from gcd_train.evaluation.baselines import BaselineSettings, ClassesAlone, build, described, usual_baselines
 from gcd_train.evaluation.metrics import NO_CLASS
 from gcd_train.evaluation.predictors import CameraPair, SourceClip, fit_statistics
 from gcd_train.evaluation.reprojection import ReprojectRgbd, ReprojectSemd, source_views
@@ -77,18 +71,6 @@ def test_classes_are_read_back_from_the_nearest_colour_and_holes_are_of_no_class
     assert (~there).any()
     assert (made[~there] == NO_CLASS).all()
     assert (made[there] == NO_CLASS).float().mean() < 0.05  # edges that points cover to less than half
-
-
-@pytest.mark.parametrize("published", [False, True])
-def test_no_colour_of_a_class_makes_a_hole_match(published: bool) -> None:
-    black = tuple(SemanticClass(name=each.name, colour=(0, 0, label)) for label, each in enumerate(CLASSES))
-    holes = []
-    for kinds in (black, CLASSES):
-        made = ReprojectSemd(classes=kinds, published=published).predict(SEEN).classes
-        assert made is not None
-        holes.append(made == NO_CLASS)
-    assert holes[0].any()
-    assert torch.equal(*holes)
 
 
 def test_points_of_the_data_sets_own_views_are_drawn_instead_where_there_are_some() -> None:

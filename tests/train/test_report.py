@@ -18,8 +18,7 @@ from gcd_model.own_format import Card
 from gcd_train.cli.main import app
 from gcd_train.errors import RunError
 from gcd_train.evaluation.clips import PairedSet
-from gcd_train.evaluation.galleries import Strip, contact_rows, write_sheet
-from gcd_train.evaluation.kept_frames import has_rows, write_rows
+from gcd_train.evaluation.galleries import Strip, contact_rows, has_rows, write_rows, write_sheet
 from gcd_train.evaluation.predictors import CopySource
 from gcd_train.evaluation.summary import Conditions, MountNumbers, Shot, Summary, to_markdown, write_summary
 

@@ -236,16 +236,6 @@ def test_error_against_angle_is_of_the_last_frame_and_either_way_round() -> None
     assert {point.clips for point in curve.points} == {2}
 
 
-def test_similarity_is_shown_over_the_views_that_hexplane_is_given() -> None:
-    of = measured(records("hexplane_8"), records("hexplane_1"), records("a"))
-    plot = next(plot for plot in all_plots(of) if plot.name == "ssim_by_views")
-    assert [(curve.name, [point.x for point in curve.points]) for curve in plot.curves] == [
-        ("HexPlane, all", [1.0, 8.0]),
-        ("HexPlane, occluded", [1.0, 8.0]),
-    ]
-    assert [level.name for level in plot.levels] == ["a, all"]
-
-
 def test_the_worst_clips_are_named_with_who_does_best_there() -> None:
     of = measured(records("a"), records("b", 1.0), records("c", -1.0))
     found = worst_clips(of, of.of.method("a"), 2)

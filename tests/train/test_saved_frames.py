@@ -107,13 +107,6 @@ def test_another_length_or_size_is_refused_not_resized(tmp_path: Path) -> None:
         predicted(tmp_path / "small")
 
 
-def test_a_missing_frame_is_noticed(tmp_path: Path) -> None:
-    save(tmp_path / KEY)
-    (tmp_path / KEY / "0001.png").unlink()
-    with pytest.raises(DataError, match=r"holds frames \[0, 2\]"):
-        predicted(tmp_path)
-
-
 def test_a_damaged_picture_or_video_is_named(tmp_path: Path) -> None:
     save(tmp_path / "a" / KEY)
     (tmp_path / "a" / KEY / "0001.png").write_bytes(b"none")

@@ -17,9 +17,8 @@ from gcd_train.cli.main import app
 from gcd_train.datasets.clip_frames import FrameSampling
 from gcd_train.datasets.trajectories import OrbitSampling
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.evaluation.choosing import Choice, public_split, public_split_names
 from gcd_train.evaluation.clips import EvaluationSet
-from gcd_train.evaluation.opening import SceneCuts, open_scenes
+from gcd_train.evaluation.opening import Choice, SceneCuts, open_scenes, public_split, public_split_names
 from gcd_train.evaluation.protocol import (
     PAPER_SOURCE,
     RELEASED_SOURCE,
@@ -152,16 +151,6 @@ def test_rates_follow_the_strides(kubric: Path, tmp_path: Path) -> None:
     listed = opened(kubric, replace(KUBRIC, bounds=FrameBounds(), controls=controls(tmp_path, ["scn02900"])))
     assert tuple(listed.rates) == (24.0,)
     assert tuple(opened(kubric, replace(KUBRIC, bounds=FrameBounds(skip=3))).rates) == (8.0,)
-
-
-def test_a_source_that_is_a_camera_of_the_scene_has_its_own_depth(kubric: Path, tmp_path: Path) -> None:
-    cuts = replace(KUBRIC, controls=controls(tmp_path, ["scn02900"]), clips=1, bounds=FrameBounds())
-    seen = opened(kubric, cuts).clip("scn02900.sample_00").seen
-    true = draw(seen.cameras.ground_from_source.numpy(), seen.cameras.source)
-    near = true.depth < 40
-    assert np.abs(seen.source_depth[0] - true.depth)[near].max() < 1e-3
-    assert seen.points is not None
-    assert [view.depth.shape for view in seen.points()] == [(32, 48)] * 3
 
 
 def test_bounds_win_over_controls_in_the_released_protocol_only(kubric: Path, tmp_path: Path) -> None:

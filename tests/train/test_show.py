@@ -1,7 +1,6 @@
 """`gcd-train show`: what is on the sheet is what is in the files, and a broken file is named."""
 
 import json
-import sys
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -160,13 +159,6 @@ def test_pair_shards_name_an_unknown_clip_and_a_damaged_shard(pairs: Path, tmp_p
     shard.write_bytes(shard.read_bytes()[:-40])
     code, told = shown(tmp_path)
     assert (code, shard.name in told) == (DataError.exit_code, True)
-
-
-def test_without_matplotlib_the_extra_is_named(orbit: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    code, told = shown(orbit)
-    assert code != 0
-    assert "gcd-node[train]" in told
 
 
 # the whole command

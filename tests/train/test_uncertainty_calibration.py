@@ -107,11 +107,6 @@ def test_samples_that_do_not_differ_have_no_scale() -> None:
         calibrate([spread_by(1.0), spread_by(1.0, seed=1)])  # of one scene
 
 
-def test_one_draw_gives_no_interval() -> None:
-    with pytest.raises(DataError, match="2 or more draws of a picture, got 1"):
-        distances(held_out(torch.zeros(T, 3, H, W)), drawn(torch.zeros(T, 3, H, W)))
-
-
 def test_the_scale_of_one_half_is_reported_on_the_other() -> None:
     found = calibrate([spread_by(1.0 if i % 2 else 3.0, seed=i, scene=f"s{i}") for i in range(4)])
     assert found.fitted == ("s0", "s2")

@@ -15,8 +15,8 @@ from gcd_train.errors import DataError, RecipeError
 if TYPE_CHECKING:
     from gcd_model import ViewSynthesizer
     from gcd_train.evaluation.calibration import Distances
-    from gcd_train.evaluation.choosing import Choice
     from gcd_train.evaluation.clips import EvaluationSet
+    from gcd_train.evaluation.opening import Choice
     from gcd_train.evaluation.predictors import Predictor
 
 _LOG = Console(stderr=True, highlight=False)
@@ -41,8 +41,8 @@ def calibrate_command(
     with errors_shown():
         from gcd_model import RenderOptions, convert_weights, load_synthesizer
         from gcd_train.evaluation.calibration import CalibrationNote, calibrate, write_calibration
-        from gcd_train.evaluation.choosing import Choice
-        from gcd_train.evaluation.model_views import SynthesizedViews
+        from gcd_train.evaluation.methods import SynthesizedViews
+        from gcd_train.evaluation.opening import Choice
         from gcd_train.evaluation.plots import require_matplotlib
 
         require_matplotlib()  # now, not after an hour

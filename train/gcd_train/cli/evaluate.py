@@ -15,8 +15,8 @@ from gcd_train.cli.errors import errors_shown
 from gcd_train.cli.progress_bar import progress_bar
 from gcd_train.cli.training_run import command_line
 from gcd_train.errors import RecipeError
+from gcd_train.evaluation.galleries import KeptViews
 from gcd_train.evaluation.hexplane import HexPlaneSettings
-from gcd_train.evaluation.kept_frames import KeptViews
 from gcd_train.evaluation.plan import EvaluateOptions, planned
 from gcd_train.evaluation.runner import Account, ClipWork, assign_gpus, measure_all
 from gcd_train.evaluation.store import RunKeeper

@@ -1,23 +1,125 @@
-"""Clips as pictures and videos: what came in, what each method made of it, what was there."""
+"""Clips as pictures and videos: frames that a run keeps, contact sheets, galleries."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
+from typing import Literal, TypeAlias
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
+from gcd_model.colours import palette
 from gcd_model.config import SemanticClass
 from gcd_train.errors import DataError, RunError
 from gcd_train.evaluation.clips import HeldOutClip
-from gcd_train.evaluation.kept_frames import painted, png, read_row, shown_frames
-from gcd_train.evaluation.predictors import to_labels
+from gcd_train.evaluation.predictors import Prediction, to_labels
 from gcd_train.evaluation.runs import EvaluatedSet, Method
 from gcd_train.evaluation.store import RunKeeper, write_whole
 
 Pictures = NDArray[np.uint8]
+
+KeptViews: TypeAlias = Literal["none", "last", "all"]
+"""Which frames are kept: none, the last of each clip, or all."""
+
+SHOWN_FRAMES = 6
+"""Frames that a row of a sheet has at most."""
+
+
+def write_views(
+    folder: Path, clip: HeldOutClip, prediction: Prediction, which: KeptViews, classes: Sequence[SemanticClass]
+) -> None:
+    """Write `source/`, `target/` and `sample_0/` and so on, each frame under its number from 0000.png on.
+
+    A method that makes class maps alone has them painted there; one that makes both has `classes_0/` and
+    `target_classes/` beside. The target is written last: where it is whole, all is. classes: the ontology. Raises
+    RunError if a file cannot be written.
+    """
+    strips = {"source": clip.seen.source}
+    for number, draw in enumerate(prediction.draws):
+        labels = None if draw.classes is None or not classes else painted(draw.classes, classes)
+        if draw.video is not None:
+            strips[f"sample_{number}"] = to_bytes(draw.video)
+        if labels is not None:
+            strips[f"sample_{number}" if draw.video is None else f"classes_{number}"] = labels
+    true = to_labels(clip.target_classes)
+    if true is not None and classes and "classes_0" in strips:
+        strips["target_classes"] = painted(true, classes)
+    strips["target"] = clip.target
+    for name, frames in strips.items():
+        for t in _wanted(which, len(frames)):
+            write_whole(folder / name / f"{t:04d}.png", png(frames[t]))
+
+
+def has_views(folder: Path, which: KeptViews, frames: int) -> bool:
+    """Whether all that `write_views` writes of a clip of so many frames is there."""
+    if which == "none":
+        return True
+    strips = {place.name: {path.name for path in place.iterdir()} for place in folder.glob("*/")}
+    wanted = {f"{t:04d}.png" for t in _wanted(which, frames)}
+    return "target" in strips and all(wanted <= there for there in strips.values())
+
+
+def _wanted(which: KeptViews, frames: int) -> range:
+    return {"none": range(0), "last": range(frames - 1, frames), "all": range(frames)}[which]
+
+
+def write_rows(place: Path, prediction: Prediction, classes: Sequence[SemanticClass]) -> None:
+    """Keep what a method has on the contact sheet: `KEY.png` of its pictures, `KEY.classes.png` of its class maps.
+
+    place: of both, without a suffix.
+    """
+    if prediction.classes is not None and classes:
+        write_whole(Path(f"{place}.classes.png"), png(_in_a_row(painted(prediction.classes, classes))))
+    if prediction.video is not None:
+        write_whole(Path(f"{place}.png"), png(_in_a_row(to_bytes(prediction.video))))
+
+
+def has_rows(place: Path) -> bool:
+    """Whether a method has any row at this place."""
+    return any(Path(f"{place}{suffix}").exists() for suffix in (".png", ".classes.png"))
+
+
+def read_row(path: Path, width: int) -> Pictures:
+    """Frames [N, H, W, 3] of a row. Raises RunError if it is damaged."""
+    picture = cv2.imread(str(path))
+    if picture is None or picture.shape[1] % width:
+        raise RunError(f"{path} is damaged; delete it, and run the same line again")
+    rows = np.ascontiguousarray(picture[..., ::-1]).astype(np.uint8)
+    return rows.reshape(len(rows), -1, width, 3).swapaxes(0, 1)
+
+
+def shown_frames(count: int) -> list[int]:
+    """Those of so many frames that a row of a sheet shows, evenly among them."""
+    return np.linspace(0, count - 1, min(SHOWN_FRAMES, count)).round().astype(int).tolist()
+
+
+def _in_a_row(frames: Pictures) -> Pictures:
+    return np.concatenate([frames[t] for t in shown_frames(len(frames))], axis=1)
+
+
+def painted(labels: Tensor, classes: Sequence[SemanticClass]) -> Pictures:
+    """Class ids uint8 [T, H, W] in colours, uint8 [T, H, W, 3]; what is of no class is black."""
+    colours = torch.zeros(256, 3, dtype=torch.uint8)
+    known = palette(tuple(classes))
+    colours[: len(known)] = known
+    return colours[labels.long()].numpy()
+
+
+def to_bytes(video: Tensor) -> Pictures:
+    """float32 [T, 3, H, W] in [0, 1] -> uint8 [T, H, W, 3]."""
+    return (video.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
+
+
+def png(picture: Pictures) -> bytes:
+    """A PNG file of an RGB picture, uint8 [H, W, 3]."""
+    done, data = cv2.imencode(".png", cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2BGR))
+    assert done, "PNG takes any picture"
+    return data.tobytes()
+
 
 _GAP, _MARGIN, _INK = 4, 140, (40, 40, 40)
 _LINE, _LETTERS, _FONT = 14, 20, cv2.FONT_HERSHEY_SIMPLEX
@@ -154,8 +256,12 @@ def _beside(rows: Sequence[Strip], moment: int) -> Pictures:
     """All rows' pictures of one moment with their names above, of even size as codecs want it."""
     pictures = [row.frames[moment] for row in rows]
     captions = [caption(row.name, each.shape[1]) for row, each in zip(rows, pictures, strict=True)]
-    lines = max(len(each.lines) for each in captions)
-    named = [_named(text, lines, picture) for text, picture in zip(captions, pictures, strict=True)]
+    most, named = max(len(lines) for lines, _ in captions), list[Pictures]()
+    for (lines, scale), picture in zip(captions, pictures, strict=True):
+        above = np.full((_LINE * most + _GAP, picture.shape[1], 3), 255, np.uint8)
+        for line, words in enumerate(lines, start=1 + most - len(lines)):
+            cv2.putText(above, words, (2, _LINE * line - 1), _FONT, scale, _INK, 1, cv2.LINE_AA)
+        named.append(np.concatenate([above, picture]))
     height = max(each.shape[0] for each in named)
     panels = [np.pad(each, ((0, height - each.shape[0]), (0, _GAP), (0, 0)), constant_values=255) for each in named]
     whole = np.concatenate(panels, axis=1)
@@ -163,25 +269,15 @@ def _beside(rows: Sequence[Strip], moment: int) -> Pictures:
     return np.pad(whole, ((0, odd[0]), (0, odd[1]), (0, 0)), constant_values=255)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Caption:
-    """A name as it is written above a picture: lines, in letters of this scale."""
+def caption(name: str, width: int) -> tuple[tuple[str, ...], float]:
+    """A name over a picture of so many pixels: in one line, else in smaller letters, else broken into lines.
 
-    lines: tuple[str, ...]
-    scale: float
-
-    @property
-    def width(self) -> int:
-        """Pixels."""
-        return max(_width(line, self.scale) for line in self.lines)
-
-
-def caption(name: str, width: int) -> Caption:
-    """A name over a picture of so many pixels: in one line, else in smaller letters, else broken into lines."""
+    Returns: the lines, and the scale of their letters.
+    """
     for scale in (_SCALE, _SMALL):
         if _width(name, scale) <= width - 2:
-            return Caption(lines=(name,), scale=scale)
-    return Caption(lines=_broken(name, width), scale=_SMALL)
+            return (name,), scale
+    return _broken(name, width), _SMALL
 
 
 def _broken(name: str, width: int) -> tuple[str, ...]:
@@ -198,11 +294,3 @@ def _broken(name: str, width: int) -> tuple[str, ...]:
 
 def _width(text: str, scale: float) -> int:
     return cv2.getTextSize(text, _FONT, scale, 1)[0][0] + 2  # the margin before it
-
-
-def _named(text: Caption, lines: int, picture: Pictures) -> Pictures:
-    """A picture under its caption, with room for so many lines."""
-    strip = np.full((_LINE * lines + _GAP, picture.shape[1], 3), 255, np.uint8)
-    for line, words in enumerate(text.lines, start=1 + lines - len(text.lines)):
-        cv2.putText(strip, words, (2, _LINE * line - 1), _FONT, text.scale, _INK, 1, cv2.LINE_AA)
-    return np.concatenate([strip, picture])

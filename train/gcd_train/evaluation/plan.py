@@ -15,7 +15,6 @@ from gcd_model.geometry import CameraMount
 from gcd_train.datasets.paired import PairedClips, require_apart
 from gcd_train.errors import RecipeError
 from gcd_train.evaluation.baselines import BaselineSettings
-from gcd_train.evaluation.choosing import Choice
 from gcd_train.evaluation.clips import EvaluationSet, PairedSet, class_grid, identity_of, require_same_kind
 from gcd_train.evaluation.galleries import Strip, contact_rows, write_sheet
 from gcd_train.evaluation.hexplane import HexPlaneSettings
@@ -29,7 +28,7 @@ from gcd_train.evaluation.methods import (
     require_names_apart,
     require_views,
 )
-from gcd_train.evaluation.opening import SceneCuts, data_kind, open_pairs, open_scenes, usual_samples
+from gcd_train.evaluation.opening import Choice, SceneCuts, data_kind, open_pairs, open_scenes, usual_samples
 from gcd_train.evaluation.predictors import TargetStatistics, fit_statistics
 from gcd_train.evaluation.protocol import FrameBounds, ProtocolName
 from gcd_train.evaluation.scene_clips import SceneSet

@@ -11,7 +11,7 @@ from typing import TypeAlias
 from gcd_model.errors import ModelError
 from gcd_train.errors import DataError, RunError, TrainError
 from gcd_train.evaluation.clips import EvaluationSet, HeldOutClip
-from gcd_train.evaluation.kept_frames import KeptViews, has_rows, has_views, write_rows, write_views
+from gcd_train.evaluation.galleries import KeptViews, has_rows, has_views, write_rows, write_views
 from gcd_train.evaluation.lpips import Lpips
 from gcd_train.evaluation.measure import predicted_and_measured
 from gcd_train.evaluation.predictors import Prediction, Predictor

@@ -113,16 +113,22 @@ class SceneSet:
         return self.dataset.ontology if self.semantic else None
 
     def _source_side(self, key: str, sample: PairSample) -> SourceClip:
-        views = [self._own_view(sample.scene, time) for time in sample.frame_numbers]
+        seen_by = [self.dataset.source_camera]
+        views = [view for time in sample.frame_numbers for view in self.dataset.views(sample.scene, time, seen_by)]
+        views = [replace(view, classes=self._places_of(view.classes)) for view in views]
         cameras = self._cameras(sample, views[0])
         apart = (cameras.ground_from_source - torch.from_numpy(views[0].world_from_camera)).abs().max()
         own = float(apart) < SAME_POSE
         ids = [view.classes for view in views if own and view.classes is not None]
+        if own:
+            depth = self._stacked([view.depth for view in views])
+        else:  # from the points of all cameras
+            pose, lens = cameras.ground_from_source.numpy(), cameras.source
+            seen = (splat(self.dataset.views(sample.scene, time), pose, lens) for time in sample.frame_numbers)
+            depth = np.stack([each.depth.cpu().numpy() for each in seen])
         return SourceClip(
             source=sample.source,
-            source_depth=self._stacked([view.depth for view in views])
-            if own
-            else _drawn_depth(self.dataset, sample, cameras),
+            source_depth=depth,
             source_classes=self._stacked(ids) if ids else None,
             cameras=cameras,
             fps=sample.fps,
@@ -145,11 +151,6 @@ class SceneSet:
             )
         path = replace(path, delta=torch.from_numpy(sample.deltas), source=sample.start)
         return CameraPair(ground_from_source=to_pose(sample.start), source=lens, target=lens, trajectory=path)
-
-    def _own_view(self, scene: str, time: int) -> SceneView:
-        """What the source camera saw, at its full size, with ids as places in the ontology."""
-        (view,) = self.dataset.views(scene, time, [self.dataset.source_camera])
-        return replace(view, classes=self._places_of(view.classes))
 
     def _places_of(self, ids: Bytes | None) -> Bytes | None:
         """Places in the ontology; of those that share a colour, or have none, as they come back from a picture."""
@@ -201,10 +202,3 @@ def nearest_resized(values: NDArray[Number], width: int, height: int) -> NDArray
     rows = top + ((np.arange(height) + 0.5) * along / height).astype(np.intp)
     columns = left + ((np.arange(width) + 0.5) * across / width).astype(np.intp)
     return values[rows[:, None], columns]
-
-
-def _drawn_depth(dataset: Dataset4D, sample: PairSample, cameras: CameraPair) -> NDArray[np.float32]:
-    """Of a source that none of the scene's cameras is, from the points of all of them."""
-    pose, lens = cameras.ground_from_source.numpy(), cameras.source
-    drawn = (splat(dataset.views(sample.scene, time), pose, lens) for time in sample.frame_numbers)
-    return np.stack([each.depth.cpu().numpy() for each in drawn])
