@@ -23,7 +23,7 @@ from warm_commands import LIMIT_MB, LIMIT_S, WarmCommands
 from gcd_model.config import PLAIN_SMALL
 from gcd_model.weights.card import Card
 from gcd_node.auth import new_key_pair, write_key_pair
-from gcd_train.evaluation.record import RunNote
+from gcd_train.evaluation.store import RunNote
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 CODES = range(64, 79)

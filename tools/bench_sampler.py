@@ -14,12 +14,13 @@ from statistics import mean
 
 from gcd_model import RenderOptions, Sampler, Schedule, load_synthesizer, sampler_of
 from gcd_model.clip import SOLVERS
-from gcd_train.baselines import Prediction
-from gcd_train.evaluation import SynthesizedViews, lead, summed_up
-from gcd_train.evaluation.choosing import Choice
-from gcd_train.evaluation.opening import open_pairs
-from gcd_train.evaluation.run import predicted_and_measured
-from gcd_train.metrics import psnr
+from gcd_train.evaluation.measure import predicted_and_measured
+from gcd_train.evaluation.methods import SynthesizedViews
+from gcd_train.evaluation.metrics import psnr
+from gcd_train.evaluation.opening import Choice, open_pairs
+from gcd_train.evaluation.predictors import Prediction
+from gcd_train.evaluation.statistics import lead
+from gcd_train.evaluation.summary import evaluation
 
 UNGUIDED = (1.0, 1.0)
 HEADS = ["steps", "solver", "guidance", "runs", "latents from Euler", "dB to Euler", "latents from fine", "dB to fine"]
@@ -54,7 +55,7 @@ def main():
     parser.add_argument("--dtype")
     options = parser.parse_args()
     model = load_synthesizer(options.weights, device=options.device, dtype=options.dtype)
-    clips = open_pairs(options.data, Choice(split=options.split, limit=options.limit), None).clips
+    clips = open_pairs(options.data, Choice(split=options.split, limit=options.limit), None)[0]
     views = SynthesizedViews.of(model, clips, RenderOptions(seed=options.seed))
     own = sampler_of(model.traits.config.sampling, RenderOptions())
     references = [replace(own, steps=25), replace(own, steps=options.fine, solver="dpmpp_2m")]
@@ -101,7 +102,7 @@ def measure(views, clips, ways, references):
             apart[way].append([number for each in references for number in distance(drawn[way], drawn[each])])
             shown = Drawn(str(way), views.shown(drawn[way]))
             records[way].append(predicted_and_measured(shown, clip, classes=clips.classes)[1])
-    truth = {way: summed_up(rows, classes=len(clips.classes)) for way, rows in records.items()}
+    truth = {way: evaluation(rows, classes=len(clips.classes)) for way, rows in records.items()}
     return {way: ([mean(column) for column in zip(*apart[way], strict=True)], truth[way]) for way in ways}
 
 
@@ -117,11 +118,15 @@ def show(found, diffusion):
         guidance = "no" if way.guidance == UNGUIDED else "{:g} to {:g}".format(*way.guidance)
         if way.guidance_interval is not None:
             guidance += ", noise {:g} to {:g}".format(*way.guidance_interval)
-        ahead_db, ahead_miou = lead(truth, own, lambda of: of.psnr_db), lead(truth, own, lambda of: of.miou)
+        ahead_db, ahead_miou = lead(truth.of_all, own.of_all, "psnr_db"), lead(truth.of_all, own.of_all, "miou")
         row = [way.steps, way.solver, guidance, Schedule.of(diffusion, options_of(way)).evaluations]
         row += [f"{number:.{digits}f}" for number, digits in zip(apart, (4, 1, 4, 1), strict=True)]
-        row += [f"{truth.total.psnr_db:.2f}", "{:.2f} ± {:.2f}".format(*ahead_db)]
-        row += [f"{truth.total.gradient_energy:.2f}", f"{truth.total.miou:.3f}", "{:.3f} ± {:.3f}".format(*ahead_miou)]
+        row += [f"{truth.value('psnr_db'):.2f}", "{:.2f} ± {:.2f}".format(*ahead_db)]
+        row += [
+            f"{truth.value('gradient_energy'):.2f}",
+            f"{truth.value('miou'):.3f}",
+            "{:.3f} ± {:.3f}".format(*ahead_miou),
+        ]
         print("| " + " | ".join(map(str, row)) + " |")
 
 

@@ -11,13 +11,11 @@ count: models of two paths share the last frame alone. Writes findings.md and fi
 import argparse
 from pathlib import Path
 
-from gcd_train.evaluation.tallies import Selection
-from gcd_train.reports.comparison import Difference, to_csv
-from gcd_train.reports.goals import Goal
-from gcd_train.reports.intervals import common_clips, difference, drawn
-from gcd_train.reports.material import Run, gather
-from gcd_train.reports.paper import PICTURE_COLUMNS
-from gcd_train.reports.table import markdown_rows
+from gcd_train.evaluation.comparison import Difference, differences_csv
+from gcd_train.evaluation.paper import PICTURE_COLUMNS
+from gcd_train.evaluation.runs import Goal, Run, gather
+from gcd_train.evaluation.statistics import Selection, bootstrap, common_clips, difference
+from gcd_train.evaluation.tables import markdown_rows
 
 CLAIMS = [
     ("gradual > direct", "study-gradual-pretrained", "study-direct-pretrained", "last"),
@@ -55,7 +53,7 @@ def main():
     table = "\n".join([*markdown_rows(HEADS, rows), *(f"\n{note}" for note in notes)]) + "\n"
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "findings.md").write_text(table)
-    (options.out / "findings.csv").write_text(to_csv(found))
+    (options.out / "findings.csv").write_text(differences_csv(found))
     print(table)
 
 
@@ -86,7 +84,9 @@ def shared(first, other, frames):
 def differences(first, other, ours, theirs, frames, seed):
     found = []
     for column in PICTURE_COLUMNS:
-        sums = (drawn(records, Selection(frames=frames, region=column.region), seed=seed) for records in (ours, theirs))
+        sums = (
+            bootstrap(records, Selection(frames=frames, region=column.region), seed=seed) for records in (ours, theirs)
+        )
         apart = difference(*sums, column.figure)
         if apart.known:
             found.append(

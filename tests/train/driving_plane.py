@@ -24,9 +24,13 @@ from gcd_model.geometry import (
     driving_trajectory,
     spherical_trajectory,
 )
-from gcd_train.baselines import BaselineSettings, Predictor, build, fit_statistics, usual_baselines
-from gcd_train.baselines.cameras import CameraPair, pixel_rays
 from gcd_train.datasets.paired import PairedClip
+from gcd_train.evaluation.baselines import BaselineSettings, build, usual_baselines
+from gcd_train.evaluation.clips import PairedSet
+from gcd_train.evaluation.measure import predicted_and_measured as measured
+from gcd_train.evaluation.predictors import CameraPair, Predictor, fit_statistics, pixel_rays
+from gcd_train.evaluation.statistics import Selection
+from gcd_train.evaluation.summary import Evaluation, evaluation
 from gcd_train.scenes.pair_world import DEPTH_UNIT_M, Orbit, World
 
 SKY, ROAD, TERRAIN = 0, 1, 4
@@ -204,3 +208,16 @@ def without_learning(clips: PlaneClips, *, named: bool = True) -> tuple[Predicto
         statistics=fit_statistics(clips),
     )
     return tuple(build(name, settings) for name in usual_baselines(settings) if not name.startswith("reproject"))
+
+
+def evaluated(
+    predictors: Sequence[Predictor],
+    clips: PlaneClips,
+    *,
+    declared: CameraMount | None = None,
+    selection: Selection | None = None,
+) -> list[Evaluation]:
+    """What an evaluation finds on these pairs."""
+    pairs = PairedSet(clips=clips, identity="plane", declared=declared)
+    of = [[measured(each, pairs.clip(key), classes=pairs.classes)[1] for key in pairs.keys] for each in predictors]
+    return [evaluation(records, selection, classes=len(pairs.classes)) for records in of]

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from gcd_train.evaluation.record import ClipRecord, Counted, Region, RegionRecord, RunNote
+from gcd_train.evaluation.store import ClipRecord, Counted, Region, RegionRecord, RunNote
 
 FRAMES = 4
 FPS = 10.0

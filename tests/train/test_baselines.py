@@ -3,29 +3,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from driving_plane import STAGE_SOURCE, PlaneClips, plane_clip, without_learning
+from driving_plane import STAGE_SOURCE, PlaneClips, plane_clip
 from torch.testing import assert_close
 
-from gcd_model.geometry import CameraMount, SphericalDelta, spherical_trajectory, to_pose
-from gcd_train.baselines import (
+from gcd_model.geometry import CameraMount, SphericalDelta, spherical_trajectory
+from gcd_train.datasets.paired import PairedClip
+from gcd_train.evaluation.predictors import (
     CameraPair,
-    CopySource,
-    DepthReprojection,
     GroundHomography,
-    MajorityMap,
-    MeanTarget,
+    SourceClip,
     TargetStatistics,
     fit_statistics,
+    pixel_rays,
+    plane_homography,
     to_pictures,
+    to_pixels,
 )
-from gcd_train.baselines.cameras import pixel_rays, to_pixels
-from gcd_train.baselines.depth_reprojection import splat
-from gcd_train.baselines.ground_homography import plane_homography
-from gcd_train.baselines.predictor import SourceClip
-from gcd_train.datasets.paired import PairedClip
-from gcd_train.errors import DataError
-from gcd_train.evaluation import source_side
-from gcd_train.metrics import psnr
+from gcd_train.evaluation.reprojection import DepthReprojection, splat
 
 FRAMES, HEIGHT, WIDTH = 5, 64, 96
 MARK, MARK_CLASS = -1.0, 12
@@ -79,15 +73,6 @@ def test_reprojecting_a_plane_gives_the_picture_drawn_by_rays(mount: CameraMount
     assert (made.classes[~seen] == MARK_CLASS).all()
 
 
-def test_reprojecting_into_the_same_camera_changes_nothing() -> None:
-    clip = plane_clip(cameras())
-    made = DepthReprojection(fill=marked_fill(), classes=13).predict(seen_by(cameras(), clip))
-    assert made.video is not None
-    assert made.classes is not None
-    assert_close(made.video[0], to_pictures(clip.source)[0], rtol=0, atol=1e-5)
-    assert torch.equal(made.classes[0], torch.from_numpy(clip.source_classes)[0])
-
-
 @pytest.mark.parametrize("mount", [CameraMount(), CameraMount(height_m=1.2, tilt_deg=-3.0)])
 def test_the_ground_homography_gives_the_picture_of_a_plane_drawn_by_rays(mount: CameraMount) -> None:
     clip = plane_clip(cameras(mount))
@@ -123,49 +108,10 @@ def test_the_nearer_surface_hides_the_farther_one() -> None:
     assert torch.nonzero(covered).tolist() == [[20, 30]]
 
 
-def test_points_behind_the_camera_or_beside_the_picture_are_not_drawn() -> None:
-    camera = cameras().source
-    points = torch.tensor([[0.0, 0.0, -5.0], [50.0, 0.0, 5.0], [0.0, 0.0, 0.05]], dtype=torch.float64)
-    shown, covered = splat(torch.ones(1, 3), points, camera)
-    assert not covered.any()
-    assert not shown.any()
-
-
-def test_the_sky_is_reprojected_as_far_away() -> None:
-    clip = plane_clip(cameras())
-    made = DepthReprojection(fill=marked_fill(), classes=13).predict(seen_by(cameras(), clip))
-    assert made.classes is not None
-    sky = torch.from_numpy(clip.target_classes) == 0
-    found = made.classes[sky]
-    assert ((found == 0) | (found == MARK_CLASS)).float().mean() > 0.97
-
-
-def test_a_wrongly_declared_mount_costs_the_homography() -> None:
-    clip = plane_clip(cameras(CameraMount(height_m=1.55)))
-    scores = []
-    for height_m in (1.55, 1.8):
-        pair = cameras(CameraMount(height_m=height_m))
-        statistics = TargetStatistics(mean=to_pictures(clip.target), majority=torch.from_numpy(clip.target_classes))
-        video = GroundHomography(fill=statistics).predict(seen_by(pair, clip)).video
-        assert video is not None
-        scores.append(float(psnr(video, to_pictures(clip.target))[1:].mean()))
-    assert scores[0] > scores[1] + 0.5
-
-
-def test_copying_shows_the_source_and_its_classes() -> None:
-    clip = PlaneClips.make(1)[0]
-    made = CopySource().predict(seen_by(cameras(), clip))
-    assert made.video is not None
-    assert made.classes is not None
-    assert np.array_equal((made.video * 255).round().permute(0, 2, 3, 1).numpy(), clip.source)
-    assert np.array_equal(made.classes.numpy(), clip.source_classes)
-
-
 def test_the_mean_target_is_by_pixel_and_frame_number() -> None:
     clips = PlaneClips.make(3)
-    mean = MeanTarget(statistics=fit_statistics(clips)).predict(seen_by(cameras(), clips[0])).video
+    mean = fit_statistics(clips).mean
     expected = np.stack([clip.target for clip in clips.clips]).mean(axis=0) / 255
-    assert mean is not None
     assert np.abs(mean.permute(0, 2, 3, 1).numpy() - expected).max() < 1e-6
 
 
@@ -176,39 +122,7 @@ def test_the_majority_map_takes_the_commonest_class_of_each_pixel() -> None:
     usual = clips[0].target_classes[2, 3, 4]
     majority = fit_statistics(clips).majority
     assert majority is not None
-    assert MajorityMap(majority=majority).predict(seen_by(cameras(), clips[1])).classes is majority
     assert (majority[1, 5, 7], majority[2, 3, 4]) == (9, usual)
-
-
-def test_constant_statistics_have_each_frames_mean_colour_and_commonest_class() -> None:
-    clips = PlaneClips.make(2)
-    statistics = fit_statistics(clips)
-    constant = statistics.constant
-    assert statistics.majority is not None
-    assert constant.majority is not None
-    assert_close(constant.mean[2, :, 0, 0], statistics.mean[2].mean(dim=(1, 2)))
-    assert constant.mean[1].flatten(1).std(dim=1).max() < 1e-6
-    assert constant.majority[3].unique().tolist() == [int(statistics.majority[3].flatten().mode().values)]
-
-
-def test_statistics_of_no_clips_are_refused() -> None:
-    with pytest.raises(DataError, match="training clips"):
-        fit_statistics(PlaneClips(()))
-
-
-def test_every_baseline_follows_one_protocol() -> None:
-    clips = PlaneClips.make(2)
-    baselines = without_learning(clips)
-    names = [each.name for each in baselines]
-    assert len(set(names)) == len(names) == 6
-    assert [each.name for each in baselines if each.privileged] == names[-2:]
-    shape = (clips.frames, 3, clips.height, clips.width)
-    seen = source_side(clips, 0, clips[0], None)
-    for each in baselines:
-        made = each.predict(seen)
-        assert made.video is not None or made.classes is not None
-        assert made.video is None or (made.video.shape == shape and made.video.dtype == torch.float32)
-        assert made.classes is None or made.classes.dtype == torch.uint8
 
 
 def turned(azimuth_deg: float, elevation_deg: float = 0.0, radius_m: float = 0.0) -> SphericalDelta:
@@ -229,31 +143,3 @@ def test_on_a_plane_that_a_camera_orbits_both_reprojections_give_what_rays_draw(
         share, error = agreement(made.video, to_pictures(clip.target), seen & near_ground(clip))
         assert share > 0.3
         assert error < 0.03
-
-
-def test_an_orbits_homography_takes_target_pixels_to_the_source_pixels_of_the_same_ground_points() -> None:
-    path = spherical_trajectory(STAGE_SOURCE, turned(40.0, 15.0, 1.0), frames=FRAMES, move_time=FRAMES - 1)
-    pair = CameraPair.orbit(path, hfov_deg=53.13, height=HEIGHT, width=WIDTH)
-    stage_from_target = to_pose(STAGE_SOURCE) @ path.source_from_target
-    homography = plane_homography(path.source_from_target, -stage_from_target[:, 2, :3], stage_from_target[:, 2, 3])
-    point = torch.tensor([1.0, -2.0, 0.0, 1.0], dtype=torch.float64)
-    in_target = (torch.linalg.inv(stage_from_target) @ point)[:, :3]
-    in_source = (torch.linalg.inv(to_pose(STAGE_SOURCE)) @ point)[:3]
-    moved = torch.einsum("tij,tj->ti", homography, in_target / in_target[:, 2:])
-    assert_close(to_pixels(moved, pair.source), to_pixels(in_source, pair.source).expand(FRAMES, 2), rtol=0, atol=1e-8)
-
-
-def test_an_orbit_whose_beginning_nobody_knows_is_refused() -> None:
-    path = spherical_trajectory(STAGE_SOURCE, turned(40.0), frames=FRAMES, move_time=FRAMES - 1)
-    with pytest.raises(DataError, match="where the source is"):
-        CameraPair.orbit(replace(path, source=None), hfov_deg=53.13, height=HEIGHT, width=WIDTH)
-
-
-def test_without_an_ontology_there_is_no_majority_map_and_no_class_map() -> None:
-    clips = PlaneClips.orbits([turned(30.0), turned(-60.0)])
-    baselines = without_learning(clips, named=False)
-    assert [each.name for each in baselines if "majority" in each.name] == []
-    assert len(baselines) == 5
-    seen = source_side(clips, 1, clips[1], None)
-    assert all(each.predict(seen).classes is None for each in baselines)
-    assert all(each.predict(seen).video is not None for each in baselines)

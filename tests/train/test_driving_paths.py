@@ -11,7 +11,7 @@ from gcd_model.geometry import CameraMount, driving_trajectory
 from gcd_train.data_kinds import open_pairs
 from gcd_train.datasets.paired import PairedClips
 from gcd_train.errors import DataError
-from gcd_train.evaluation.held_out import cameras_of
+from gcd_train.evaluation.clips import cameras_of
 from gcd_train.model_setup import model_config
 from gcd_train.recipe import load_recipe
 from gcd_train.scenes.driving.pair_scene import driving_scene

@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 import torch
-from driving_plane import STAGE_SOURCE, PlaneClips
+from driving_plane import STAGE_SOURCE, PlaneClips, evaluated
 from torch import Tensor
 
 from gcd_model import FAMILIES, Clip, Family, ModelConfig, RenderOptions, Trajectory, View
@@ -12,26 +12,18 @@ from gcd_model.clip import Augmentation
 from gcd_model.conditioning import SourceFeatures
 from gcd_model.config import DRIVING_CLASSES, SMALL, SemanticClass
 from gcd_model.geometry import CameraMount, Spherical, SphericalDelta, driving_trajectory, spherical_trajectory
-from gcd_train.baselines import (
+from gcd_train.errors import DataError
+from gcd_train.evaluation.clips import PairedSet
+from gcd_train.evaluation.methods import SynthesizedViews
+from gcd_train.evaluation.predictors import (
     CopySource,
     GroundHomography,
     Prediction,
-    Predictor,
     SourceClip,
     fit_statistics,
+    pixel_rays,
     to_pictures,
-)
-from gcd_train.baselines.cameras import pixel_rays, to_pixels
-from gcd_train.datasets.paired import PairedClip
-from gcd_train.errors import DataError
-from gcd_train.evaluation import (
-    Evaluation,
-    PairedSet,
-    Selection,
-    SynthesizedViews,
-    evaluate,
-    lead,
-    require_same_kind,
+    to_pixels,
 )
 
 
@@ -40,18 +32,16 @@ class Oracle:
     """Looks its answer up: the target itself, changed as asked."""
 
     clips: PlaneClips
-    brighter: float = 0.0
-    blind: bool = False
     name: str = "oracle"
     privileged: bool = True
 
     def predict(self, clip: SourceClip) -> Prediction:
         (true,) = [each for each in self.clips.clips if each.source is clip.source]
-        video = (to_pictures(true.target) + self.brighter).clamp(0, 1)
+        video = to_pictures(true.target)
         video[0] = 0.0  # the first frame must not count
         classes = torch.from_numpy(true.target_classes.copy())
         classes[0] = 0
-        return Prediction(video=None if self.blind else video, classes=classes if self.clips.classes else None)
+        return Prediction(video=video, classes=classes if self.clips.classes else None)
 
 
 @dataclass
@@ -127,32 +117,12 @@ def fake(clips: PlaneClips, classes: tuple[SemanticClass, ...] = DRIVING_CLASSES
     return FakeSynthesizer(FakeTraits(config=config, classes=classes))
 
 
-def found_by(predictors: list[Predictor], clips: PlaneClips, declared: CameraMount | None = None) -> list[Evaluation]:
-    """What `evaluate` finds on pairs."""
-    return list(evaluate(predictors, PairedSet(clips=clips, identity="plane", declared=declared)))
-
-
 def test_the_target_itself_is_perfect_and_its_first_frame_is_not_looked_at() -> None:
     clips = PlaneClips.make(2)
-    (found,) = found_by([Oracle(clips)], clips)
-    total = found.total
-    assert (total.psnr_db, total.last_psnr_db) == pytest.approx((100.0, 100.0))
-    ideal = (total.ssim, total.gradient_energy, total.flicker, total.miou, total.miou_full, total.accuracy)
-    assert ideal == pytest.approx((1.0,) * 6, abs=1e-6)
-
-
-def test_a_view_that_is_a_tenth_too_bright_has_20_db_and_the_targets_gradient() -> None:
-    clips = PlaneClips.make(2)
-    (found,) = found_by([Oracle(clips, brighter=0.1)], clips)
-    assert found.total.psnr_db == pytest.approx(20.0, abs=0.01)
-    assert found.total.gradient_energy == pytest.approx(1.0, abs=1e-4)
-
-
-def test_figures_that_a_predictor_does_not_have_are_nan() -> None:
-    clips = PlaneClips.make(2)
-    (found,) = found_by([Oracle(clips, blind=True)], clips)
-    assert np.isnan([found.total.psnr_db, found.total.ssim, found.total.gradient_energy, found.total.flicker]).all()
-    assert found.total.miou == 1.0
+    (found,) = evaluated([Oracle(clips)], clips)
+    assert (found.value("psnr_db"), found.value("last_psnr_db")) == pytest.approx((100.0, 100.0))
+    names = ("ssim", "gradient_energy", "flicker", "miou", "miou_full", "accuracy")
+    assert [found.value(name) for name in names] == pytest.approx([1.0] * 6, abs=1e-6)
 
 
 @dataclass
@@ -185,68 +155,23 @@ def test_iou_of_car_and_person_is_what_one_counts_by_hand() -> None:
     clip.target_classes[:, 16:20, 0:4] = PERSON  # 16 pixels, 4 cells
     said = block(CAR, slice(0, 8), slice(4, 16))  # 96 pixels, 64 of them right: 64 / 128
     said[:, 16:20, 2:10] = PERSON  # 32 pixels, 8 of them right: 8 / 40
-    (found,) = found_by([Painted(classes=said)], clips)
-    for iou in (found.total.class_iou, found.total.class_iou_full):
+    (found,) = evaluated([Painted(classes=said)], clips)
+    for iou in (found.class_iou(), found.class_iou(full=True)):
         assert iou[CAR] == pytest.approx(64 / 128)
         assert iou[PERSON] == pytest.approx(8 / 40)
     road = (32 * 48 - 96 - 16, 32 * 48 - 96 - 32)  # true, said
     both = 32 * 48 - 128 - 40  # neither a car nor a person for either of them
     expected = (64 / 128 + 8 / 40 + both / (sum(road) - both)) / 3
-    assert found.total.miou_full == pytest.approx(expected)
-
-
-def test_flicker_is_the_views_change_over_the_targets() -> None:
-    clips = PlaneClips.make(1)
-    clip = clips[0]
-    for t, level in enumerate((0, 100, 110, 130)):  # changes by 10 and by 20; the first frame does not count
-        clip.target[t] = level
-    video = torch.tensor([0.9, 0.2, 0.2, 0.2 + 15 / 255]).view(4, 1, 1, 1).expand(4, 3, 32, 48)  # by 0 and by 15
-    (found,) = found_by([Painted(video=video)], clips)
-    assert found.total.flicker == pytest.approx(15 / 30)
-
-
-def test_the_standard_error_of_a_mean_is_the_usual_one() -> None:
-    clips = PlaneClips.make(4)
-    (found,) = found_by([CopySource()], clips)
-    each = np.array([clip.psnr_db for clip in found.clips])
-    assert each.std() > 0
-    assert found.error.psnr_db == pytest.approx(each.std(ddof=1) / 2)
-
-
-def test_clips_of_one_scene_count_as_one() -> None:
-    clips = replace(PlaneClips.make(4), clips_per_scene=2)
-    (found,) = found_by([CopySource()], clips)
-    each = np.array([clip.psnr_db for clip in found.clips]).reshape(2, 2).mean(axis=1)
-    assert len(found.without) == 2
-    assert found.error.psnr_db == pytest.approx(each.std(ddof=1) / np.sqrt(2))
-
-
-def test_a_lead_is_paired_over_scenes() -> None:
-    clips = PlaneClips.make(4)
-    first, other = found_by([Oracle(clips, brighter=0.1), CopySource()], clips)
-    apart = np.array([a.psnr_db - b.psnr_db for a, b in zip(first.clips, other.clips, strict=True)])
-    ahead, error = lead(first, other, lambda of: of.psnr_db)
-    assert ahead == pytest.approx(apart.mean())
-    assert error == pytest.approx(apart.std(ddof=1) / 2)
-    assert lead(first, first, lambda of: of.miou) == (0.0, 0.0)
-
-
-def test_every_predictor_sees_the_same_clips_and_progress_is_told() -> None:
-    clips, told = PlaneClips.make(2), list[tuple[int, int]]()
-    pairs = PairedSet(clips=clips, identity="plane")
-    found = evaluate([CopySource(), Oracle(clips)], pairs, progress=lambda *at: told.append(at))
-    assert [each.name for each in found] == ["copy_source", "oracle"]
-    assert [len(each.clips) for each in found] == [2, 2]
-    assert told == [(1, 2), (2, 2)]
+    assert found.value("miou_full") == pytest.approx(expected)
 
 
 def test_a_model_gets_the_clip_in_its_own_range_and_its_shipped_settings() -> None:
     clips = PlaneClips.make(2)
     synthesizer = fake(clips)
-    (found, copied) = found_by([SynthesizedViews.of(synthesizer, clips), CopySource()], clips)
+    (found, copied) = evaluated([SynthesizedViews.of(synthesizer, clips), CopySource()], clips)
     assert found.name == "fake-small"
-    assert found.total.psnr_db == pytest.approx(copied.total.psnr_db, abs=1e-3)
-    assert found.total.class_iou[1] == pytest.approx(
+    assert found.value("psnr_db") == pytest.approx(copied.value("psnr_db"), abs=1e-3)
+    assert found.class_iou()[1] == pytest.approx(
         float(np.mean([(clip.target_classes[1:] == 1).mean() for clip in clips.clips])), abs=0.05
     )
     first = synthesizer.clips[0]
@@ -257,35 +182,15 @@ def test_a_model_gets_the_clip_in_its_own_range_and_its_shipped_settings() -> No
     assert synthesizer.steps == [None, None]
 
 
-def test_the_same_weights_are_measured_with_other_steps_too() -> None:
-    clips = PlaneClips.make(1)
-    synthesizer = fake(clips)
-    rows = [SynthesizedViews.of(synthesizer, clips, RenderOptions(steps=steps)) for steps in (None, 1, 4)]
-    found = found_by(rows, clips)
-    assert [each.name for each in found] == ["fake-small", "fake-small (1 step)", "fake-small (4 steps)"]
-    assert synthesizer.steps == [None, 1, 4]
-
-
-def test_a_row_says_how_it_is_sampled_and_the_model_is_asked_so() -> None:
-    clips = PlaneClips.make(1)
-    synthesizer = fake(clips)
-    sampled = RenderOptions(
-        quality="fast", steps=4, solver="dpmpp_2m", guidance=(1.0, 2.5), guidance_interval=(0.5, 20.0)
-    )
-    (found,) = found_by([SynthesizedViews.of(synthesizer, clips, sampled)], clips)
-    assert found.name == "fake-small (fast, 4 steps, dpmpp_2m, guidance 1 to 2.5, guided from 0.5 to 20)"
-    assert synthesizer.options == [sampled]
-
-
 def test_a_declared_mount_reaches_the_live_models_clip_and_the_baselines() -> None:
     clips = PlaneClips.make(1)
     synthesizer, mount = fake(clips), CameraMount(height_m=1.8)
     synthesizer.traits.live = True
     homography = GroundHomography(fill=fit_statistics(clips))
-    _, told = found_by([SynthesizedViews.of(synthesizer, clips), homography], clips, mount)
+    _, told = evaluated([SynthesizedViews.of(synthesizer, clips), homography], clips, declared=mount)
     assert synthesizer.clips[0].mount == mount
-    (true,) = found_by([homography], clips)
-    assert told.total.psnr_db < true.total.psnr_db
+    (true,) = evaluated([homography], clips)
+    assert told.value("psnr_db") < true.value("psnr_db")
 
 
 CHANGES = (SphericalDelta(azimuth_deg=40.0, elevation_deg=10.0), SphericalDelta(azimuth_deg=-60.0, radius_m=1.5))
@@ -294,36 +199,28 @@ CHANGES = (SphericalDelta(azimuth_deg=40.0, elevation_deg=10.0), SphericalDelta(
 def test_a_steered_model_goes_each_clips_own_way_from_where_its_source_stands() -> None:
     clips = PlaneClips.orbits(CHANGES)
     synthesizer = fake(clips, classes=())
-    found, copied = found_by([SynthesizedViews.of(synthesizer, clips), CopySource()], clips)
-    assert found.total.psnr_db == pytest.approx(copied.total.psnr_db, abs=1e-3)
+    found, copied = evaluated([SynthesizedViews.of(synthesizer, clips), CopySource()], clips)
+    assert found.value("psnr_db") == pytest.approx(copied.value("psnr_db"), abs=1e-3)
     assert synthesizer.traits.asked == [(change, STAGE_SOURCE) for change in CHANGES]
     for path, wanted in zip(synthesizer.paths, clips.paths, strict=True):
         assert torch.equal(path.source_from_target, wanted.source_from_target)
     assert synthesizer.clips[0].fps == 12.0
     assert synthesizer.clips[0].mount is None
-    assert np.isnan(found.total.miou)
-    assert found.total.class_iou == ()
-
-
-def test_a_model_that_moves_at_another_pace_than_the_clips_is_refused() -> None:
-    clips = PlaneClips.orbits(CHANGES)
-    synthesizer = fake(clips, classes=())
-    synthesizer.traits.move_time = 0
-    with pytest.raises(DataError, match="reaches its goal in frame 0"):
-        found_by([SynthesizedViews.of(synthesizer, clips)], clips)
+    assert np.isnan(found.value("miou"))
+    assert found.class_iou().size == 0
 
 
 def test_a_model_that_paints_classes_is_compared_by_its_class_map_alone() -> None:
     clips = PlaneClips.make(1)
     synthesizer = fake(clips)
     synthesizer.traits.family = FAMILIES["driving-semantic"]
-    (found,) = found_by([SynthesizedViews.of(synthesizer, clips)], clips)
-    assert np.isnan(found.total.psnr_db)
-    assert found.total.class_iou[1] > 0
+    (found,) = evaluated([SynthesizedViews.of(synthesizer, clips)], clips)
+    assert np.isnan(found.value("psnr_db"))
+    assert found.class_iou()[1] > 0
     synthesizer.traits.classes = ()  # as in the published files: then the clips say what the colours mean
-    (read,) = found_by([SynthesizedViews.of(synthesizer, clips)], clips)
-    assert np.isnan(read.total.psnr_db)
-    assert not np.isnan(read.total.miou)
+    (read,) = evaluated([SynthesizedViews.of(synthesizer, clips)], clips)
+    assert np.isnan(read.value("psnr_db"))
+    assert not np.isnan(read.value("miou"))
     with pytest.raises(DataError, match="names no classes"):
         SynthesizedViews.of(synthesizer, replace(clips, classes=()))
 
@@ -338,42 +235,18 @@ def test_a_model_of_another_size_ontology_or_camera_is_refused() -> None:
         SynthesizedViews.of(fake(clips), PlaneClips.orbits(CHANGES))
 
 
-def test_training_clips_of_another_kind_are_refused() -> None:
-    clips = PlaneClips.make(1)
-    require_same_kind(clips, clips)
-    with pytest.raises(DataError, match="one kind"):
-        require_same_kind(PlaneClips.make(1, width=64), clips)
-    with pytest.raises(DataError, match="one kind"):
-        require_same_kind(replace(clips, classes=DRIVING_CLASSES[:3]), clips)
-    with pytest.raises(DataError, match="camera control"):
-        require_same_kind(replace(PlaneClips.orbits(CHANGES), classes=DRIVING_CLASSES), clips)
-
-
-def test_nothing_to_measure_is_refused() -> None:
-    with pytest.raises(DataError, match="3 frames"):
-        found_by([CopySource()], PlaneClips.make(1, frames=2))
-
-
-def test_a_class_the_ontology_lacks_is_refused() -> None:
-    clips = PlaneClips.make(1)
-    clip: PairedClip = clips[0]
-    clip.target_classes[2, 0, 0] = 13
-    with pytest.raises(ValueError, match="below 13"):
-        found_by([CopySource()], clips)
-
-
 def test_several_draws_are_measured_each_and_their_spread_is_told() -> None:
     clips = PlaneClips.make(1)
     synthesizer = fake(clips)
     rows = [SynthesizedViews.of(synthesizer, clips, RenderOptions(samples=each, seed=7)) for each in (1, 3)]
-    one, three = found_by(rows, clips)
+    one, three = evaluated(rows, clips)
     assert [each.samples for each in synthesizer.options] == [1, 3]
     assert {each.seed for each in synthesizer.options} == {7}
-    assert np.isnan(one.total.diversity)
-    assert three.total.diversity > 0
+    assert np.isnan(one.value("diversity"))
+    assert three.value("diversity") > 0
     drawn = rows[1].predict(PairedSet(clips=clips, identity="plane").clip("plane-00000000").seen).draws
-    each = [found_by([Painted(video=draw.video)], clips)[0].total.psnr_db for draw in drawn]
-    assert three.total.psnr_db == pytest.approx(np.mean(each))
+    each = [evaluated([Painted(video=draw.video)], clips)[0].value("psnr_db") for draw in drawn]
+    assert three.value("psnr_db") == pytest.approx(np.mean(each))
 
 
 def test_a_model_of_another_pace_than_driving_clips_is_refused() -> None:
@@ -385,24 +258,10 @@ def test_a_model_of_another_pace_than_driving_clips_is_refused() -> None:
         SynthesizedViews.of(synthesizer, clips).predict(replace(seen, cameras=direct))
 
 
-def test_a_selection_of_frames_is_what_figures_are_of() -> None:
-    clips = PlaneClips.make(1)
-    pairs = PairedSet(clips=clips, identity="plane")
-    rows = {span: evaluate([CopySource()], pairs, selection=Selection(frames=span))[0] for span in ("2-last", "last")}
-    assert rows["last"].total.psnr_db == pytest.approx(rows["2-last"].total.last_psnr_db)
-    first = evaluate([CopySource()], pairs, selection=Selection(frames=1))[0]
-    assert first.total.psnr_db == pytest.approx(100.0)  # there both cameras stand at one place
-
-
 def visible_of(clips: PlaneClips, number: int = 0) -> np.ndarray:
     visible = PairedSet(clips=clips, identity="plane").clip(f"plane-{number:08d}").visible
     assert visible is not None
     return visible
-
-
-def test_where_both_cameras_are_one_everything_is_visible() -> None:
-    for clips in (PlaneClips.make(1), PlaneClips.orbits(CHANGES)):
-        assert visible_of(clips)[0].all()
 
 
 def test_on_a_plane_what_lies_in_the_source_picture_is_visible_and_nothing_else() -> None:
@@ -417,18 +276,3 @@ def test_on_a_plane_what_lies_in_the_source_picture_is_visible_and_nothing_else(
     ground = clip.target_depth[3] > 0
     assert 0.1 < inside[ground].mean() < 1.0
     assert (visible_of(clips)[3][ground] == inside[ground]).mean() > 0.99
-
-
-def test_what_something_else_stands_before_is_occluded() -> None:
-    clips = PlaneClips.orbits(CHANGES)
-    before = visible_of(clips)[3].mean()
-    clips.clips[0].source_depth[:] = 1.0  # a board right before the source camera
-    assert visible_of(clips)[3].mean() < 0.01 < before
-
-
-def test_a_clip_is_called_by_its_world_and_number() -> None:
-    pairs = PairedSet(clips=PlaneClips.make(2), identity="plane")
-    assert pairs.keys == ("plane-00000000", "plane-00000001")
-    assert pairs.clip("plane-00000001").key == pairs.clip("plane-00000001").seen.key == "plane-00000001"
-    with pytest.raises(DataError, match="there is no clip plane-7"):
-        pairs.clip("plane-7")

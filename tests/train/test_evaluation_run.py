@@ -1,7 +1,7 @@
 """Runs that are kept: records, resuming, failures, processes, frames that are read back."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
@@ -9,31 +9,17 @@ import numpy as np
 import pytest
 from driving_plane import PlaneClips
 from made_records import note, record
-from tiny_driving import write_untrained
 from typer.testing import CliRunner
 
-from gcd_train.baselines import (
-    BaselineSettings,
-    CopySource,
-    Prediction,
-    Predictor,
-    SavedFrames,
-    SourceClip,
-    build,
-    fit_statistics,
-    to_pictures,
-)
-from gcd_train.cli.evaluate import gpu_seats
 from gcd_train.cli.main import app
 from gcd_train.datasets.paired import PairedClips
-from gcd_train.errors import DataError, RecipeError, RunError
-from gcd_train.evaluation import ClipWork, HeldOutClip, PairedSet, RunKeeper, folder_name, measure_all, read_run
-from gcd_train.evaluation.kept_frames import KeptViews, png
-from gcd_train.evaluation.methods import of_baselines
-from gcd_train.evaluation.paired_set import chosen, identity_of
-from gcd_train.evaluation.run import predicted_and_measured
-from gcd_train.evaluation.spread import GIVE_UP_AFTER, Account
-from gcd_train.reports.material import Run, gather
+from gcd_train.errors import DataError, RunError
+from gcd_train.evaluation.clips import HeldOutClip, PairedSet, chosen, identity_of
+from gcd_train.evaluation.galleries import KeptViews, png
+from gcd_train.evaluation.predictors import CopySource, Prediction, Predictor, SourceClip, to_pictures
+from gcd_train.evaluation.runner import GIVE_UP_AFTER, Account, ClipWork, assign_gpus, measure_all
+from gcd_train.evaluation.saved_frames import SavedFrames
+from gcd_train.evaluation.store import RunKeeper, folder_name, read_run
 
 
 @dataclass
@@ -104,14 +90,6 @@ def test_names_become_file_names_and_two_methods_never_share_a_folder(tmp_path: 
         RunKeeper(tmp_path).begin(note(methods={"a b": {}, "a/b": {}}))
 
 
-def test_a_run_goes_on_with_more_methods_and_keeps_its_first_command(tmp_path: Path) -> None:
-    RunKeeper(tmp_path).begin(note(methods={"a": {"seed": "0"}}, command="first"))
-    RunKeeper(tmp_path).keep(record("a", "k"))
-    joined = RunKeeper(tmp_path).begin(note(methods={"b": {"seed": "0"}}, command="second"))
-    assert (joined.command, list(joined.methods)) == ("first", ["a", "b"])
-    assert read_run(tmp_path)[0] == joined
-
-
 def test_what_never_measured_anything_binds_nobody(tmp_path: Path) -> None:
     keeper = RunKeeper(tmp_path)
     keeper.begin(note(methods={"a": {}}, data_identity="a mistake", command="first"))
@@ -133,13 +111,6 @@ def test_lines_beside_each_other_keep_each_others_methods_before_there_is_a_reco
         first.keep(record("a", "k"))
     second.keep(record("b", "k"))
     assert list(read_run(tmp_path)[0].methods) == ["a", "b"]
-
-
-def test_frames_are_known_again_by_what_they_are_and_not_by_their_place(tmp_path: Path) -> None:
-    keeper = RunKeeper(tmp_path)
-    keeper.begin(note(methods={"flat": {"frames in": "p/flat", "digest": "1"}}))
-    keeper.keep(record("flat", "k"))
-    assert keeper.begin(note(methods={"flat": {"frames in": "q", "digest": "1"}})).methods["flat"]["frames in"] == "q"
 
 
 @pytest.mark.parametrize(
@@ -196,8 +167,26 @@ def test_a_clip_that_cannot_be_read_is_named_and_the_others_are_measured(tmp_pat
 def test_a_method_that_fails_takes_nothing_from_the_others(tmp_path: Path) -> None:
     account = finished(tmp_path, pairs(2), Counting(refused=["plane-00000000"]), CopySource())
     assert account.failures == {"plane-00000000, counting": "no frames for plane-00000000"}
-    assert "copy_source/plane-00000000.json" in records_in(tmp_path)
-    assert "counting/plane-00000000.json" not in records_in(tmp_path)
+    assert {"copy_source/plane-00000000.json", "counting/plane-00000001.json"} <= set(records_in(tmp_path))
+    assert set(account.records) == {
+        ("copy_source", "plane-00000000"),
+        ("copy_source", "plane-00000001"),
+        ("counting", "plane-00000001"),
+    }
+
+
+def test_nothing_to_measure_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError):
+        finished(tmp_path, PairedSet(clips=PlaneClips.make(1, frames=2), identity="plane"), CopySource())
+
+
+def test_rows_of_the_contact_sheet_are_kept_and_drawn_again_only_where_they_lack(tmp_path: Path) -> None:
+    method = Counting()
+    for sheet in (("plane-00000000",), ("plane-00000000", "plane-00000001")) * 2:
+        work = ClipWork(folder=tmp_path, clips=pairs(2), makers={"counting": lambda: method}, sheet=sheet)
+        *_, account = measure_all(work)
+        assert account.failures == {}
+    assert method.met == ["plane-00000000", "plane-00000001", "plane-00000001"]
 
 
 def test_a_run_in_which_nothing_goes_right_gives_up(tmp_path: Path) -> None:
@@ -220,10 +209,10 @@ def written(folder: Path, count: int, first_seed: int = 0) -> PairedClips:
 def test_workers_take_gpus_in_turn_unless_one_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     each = [{"CUDA_VISIBLE_DEVICES": "0"}, {"CUDA_VISIBLE_DEVICES": "1"}, {"CUDA_VISIBLE_DEVICES": "2"}]
-    assert list(gpu_seats("auto", 3)) == list(gpu_seats("cuda", 3)) == each
-    assert gpu_seats("cpu", 3) == gpu_seats("cuda:1", 3) == gpu_seats("auto", 1) == gpu_seats("auto", 0) == ()
+    assert list(assign_gpus("auto", 3)) == list(assign_gpus("cuda", 3)) == each
+    assert assign_gpus("cpu", 3) == assign_gpus("cuda:1", 3) == assign_gpus("auto", 1) == assign_gpus("auto", 0) == ()
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5, GPU-3a")
-    assert [seat["CUDA_VISIBLE_DEVICES"] for seat in gpu_seats("auto", 2)] == ["5", "GPU-3a"]
+    assert [seat["CUDA_VISIBLE_DEVICES"] for seat in assign_gpus("auto", 2)] == ["5", "GPU-3a"]
 
 
 @pytest.mark.slow
@@ -257,13 +246,6 @@ def test_kept_frames_are_predictions_that_score_the_same(tmp_path: Path) -> None
     assert np.array_equal((read.video * 255).round().byte().permute(0, 2, 3, 1).numpy(), clip.seen.source)
 
 
-def test_only_the_last_frame_is_kept_where_that_is_asked(tmp_path: Path) -> None:
-    work = ClipWork(folder=tmp_path, clips=pairs(1), makers={"copy_source": CopySource}, views="last")
-    *_, account = measure_all(work)
-    assert account.done == 1
-    assert {path.name for path in (tmp_path / "views").rglob("*.png")} == {"0003.png"}
-
-
 def pictures_in(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted((folder / "views").rglob("*.png"))}
 
@@ -293,14 +275,6 @@ def test_the_identity_follows_the_pictures_and_not_the_place(tmp_path: Path) -> 
     assert identity_of(clips) == identity_of(written(tmp_path / "b", 2))
     assert identity_of(clips) != identity_of(chosen(clips, limit=1))
     assert identity_of(clips) != identity_of(written(tmp_path / "c", 2, first_seed=1))
-
-
-def test_a_limit_counts_scenes_and_a_split_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    clips = written(tmp_path, 4)
-    assert len(chosen(clips, limit=3)) == 3
-    assert [chosen(clips, scenes={("driving", 2)}).scene(0)] == [("driving", 2)]
-    with pytest.raises(DataError, match="none of the 4 clips"):
-        chosen(clips, scenes={("driving", 9)})
 
 
 def evaluated(folder: Path, *options: str) -> tuple[int, str]:
@@ -342,60 +316,6 @@ def test_a_line_that_measured_nothing_can_be_corrected(tmp_path: Path, monkeypat
         code, said = evaluated(tmp_path, "--no-baselines", "--predictions", f"none={folder}")
         assert code == 0, said
     assert list(read_run(tmp_path / "run")[0].methods) == ["copy_source", "none"]
-
-
-def test_what_is_wrong_is_said_before_training_clips_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    PlaneClips.make(1).write(tmp_path / "data")
-    PlaneClips.make(2).write(tmp_path / "train", first_seed=5)
-    means = ["--methods", "mean_target", "--train", str(tmp_path / "train")]
-    code, said = evaluated(tmp_path, *means)
-    assert code == 0, said
-
-    def unwanted(*_: object, **__: object) -> None:
-        pytest.fail("the means were worked out")
-
-    monkeypatch.setattr("gcd_train.evaluation.plan.fit_statistics", unwanted)
-    for options, words in (
-        (["--lpips", str(tmp_path / "nowhere")], "nowhere"),
-        (["--predictions", f"other={tmp_path / 'nowhere'}"], "is no folder"),
-        (["--seed", "4"], "seed was 0, is 4"),
-    ):
-        code, said = evaluated(tmp_path, *means, *options)
-        assert (code != 0, words in said) == (True, True), said
-
-
-def test_means_are_those_of_the_training_clips(tmp_path: Path) -> None:
-    held_out = PlaneClips.make(1).write(tmp_path / "data")
-    training = PlaneClips.make(2).write(tmp_path / "train", first_seed=5)
-    code, said = evaluated(tmp_path, "--methods", "mean_target", "--train", str(training))
-    assert code == 0, said
-    mean = build("mean_target", settings_of(PairedClips.open(training)))
-    clip = PairedSet.of(PairedClips.open(held_out))
-    _, wanted = predicted_and_measured(mean, clip.clip(clip.keys[0]), classes=clip.classes)
-    (record,) = read_run(tmp_path / "run")[1]
-    assert record.regions == wanted.regions
-
-
-def settings_of(training: PairedClips) -> BaselineSettings:
-    return BaselineSettings(
-        frames=training.frames,
-        height=training.height,
-        width=training.width,
-        classes=tuple(training.classes),
-        statistics=fit_statistics(training),
-    )
-
-
-def test_what_a_hexplane_learns_can_be_said_and_is_kept(tmp_path: Path) -> None:
-    PlaneClips.make(1).write(tmp_path / "data")
-    few = ["--methods", "hexplane_1", "--hexplane-updates", "2", "--hexplane-rays", "16", "--limit", "1"]
-    code, said = evaluated(tmp_path, *few)
-    assert code == 0, said
-    told, (record,) = read_run(tmp_path / "run")
-    assert (told.methods["hexplane_1"]["updates"], told.methods["hexplane_1"]["rays"]) == ("2", "16")
-    assert record.regions["all"].psnr_db is not None
-    code, said = evaluated(tmp_path, *few, "--hexplane-rays", "17")
-    assert (code != 0, "rays of hexplane_1 was 16, is 17" in said) == (True, True), said
 
 
 def test_frames_of_a_method_that_was_given_more_are_starred(tmp_path: Path) -> None:
@@ -440,45 +360,3 @@ def test_the_command_says_what_is_wrong(tmp_path: Path, options: list[str], code
     assert (found, words in said) == (code, True), said
     assert "Traceback" not in said
     assert not (tmp_path / "run" / "run.json").exists()
-
-
-def test_vanilla_svd_takes_weights_that_make_a_video_out_of_a_picture(tmp_path: Path) -> None:
-    settings = BaselineSettings(frames=4, height=32, width=48, samples=3, seed=5)
-    (method,) = of_baselines(["vanilla_svd"], replace(settings, svd="random:svd"), "nothing")
-    told = {"baseline": "vanilla_svd", "samples": "3", "seed": "5", "weights": "random:svd"}
-    assert method.told == told
-    with pytest.raises(RecipeError, match="is of the family driving"):
-        of_baselines(["vanilla_svd"], replace(settings, svd=str(write_untrained(tmp_path))), "nothing")
-
-
-def test_a_baseline_tells_no_more_than_it_uses_so_that_runs_go_together(tmp_path: Path) -> None:
-    PlaneClips.make(1).write(tmp_path / "data")
-    PlaneClips.make(2).write(tmp_path / "train", first_seed=5)
-    lines = (
-        ["--methods", "copy_source,reproject_rgbd"],
-        ["--methods", "copy_source,reproject_rgbd,mean_target", "--train", str(tmp_path / "train"), "--samples", "3"],
-    )
-    for number, options in enumerate(lines):
-        code, said = evaluated(tmp_path, *options, "--out", str(tmp_path / str(number)))
-        assert code == 0, said
-    (one,) = gather([Run.read(tmp_path / each) for each in "01"])
-    assert [method.name for method in one.methods] == ["copy_source", "reproject_rgbd", "mean_target"]
-    assert one.method("copy_source").details == {"baseline": "copy_source"}
-    assert set(one.method("mean_target").details) == {"baseline", "means of"}
-
-
-def test_weights_of_vanilla_svd_are_told_where_they_lie_whoever_stands_where(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    PlaneClips.make(1).write(tmp_path / "data")
-    met: list[BaselineSettings] = []
-
-    def noted(names: object, settings: BaselineSettings, trained_on: str) -> tuple[()]:
-        met.append(settings)
-        return ()
-
-    monkeypatch.setattr("gcd_train.evaluation.plan.of_baselines", noted)
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "svd.safetensors").touch()
-    evaluated(tmp_path, "--methods", "vanilla_svd", "--svd", "svd.safetensors")
-    assert [each.svd for each in met] == [str(tmp_path / "svd.safetensors")]

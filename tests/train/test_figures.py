@@ -1,19 +1,31 @@
 """Figures from records: what is summed, over which frames and pixels, and how sure it is."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 from made_records import record, region
 
 from gcd_train.errors import DataError
-from gcd_train.evaluation import Selection, figures, lead, summed_up, tallies
-from gcd_train.evaluation.class_counts import class_counts
-from gcd_train.evaluation.record import ClipRecord
-from gcd_train.evaluation.tallies import FIGURE_NAMES
+from gcd_train.evaluation.statistics import (
+    FIGURE_NAMES,
+    FigureName,
+    Selection,
+    bootstrap,
+    class_counts,
+    clip_sums,
+    difference,
+    lead,
+    scene_weights,
+)
+from gcd_train.evaluation.store import ClipRecord
+from gcd_train.evaluation.summary import evaluation
+
+OCCLUDED = Selection(region="occluded")
 
 
-def four_scenes(method: str = "model", shift: float = 0.0) -> list[ClipRecord]:
+def scenes(method: str = "model", shift: float = 0.0) -> list[ClipRecord]:
     """Two clips of each of four scenes, all of other PSNR."""
     values = (18.0, 19.0, 21.0, 20.5, 17.0, 16.0, 25.0, 24.0)
     return [
@@ -22,38 +34,63 @@ def four_scenes(method: str = "model", shift: float = 0.0) -> list[ClipRecord]:
     ]
 
 
-# --- laws ---------------------------------------------------------------------------------------------------------
+def figure(records: Sequence[ClipRecord], name: FigureName, selection: Selection | None = None) -> float:
+    return evaluation(records, selection).value(name)
 
 
-def test_sums_of_clips_add_up_to_the_sum_of_all() -> None:
-    clips = tallies(four_scenes(), Selection())
-    grouped = clips.grouped([each.scene for each in four_scenes()])
-    whole = clips.weighted(np.ones(8))
+# --- how sure -----------------------------------------------------------------------------------------------------
+
+
+def test_every_draw_takes_as_many_scenes_as_there_are_and_the_same_seed_takes_the_same() -> None:
+    weights = scene_weights(7, draws=50, seed=1)
+    np.testing.assert_array_equal(weights.sum(axis=1), np.full(50, 7.0))
+    np.testing.assert_array_equal(weights, scene_weights(7, draws=50, seed=1))
+    assert not np.array_equal(weights, scene_weights(7, draws=50, seed=2))
+
+
+def test_sums_of_scenes_add_up_to_the_sum_of_all() -> None:
+    clips = clip_sums(scenes(), Selection())
+    grouped = clips.grouped([each.scene for each in scenes()])
     for name in FIGURE_NAMES:
-        np.testing.assert_allclose(grouped.weighted(np.ones(4)).figure(name), whole.figure(name))
+        np.testing.assert_allclose(grouped.figure(name, np.ones(4)), clips.figure(name, np.ones(8)))
 
 
-def test_the_order_of_clips_changes_no_total() -> None:
-    some = four_scenes()
-    assert figures(some).psnr_db == pytest.approx(figures(some[::-1]).psnr_db)
+def test_interval_and_error_of_a_mean_are_those_of_a_plain_bootstrap_over_scenes() -> None:
+    found = bootstrap(scenes(), Selection(), seed=4)
+    of_scenes = np.array([18.5, 20.75, 16.5, 24.5])
+    drawn = of_scenes[np.random.default_rng(0).integers(0, 4, size=(20_000, 4))].mean(axis=1)
+    interval = found.interval("psnr_db")
+    assert interval.value == pytest.approx(of_scenes.mean())
+    assert (interval.low, interval.high) == pytest.approx(tuple(np.quantile(drawn, [0.025, 0.975])), abs=0.15)
+    assert found.error("psnr_db") == pytest.approx(of_scenes.std() / 2, rel=0.03)
 
 
-def test_a_row_leads_itself_by_nothing() -> None:
-    found = summed_up(four_scenes())
-    assert lead(found, found, lambda of: of.psnr_db) == (0.0, 0.0)
+def test_a_difference_is_paired_so_a_constant_lead_has_no_error() -> None:
+    first, other = (bootstrap(scenes(name, shift), Selection()) for name, shift in (("a", 1.5), ("b", 0.0)))
+    apart = difference(first, other, "psnr_db")
+    assert (apart.value, apart.low, apart.high) == pytest.approx((1.5,) * 3)
+    assert apart.off_zero
+    assert lead(first, other, "psnr_db") == pytest.approx((1.5, 0.0), abs=1e-9)
+    back = difference(other, first, "psnr_db")
+    assert (back.low, back.high) == pytest.approx((-apart.high, -apart.low))
 
 
-def test_the_error_of_a_mean_over_scenes_is_the_usual_one() -> None:
-    found = summed_up(four_scenes())
-    scenes = np.array([each.psnr_db for each in found.clips]).reshape(4, 2).mean(axis=1)
-    assert len(found.without) == 4
-    assert found.error.psnr_db == pytest.approx(scenes.std(ddof=1) / 2)
+def test_a_single_scene_has_no_bounds_and_no_claim() -> None:
+    found = bootstrap(scenes()[:2], Selection())
+    assert math.isnan(found.error("psnr_db"))
+    assert math.isnan(found.interval("psnr_db").low)
+    assert not found.interval("psnr_db").off_zero
+    assert math.isnan(lead(found, found, "psnr_db")[1])
 
 
-def test_a_constant_lead_has_no_error() -> None:
-    ahead, error = lead(summed_up(four_scenes(shift=1.5)), summed_up(four_scenes("other")), lambda of: of.psnr_db)
-    assert ahead == pytest.approx(1.5)
-    assert error == pytest.approx(0.0, abs=1e-9)
+def test_intervals_of_pooled_classes_lie_around_the_figure_of_all() -> None:
+    clips = [
+        record("a", f"s{scene}", regions={"all": region(counts=[(0, 0, 50), (1, 1, 10 + scene), (1, 0, 9)])})
+        for scene in range(5)
+    ]
+    found = bootstrap(clips, Selection()).interval("miou_common")
+    assert found.low < found.value < found.high
+    assert found.value == pytest.approx((250 / 295 + 60 / 105) / 2)
 
 
 # --- frames and pixels --------------------------------------------------------------------------------------------
@@ -66,122 +103,84 @@ def test_a_constant_lead_has_no_error() -> None:
         (Selection(frames="all"), 40.0),
         (Selection(frames="last"), 30.0),
         (Selection(frames=2), 10.0),
-        (Selection(region="occluded"), 12.0),  # of frames 3 and 4, frame 2 has no such pixel
+        (OCCLUDED, 12.0),  # of frames 3 and 4, frame 2 has no such pixel
         (Selection(frames=2, region="occluded"), math.nan),
         (Selection(region="visible"), math.nan),
     ],
 )
 def test_figures_are_of_the_frames_and_pixels_asked_for(selection: Selection, expected: float) -> None:
-    clip = record(
-        regions={"all": region((100.0, 10.0, 20.0, 30.0)), "occluded": region((None, None, 11.0, 13.0))},
-    )
-    assert figures([clip], selection).psnr_db == pytest.approx(expected, nan_ok=True)
-
-
-def test_the_last_frame_has_its_own_figure_in_every_selection() -> None:
-    clip = record(regions={"all": region((100.0, 10.0, 20.0, 30.0))})
-    assert figures([clip]).last_psnr_db == 30.0
+    regions = {"all": region((100.0, 10.0, 20.0, 30.0)), "occluded": region((None, None, 11.0, 13.0))}
+    clip = record(regions=regions)
+    assert figure([clip], "psnr_db", selection) == pytest.approx(expected, nan_ok=True)
+    assert figure([clip], "last_psnr_db") == 30.0
 
 
 def test_a_clip_without_such_pixels_does_not_count_and_every_other_counts_alike() -> None:
-    sparse = record(key="a", regions={"all": region((1.0,) * 4), "occluded": region((None, None, None, 10.0))})
-    none = record(key="b", regions={"all": region((1.0,) * 4), "occluded": region((None,) * 4)})
-    full = record(key="c", regions={"all": region((1.0,) * 4), "occluded": region((20.0,) * 4)})
-    assert figures([sparse, none, full], Selection(region="occluded")).psnr_db == pytest.approx(15.0)
+    clips = [
+        record(key=key, regions={"all": region((1.0,) * 4), "occluded": region(values)})
+        for key, values in (("a", (None, None, None, 10.0)), ("b", (None,) * 4), ("c", (20.0,) * 4))
+    ]
+    assert figure(clips, "psnr_db", OCCLUDED) == pytest.approx(15.0)
 
 
 def test_sharpness_and_flicker_are_ratios_of_sums_without_the_first_frame() -> None:
     clip = record(gradient=(9.0, 1.0, 2.0, 3.0), step=(9.0, 1.0, 3.0))
-    found = figures([clip])
-    assert found.gradient_energy == pytest.approx(6.0 / 6.0)
-    assert found.flicker == pytest.approx(4.0 / 4.0)
-    last = figures([clip], Selection(frames="last"))
-    assert (last.gradient_energy, last.flicker) == pytest.approx((1.5, 1.5))
-    third = figures([clip], Selection(frames=3))
-    assert (third.gradient_energy, third.flicker) == pytest.approx((1.0, 0.5))
-    assert math.isnan(figures([clip], Selection(frames=1)).flicker)
+    for frames, expected in (("2-last", (1.0, 1.0)), ("last", (1.5, 1.5)), (3, (1.0, 0.5))):
+        selection = Selection(frames=frames)
+        found = figure([clip], "gradient_energy", selection), figure([clip], "flicker", selection)
+        assert found == pytest.approx(expected)
+    assert math.isnan(figure([clip], "flicker", Selection(frames=1)))
 
 
 def test_what_is_not_measured_apart_is_nan_there() -> None:
     clip = record(lpips=0.3, regions={"all": region((20.0,) * 4), "occluded": region((20.0,) * 4)}, grid=[(0, 0, 5)])
-    assert figures([clip]).lpips == pytest.approx(0.3)
-    apart = figures([clip], Selection(region="occluded"))
-    assert np.isnan([apart.lpips, apart.flicker, apart.miou, apart.accuracy]).all()
+    assert figure([clip], "lpips") == pytest.approx(0.3)
+    names: tuple[FigureName, ...] = ("lpips", "flicker", "miou", "accuracy")
+    assert np.isnan([figure([clip], name, OCCLUDED) for name in names]).all()
 
 
 def test_sharpness_of_a_region_weighs_frames_by_their_pixels_and_skips_those_without() -> None:
     parts = region((20.0,) * 4, gradient=(9.0, None, 1.0, 4.0), pixels=(0.9, 0.0, 0.1, 0.3))
     clip = record(regions={"all": region((20.0,) * 4), "occluded": parts})
-    found = figures([clip], Selection(region="occluded"))
-    assert found.gradient_energy == pytest.approx((0.1 * 1.0 + 0.3 * 4.0) / (0.4 * 2.0))
-    assert math.isnan(figures([clip], Selection(frames=2, region="occluded")).gradient_energy)
-
-
-def test_a_method_without_pictures_has_figures_of_classes_alone() -> None:
-    clip = record(regions={"all": region(counts=[(0, 0, 3), (1, 0, 1)])}, gradient=None, step=None)
-    found = figures([clip])
-    pictures = (found.psnr_db, found.ssim, found.lpips, found.gradient_energy, found.flicker, found.diversity)
-    assert np.isnan(pictures).all()
-    assert found.class_iou_full == pytest.approx((0.75, 0.0))
+    assert figure([clip], "gradient_energy", OCCLUDED) == pytest.approx((0.1 * 1.0 + 0.3 * 4.0) / (0.4 * 2.0))
 
 
 def test_draws_are_averaged_and_their_spread_is_told() -> None:
     draws = region((20.0,) * 4, draws=2)
     apart = type(draws)(pixels=draws.pixels, psnr_db=((10.0,) * 4, (20.0,) * 4), ssim=draws.ssim, diversity=(0.02,) * 4)
-    found = figures([record(regions={"all": apart}, draws=2)])
-    assert found.psnr_db == pytest.approx(15.0)
-    assert found.diversity == pytest.approx(0.02)
+    clip = record(regions={"all": apart}, draws=2)
+    assert (figure([clip], "psnr_db"), figure([clip], "diversity")) == pytest.approx((15.0, 0.02))
 
 
 # --- classes ------------------------------------------------------------------------------------------------------
 
 
 def test_iou_is_pooled_over_clips_not_averaged() -> None:
-    one = record(key="a", regions={"all": region(counts=[(0, 0, 90), (1, 0, 10)])})
-    two = record(key="b", regions={"all": region(counts=[(0, 1, 10), (1, 1, 10)])})
-    found = figures([one, two])
-    assert found.class_iou_full == pytest.approx((90 / 110, 10 / 30))
-    assert found.miou_full == pytest.approx((90 / 110 + 10 / 30) / 2)
-
-
-def test_every_class_has_a_place_even_if_nobody_saw_it() -> None:
-    clip = record(regions={"all": region(counts=[(0, 0, 90)])}, grid=[(0, 0, 9)])
-    found = figures([clip], classes=3)
-    assert found.class_iou_full == pytest.approx((1.0, math.nan, math.nan), nan_ok=True)
-    assert len(found.class_iou) == 3
-    assert found.accuracy == 1.0
+    one = record(key="a", regions={"all": region(counts=[(0, 0, 90), (1, 0, 10)])}, gradient=None, step=None)
+    two = record(key="b", regions={"all": region(counts=[(0, 1, 10), (1, 1, 10)])}, gradient=None, step=None)
+    found = evaluation([one, two])
+    assert found.class_iou(full=True) == pytest.approx((90 / 110, 10 / 30))
+    assert found.value("miou_full") == pytest.approx((90 / 110 + 10 / 30) / 2)
+    assert math.isnan(found.value("psnr_db"))
 
 
 def test_what_is_said_to_be_of_no_class_is_wrong_and_makes_no_class() -> None:
     clip = record(regions={"all": region(counts=[(0, 0, 6), (0, 255, 2), (1, 1, 4)])}, grid=[(0, 255, 3), (0, 0, 1)])
-    found = figures([clip], classes=2)
-    assert found.class_iou_full == pytest.approx((6 / 8, 1.0))
-    assert (found.class_iou[0], found.accuracy) == (0.25, 0.25)
+    found = evaluation([clip], classes=3)
+    assert found.class_iou(full=True) == pytest.approx((6 / 8, 1.0, math.nan), nan_ok=True)
+    assert (found.class_iou()[0], found.value("accuracy")) == (0.25, 0.25)
     assert class_counts([clip]).common == (0, 1)
 
 
 def test_the_ten_commonest_classes_are_those_of_all_targets_in_every_region() -> None:
     counts = [(label, label, 100 - label) for label in range(12)]
-    rare = [(11, 0, 50)]
-    clip = record(regions={"all": region(counts=counts), "occluded": region(counts=rare)})
+    clip = record(regions={"all": region(counts=counts), "occluded": region(counts=[(11, 0, 50)])})
     assert class_counts([clip]).common == tuple(range(10))
-    assert figures([clip]).miou_common == pytest.approx(1.0)
-    apart = figures([clip], Selection(region="occluded"))
-    assert apart.miou_full == pytest.approx(0.0)
-    assert apart.miou_common == pytest.approx(0.0)  # class 0, said where 11 is
-
-
-# --- refusals -----------------------------------------------------------------------------------------------------
+    assert figure([clip], "miou_common") == pytest.approx(1.0)
+    assert figure([clip], "miou_common", OCCLUDED) == pytest.approx(0.0)  # class 0, said where 11 is
 
 
 @pytest.mark.parametrize("records", [[], [record("a"), record("b")]])
 def test_figures_of_none_or_of_several_methods_are_refused(records: list[ClipRecord]) -> None:
-    with pytest.raises(DataError, match="records of one method"):
-        summed_up(records)
-
-
-def test_a_single_scene_tells_nothing_of_the_error() -> None:
-    found = summed_up([record(key="a.0"), record(key="a.1")])
-    assert math.isnan(found.error.psnr_db)
-    assert found.without == ()
-    assert math.isnan(lead(found, found, lambda of: of.psnr_db)[1])
+    with pytest.raises(DataError):
+        evaluation(records)

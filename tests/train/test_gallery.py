@@ -2,8 +2,6 @@
 
 import os
 import re
-import subprocess
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,15 +26,13 @@ from gcd_model import (
     Traits,
     Trajectory,
     View,
-    ViewRangeError,
     load_synthesizer,
 )
 from gcd_model.config import SMALL
 from gcd_train.cli.gallery import gallery_command
-from gcd_train.errors import DataError, RecipeError
-from gcd_train.gallery import ViewRecipe, WindowChoice, Windowed, find_videos, read_windows, view_window
-from gcd_train.gallery.real_video import fitted, kept_share
-from gcd_train.gallery.viewed import mounted
+from gcd_train.errors import DataError
+from gcd_train.look.gallery import ViewRecipe, mounted, view_window
+from gcd_train.look.real_video import WindowChoice, Windowed, find_videos, kept_share, read_windows
 
 T, H, W = 4, 32, 64
 REAL = Path(os.environ.get("GCD_REAL_VIDEOS", "no folder of videos"))
@@ -95,12 +91,6 @@ def test_frames_come_at_the_highest_trained_rate(
     assert numbers(window) == expected
 
 
-def test_a_slow_video_keeps_its_own_rate_and_says_so(tmp_path: Path) -> None:
-    (window,) = windows_of(write_video(tmp_path / "a.avi", 5, 3.0), WindowChoice(count=1), "driving")
-    assert (window.fps, window.trained_rate) == (3.0, False)
-    assert numbers(window) == [0, 1, 2, 3]
-
-
 def test_windows_reach_from_the_start_to_the_end_and_do_not_overlap(tmp_path: Path) -> None:
     path = write_video(tmp_path / "a.avi", 20, 10.0)
     choice = WindowChoice(count=3, start_s=0.2)
@@ -113,11 +103,6 @@ def test_windows_reach_from_the_start_to_the_end_and_do_not_overlap(tmp_path: Pa
     assert [number for window in many for number in numbers(window)] == list(range(20))
 
 
-def test_a_start_that_is_no_number_is_refused() -> None:
-    with pytest.raises(RecipeError, match="that are numbers"):
-        WindowChoice(start_s=float("nan"))
-
-
 def test_a_folder_of_pictures_is_a_video_in_the_order_of_names(tmp_path: Path) -> None:
     for number in (11, 9, 10, 8):
         cv2.imwrite(str(tmp_path / f"im_{number}.png"), np.full((H, W, 3), 4 * number, np.uint8))
@@ -127,29 +112,9 @@ def test_a_folder_of_pictures_is_a_video_in_the_order_of_names(tmp_path: Path) -
         windows_of(tmp_path)
 
 
-def test_the_middle_is_kept_in_the_networks_shape() -> None:
-    picture = np.zeros((40, 200, 3), np.uint8)
-    picture[:, 60:140] = 200  # the middle 2:1
-    assert fitted(picture, 64, 32).shape == (32, 64, 3)
-    assert fitted(picture, 64, 32).min() == 200
-    assert fitted(picture[:, 60:140], 32, 16, share=0.5).min() == 200
-
-
 @pytest.mark.parametrize(("hfov", "trained", "share"), [(None, 53.0, 1.0), (60.0, None, 1.0), (50.0, 85.0, 1.0)])
 def test_what_is_not_too_wide_is_kept_whole(hfov: float | None, trained: float | None, share: float) -> None:
     assert kept_share(hfov, trained) == share
-
-
-def test_the_angle_of_what_is_kept_is_told(tmp_path: Path) -> None:
-    path = write_video(tmp_path / "a.avi", 8, 24.0, size=(64, 64))
-    (wide, *_), (narrow, *_) = (windows_of(path, WindowChoice(hfov_deg=hfov)) for hfov in (90.0, 40.0))
-    assert wide.hfov_deg == pytest.approx(53.13, abs=0.01)
-    assert narrow.hfov_deg == pytest.approx(40.0)
-    assert windows_of(path)[0].hfov_deg is None
-
-
-def test_what_is_too_wide_is_cut_to_the_trained_angle() -> None:
-    assert kept_share(90.0, 53.13) == pytest.approx(0.5, abs=1e-4)  # tan 26.565 deg is a half
 
 
 @pytest.mark.parametrize(
@@ -164,41 +129,6 @@ def test_what_is_no_video_is_refused_by_name(tmp_path: Path, content: bytes, sai
     (tmp_path / "broken.mp4").write_bytes(content)
     with pytest.raises(DataError, match=rf"broken.mp4 {said}"):
         windows_of(tmp_path / "broken.mp4")
-
-
-def test_the_decoder_prints_no_lines_of_its_own(tmp_path: Path) -> None:
-    broken = tmp_path / "broken.mp4"
-    broken.write_bytes(b"\0\0\0\x18ftypmp42" + b"\0" * 64)
-    code = f"from gcd_train.gallery import find_videos; find_videos([__import__('pathlib').Path({str(broken)!r})])[0]"
-    done = subprocess.run(
-        [sys.executable, "-c", f"{code}.measured()"],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={name: value for name, value in os.environ.items() if name != "OPENCV_FFMPEG_LOGLEVEL"},
-    )
-    assert "cannot be decoded" in done.stderr
-    assert "moov atom" not in done.stderr + done.stdout
-
-
-def test_a_short_video_is_refused_with_what_it_lacks(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="has 3 frames at 24 a second; 4 at 24 a second from 0 s on want 4"):
-        windows_of(write_video(tmp_path / "a.avi", 3, 24.0))
-
-
-def test_nothing_to_show_is_said(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="holds neither videos nor pictures"):
-        find_videos([tmp_path])
-    with pytest.raises(DataError, match="does not exist"):
-        find_videos([tmp_path / "absent"])
-
-
-def test_videos_of_one_name_get_files_of_their_own(tmp_path: Path) -> None:
-    paths = [tmp_path / place / "drive 1.avi" for place in ("a", "b")]
-    for path in paths:
-        path.parent.mkdir()
-        path.touch()
-    assert [video.name for video in find_videos(paths)] == ["drive_1", "drive_1.2"]
 
 
 # --- views ------------------------------------------------------------------------------------------------------------
@@ -262,11 +192,6 @@ def test_the_live_models_view_knows_how_the_camera_is_mounted() -> None:
     assert mounted(live, ViewRecipe(), None) is None
     assert mounted(live, ViewRecipe(tilt_deg=4.0), 60.0) == CameraMount(tilt_deg=4.0, hfov_deg=60.0)
     assert mounted(traits(), ViewRecipe(height_m=2.0), None) is None
-
-
-def test_a_goal_outside_the_family_is_refused() -> None:
-    with pytest.raises(ViewRangeError, match="azimuth_deg 120 is outside"):
-        view_window(Mirror(traits()), a_window(), ViewRecipe(angles=(SphericalDelta(azimuth_deg=120.0),)))
 
 
 # --- the command ------------------------------------------------------------------------------------------------------

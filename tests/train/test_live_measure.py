@@ -14,6 +14,7 @@ from gcd_model.errors import CheckpointError
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.config import LiveConfig
 from gcd_train.errors import DataError
+from gcd_train.evaluation.metrics import gradient_map
 from gcd_train.live.clips import LiveClip
 from gcd_train.live.judge import Moments, frechet_distance, random_judge
 from gcd_train.live.measure import SetResult, differences, methods_of, open_networks, to_json, to_markdown
@@ -30,7 +31,6 @@ from gcd_train.live.measure_figures import (
     surface_motion,
 )
 from gcd_train.live.measure_methods import BestHomography, Kept
-from gcd_train.metrics.pictures import gradient_map
 
 FRAMES, HEIGHT, WIDTH = 4, 64, 96
 LENS = Intrinsics.from_hfov(70.0, WIDTH, HEIGHT)

@@ -7,10 +7,9 @@ import msgspec
 import pytest
 from made_records import FRAMES, note, record, region
 
-from gcd_train.evaluation.keeping import RunKeeper
-from gcd_train.evaluation.record import ClipRecord, RegionRecord
-from gcd_train.reports import Choices, EvaluatedSet, Run, gather, make_report
-from gcd_train.reports.goals import Goal, on_the_same_goals
+from gcd_train.evaluation.report import Choices, make_report
+from gcd_train.evaluation.runs import EvaluatedSet, Run, gather, on_the_same_goals
+from gcd_train.evaluation.store import ClipRecord, RegionRecord, RunKeeper
 
 Change = tuple[float, float, float]
 AHEAD: Change = (30.0, 5.0, 0.0)
@@ -42,8 +41,8 @@ def run(name: str, *of: list[ClipRecord]) -> Run:
 
 def test_clips_of_the_same_name_that_go_elsewhere_are_not_joined_and_it_is_said_why() -> None:
     found = on_the_same_goals(sets(k0=[clips("a", AHEAD, ASIDE)], k1=[clips("b", ASIDE, AHEAD)]))
-    assert found.sets == ()
-    (told,) = found.notes
+    assert found[0] == ()
+    (told,) = found[1]
     assert told.startswith("k0 and k1: of 2 clips of the same names 2 do not end at the same goal")
     assert "azimuth +30.0, elevation +5.0, radius +0.0 and by azimuth -60.0" in told
 
@@ -51,68 +50,26 @@ def test_clips_of_the_same_name_that_go_elsewhere_are_not_joined_and_it_is_said_
 def test_of_clips_that_end_at_the_same_goal_in_part_only_those_are_joined() -> None:
     nearly = (30.001, 5.0, 0.0)
     found = on_the_same_goals(sets(k0=[clips("a", AHEAD, ASIDE)], k1=[clips("b", nearly, AHEAD)]))
-    (joined,) = found.sets
+    (joined,) = found[0]
     assert {method.name: method.keys for method in joined.methods} == {
         "a": ("scn00000.sample_00", "scn00001.sample_00"),
         "b": ("scn00000.sample_00",),
     }
-    assert "of 2 clips of the same names 1 do not" in found.notes[0]
+    assert "of 2 clips of the same names 1 do not" in found[1][0]
 
 
 @pytest.mark.parametrize("change", [None, AHEAD])
 def test_the_same_path_at_another_moment_is_another_goal(change: Change | None) -> None:
     moved = clips("b", change, change, target=(2.0, 2.0, 2.0, 2.01))
     found = on_the_same_goals(sets(k0=[clips("a", change, change)], k1=[moved]))
-    assert (found.sets, len(found.notes)) == ((), 1)
-    assert "the target's pictures differ" in found.notes[0]
+    assert (found[0], len(found[1])) == ((), 1)
+    assert "the target's pictures differ" in found[1][0]
 
 
 def test_another_way_to_the_same_last_picture_is_joined() -> None:
     direct = clips("b", None, target=(5.0, 5.0, 5.0, 2.0))
-    (joined,) = on_the_same_goals(sets(k0=[clips("a", None)], k1=[direct])).sets
+    (joined,) = on_the_same_goals(sets(k0=[clips("a", None)], k1=[direct]))[0]
     assert [method.name for method in joined.methods] == ["a", "b"]
-
-
-def test_class_maps_alone_tell_whether_the_goal_is_the_same() -> None:
-    seen, same, other = (
-        [record(name, "s.0", regions={"all": region(counts=counts)})]
-        for name, counts in (
-            ("a", [(0, 0, 5), (1, 1, 5)]),
-            ("b", [(0, 1, 5), (1, 0, 5)]),
-            ("c", [(0, 0, 4), (1, 1, 6)]),
-        )
-    )
-    bare = [
-        [
-            msgspec.structs.replace(
-                of[0], regions={"all": msgspec.structs.replace(of[0].regions["all"], gradient_target=None)}
-            )
-        ]
-        for of in (seen, same, other)
-    ]
-    assert Goal.of(bare[0]).apart_from(Goal.of(bare[1])) == ""
-    assert Goal.of(bare[0]).apart_from(Goal.of(bare[2]))
-
-
-def test_where_nobody_knows_the_goal_nothing_is_compared() -> None:
-    bare = msgspec.structs.replace(sharp((2.0,) * FRAMES), gradient_target=None)
-    ours, theirs = ([record(name, "s.0", regions={"all": bare})] for name in ("a", "b"))
-    assert "nobody knows" in Goal.of(ours).apart_from(Goal.of(theirs))
-
-
-def test_methods_stand_in_the_order_of_the_first_run_and_then_as_they_come() -> None:
-    of = {"k0": ("a", "copy_source", "b"), "k1": ("c", "copy_source", "a", "d")}
-    made = sets(**{name: [clips(method, AHEAD) for method in methods] for name, methods in of.items()})
-    (joined,) = on_the_same_goals(made).sets
-    assert [method.name for method in joined.methods] == ["a", "copy_source", "b", "c", "d"]
-    assert joined.method("a").folder == Path("k0")
-
-
-def test_two_methods_of_one_name_in_two_sets_are_told() -> None:
-    ours, theirs = (run(name, clips("a", AHEAD)) for name in ("k0", "k1"))
-    named = msgspec.structs.replace(theirs.note, methods={"a": {"weights": "other"}})
-    found = on_the_same_goals(gather([ours, Run(folder=theirs.folder, note=named, records=theirs.records)]))
-    assert "a is another method in k1 than in k0" in found.notes[0]
 
 
 def test_a_report_of_other_goals_makes_no_claim_and_says_so(tmp_path: Path) -> None:

@@ -2,8 +2,6 @@
 
 import csv
 import json
-import math
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -16,28 +14,13 @@ from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
 from gcd_train.errors import RunError
-from gcd_train.evaluation.keeping import RunKeeper
-from gcd_train.evaluation.record import ClipRecord, RunNote
-from gcd_train.evaluation.tallies import Selection
-from gcd_train.reports import (
-    PAPER_TABLES,
-    Choices,
-    Interval,
-    Measured,
-    Run,
-    all_plots,
-    difference,
-    differences,
-    drawn,
-    gather,
-    main_tables,
-    make_report,
-    row_label,
-    worst_clips,
-)
-from gcd_train.reports.curves import angle_bins
-from gcd_train.reports.intervals import scene_weights
-from gcd_train.reports.table import Cell, Row, Table, to_csv, to_markdown
+from gcd_train.evaluation.comparison import differences, worst_clips
+from gcd_train.evaluation.paper import PAPER_TABLES, row_label
+from gcd_train.evaluation.plots import all_plots
+from gcd_train.evaluation.report import Choices, make_report
+from gcd_train.evaluation.runs import Run, gather
+from gcd_train.evaluation.store import ClipRecord, RunKeeper, RunNote
+from gcd_train.evaluation.tables import Measured, main_tables, to_csv, to_markdown
 
 WEIGHTS = {"weights": "0123456789ab", "steps": "4"}
 SCENES = 6
@@ -72,54 +55,6 @@ def measured(*methods: Sequence[ClipRecord], **told: object) -> Measured:
 # --- intervals ----------------------------------------------------------------------------------------------------
 
 
-def test_every_draw_takes_as_many_scenes_as_there_are_and_the_same_seed_takes_the_same() -> None:
-    weights = scene_weights(7, draws=50, seed=1)
-    assert weights.shape == (50, 7)
-    np.testing.assert_array_equal(weights.sum(axis=1), 7.0)
-    np.testing.assert_array_equal(weights, scene_weights(7, draws=50, seed=1))
-    assert not np.array_equal(weights, scene_weights(7, draws=50, seed=2))
-
-
-def test_an_interval_of_a_mean_is_that_of_a_plain_bootstrap() -> None:
-    found = drawn(records("a"), Selection(), seed=4).interval("psnr_db")
-    scenes = 18.125 + np.arange(SCENES)
-    random = np.random.default_rng(0)
-    plain = scenes[random.integers(0, SCENES, size=(20_000, SCENES))].mean(axis=1)
-    assert found.value == pytest.approx(scenes.mean())
-    assert (found.low, found.high) == pytest.approx(tuple(np.quantile(plain, [0.025, 0.975])), abs=0.1)
-
-
-def test_intervals_of_pooled_classes_lie_around_the_figure_of_all() -> None:
-    clips = [
-        record("a", f"s{scene}", regions={"all": region(counts=[(0, 0, 50), (1, 1, 10 + scene), (1, 0, 9)])})
-        for scene in range(5)
-    ]
-    found = drawn(clips, Selection()).interval("miou_common")
-    assert found.low < found.value < found.high
-    assert found.value == pytest.approx((250 / 295 + 60 / 105) / 2)
-
-
-def test_a_difference_is_paired_so_a_constant_lead_has_a_narrow_interval() -> None:
-    first, other = (drawn(records(name, shift), Selection()) for name, shift in (("a", 0.5), ("b", 0.0)))
-    apart = difference(first, other, "psnr_db")
-    assert (apart.value, apart.low, apart.high) == pytest.approx((0.5, 0.5, 0.5))
-    assert apart.off_zero
-    assert first.interval("psnr_db").high - first.interval("psnr_db").low > 1.0
-
-
-def test_swapping_the_two_turns_a_difference_round() -> None:
-    first, other = (drawn(records(name, shift), Selection(), seed=2) for name, shift in (("a", 0.5), ("b", 0.0)))
-    there, back = difference(first, other, "ssim"), difference(other, first, "ssim")
-    assert (there.value, there.low, there.high) == pytest.approx((-back.value, -back.high, -back.low))
-
-
-def test_one_scene_has_no_bounds_and_no_claim() -> None:
-    found = drawn(records("a")[:2], Selection()).interval("psnr_db")
-    assert found.value == pytest.approx(18.125)
-    assert math.isnan(found.low)
-    assert not found.off_zero
-
-
 # --- tables -------------------------------------------------------------------------------------------------------
 
 
@@ -140,40 +75,6 @@ def test_a_table_of_the_paper_has_its_rows_and_nobody_is_given_a_printed_figure(
     assert len(ablation.rows) == 8 + 3
     direct = next(row for row in lines(to_csv(ablation)) if row["row"] == "GCD (direct, max 90, finetuned)")
     assert (direct["method"], direct["PSNR all"], direct["PSNR all paper"]) == ("not run", "", "17.23")
-
-
-def test_without_weights_for_lpips_its_column_says_so() -> None:
-    main, _ = main_tables(measured(records("a"), records("b", lpips=0.25)))
-    cells = {row.method: str(row.cells[2]) for row in main.rows}
-    assert cells == {"a": "no weights given", "b": "0.250 [0.250, 0.250]"}
-
-
-def test_a_row_says_how_many_of_the_clips_it_has_and_what_it_was_given() -> None:
-    main, _ = main_tables(measured(records("a"), records("oracle", privileged=True)[:5]))
-    assert [(row.method, row.clips) for row in main.rows] == [("a", "12 of 12"), ("oracle *", "5 of 12")]
-    assert re.match(r"Frames 2-\d+ of 12 clips of 6 scenes\.", main.notes[0])
-
-
-def test_figures_of_the_table_are_of_its_frames() -> None:
-    clip = record("a", regions={"all": region((100.0, 10.0, 20.0, 30.0))})
-    main, last = main_tables(measured([clip]))
-    assert [str(table.rows[0].cells[0]) for table in (main, last)] == ["20.00", "30.00"]
-
-
-def test_clips_of_our_own_with_classes_have_columns_for_both() -> None:
-    counted = [
-        record("a", f"s{n}", regions={"all": region((20.0,) * 4, counts=[(0, 0, 9), (1, 0, 1)])}) for n in (1, 2)
-    ]
-    main, _ = main_tables(measured(counted, kind="driving", classes=("sky", "road")))
-    assert main.headings == ("PSNR all", "SSIM all", "LPIPS all", "mIoU all")
-    assert str(main.rows[0].cells[3]) == "0.450 [0.450, 0.450]"
-
-
-def test_pixels_that_nobody_knows_are_unknown_in_a_table_of_the_paper() -> None:
-    _, main = main_tables(measured(records("gradual-90", occluded=None), kind="kubric", protocol="released"))
-    (row,) = [row for row in main.rows if row.method]
-    assert [str(cell) for cell in row.cells[3:]] == ["unknown", "unknown"]
-    assert "Unknown" in main.notes[1]
 
 
 def test_a_released_run_also_has_its_own_figures_over_all_frames(tmp_path: Path) -> None:
@@ -202,14 +103,6 @@ def test_a_released_run_also_has_its_own_figures_over_all_frames(tmp_path: Path)
     assert not (tmp_path / "other" / "tables" / "all_frames.csv").exists()
 
 
-def test_a_table_with_regions_says_that_lpips_has_none() -> None:
-    main, last = main_tables(measured(records("a")))
-    assert any("LPIPS is over all pixels alone" in line for line in main.notes)
-    assert "LPIPS is over all pixels alone" in to_markdown(last)
-    whole = main_tables(measured(records("a", occluded=None)))[0]
-    assert not any("LPIPS" in line for line in whole.notes)
-
-
 @pytest.mark.parametrize(
     ("method", "details", "table", "label"),
     [
@@ -231,21 +124,6 @@ def test_a_method_finds_its_row(method: str, details: Mapping[str, str], table: 
     found = row_label(method, details, PAPER_TABLES[table])
     assert found == label
     assert found is None or any(row.label == found for row in PAPER_TABLES[table].rows)
-
-
-def test_a_user_may_say_where_a_method_stands() -> None:
-    of = measured(records("mine"), kind="kubric", protocol="paper")
-    placed = Measured(of=of.of, rows={"mine": "DynIBaR"})
-    table = main_tables(placed)[1]
-    assert [row.method for row in table.rows if row.label == "DynIBaR"] == ["mine"]
-
-
-def test_what_the_paper_does_not_have_stands_below() -> None:
-    table = main_tables(measured(records("copy_source"), kind="driving", protocol="released"))[0]
-    assert [(row.label, row.method) for row in table.below] == [("not in the paper", "copy_source")]
-    assert not any(row.method for row in table.rows)
-    line = to_markdown(table).splitlines().index(f"| {' | '.join(['———'] * 9)} |")
-    assert "copy_source" in to_markdown(table).splitlines()[line + 1]
 
 
 def test_the_papers_tables_hold_all_it_prints() -> None:
@@ -272,13 +150,6 @@ def test_the_means_that_the_papers_text_tells_follow_from_its_rows_and_are_measu
     assert str(some.rows[-1].cells[0]) == "not run"
 
 
-def test_a_bar_in_a_name_breaks_no_table() -> None:
-    cell = Cell(figure=Interval(value=1.0, low=0.5, high=1.5))
-    table = Table(name="t", title="T", headings=("x",), rows=(Row(label="a|b", cells=(cell,)),))
-    assert "| a\\|b |  |  | 1.00 [0.50, 1.50] |" in to_markdown(table)
-    assert lines(to_csv(table))[0]["x low"] == "0.5"
-
-
 # --- differences --------------------------------------------------------------------------------------------------
 
 
@@ -296,23 +167,11 @@ def test_a_claim_is_made_only_where_zero_lies_outside() -> None:
     assert back["a", "PSNR all"].verdict == "worse"
 
 
-def test_less_lpips_is_better() -> None:
-    of = measured(records("a", lpips=0.2), records("b", lpips=0.3))
-    (found,) = [each for each in differences(of, of.of.method("a")) if each.column.figure == "lpips"]
-    assert (found.apart.value, found.verdict) == (pytest.approx(-0.1), "better")
-
-
 def test_methods_are_compared_on_the_clips_that_both_have() -> None:
     of = measured(records("a"), records("b", 1.0)[3:])
     found = differences(of, of.of.method("a"))
     assert {each.clips for each in found} == {9}
     assert found[0].apart.value == pytest.approx(-1.0)
-
-
-def test_a_method_that_was_not_run_is_no_lead() -> None:
-    of = measured(records("a"))
-    with pytest.raises(RunError, match="no method is called 'c'"):
-        of.of.method("c")
 
 
 # --- runs ---------------------------------------------------------------------------------------------------------
@@ -325,13 +184,6 @@ def test_runs_on_the_same_clips_make_one_set_and_others_their_own() -> None:
     sets = gather([one, other, two])
     assert [[method.name for method in each.methods] for each in sets] == [["a", "b"], ["a"]]
     assert sets[0].method("a").folder == Path("one")
-
-
-def test_two_methods_of_one_name_are_refused() -> None:
-    one = run(note(methods={"a": WEIGHTS}), records("a"), folder="one")
-    two = run(note(methods={"a": {"weights": "other"}}), records("a"), folder="two")
-    with pytest.raises(RunError, match="a is another method in one than in two"):
-        gather([one, two])
 
 
 def test_a_method_measured_with_lpips_in_one_run_and_frames_that_were_moved_stay_one_method() -> None:
@@ -349,13 +201,6 @@ def test_a_method_measured_with_lpips_in_one_run_and_frames_that_were_moved_stay
     vgg, alex = (run(note(methods={"a": {"lpips": name}}), records("a"), folder=name) for name in ("vgg", "alex"))
     with pytest.raises(RunError, match="measure it alike in both"):
         gather([vgg, alex])
-
-
-def test_a_clip_is_as_fast_as_its_record_says_else_as_its_run() -> None:
-    (told,) = gather(
-        [run(note(methods={"a": WEIGHTS}), (msgspec.structs.replace(record("a", "x"), fps=6.0), record("a", "y")))]
-    )
-    assert (told.fps("x"), told.fps("y")) == (6.0, 10.0)
 
 
 def test_the_same_clips_measured_in_another_way_are_refused() -> None:
@@ -389,29 +234,6 @@ def test_error_against_angle_is_of_the_last_frame_and_either_way_round() -> None
     assert [point.x for point in curve.points] == [0.0, 15.0, 30.0, 45.0, 60.0, 75.0]
     assert [point.y.value for point in curve.points] == pytest.approx([18.125 + scene for scene in range(SCENES)])
     assert {point.clips for point in curve.points} == {2}
-
-
-def test_many_angles_are_put_together_in_steps_of_15_degrees() -> None:
-    assert angle_bins([0.0, 15.04, 180.0]) == [0.0, 15.0, 180.0]
-    assert angle_bins([float(angle) for angle in range(20)])[14:17] == [7.5, 22.5, 22.5]
-    assert angle_bins([180.0, *map(float, range(20))])[0] == 172.5
-
-
-def test_similarity_is_shown_over_the_views_that_hexplane_is_given() -> None:
-    of = measured(records("hexplane_8"), records("hexplane_1"), records("a"))
-    plot = next(plot for plot in all_plots(of) if plot.name == "ssim_by_views")
-    assert [(curve.name, [point.x for point in curve.points]) for curve in plot.curves] == [
-        ("HexPlane, all", [1.0, 8.0]),
-        ("HexPlane, occluded", [1.0, 8.0]),
-    ]
-    assert [level.name for level in plot.levels] == ["a, all"]
-
-
-def test_one_path_for_all_has_no_angles_and_its_frames_begin_with_the_second() -> None:
-    fixed = [record("a", f"s{number}") for number in range(3)]
-    (plot,) = all_plots(measured(fixed))
-    assert plot.name == "by_frame"
-    assert [point.x for point in plot.curves[0].points] == [2, 3, 4]
 
 
 def test_the_worst_clips_are_named_with_who_does_best_there() -> None:
@@ -480,14 +302,6 @@ def test_a_gallery_has_source_methods_and_target_and_plays(tmp_path: Path) -> No
     video = cv2.VideoCapture(str(next((out / "gallery").glob("*.mp4"))))
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == FRAMES + 7  # the last is held
     assert video.get(cv2.CAP_PROP_FRAME_WIDTH) == 4 * (47 + 4)
-
-
-def test_a_run_without_kept_frames_has_a_report_without_a_gallery(tmp_path: Path) -> None:
-    path = make_report([kept(tmp_path / "run", views=False)], tmp_path / "out", Choices(drawn=False))
-    assert "evaluate with `--views all`" in path.read_text()
-    assert not (tmp_path / "out" / "gallery").exists()
-    assert not (tmp_path / "out" / "plots" / "by_frame.png").exists()
-    assert (tmp_path / "out" / "plots" / "by_frame.csv").is_file()
 
 
 @pytest.mark.parametrize(

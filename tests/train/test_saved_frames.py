@@ -1,6 +1,5 @@
 """Frames that other methods saved: found in every layout, checked, and scored as they are."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,9 +9,10 @@ import torch
 from driving_plane import PlaneClips
 
 from gcd_model.geometry import CameraMount
-from gcd_train.baselines import CameraPair, SavedFrames, SourceClip, find_draws, to_pictures
 from gcd_train.datasets.skips import FileFault
 from gcd_train.errors import DataError
+from gcd_train.evaluation.predictors import CameraPair, SourceClip, to_pictures
+from gcd_train.evaluation.saved_frames import SavedFrames
 
 FRAMES, HEIGHT, WIDTH = 3, 32, 48
 KEY = "scn02900.sample_02"
@@ -80,14 +80,6 @@ def test_videos_are_read_too(tmp_path: Path, place: str) -> None:
     assert (draw - to_pictures(CLIP.target)).abs().mean() < 0.05
 
 
-def test_pictures_win_over_a_video_of_the_same_name(tmp_path: Path) -> None:
-    for place in (f"{KEY}/sample_0", "extra/t_000_n0_c02_scn02900_fs0_pred_s0"):
-        save(tmp_path / place)
-        save_video(tmp_path / f"{place}.mp4", CLIP.target // 2)
-    assert_target(predicted(tmp_path))
-    assert_target(predicted(tmp_path / "extra"))
-
-
 @pytest.mark.parametrize("inside", ["extra", ""])
 def test_outputs_of_the_papers_script_are_found_by_scene_and_trajectory(tmp_path: Path, inside: str) -> None:
     wrong = CLIP.target // 2
@@ -99,30 +91,11 @@ def test_outputs_of_the_papers_script_are_found_by_scene_and_trajectory(tmp_path
     assert_target(predicted(tmp_path), count=2)
 
 
-def test_an_output_without_a_number_is_the_first_trajectorys(tmp_path: Path) -> None:
-    save(tmp_path / "extra" / "kg90_000_n0_scn02900_fs2_fr12_az30_el5_rd0_pred_s0")
-    assert len(find_draws(tmp_path, "scn02900.sample_00")) == len(find_draws(tmp_path, "scn02900")) == 1
-    with pytest.raises(DataError, match="holds no frames"):
-        find_draws(tmp_path, KEY)
-
-
-def test_outputs_of_several_models_are_not_mixed(tmp_path: Path) -> None:
-    for model in (0, 1):
-        save(tmp_path / "extra" / f"kg90_000_n{model}_c02_scn02900_fs2_pred_s0")
-    with pytest.raises(DataError, match=f"clip {KEY} several times: kg90_000_n0.*kg90_000_n1"):
-        find_draws(tmp_path, KEY)
-
-
 def test_a_clip_that_is_not_there_is_named_with_what_was_looked_for(tmp_path: Path) -> None:
     save(tmp_path / "another")
     (tmp_path / KEY).mkdir()
     with pytest.raises(DataError, match=f"holds no frames for clip {KEY}: wanted {KEY}/0000.png"):
         predicted(tmp_path)
-
-
-def test_a_name_that_is_a_path_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"must be a file name, got '\.\./x'"):
-        find_draws(tmp_path, "../x")
 
 
 def test_another_length_or_size_is_refused_not_resized(tmp_path: Path) -> None:
@@ -132,13 +105,6 @@ def test_another_length_or_size_is_refused_not_resized(tmp_path: Path) -> None:
     save(tmp_path / "small" / KEY, CLIP.target[:, ::2])
     with pytest.raises(DataError, match="frame 0 is 48 x 16, the target 48 x 32"):
         predicted(tmp_path / "small")
-
-
-def test_a_missing_frame_is_noticed(tmp_path: Path) -> None:
-    save(tmp_path / KEY)
-    (tmp_path / KEY / "0001.png").unlink()
-    with pytest.raises(DataError, match=r"holds frames \[0, 2\]"):
-        predicted(tmp_path)
 
 
 def test_a_damaged_picture_or_video_is_named(tmp_path: Path) -> None:
@@ -160,13 +126,3 @@ def test_painted_frames_become_class_maps_by_the_nearest_colour(tmp_path: Path) 
     assert made.video is None
     assert made.classes is not None
     assert np.array_equal(made.classes.numpy(), CLIP.target_classes)
-
-
-def test_a_folder_that_is_none_is_refused_at_once(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="which is no folder; give NAME=FOLDER"):
-        SavedFrames.open("other", tmp_path / "nowhere")
-
-
-def test_a_saved_method_may_be_privileged(tmp_path: Path) -> None:
-    assert not SavedFrames.open("other", tmp_path).privileged
-    assert replace(SavedFrames.open("4d_gs", tmp_path), privileged=True).privileged

@@ -13,21 +13,22 @@ from tiny_scenes4d import draw, kubric_poses, write_driving, write_kubric
 from typer.testing import CliRunner
 
 from gcd_model.geometry import Spherical
-from gcd_train.baselines import CopySource
 from gcd_train.cli.main import app
 from gcd_train.datasets.clip_frames import FrameSampling
 from gcd_train.datasets.trajectories import OrbitSampling
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.evaluation import EvaluationSet, read_run
-from gcd_train.evaluation.asked import Asked, Rivals, SceneWishes
-from gcd_train.evaluation.choosing import Choice, public_split, public_split_names
-from gcd_train.evaluation.opening import SceneCuts, data_kind, fingerprint, open_scenes, usual_samples
-from gcd_train.evaluation.plan import planned
-from gcd_train.evaluation.protocols import PAPER_SOURCE, RELEASED_SOURCE, DrawnControls, FrameBounds, ReleasedControl
-from gcd_train.evaluation.run import predicted_and_measured
-from gcd_train.evaluation.scene_set import far_apart
+from gcd_train.evaluation.clips import EvaluationSet
+from gcd_train.evaluation.opening import Choice, SceneCuts, open_scenes, public_split, public_split_names
+from gcd_train.evaluation.protocol import (
+    PAPER_SOURCE,
+    RELEASED_SOURCE,
+    DrawnControls,
+    FrameBounds,
+    ListedControls,
+    released_controls,
+)
+from gcd_train.evaluation.store import read_run
 from gcd_train.layouts.manifest import MANIFEST, SceneManifest
-from gcd_train.pointcloud import visibility
 
 SCENES = ("scn02900", "scene_000005")
 VIEWS = tuple(f"view{number}" for number in range(4))
@@ -54,7 +55,7 @@ def driving(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def opened(root: Path, cuts: SceneCuts, **choice: object) -> EvaluationSet:
-    return open_scenes(root, Choice(**choice), cuts).clips  # pyright: ignore[reportArgumentType]
+    return open_scenes(root, Choice(**choice), cuts)[0]  # pyright: ignore[reportArgumentType]
 
 
 # --- which clips ---------------------------------------------------------------------------------------------------
@@ -82,14 +83,10 @@ def test_a_scene_has_the_same_clips_whatever_others_there_are_and_another_seed_h
     assert first[0].goal != replace(DRAWN, seed=4).control("scn02900", "sample_00", 60).goal
 
 
-def test_frames_of_the_command_line_leave_the_goals_as_they_are() -> None:
-    told = replace(DRAWN, bounds=FrameBounds(start=5, skip=3)).control("scn02900", "sample_01", 60)
-    assert (told.frame_start, told.frame_skip) == (5, 3)
-    assert told.goal == DRAWN.control("scn02900", "sample_01", 60).goal
-
-
 def test_the_released_script_makes_one_clip_of_its_own_angles() -> None:
-    control = ReleasedControl(orbit=True, bounds=FrameBounds(skip=4)).control("scn02900", "sample_00", 60)
+    control = ListedControls(
+        controls=released_controls(["scn02900"], orbit=True), clips=1, bounds=FrameBounds(skip=4)
+    ).control("scn02900", "sample_00", 60)
     assert control.start == RELEASED_SOURCE
     assert control.goal == Spherical(azimuth_deg=50.0, elevation_deg=25.0, radius_m=15.0)
     assert (control.frame_start, control.frame_skip) == (0, 4)
@@ -105,10 +102,10 @@ def controls(folder: Path, scenes: list[str], samples: int = 3) -> Path:
 
 def test_a_control_list_says_which_clips_there_are_and_who_is_missing_is_told(kubric: Path, tmp_path: Path) -> None:
     listed = controls(tmp_path, ["test/scn02901", "scn02999"])
-    found = open_scenes(kubric, Choice(), replace(KUBRIC, controls=listed, clips=2, bounds=FrameBounds()))
-    assert found.clips.keys == ("scn02901.sample_00", "scn02901.sample_01")
-    assert "scn02900" in "".join(found.notes)
-    clip = found.clips.clip("scn02901.sample_01")
+    clips, notes = open_scenes(kubric, Choice(), replace(KUBRIC, controls=listed, clips=2, bounds=FrameBounds()))
+    assert clips.keys == ("scn02901.sample_00", "scn02901.sample_01")
+    assert "scn02900" in "".join(notes)
+    clip = clips.clip("scn02901.sample_01")
     assert clip.change == pytest.approx((30.0, 5.0, -1.0))
     assert clip.seen.fps == 24.0
 
@@ -131,11 +128,9 @@ def test_a_camera_below_the_ground_is_told(kubric: Path, tmp_path: Path) -> None
     path = controls(tmp_path, ["scn02900", "scn02901"], samples=1)
     path.write_text(path.read_text().replace("[50, 40, 14]", "[50, -40, 14]", 1))
     cuts = replace(KUBRIC, bounds=FrameBounds(), controls=path)
-    (told,) = open_scenes(kubric, Choice(), cuts).notes
+    (told,) = open_scenes(kubric, Choice(), cuts)[1]
     assert told.endswith("1 of 2 clips have a camera below the ground, first scn02900, sample_00; see its angles")
-    assert (
-        open_scenes(kubric, Choice(), replace(cuts, controls=controls(tmp_path, ["scn02901", "scn02900"]))).notes == ()
-    )
+    assert open_scenes(kubric, Choice(), replace(cuts, controls=controls(tmp_path, ["scn02901", "scn02900"])))[1] == ()
 
 
 def test_cameras_that_no_scene_has_are_refused_at_once(kubric: Path, driving: Path) -> None:
@@ -148,16 +143,6 @@ def test_cameras_that_no_scene_has_are_refused_at_once(kubric: Path, driving: Pa
             opened(root, replace(cuts, cameras=names or ("yaw-0", "nope")))
 
 
-def test_more_views_than_there_are_cameras_are_refused_at_once(kubric: Path) -> None:
-    def asked(names: str) -> Asked:
-        cut = SceneWishes(cameras=VIEWS, bounds=FrameBounds(start=0, skip=1))
-        return Asked(data=[kubric], cut=cut, rivals=Rivals(names=[names]))
-
-    assert len(planned(asked("hexplane_4")).methods) == 1
-    with pytest.raises(RecipeError, match="hexplane_9 wants 9 cameras, and these clips have 3 beside the source; give"):
-        planned(asked("copy_source,hexplane_9"))
-
-
 def test_rates_follow_the_strides(kubric: Path, tmp_path: Path) -> None:
     drawn = opened(kubric, replace(KUBRIC, bounds=FrameBounds(), protocol="paper"))
     assert (drawn.fps, tuple(drawn.rates)) == (24.0, (24.0, 12.0, 8.0, 6.0))
@@ -166,38 +151,6 @@ def test_rates_follow_the_strides(kubric: Path, tmp_path: Path) -> None:
     listed = opened(kubric, replace(KUBRIC, bounds=FrameBounds(), controls=controls(tmp_path, ["scn02900"])))
     assert tuple(listed.rates) == (24.0,)
     assert tuple(opened(kubric, replace(KUBRIC, bounds=FrameBounds(skip=3))).rates) == (8.0,)
-
-
-def test_a_record_tells_its_clips_own_rate(kubric: Path) -> None:
-    clips = opened(kubric, replace(KUBRIC, frames=2, protocol="released", bounds=FrameBounds(skip=3)))
-    clip = clips.clip("scn02900.sample_00")
-    _, record = predicted_and_measured(CopySource(), clip, classes=())
-    assert (record.fps, clips.fps) == (8.0, 8.0)
-
-
-def test_a_source_that_is_a_camera_of_the_scene_has_its_own_depth(kubric: Path, tmp_path: Path) -> None:
-    cuts = replace(KUBRIC, controls=controls(tmp_path, ["scn02900"]), clips=1, bounds=FrameBounds())
-    seen = opened(kubric, cuts).clip("scn02900.sample_00").seen
-    true = draw(seen.cameras.ground_from_source.numpy(), seen.cameras.source)
-    near = true.depth < 40
-    assert np.abs(seen.source_depth[0] - true.depth)[near].max() < 1e-3
-    assert seen.points is not None
-    assert [view.depth.shape for view in seen.points()] == [(32, 48)] * 3
-
-
-def test_its_own_points_tell_what_that_camera_saw(kubric: Path, tmp_path: Path) -> None:
-    cuts = replace(KUBRIC, controls=controls(tmp_path, ["scn02900"]), clips=1, bounds=FrameBounds())
-    clip = opened(kubric, cuts).clip("scn02900.sample_00")
-    assert clip.seen.points is not None
-    assert clip.visible is not None
-    poses = (clip.seen.cameras.ground_from_source @ clip.seen.cameras.source_from_target).numpy()
-    for view, pose, visible in zip(clip.seen.points(), poses, clip.visible, strict=True):
-        assert (visibility(view, pose, view.lens, width=48, height=32) == visible).mean() > 0.999
-
-
-def test_scenes_are_drawn_as_often_as_the_protocol_says_and_pairs_once(kubric: Path, tmp_path: Path) -> None:
-    assert [usual_samples([kubric], protocol) for protocol in ("paper", "released")] == [4, 2]
-    assert usual_samples([tmp_path], "paper") == 1
 
 
 def test_bounds_win_over_controls_in_the_released_protocol_only(kubric: Path, tmp_path: Path) -> None:
@@ -211,10 +164,10 @@ def test_bounds_win_over_controls_in_the_released_protocol_only(kubric: Path, tm
 def test_lists_and_splits_choose_scenes(kubric: Path, tmp_path: Path) -> None:
     listed = tmp_path / "test2.txt"
     listed.write_text("# two\ndata/test/scn02901\nkubric/scn02900  # invalid\nscn02950\n")
-    found = open_scenes(kubric, Choice(listed=listed), KUBRIC)
-    assert {key.partition(".")[0] for key in found.clips.keys} == {"scn02901"}
-    assert any("invalid" in line for line in found.notes)
-    assert any("scn02950" in line for line in found.notes)
+    clips, notes = open_scenes(kubric, Choice(listed=listed), KUBRIC)
+    assert {key.partition(".")[0] for key in clips.keys} == {"scn02901"}
+    assert any("invalid" in line for line in notes)
+    assert any("scn02950" in line for line in notes)
     assert len(opened(kubric, KUBRIC, split="kubric4d-test20").keys) == 8
     assert len(opened(kubric, KUBRIC, limit=1).keys) == 4
     with pytest.raises(DataError, match="no scene of the list or split"):
@@ -256,23 +209,6 @@ def test_a_scene_of_ours_is_of_the_world_that_its_manifest_says(tmp_path: Path) 
             opened(tmp_path, KUBRIC, split=split)
 
 
-def test_a_split_file_of_parallel_domain_names_its_part(driving: Path, tmp_path: Path) -> None:
-    file = tmp_path / "split.json"
-    file.write_text(json.dumps({"train": ["a/scene_000005"], "val": [], "test": ["scene_000006"]}))
-    assert len(opened(driving, DRIVING, split=f"{file}:train").keys) == 4
-    with pytest.raises(DataError, match="no scene of the list or split"):
-        opened(driving, DRIVING, split=str(file))
-
-
-def test_the_identity_follows_scenes_and_cuts(kubric: Path) -> None:
-    first = opened(kubric, KUBRIC).identity
-    assert first == opened(kubric, KUBRIC).identity
-    others = [replace(KUBRIC, seed=1), replace(KUBRIC, gradual=False), replace(KUBRIC, far=True)]
-    assert (
-        len({first, opened(kubric, KUBRIC, limit=1).identity, *(opened(kubric, each).identity for each in others)}) == 5
-    )
-
-
 def test_the_identity_follows_the_files_and_neither_their_place_nor_their_times(kubric: Path, tmp_path: Path) -> None:
     first, copy = opened(kubric, KUBRIC).identity, tmp_path / "copy"
     shutil.copytree(kubric, copy)  # with times of its own
@@ -286,20 +222,6 @@ def test_the_identity_follows_the_files_and_neither_their_place_nor_their_times(
     told = next(copy.glob("scn02900/*.json"))
     told.write_bytes(told.read_bytes().replace(b"0", b"1", 1))  # of the same size
     assert opened(copy, KUBRIC).identity != first
-
-
-def test_what_begins_with_a_dot_is_no_part_of_a_scene_and_a_missing_one_is_named(tmp_path: Path) -> None:
-    (tmp_path / "a.json").write_text("{}")
-    bare = fingerprint(tmp_path)
-    (tmp_path / ".DS_Store").write_text("where icons lie")
-    (tmp_path / ".cache").mkdir()
-    (tmp_path / ".cache" / "thumb.png").write_text("small")
-    assert fingerprint(tmp_path) == bare
-    (tmp_path / "b").mkdir()
-    (tmp_path / "a.json").rename(tmp_path / "b" / "a.json")
-    assert fingerprint(tmp_path) != bare
-    with pytest.raises(DataError, match="nowhere cannot be read"):
-        fingerprint(tmp_path / "nowhere")
 
 
 def test_public_splits_of_a_world_share_no_scene() -> None:
@@ -352,11 +274,6 @@ def test_further_cameras_are_given_at_the_clips_size_and_times(kubric: Path) -> 
         clip.seen.others(4)
 
 
-def test_cameras_are_taken_far_from_each_other() -> None:
-    places = np.array([[0.0, 0, 0], [1, 0, 0], [10, 0, 0], [6, 0, 0]])
-    assert far_apart(places) == [0, 2, 3, 1]
-
-
 def test_a_driving_clip_has_the_forward_cameras_own_depth_and_classes(driving: Path) -> None:
     clips = opened(driving, replace(DRIVING, semantic=True))
     clip = clips.clip("scene_000005.sample_00")
@@ -376,38 +293,6 @@ def test_a_driving_clip_has_the_forward_cameras_own_depth_and_classes(driving: P
     assert clip.visible[0].mean() > 0.95
     assert clip.seen.points is not None
     assert [view.rgb.shape for view in clip.seen.points()] == [(36, 48, 3)] * 3
-
-
-def test_colours_alone_have_no_classes_and_kubric_never_has(driving: Path, kubric: Path) -> None:
-    assert opened(driving, DRIVING).classes == ()
-    with pytest.raises(RecipeError, match="Kubric-4D has no classes"):
-        opened(kubric, replace(KUBRIC, semantic=True))
-
-
-def test_a_direct_path_is_at_its_goal_from_the_first_frame_on(driving: Path) -> None:
-    for gradual, arrives in ((True, 2), (False, 0)):
-        clip = opened(driving, replace(DRIVING, gradual=gradual)).clip("scene_000005.sample_00")
-        assert clip.seen.cameras.trajectory.at_goal.index(True) == arrives
-
-
-def test_a_missing_file_is_named_with_its_clip(kubric: Path, tmp_path: Path) -> None:
-    write_kubric(tmp_path, 7, frames=3)
-    clips = opened(tmp_path, replace(KUBRIC, frames=2))
-    (tmp_path / "scn00007" / "frames_p0_v2" / "rgba_00001.png").unlink()
-    with pytest.raises(DataError, match="rgba_00001"):
-        clips.clip("scn00007.sample_00")
-
-
-def test_what_a_folder_holds_is_seen_by_its_names(kubric: Path, driving: Path, tmp_path: Path) -> None:
-    assert (data_kind([kubric]), data_kind([driving]), data_kind([tmp_path])) == (
-        "kubric4d",
-        "parallel_domain4d",
-        "pairs",
-    )
-    with pytest.raises(DataError, match="one folder"):
-        data_kind([kubric, driving])
-    with pytest.raises(DataError, match="cannot be read"):
-        data_kind([tmp_path / "nowhere"])
 
 
 @pytest.mark.slow

@@ -1,10 +1,8 @@
 """`gcd-train show`: what is on the sheet is what is in the files, and a broken file is named."""
 
 import json
-import sys
 import zipfile
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -19,11 +17,10 @@ from typer.testing import CliRunner
 from gcd_train.cli.main import app
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.layouts.scene_writer import SceneFormat, write_scene
+from gcd_train.look.clip import SKY_M, UNSEEN, Footage
+from gcd_train.look.open_scene import open_scene
+from gcd_train.look.scene_clip import ShowOptions
 from gcd_train.scenes.pair_world import DEPTH_UNIT_M, World
-from gcd_train.show.clips import ShowOptions
-from gcd_train.show.colours import SKY_M, UNKNOWN, depth_colours, depth_ticks, instance_colour
-from gcd_train.show.footage import UNSEEN, Footage
-from gcd_train.show.open_scene import open_scene
 
 FRAMES = 4
 
@@ -90,35 +87,6 @@ def test_every_layout_gives_a_clip_whose_path_begins_at_the_source(layout: str, 
     assert np.abs(footage.splat[0].astype(int) - footage.source[0])[footage.depth[0] < SKY_M].mean() < 12
 
 
-@pytest.mark.parametrize("layout", ["orbit", "drive", "pairs"])
-def test_pixel_shares_of_the_labels_make_a_whole(layout: str, request: pytest.FixtureRequest) -> None:
-    footage = opened(request.getfixturevalue(layout))
-    shares = [share for _, share in footage.shares()]
-    assert sum(shares) == pytest.approx(1.0)
-    assert shares == sorted(shares, reverse=True)
-
-
-def test_nearer_is_nearer_to_red_and_sky_has_no_depth() -> None:
-    metres = np.geomspace(2, 50, 40).astype(np.float32)
-    colours = depth_colours(metres, 2, 50).astype(int)
-    assert len({tuple(colour) for colour in colours.tolist()}) == 40
-    assert colours[0, 0] > colours[0, 2]
-    assert colours[-1, 0] < colours[-1, 2]
-    assert depth_colours(np.array([0.0, 2 * SKY_M], np.float32), 2, 50).tolist() == [list(UNKNOWN)] * 2
-
-
-@pytest.mark.parametrize(("near", "far"), [(0.3, 1.2), (2.5, 93.0), (1.0, 240.0), (13.0, 17.0)])
-def test_the_depth_bar_has_a_few_round_metres_within_its_range(near: float, far: float) -> None:
-    ticks = depth_ticks(near, far)
-    assert 1 <= len(ticks) <= 8
-    assert all(near <= tick <= far for tick in ticks)
-
-
-def test_instances_that_follow_each_other_differ_in_colour() -> None:
-    colours = [np.array(instance_colour(number)) for number in range(25)]
-    assert all(np.abs(a - b).sum() > 60 for a, b in pairwise(colours))
-
-
 def test_only_surfaces_that_were_not_seen_turn_orange(pairs: Path) -> None:
     footage = opened(pairs)
     visible, surface = footage.visible.copy(), footage.surface.copy()
@@ -141,12 +109,6 @@ def test_frames_are_those_asked_for(tmp_path: Path) -> None:
         opened(scene, start=3)
     with pytest.raises(RecipeError, match=r"with stride 2 .* got 0"):
         opened(scene, start=0, stride=2)
-
-
-def test_the_path_follows_from_the_seed(orbit: Path) -> None:
-    one, again, other = (opened(orbit, seed=seed).world_from_target for seed in (4, 4, 5))
-    assert np.array_equal(one, again)
-    assert not np.allclose(one, other)
 
 
 def test_a_scene_that_is_too_short_is_shown_whole(drive: Path) -> None:
@@ -197,13 +159,6 @@ def test_pair_shards_name_an_unknown_clip_and_a_damaged_shard(pairs: Path, tmp_p
     shard.write_bytes(shard.read_bytes()[:-40])
     code, told = shown(tmp_path)
     assert (code, shard.name in told) == (DataError.exit_code, True)
-
-
-def test_without_matplotlib_the_extra_is_named(orbit: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    code, told = shown(orbit)
-    assert code != 0
-    assert "gcd-node[train]" in told
 
 
 # the whole command

@@ -16,11 +16,9 @@ from typer.testing import CliRunner
 from gcd_model import View, load_synthesizer
 from gcd_model.geometry import CameraMount, driving_trajectory
 from gcd_model.weights.load import inspect_weights
-from gcd_train.baselines import CameraPair, Prediction, SourceClip
 from gcd_train.cli.calibrate import calibrate_command
 from gcd_train.errors import DataError
 from gcd_train.evaluation.calibration import (
-    LEVELS,
     Distances,
     best_scale,
     calibrate,
@@ -30,6 +28,7 @@ from gcd_train.evaluation.calibration import (
     miscoverage,
 )
 from gcd_train.evaluation.clips import HeldOutClip
+from gcd_train.evaluation.predictors import CameraPair, Prediction, SourceClip
 
 T, H, W = 4, 48, 64
 
@@ -69,25 +68,6 @@ def test_the_scale_is_the_truths_own_spread(share: float) -> None:
     assert miscoverage(counts, share) < 0.01
 
 
-def test_an_honest_deviation_holds_what_it_says_at_every_level() -> None:
-    counts = spread_by(1.0).counts["all"]
-    assert [coverage(counts, level) for level in LEVELS] == pytest.approx(LEVELS, abs=0.015)
-
-
-def test_an_interval_holds_more_the_wider_it_is() -> None:
-    counts = spread_by(1.0).counts["all"]
-    held = [coverage(counts, 0.5, scale) for scale in (0.0001, 0.1, 0.5, 1.0, 2.0, 1000.0)]
-    assert held == sorted(held)
-    assert held[0] < 0.001
-    assert held[-1] == 1.0
-
-
-def test_a_half_as_wide_interval_holds_what_tables_of_the_normal_say() -> None:
-    counts = spread_by(2.0).counts["all"]
-    assert coverage(counts, 0.9) == pytest.approx(0.589, abs=0.015)  # P(|N| < 1.645 / 2)
-    assert coverage(counts, 0.5) == pytest.approx(0.264, abs=0.015)  # P(|N| < 0.674 / 2)
-
-
 def test_the_deviation_is_that_of_a_view() -> None:
     samples = torch.rand(3, T, 3, H, W, generator=torch.Generator().manual_seed(1))
     path = driving_trajectory(frames=T, move_time=T - 1)
@@ -109,14 +89,6 @@ def test_the_first_frame_does_not_count() -> None:
     assert both[0].sum() == (T - 1) * 3 * H * W
 
 
-def test_visible_and_occluded_pixels_are_counted_apart() -> None:
-    visible = np.zeros((T, H, W), np.bool_)
-    visible[:, :, : W // 4] = True
-    counts = spread_by(1.0, visible=visible).counts
-    assert counts["visible"].sum() * 3 == counts["occluded"].sum()
-    assert np.array_equal(counts["visible"] + counts["occluded"], counts["all"])
-
-
 def test_flat_pixels_are_held_as_often_as_their_rounding_has_it() -> None:
     """Draws that miss a rounded truth by a tenth of a grey level are neither always right nor always wrong."""
     level = 0.1 / 255
@@ -129,13 +101,10 @@ def test_samples_that_do_not_differ_have_no_scale() -> None:
     same = torch.full((T, 3, H, W), 0.3)
     counts = distances(held_out(same + 0.1), drawn(same, same)).counts["all"]
     assert coverage(counts, 0.95, 1e6) == 0.0
-    with pytest.raises(DataError, match="the samples are all the same"):
+    with pytest.raises(DataError):
         best_scale(counts)
-
-
-def test_one_draw_gives_no_interval() -> None:
-    with pytest.raises(DataError, match="2 or more draws of a picture, got 1"):
-        distances(held_out(torch.zeros(T, 3, H, W)), drawn(torch.zeros(T, 3, H, W)))
+    with pytest.raises(DataError):
+        calibrate([spread_by(1.0), spread_by(1.0, seed=1)])  # of one scene
 
 
 def test_the_scale_of_one_half_is_reported_on_the_other() -> None:
@@ -146,11 +115,6 @@ def test_the_scale_of_one_half_is_reported_on_the_other() -> None:
     assert found.regions["all"].miscoverage < 0.01  # these need no scale
     assert found.regions["all"].miscoverage_scaled > 0.2
     assert list(found.regions) == ["all"]
-
-
-def test_one_scene_is_not_enough() -> None:
-    with pytest.raises(DataError, match="2 wanted, got 1"):
-        calibrate([spread_by(1.0), spread_by(1.0, seed=1)])
 
 
 # --- the command ------------------------------------------------------------------------------------------------------

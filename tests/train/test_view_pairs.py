@@ -27,11 +27,9 @@ from torch.utils.data import DataLoader
 
 from gcd_model.geometry import SphericalDelta, relative_pose, to_pose
 from gcd_train.datasets.clip_frames import FrameSampling
-from gcd_train.datasets.clip_source import ClipSource
 from gcd_train.datasets.controls import Control
 from gcd_train.datasets.kubric4d import Kubric4D
 from gcd_train.datasets.ontology import VOID
-from gcd_train.datasets.pair_clips import DrivingClips
 from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
 from gcd_train.datasets.pictures_of_draws import trained_lens, trained_picture
 from gcd_train.datasets.trajectories import DRIVING, MAX90, generator
@@ -319,26 +317,3 @@ def test_a_set_reduced_to_a_list_keeps_its_options(driving_root: Path) -> None:
     assert dataset.views("scene_000009", 0)[0].instances is not None
     with pytest.raises(DataError, match="no scene of the list or split"):
         dataset.only([])
-
-
-def test_the_trainer_reads_a_driving_set_as_clips(driving_root: Path) -> None:
-    dataset = ParallelDomain4D.open(driving_root, cameras=CAMERAS)
-    clips: ClipSource = DrivingClips(dataset, SIZE, clips_of_scene=2, frames=CLIP)
-    assert len(clips) == 4
-    assert [clips.seed(number) for number in range(4)] == [4000, 9000, 4001, 9001]
-    assert clips.fps == 10.0
-    source, target = clips.rgb(1)
-    ids = clips.target_classes(1)
-    assert source.shape == target.shape == (*ids.shape, 3) == (4, 32, 48, 3)
-    assert [kind.name for kind in clips.classes] == ["Car", "Road", "Sky", "Void"]
-    assert set(np.unique(ids).tolist()) <= {0, 1, 2, 3}
-    mount = clips.mount
-    assert (mount.height_m, mount.forward_m, mount.left_m) == pytest.approx((1.55, 1.6, 0.0))
-    assert (mount.tilt_deg, mount.hfov_deg) == pytest.approx((0.0, 85.0), abs=1e-4)
-    assert clips.origin == DrivingClips(dataset, SIZE, frames=CLIP).origin
-    assert clips.origin != DrivingClips(dataset, (96, 64), frames=CLIP).origin
-
-
-def test_a_set_without_classes_gives_no_clips(driving_root: Path) -> None:
-    with pytest.raises(DataError, match="open the set with classes=True"):
-        DrivingClips(ParallelDomain4D.open(driving_root, cameras=CAMERAS, classes=False))

@@ -21,14 +21,7 @@ from gcd_train.engine.processes import ALONE, Processes
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.loop import Loop, LoopOptions, Task
 from gcd_train.lora import adapter_of, merge_lora
-from gcd_train.model_setup import (
-    digest_of,
-    family_of,
-    fill,
-    model_config,
-    require_exportable,
-    sampled_as_trained,
-)
+from gcd_train.model_setup import digest_of, family_of, fill, model_config, require_exportable, sampled_as_trained
 from gcd_train.precision import Precision
 from gcd_train.recipe import Recipe, StageName, UNetRecipe, VAERecipe
 from gcd_train.run_folder import RunFolder

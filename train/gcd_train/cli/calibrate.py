@@ -1,6 +1,7 @@
 """`gcd-train calibrate`: how far the deviation over samples can be trusted, and the scale that corrects it."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,10 +14,10 @@ from gcd_train.errors import DataError, RecipeError
 
 if TYPE_CHECKING:
     from gcd_model import ViewSynthesizer
-    from gcd_train.baselines import Predictor
     from gcd_train.evaluation.calibration import Distances
-    from gcd_train.evaluation.choosing import Choice
     from gcd_train.evaluation.clips import EvaluationSet
+    from gcd_train.evaluation.opening import Choice
+    from gcd_train.evaluation.predictors import Predictor
 
 _LOG = Console(stderr=True, highlight=False)
 
@@ -39,11 +40,10 @@ def calibrate_command(
     """Measure how often the truth lies within the intervals of the samples, and the scale that makes it as meant."""
     with errors_shown():
         from gcd_model import RenderOptions, convert_weights, load_synthesizer
-        from gcd_train.evaluation.calibration import calibrate
-        from gcd_train.evaluation.calibration_report import CalibrationNote, stored_line, warnings, write_calibration
-        from gcd_train.evaluation.choosing import Choice
-        from gcd_train.evaluation.synthesized import SynthesizedViews
-        from gcd_train.show.matplotlib_door import require_matplotlib
+        from gcd_train.evaluation.calibration import CalibrationNote, calibrate, write_calibration
+        from gcd_train.evaluation.methods import SynthesizedViews
+        from gcd_train.evaluation.opening import Choice
+        from gcd_train.evaluation.plots import require_matplotlib
 
         require_matplotlib()  # now, not after an hour
         path = None if store is None else _weights_file(weights, store, steps)
@@ -69,10 +69,13 @@ def calibrate_command(
         text = write_calibration(note, out)
         if path is not None and store is not None:
             convert_weights(path, store, uncertainty_scale=found.scale)
-            _say(stored_line(note, store))
+            _say(
+                f"{store} holds the scale {found.scale:.3g}: for {samples} samples in {note.steps} steps, and scenes "
+                "like these; with other --samples it is wrong"
+            )
     echo(text)
-    for line in warnings(note):
-        _say(f"warning: {line}")
+    if note.warning:
+        _say(f"warning: {note.warning}")
     written = f"{out}/calibration.json, calibration.md and reliability.png" + ("" if store is None else f", {store}")
     _say(f"wrote {written}")
 
@@ -85,23 +88,13 @@ def _clips(data: Sequence[Path], choice: "Choice", model: "ViewSynthesizer", see
     """The clips; of whole scenes four each, with goals drawn by the seed as the model was trained."""
     from gcd_train.evaluation.opening import SceneCuts, data_kind, open_pairs, open_scenes
 
-    traits = model.traits
     if data_kind(data) == "pairs":
-        opened = open_pairs(data, choice, None)
+        clips, notes = open_pairs(data, choice, None)
     else:
-        far, size = traits.family is not None and traits.family.name == "kubric180", traits.config
-        cuts = SceneCuts(
-            seed=seed,
-            far=far,
-            gradual=traits.move_time > 0,
-            frames=size.frames,
-            height=size.height,
-            width=size.width,
-        )
-        opened = open_scenes(data[0], choice, cuts)
-    for note in opened.notes:
+        clips, notes = open_scenes(data[0], choice, replace(SceneCuts.suiting(model.traits), seed=seed, semantic=False))
+    for note in notes:
         _say(note)
-    return opened.clips
+    return clips
 
 
 def _weights_file(weights: str, store: Path, steps: int | None) -> Path:

@@ -1,9 +1,7 @@
 """`gcd-train evaluate`: weights and what they have to beat, on held-out clips."""
 
-import os
 import signal
-from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,21 +10,17 @@ import typer
 from rich.console import Console
 from typer import Option
 
-from gcd_model import Quality, RenderOptions, SolverName
+from gcd_model import Quality, SolverName
 from gcd_train.cli.errors import errors_shown
 from gcd_train.cli.progress_bar import progress_bar
 from gcd_train.cli.training_run import command_line
 from gcd_train.errors import RecipeError
-from gcd_train.evaluation import ClipWork, RunKeeper, measure_all
-from gcd_train.evaluation.asked import Asked, Candidate, Looks, Rivals, SceneWishes, declared_mount
-from gcd_train.evaluation.choosing import Choice
-from gcd_train.evaluation.kept_frames import KeptViews
-from gcd_train.evaluation.opening import usual_samples
-from gcd_train.evaluation.outcome import write_outcome
-from gcd_train.evaluation.plan import note_of, planned
-from gcd_train.evaluation.protocols import FrameBounds
-from gcd_train.evaluation.spread import Account
-from gcd_train.hexplane import HexPlaneSettings
+from gcd_train.evaluation.galleries import KeptViews
+from gcd_train.evaluation.hexplane import HexPlaneSettings
+from gcd_train.evaluation.plan import EvaluateOptions, planned
+from gcd_train.evaluation.runner import Account, ClipWork, assign_gpus, measure_all
+from gcd_train.evaluation.store import RunKeeper
+from gcd_train.evaluation.summary import complete_rows, to_markdown, write_summary
 
 _LOG = Console(stderr=True, highlight=False)
 _FIELD = HexPlaneSettings()
@@ -118,22 +112,11 @@ def evaluate_command(
     dtype: Dtype = None,
 ) -> None:
     """Measure weights, baselines and others' frames on held-out clips, and say what is reached."""
+    given = dict(locals())
     with errors_shown():
-        choice = Choice(split=split, listed=listed, limit=limit)
-        looks, field = Looks(angles=angles, path=path, modality=modality), HexPlaneSettings(updates=updates, rays=rays)
-        bounds, mount = FrameBounds(start=frame_start, skip=frame_skip), declared_mount(declared_height, declared_tilt)
-        cut = SceneWishes(
-            looks=looks, bounds=bounds, controls=controls, clips=trajectories, exact=exact, cameras=camera or None
-        )
-        known = Rivals(usual=baselines, names=methods, train=train, train_limit=train_limit, svd=svd)
-        rivals = replace(known, predictions=predictions, privileged=privileged, hexplane=field)
-        sampler = RenderOptions(quality=quality, solver=solver, guidance=guidance, guidance_interval=guidance_interval)
-        sampling = replace(sampler, samples=samples or usual_samples(data, protocol), seed=seed)
-        tested = Candidate(weights=_one(weights), device=device, dtype=dtype, steps=steps, sampling=sampling)
-        asked = Asked(
-            data=data, protocol=protocol, choice=choice, cut=cut, mount=mount, tested=tested, rivals=rivals, lpips=lpips
-        )
-        _evaluate(asked, out, views=views, workers=workers, ray=ray, sheet_clips=sheet_clips)
+        given |= {"weights": _one(weights), "hexplane": HexPlaneSettings(updates=updates, rays=rays)}
+        options = EvaluateOptions(**{field.name: given[field.name] for field in fields(EvaluateOptions)})
+        _evaluate(options, out, views=views, workers=workers, ray=ray, sheet_clips=sheet_clips)
 
 
 def _one(weights: list[str] | None) -> str | None:
@@ -144,24 +127,34 @@ def _one(weights: list[str] | None) -> str | None:
     return weights[0] if weights else None
 
 
-def _evaluate(asked: Asked, out: Path, *, views: KeptViews, workers: int, ray: str | None, sheet_clips: int) -> None:
+def _evaluate(
+    options: EvaluateOptions, out: Path, *, views: KeptViews, workers: int, ray: str | None, sheet_clips: int
+) -> None:
     out.mkdir(parents=True, exist_ok=True)  # to know at once
-    plan = planned(asked)
-    for line in plan.opened.notes:
+    plan, keeper = planned(options), RunKeeper(out)
+    for line in plan.notes:
         _say(line)
-    with RunKeeper(out).in_use(note_of(plan, command_line())):
+    with keeper.in_use(plan.note(command_line())):
         plan = plan.with_means(progress_bar)
         work = ClipWork(
             folder=out.resolve(),
             clips=plan.clips,
             makers={method.name: method.make for method in plan.methods},
-            lpips=None if asked.lpips is None else asked.lpips.resolve(),
+            lpips=None if options.lpips is None else options.lpips.resolve(),
             views=views,
+            sheet=tuple(plan.clips.keys[:sheet_clips]),
         )
-        account = _measured(work, workers, ray, asked.tested.device)
+        account = _measured(work, workers, ray, options.device)
     for line in account.lines():
         _say(line)
-    typer.echo(write_outcome(plan, work, sheet_clips))
+    rows = complete_rows(keeper, list(work.makers), plan.clips.keys, account.records)
+    summary = plan.summary(rows)
+    text = to_markdown(summary)
+    write_summary(summary, text, out)
+    keys = [record.key for record in next(iter(rows.values())) if record.key in work.sheet]
+    if keys:
+        plan.write_sheet(out / "contact_sheet.png", summary, keys, keeper)
+    typer.echo(text)
     _say(
         f"wrote {out}/run.json, records, evaluation.json, evaluation.md" + " and contact_sheet.png" * (sheet_clips > 0)
     )
@@ -172,10 +165,10 @@ def _evaluate(asked: Asked, out: Path, *, views: KeptViews, workers: int, ray: s
 def _measured(work: ClipWork, workers: int, ray: str | None, device: str) -> Account:
     if workers > 1 or ray is not None:
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that no worker is left behind
-    account, seats = Account(clips=len(work.clips.keys)), gpu_seats(device, torch.cuda.device_count())
+    account, gpus = Account(clips=len(work.clips.keys)), assign_gpus(device, torch.cuda.device_count())
     with progress_bar("clips", len(work.clips.keys)) as show:
         for account in measure_all(
-            work, workers=workers, ray_address=ray, gpus=float(device != "cpu"), environments=seats
+            work, workers=workers, ray_address=ray, gpus=float(device != "cpu"), environments=gpus
         ):
             show(account.done)
     return account
@@ -183,23 +176,3 @@ def _measured(work: ClipWork, workers: int, ray: str | None, device: str) -> Acc
 
 def _say(line: str) -> None:
     _LOG.print(line, markup=False, soft_wrap=True)
-
-
-_VISIBLE = "CUDA_VISIBLE_DEVICES"
-
-
-def gpu_seats(device: str, count: int) -> tuple[Mapping[str, str], ...]:
-    """What the environment of worker k says: it sees GPU k alone, and whatever asks for CUDA finds that one.
-
-    Workers beyond the last GPU begin again with the first; see `environments` of `map_items`.
-
-    Args:
-        device: as asked for; one that is named, as `cuda:1` or `cpu`, is everybody's. count: of GPUs of this process.
-    Returns:
-        One environment for each GPU; nothing where there is no choice.
-    """
-    if device not in ("auto", "cuda") or count < 2:
-        return ()
-    told = [name.strip() for name in os.environ.get(_VISIBLE, "").split(",") if name.strip()]
-    names = told[:count] if len(told) >= count else [str(number) for number in range(count)]
-    return tuple({_VISIBLE: name} for name in names)

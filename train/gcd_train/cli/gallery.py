@@ -16,7 +16,8 @@ from gcd_train.errors import DataError, RecipeError
 
 if TYPE_CHECKING:
     from gcd_model import SphericalDelta, ViewSynthesizer
-    from gcd_train.gallery import RealVideo, Viewed, ViewRecipe, WindowChoice
+    from gcd_train.look.gallery import Viewed, ViewRecipe
+    from gcd_train.look.real_video import RealVideo, WindowChoice
 
 _LOG = Console(stderr=True, highlight=False)
 
@@ -52,8 +53,8 @@ def gallery_command(
     """View real videos from other cameras: sheets, videos, and a page of them all. A bad video is one line."""
     with errors_shown():
         from gcd_model import load_synthesizer
-        from gcd_train.gallery import ViewRecipe, WindowChoice, find_videos, write_page
-        from gcd_train.gallery.viewed import paths
+        from gcd_train.look.gallery import ViewRecipe, paths, write_page
+        from gcd_train.look.real_video import WindowChoice, find_videos
 
         found = find_videos(videos)
         recipe = ViewRecipe(
@@ -96,7 +97,8 @@ def _viewed(
     out: Path,
 ) -> "tuple[list[Viewed], list[str]]":
     """What was shown, and a line for each video that could not be."""
-    from gcd_train.gallery import read_windows, view_window, write_viewed
+    from gcd_train.look.gallery import view_window, write_viewed
+    from gcd_train.look.real_video import read_windows
 
     viewed: list[Viewed] = []
     faults: list[str] = []

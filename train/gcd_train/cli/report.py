@@ -27,7 +27,7 @@ def report_command(
     seed: Annotated[int, typer.Option(min=0, help="Of the draws of scenes that intervals come from.")] = 0,
 ) -> None:
     """Write the paper's tables, or the same for our own clips, from what was measured; nothing is measured again."""
-    from gcd_train.reports.pages import Choices, make_report  # here: `--help` wants none of it
+    from gcd_train.evaluation.report import Choices, make_report  # here: `--help` wants none of it
 
     with errors_shown():
         choices = Choices(

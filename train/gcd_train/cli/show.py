@@ -13,7 +13,7 @@ from gcd_train.cli.errors import errors_shown
 from gcd_train.errors import RunError
 
 if TYPE_CHECKING:
-    from gcd_train.show.footage import Footage
+    from gcd_train.look.clip import Footage
 
 SceneFolder: TypeAlias = Annotated[
     Path, Argument(metavar="SCENE", help="Folder scnNNNNN or scene_NNNNNN, or pair shards (folder or one zip).")
@@ -43,12 +43,11 @@ def show(
 ) -> None:
     """Contact sheet, video, camera path and facts of one clip of a scene (extra `train`)."""
     with errors_shown():
-        from gcd_train.show.clips import ShowOptions
-        from gcd_train.show.facts import facts_of
-        from gcd_train.show.matplotlib_door import require_matplotlib
-        from gcd_train.show.open_scene import open_scene
-        from gcd_train.show.sheet import write_sheet, write_trajectory
-        from gcd_train.show.video import write_video
+        from gcd_train.evaluation.plots import require_matplotlib
+        from gcd_train.look.clip import facts_of
+        from gcd_train.look.open_scene import open_scene
+        from gcd_train.look.scene_clip import ShowOptions
+        from gcd_train.look.sheet import write_sheet, write_trajectory, write_video
 
         require_matplotlib()
         _refuse_unwritable(out)
@@ -70,7 +69,7 @@ def _refuse_unwritable(folder: Path) -> None:
 
 
 def _print_facts(footage: "Footage", facts: list[tuple[str, str]]) -> None:
-    from gcd_train.show.sheet import percent
+    from gcd_train.look.sheet import percent
 
     table = Table(title=footage.title, box=SIMPLE, show_header=False, title_justify="left")
     table.add_column(no_wrap=True)

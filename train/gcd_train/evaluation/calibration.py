@@ -12,6 +12,7 @@ The first frame is left out: there the target camera of a gradual path stands wh
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from statistics import NormalDist
 
 import msgspec
@@ -20,16 +21,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gcd_train.baselines import Prediction, to_pictures
 from gcd_train.errors import DataError
 from gcd_train.evaluation.clips import HeldOutClip
-from gcd_train.evaluation.record import Region
+from gcd_train.evaluation.plots import new_figure, save
+from gcd_train.evaluation.predictors import Prediction, to_pictures
+from gcd_train.evaluation.statistics import FEW_SCENES, FIRST_MEASURED
+from gcd_train.evaluation.store import Region, write_whole
+from gcd_train.evaluation.tables import markdown_rows
 
 LEVELS = tuple(round(0.05 * step, 2) for step in range(1, 20))
 """Shares of pixels that intervals are meant to hold, 5 % to 95 %."""
-
-FIRST_MEASURED = 1
-"""Frames before this one, counted from 0, are not measured."""
+STATED = (0.5, 0.9)
+"""Levels that tables show."""
 
 Counts = NDArray[np.int64]
 """How many colours of pixels lie how many deviations from the truth: [_BINS], in equal steps of the logarithm."""
@@ -37,6 +40,7 @@ Counts = NDArray[np.int64]
 _LOWEST, _HIGHEST, _PER_OCTAVE = -20, 40, 48  # powers of two; what lies beyond stands in the first and the last bin
 _BINS = (_HIGHEST - _LOWEST) * _PER_OCTAVE + 2
 _HALVINGS = 60
+_COLOURS: dict[Region, str] = {"all": "#1f4e9c", "visible": "#2c8a4b", "occluded": "#c0392b"}
 
 
 class Reliability(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -58,7 +62,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     """What was found on held-out scenes.
 
     scale: what the deviation has to be multiplied with. fitted: scenes it was chosen on. reported: the other half, on
-    which `regions` were measured; "visible" and "occluded" are missing where nobody knows what the source camera saw.
+    which `regions` were measured; "visible" and "occluded" are missing where it is unknown what the source camera saw.
     """
 
     scale: float
@@ -66,6 +70,36 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     reported: tuple[str, ...]
     levels: tuple[float, ...]
     regions: dict[Region, Reliability]
+
+
+class CalibrationNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a calibration holds for, and what it found; `calibration.json`.
+
+    weights, sha256_12: of the model. data: folders. data_identity: digest of the clips. clips: measured. unreadable:
+    clips that could not be read, with the reason. samples, steps, seed: of the sampler.
+    """
+
+    weights: str
+    sha256_12: str
+    data: tuple[str, ...]
+    data_identity: str
+    clips: int
+    unreadable: tuple[str, ...]
+    samples: int
+    steps: int
+    seed: int
+    found: Calibration
+
+    @property
+    def scenes(self) -> int:
+        """How many there were."""
+        return len(self.found.fitted) + len(self.found.reported)
+
+    @property
+    def warning(self) -> str:
+        """What the scale should not be trusted for; empty for nothing."""
+        few = f"Measured on {_scenes(self.scenes)}: of fewer than {FEW_SCENES} no claim can rest on this scale."
+        return few if self.scenes < FEW_SCENES else ""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -84,16 +118,23 @@ def distances(clip: HeldOutClip, prediction: Prediction) -> Distances:
 
     Raises: DataError for fewer than two draws, or draws without pictures.
     """
-    drawn = _draws(prediction)[:, FIRST_MEASURED:]
+    videos = [draw.video for draw in prediction.draws if draw.video is not None]
+    if len(videos) < 2:
+        raise DataError(f"intervals want 2 or more draws of a picture, got {len(videos)}; give more --samples")
+    drawn = torch.stack(videos).float().cpu()[:, FIRST_MEASURED:]
     truth = to_pictures(clip.target)[FIRST_MEASURED:]
     spread = np.random.default_rng(zlib.crc32(clip.key.encode())).random(truth.shape, np.float32)
     truth = truth + (torch.from_numpy(spread) - 0.5) / 255.0
     far = (truth - drawn.mean(dim=0)).abs() / deviation(drawn)[:, None]  # [T-1, 3, H, W]; no deviation: infinitely far
-    places = _places(far)
-    counts: dict[Region, Counts] = {"all": _counted(places)}
+    exact = (far.nan_to_num(nan=0.0, posinf=torch.inf).log2() - _LOWEST) * _PER_OCTAVE + 1
+    places = exact.clamp(0, _BINS - 1).floor().long()  # NaN (0 / 0) is no distance at all
+    parts: dict[Region, Tensor] = {"all": places}
     if clip.visible is not None:
         seen = torch.from_numpy(clip.visible[FIRST_MEASURED:])[:, None].expand_as(places)
-        counts |= {"visible": _counted(places[seen]), "occluded": _counted(places[~seen])}
+        parts |= {"visible": places[seen], "occluded": places[~seen]}
+    counts: dict[Region, Counts] = {
+        name: np.bincount(part.flatten().numpy(), minlength=_BINS).astype(np.int64) for name, part in parts.items()
+    }
     return Distances(scene=clip.scene, counts=counts)
 
 
@@ -123,15 +164,19 @@ def best_scale(counts: Counts) -> float:
 
     Raises: DataError where no scale does, because most samples do not differ at all.
     """
-    low, high = float(_LOWEST), float(_HIGHEST)  # powers of two
-    if not _lacking(counts, 2.0**low) > 0 > _lacking(counts, 2.0**high):
+
+    def lacking(power: float) -> float:
+        return float(np.mean([level - coverage(counts, level, 2.0**power) for level in LEVELS]))
+
+    low, high = float(_LOWEST), float(_HIGHEST)
+    if not lacking(low) > 0 > lacking(high):
         raise DataError(
             "no scale makes intervals of this deviation hold what they should: the samples are all the same; "
             "check that the model draws, and that --samples is 2 or more"
         )
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        low, high = (middle, high) if _lacking(counts, 2.0**middle) > 0 else (low, middle)
+        low, high = (middle, high) if lacking(middle) > 0 else (low, middle)
     return float(2.0 ** ((low + high) / 2))
 
 
@@ -143,52 +188,83 @@ def calibrate(clips: Sequence[Distances]) -> Calibration:
     scenes = sorted({clip.scene for clip in clips})
     if len(scenes) < 2:
         raise DataError(f"a scale is chosen on half of the scenes and tried on the others: 2 wanted, got {len(scenes)}")
+
+    def summed(chosen: Sequence[str], region: Region) -> Counts:
+        each = [clip.counts[region] for clip in clips if clip.scene in chosen and region in clip.counts]
+        return np.sum(each, axis=0) if each else np.zeros(_BINS, np.int64)
+
     fitted, reported = tuple(scenes[::2]), tuple(scenes[1::2])
-    scale = best_scale(_summed(clips, fitted, "all"))
-    regions: dict[Region, Reliability] = {}
-    for region in clips[0].counts:
-        counts = _summed(clips, reported, region)
-        if counts.any():
-            regions[region] = _reliability(counts, scale)
+    scale = best_scale(summed(fitted, "all"))
+    by_region: dict[Region, Counts] = {region: summed(reported, region) for region in clips[0].counts}
+    regions: dict[Region, Reliability] = {
+        region: Reliability(
+            colours=int(counts.sum()),
+            held=tuple(coverage(counts, level) for level in LEVELS),
+            held_scaled=tuple(coverage(counts, level, scale) for level in LEVELS),
+            miscoverage=miscoverage(counts),
+            miscoverage_scaled=miscoverage(counts, scale),
+        )
+        for region, counts in by_region.items()
+        if counts.any()
+    }
     return Calibration(scale=scale, fitted=fitted, reported=reported, levels=LEVELS, regions=regions)
 
 
-def _reliability(counts: Counts, scale: float) -> Reliability:
-    return Reliability(
-        colours=int(counts.sum()),
-        held=tuple(coverage(counts, level) for level in LEVELS),
-        held_scaled=tuple(coverage(counts, level, scale) for level in LEVELS),
-        miscoverage=miscoverage(counts),
-        miscoverage_scaled=miscoverage(counts, scale),
-    )
+def write_calibration(note: CalibrationNote, folder: Path) -> str:
+    """Write `calibration.json`, `calibration.md` and `reliability.png`; gives the text.
+
+    Raises: RunError if they cannot be written, RenderError without matplotlib.
+    """
+    text = _text(note)
+    write_whole(folder / "calibration.json", msgspec.json.format(msgspec.json.encode(note), indent=1))
+    write_whole(folder / "calibration.md", text.encode())
+    _write_plot(note.found, folder / "reliability.png")
+    return text
 
 
-def _draws(prediction: Prediction) -> Tensor:
-    """[S, T, 3, H, W]."""
-    videos = [draw.video for draw in prediction.draws if draw.video is not None]
-    if len(videos) < 2:
-        raise DataError(f"intervals want 2 or more draws of a picture, got {len(videos)}; give more --samples")
-    return torch.stack(videos).float().cpu()
+def _text(note: CalibrationNote) -> str:
+    """Markdown: one row for each kind of pixel."""
+    found = note.found
+    head = ["pixels", *(f"{100 * level:.0f} % interval holds | with the scale" for level in STATED)]
+    columns = " | ".join([*head, "mean absolute miscoverage | with the scale"]).split(" | ")
+    rows: list[list[str]] = []
+    for region, of in found.regions.items():
+        places = [LEVELS.index(level) for level in STATED]
+        held = [f"{100 * share:.0f} %" for place in places for share in (of.held[place], of.held_scaled[place])]
+        rows.append([region, *held, f"{of.miscoverage:.3f}", f"{of.miscoverage_scaled:.3f}"])
+    lines = [
+        f"# Calibration of {note.weights}",
+        "",
+        f"Weights {note.sha256_12}, {note.samples} samples, steps {note.steps}, seed {note.seed}; {note.clips} clips "
+        f"({note.data_identity}) of {_scenes(note.scenes)} in {', '.join(note.data)}.",
+        "",
+        f"**Scale {found.scale:.3g}**, chosen on {_scenes(len(found.fitted))}; the table is of the other "
+        f"{len(found.reported)}.",
+        "",
+        *([f"{note.warning}\n"] if note.warning else []),
+        *markdown_rows(columns, rows),
+        *(f"\nNot read: {why}" for why in note.unreadable),
+    ]
+    return "\n".join(lines) + "\n"
 
 
-def _places(far: Tensor) -> Tensor:
-    """The bin of each distance; the first and the last take what lies beyond, NaN (0 / 0) is no distance at all."""
-    exact = (far.nan_to_num(nan=0.0, posinf=torch.inf).log2() - _LOWEST) * _PER_OCTAVE + 1
-    return exact.clamp(0, _BINS - 1).floor().long()
+def _write_plot(found: Calibration, out: Path) -> None:
+    """What intervals hold over what they are meant to hold, with the scale and without."""
+    figure = new_figure(6.0, 5.6)
+    axes = figure.add_axes((0.12, 0.11, 0.84, 0.8))
+    axes.plot([0, 100], [0, 100], color="#999999", linewidth=1)
+    levels = [100 * level for level in found.levels]
+    for region, of in found.regions.items():
+        colour, scaled = _COLOURS[region], [100 * held for held in of.held_scaled]
+        held = [100 * held for held in of.held]
+        axes.plot(levels, held, "--", color=colour, linewidth=1, label=f"{region}, as drawn")
+        axes.plot(levels, scaled, "o-", color=colour, markersize=3.5, label=f"{region}, times {found.scale:.3g}")
+    axes.set(xlim=(0, 100), ylim=(0, 100), xlabel="interval is meant to hold, %", ylabel="held, % of colours")
+    axes.set_title("How often the truth lies within the interval", fontsize=10.5)
+    axes.grid(color="#eeeeee")
+    axes.legend(fontsize=8, loc="upper left")
+    save(figure, out)
 
 
-def _counted(places: Tensor) -> Counts:
-    return np.bincount(places.flatten().numpy(), minlength=_BINS).astype(np.int64)
-
-
-def _lacking(counts: Counts, scale: float) -> float:
-    """How much less is held than should be, on the mean over LEVELS; falls as the scale rises."""
-    return float(np.mean([level - coverage(counts, level, scale) for level in LEVELS]))
-
-
-def _summed(clips: Sequence[Distances], scenes: Sequence[str], region: Region) -> Counts:
-    total = np.zeros(_BINS, np.int64)
-    for clip in clips:
-        if clip.scene in scenes and region in clip.counts:
-            total += clip.counts[region]
-    return total
+def _scenes(count: int) -> str:
+    return f"{count} scene" + "s" * (count != 1)

@@ -1,14 +1,17 @@
 """From the folders and options of a user to the clips that are measured."""
 
+import difflib
 import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from importlib.resources import files
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, get_args
 
 import msgspec
 
+from gcd_model import Traits
 from gcd_model.geometry import CameraMount
 from gcd_model.small_files import read_small
 from gcd_train.datasets.clip_frames import CLIP, DRIVING_FRAMES, KUBRIC_FRAMES, FrameSampling
@@ -17,13 +20,12 @@ from gcd_train.datasets.kubric4d import Kubric4D
 from gcd_train.datasets.paired import PairedClips
 from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
 from gcd_train.datasets.skips import Skips
-from gcd_train.datasets.trajectories import DrivingSampling, OrbitSampling, Sampling
+from gcd_train.datasets.splits import Part, present, read_scene_list, read_split
+from gcd_train.datasets.trajectories import DrivingSampling, OrbitSampling
 from gcd_train.datasets.view_pairs import ViewPairs
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.evaluation.choosing import Choice, pairs_of_split, wanted_scenes
-from gcd_train.evaluation.clips import EvaluationSet
-from gcd_train.evaluation.paired_set import PairedSet, chosen
-from gcd_train.evaluation.protocols import (
+from gcd_train.evaluation.clips import EvaluationSet, PairedSet, chosen
+from gcd_train.evaluation.protocol import (
     AS_PLANNED,
     CLIPS,
     SAMPLES,
@@ -32,16 +34,154 @@ from gcd_train.evaluation.protocols import (
     FrameBounds,
     ListedControls,
     ProtocolName,
-    ReleasedControl,
+    controlled,
+    orbit_notes,
+    released_controls,
+    require_cameras,
 )
-from gcd_train.evaluation.scene_checks import controlled, orbit_notes, require_cameras
-from gcd_train.evaluation.scene_set import SceneSet
+from gcd_train.evaluation.scene_clips import SceneSet
 from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
+from gcd_train.layouts.manifest import MANIFEST, read_manifest
+
+
+class _World(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One file of `splits_public`. parts: name to runs of scenes, each the first seed and how many."""
+
+    about: str
+    world: str
+    parts: dict[str, tuple[tuple[int, int], ...]]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PublicSplit:
+    """One part of a world's scenes. runs: of seeds, or of Kubric-4D's scene numbers, that follow each other."""
+
+    name: str
+    world: str
+    runs: tuple[range, ...]
+
+    def __contains__(self, seed: int) -> bool:
+        return any(seed in run for run in self.runs)
+
+    def __len__(self) -> int:
+        return sum(map(len, self.runs))
+
+
+def public_split_names() -> tuple[str, ...]:
+    """All there are, by name."""
+    return tuple(sorted(f"{stem}-{part}" for stem, world in _worlds().items() for part in world.parts))
+
+
+def _worlds() -> dict[str, _World]:
+    """By the name of their file."""
+    found = [file for file in (files("gcd_train") / "splits_public").iterdir() if file.name.endswith(".json")]
+    return {file.name.removesuffix(".json"): msgspec.json.decode(file.read_bytes(), type=_World) for file in found}
+
+
+def public_split(name: str) -> PublicSplit:
+    """The part of that name. Raises RecipeError for another."""
+    if name not in public_split_names():
+        near = difflib.get_close_matches(name, public_split_names(), n=1)
+        meant = f"did you mean {near[0]}? " if near else ""
+        raise RecipeError(
+            f"no split is called {name!r}, and it is no file; {meant}there are {', '.join(public_split_names())}"
+        )
+    stem, _, part = name.rpartition("-")
+    world = _worlds()[stem]
+    runs = tuple(range(first, first + count) for first, count in world.parts[part])
+    return PublicSplit(name=name, world=world.world, runs=runs)
+
+
+_PARTS: dict[str, Part] = {part: part for part in get_args(Part)}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Choice:
+    """Which scenes of a folder. split: a public one's name, or a split file with `:train`, `:val` or `:test` after it.
+
+    listed: a file with a scene a line. limit: only the first so many.
+    """
+
+    split: str | None = None
+    listed: Path | None = None
+    limit: int | None = None
+
+
+def pairs_of_split(name: str, scenes: Collection[tuple[str, int]], notes: Skips) -> set[tuple[str, int]]:
+    """Scenes of pairs, each a world and a seed, that are of a public split. notes: gets what is missing.
+
+    Raises: RecipeError for no such split, DataError where none of the scenes is of its world.
+    """
+    split = public_split(name)
+    worlds = sorted({world for world, _ in scenes})
+    if split.world not in worlds:
+        raise _of_another_world(split, f"these pairs are of {', '.join(worlds) or 'none'}")
+    wanted = {(world, seed) for world, seed in scenes if world == split.world and seed in split}
+    _note_missing(split, {seed for _, seed in wanted}, notes)
+    return wanted
+
+
+def wanted_scenes(folder: Path, there: Sequence[str], choice: Choice, notes: Skips) -> tuple[str, ...]:
+    """Whole scenes of a folder that are chosen, whatever the limit. notes: gets what is missing.
+
+    Args:
+        there: names of the scenes in the folder.
+    Raises:
+        RecipeError: a list and a split, or no such split. DataError: a list cannot be read, or the split is of another
+            world than the scenes.
+    """
+    if choice.listed is not None and choice.split is not None:
+        raise RecipeError("give --list or --split, not both")
+    if choice.listed is not None:
+        return present(read_scene_list(choice.listed, notes).scenes, there, notes, choice.listed)
+    if choice.split is None:
+        return tuple(there)
+    place, _, part = choice.split.rpartition(":")
+    file = Path(place if part in _PARTS and place else choice.split)
+    if file.is_file():
+        return present(read_split(file, _PARTS.get(part, "test")), there, notes, file)
+    return _of_public_split(folder, there, public_split(choice.split), notes)
+
+
+def _of_public_split(folder: Path, there: Sequence[str], split: PublicSplit, notes: Skips) -> tuple[str, ...]:
+    scenes = tuple(scene for scene in there if _seed(scene) in split)
+    for scene in scenes or there[:1]:
+        world = _world(folder / scene)
+        if world != split.world:
+            raise _of_another_world(split, f"{folder / scene} is of {world}")
+    _note_missing(split, {_seed(scene) for scene in scenes}, notes)
+    return scenes
+
+
+def _of_another_world(split: PublicSplit, came: str) -> DataError:
+    return DataError(f"--split {split.name} is for the world {split.world}, but {came}; give another --split or --data")
+
+
+def _world(scene: Path) -> str:
+    """As its manifest says; a scene without one was published, and counts as its layout."""
+    if (scene / MANIFEST).is_file():
+        return read_manifest(scene).world
+    return "kubric4d" if kubric4d_names.scene_number(scene.name) is not None else "parallel_domain4d"
+
+
+def _note_missing(split: PublicSplit, there: set[int], notes: Skips) -> None:
+    """A part that is open-ended in practice, as `train`, is not missed."""
+    if there and len(there) < len(split) and not split.name.endswith("-train"):
+        notes.add(split.name, "--data", f"has {len(there)} of its {len(split)} scenes")
+
+
+def _seed(scene: str) -> int:
+    number = kubric4d_names.scene_number(scene)
+    return (parallel_domain4d_names.scene_number(scene) or 0) if number is None else number
+
 
 DataKind: TypeAlias = Literal["pairs", "kubric4d", "parallel_domain4d"]
 """What a folder holds."""
 
 _DIGITS = 12
+_SMALL_BYTES = 4 << 20
+_NEAR_DEG = 90.0
+"""Families that were trained up to this azimuth have goals drawn up to it, others up to 180 degrees."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -69,38 +209,48 @@ class SceneCuts:
     height: int = 256
     width: int = 384
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Opened:
-    """Clips to be measured. notes: what of the split or list is not there, and what is odd, line by line."""
-
-    clips: EvaluationSet
-    notes: tuple[str, ...] = ()
+    @classmethod
+    def suiting(cls, model: Traits | None) -> "SceneCuts":
+        """As the weights were trained; the usual ones without weights."""
+        if model is None:
+            return cls()
+        family, config = model.family, model.config
+        return cls(
+            far=family is not None and family.limits is not None and family.limits.azimuth_deg > _NEAR_DEG,
+            gradual=model.move_time > 0,
+            semantic=family is not None and family.output == "semantic",
+            frames=config.frames,
+            height=config.height,
+            width=config.width,
+        )
 
 
 def data_kind(folders: Sequence[Path]) -> DataKind:
     """What the folders hold. Raises DataError for nothing that is known, or several folders of scenes."""
-    found = _kind(_names(folders[0]))
-    if found != "pairs" and len(folders) > 1:
+    try:
+        names = [path.name for path in folders[0].iterdir()]
+    except OSError as error:
+        raise DataError(f"{folders[0]} cannot be read ({error}); give a folder with pairs or with scenes") from error
+    if any(kubric4d_names.scene_number(name) is not None for name in names):
+        found: DataKind = "kubric4d"
+    elif any(parallel_domain4d_names.scene_number(name) is not None for name in names):
+        found = "parallel_domain4d"
+    else:
+        return "pairs"
+    if len(folders) > 1:
         raise DataError(f"scenes are taken from one folder, got {len(folders)}; give one --data, or pairs")
     return found
 
 
 def usual_samples(folders: Sequence[Path], protocol: ProtocolName) -> int:
-    """Draws of each view where nobody says how many. Raises DataError as `data_kind`."""
+    """Draws of each view by default. Raises DataError as `data_kind`."""
     return 1 if data_kind(folders) == "pairs" else SAMPLES[protocol]
 
 
-def _kind(names: Sequence[str]) -> DataKind:
-    if any(kubric4d_names.scene_number(name) is not None for name in names):
-        return "kubric4d"
-    if any(parallel_domain4d_names.scene_number(name) is not None for name in names):
-        return "parallel_domain4d"
-    return "pairs"
-
-
-def open_pairs(folders: Sequence[Path], choice: Choice, mount: CameraMount | None) -> Opened:
-    """Pairs of the folders.
+def open_pairs(
+    folders: Sequence[Path], choice: Choice, mount: CameraMount | None
+) -> tuple[EvaluationSet, tuple[str, ...]]:
+    """Pairs of the folders; and what of the split is not there, line by line.
 
     Args:
         mount: what everybody is told of the source camera of driving clips; None for the usual one.
@@ -118,14 +268,12 @@ def open_pairs(folders: Sequence[Path], choice: Choice, mount: CameraMount | Non
     wanted = None
     if choice.split is not None:
         wanted = pairs_of_split(choice.split, scenes, notes)
-    return Opened(
-        clips=PairedSet.of(chosen(clips, scenes=wanted, limit=choice.limit), declared=_declared(mount, clips)),
-        notes=tuple(notes.plain_lines()),
-    )
+    some = chosen(clips, scenes=wanted, limit=choice.limit)
+    return PairedSet.of(some, declared=_declared(mount, clips)), tuple(notes.plain_lines())
 
 
-def open_scenes(folder: Path, choice: Choice, cuts: SceneCuts) -> Opened:
-    """Whole scenes, in either layout.
+def open_scenes(folder: Path, choice: Choice, cuts: SceneCuts) -> tuple[EvaluationSet, tuple[str, ...]]:
+    """Whole scenes, in either layout; and what of the list is not there or is odd, line by line.
 
     Raises:
         DataError: no scene is left, or a list or a control list cannot be read. RecipeError: options that contradict
@@ -133,12 +281,14 @@ def open_scenes(folder: Path, choice: Choice, cuts: SceneCuts) -> Opened:
     """
     folder = folder.resolve()  # processes may stand elsewhere
     orbits, notes = data_kind([folder]) == "kubric4d", Skips(logged=False)
-    whole = _kubric(folder, cuts) if orbits else _driving(folder, cuts)
-    controls = _controls(cuts, orbits=orbits)
+    whole = _dataset(folder, cuts, orbits=orbits)
+    controls = _controls(cuts, whole.scenes, orbits=orbits)
     scenes = wanted_scenes(folder, whole.scenes, choice, notes)
     scenes = controlled(scenes, controls, cuts.controls, folder, notes)[: choice.limit]
     data = whole.only(scenes)
-    odd = _odd(controls, scenes, cuts) if orbits else ()
+    odd: tuple[str, ...] = ()
+    if orbits and cuts.controls is not None and isinstance(controls, ListedControls):
+        odd = orbit_notes(controls, scenes, cuts.controls)
     require_cameras(data)
     pairs = ViewPairs(
         data,
@@ -161,15 +311,7 @@ def open_scenes(folder: Path, choice: Choice, cuts: SceneCuts) -> Opened:
         identity=_identity(folder, scenes, cuts),
         semantic=cuts.semantic,
     )
-    return Opened(clips=clips, notes=(*notes.plain_lines(), *odd))
-
-
-def _odd(controls: ClipControls, scenes: Sequence[str], cuts: SceneCuts) -> tuple[str, ...]:
-    """See `orbit_notes`; only a list can be odd."""
-    if cuts.controls is None or not isinstance(controls, ListedControls):
-        return ()
-    chosen = [(scene, name) for scene in scenes for name in controls.names(scene)]
-    return orbit_notes(controls.controls, chosen, cuts.controls)
+    return clips, (*notes.plain_lines(), *odd)
 
 
 def _declared(mount: CameraMount | None, clips: PairedClips) -> CameraMount | None:
@@ -181,26 +323,16 @@ def _declared(mount: CameraMount | None, clips: PairedClips) -> CameraMount | No
     return None
 
 
-def _kubric(folder: Path, cuts: SceneCuts) -> Kubric4D:
+def _dataset(folder: Path, cuts: SceneCuts, *, orbits: bool) -> Kubric4D | ParallelDomain4D:
+    names = kubric4d_names.CAMERAS if orbits else parallel_domain4d_names.CAMERAS
+    if not orbits:
+        return ParallelDomain4D.open(folder, cameras=cuts.cameras or names, classes=cuts.semantic)
     if cuts.semantic:
         raise RecipeError("Kubric-4D has no classes: leave out --modality semantic")
-    cameras = cuts.cameras or kubric4d_names.CAMERAS
-    return Kubric4D.open(folder, cameras=cameras, published=cuts.protocol == "released")
+    return Kubric4D.open(folder, cameras=cuts.cameras or names, published=cuts.protocol == "released")
 
 
-def _driving(folder: Path, cuts: SceneCuts) -> ParallelDomain4D:
-    cameras = cuts.cameras or parallel_domain4d_names.CAMERAS
-    return ParallelDomain4D.open(folder, cameras=cameras, classes=cuts.semantic)
-
-
-def _names(folder: Path) -> list[str]:
-    try:
-        return [path.name for path in folder.iterdir()]
-    except OSError as error:
-        raise DataError(f"{folder} cannot be read ({error}); give a folder with pairs or with scenes") from error
-
-
-def _controls(cuts: SceneCuts, *, orbits: bool) -> ClipControls:
+def _controls(cuts: SceneCuts, scenes: Sequence[str], *, orbits: bool) -> ClipControls:
     clips = CLIPS[cuts.protocol] if cuts.clips is None else cuts.clips
     if cuts.controls is not None:
         if cuts.protocol == "paper" and cuts.bounds != AS_PLANNED:
@@ -210,33 +342,22 @@ def _controls(cuts: SceneCuts, *, orbits: bool) -> ClipControls:
             )
         return ListedControls(controls=read_controls(cuts.controls), clips=clips, bounds=cuts.bounds)
     if cuts.protocol == "released":
-        return ReleasedControl(orbit=orbits, bounds=cuts.bounds)
-    return DrawnControls(
-        seed=cuts.seed,
-        clips=clips,
-        frames=_frames(cuts, orbits=orbits),
-        orbit=_orbit(cuts) if orbits else None,
-        bounds=cuts.bounds,
-    )
+        return ListedControls(controls=released_controls(scenes, orbit=orbits), clips=clips, bounds=cuts.bounds)
+    sampling = _sampling(cuts, orbits=orbits)
+    orbit = sampling if isinstance(sampling, OrbitSampling) else None
+    return DrawnControls(seed=cuts.seed, clips=clips, frames=sampling.frames, orbit=orbit, bounds=cuts.bounds)
 
 
-def _frames(cuts: SceneCuts, *, orbits: bool) -> FrameSampling:
+def _sampling(cuts: SceneCuts, *, orbits: bool) -> OrbitSampling | DrivingSampling:
+    """How goals, first frames and strides are drawn."""
     usual = KUBRIC_FRAMES if orbits else DRIVING_FRAMES
-    return FrameSampling(clip=cuts.frames, strides=usual.strides, latest_start=usual.latest_start)
-
-
-def _orbit(cuts: SceneCuts) -> OrbitSampling:
+    frames = FrameSampling(clip=cuts.frames, strides=usual.strides, latest_start=usual.latest_start)
+    if not orbits:
+        return DrivingSampling(gradual=cuts.gradual, frames=frames)
     azimuth_deg, elevation_deg = (180.0, 60.0) if cuts.far else (90.0, 30.0)
     return OrbitSampling(
-        max_azimuth_deg=azimuth_deg,
-        max_elevation_deg=elevation_deg,
-        gradual=cuts.gradual,
-        frames=_frames(cuts, orbits=True),
+        max_azimuth_deg=azimuth_deg, max_elevation_deg=elevation_deg, gradual=cuts.gradual, frames=frames
     )
-
-
-def _sampling(cuts: SceneCuts, *, orbits: bool) -> Sampling:
-    return _orbit(cuts) if orbits else DrivingSampling(gradual=cuts.gradual, frames=_frames(cuts, orbits=False))
 
 
 def _identity(folder: Path, scenes: Sequence[str], cuts: SceneCuts) -> str:
@@ -249,10 +370,6 @@ def _identity(folder: Path, scenes: Sequence[str], cuts: SceneCuts) -> str:
     return digest.hexdigest()[:_DIGITS]
 
 
-_TOLD_BY = ".json"
-_SMALL_BYTES = 4 << 20
-
-
 def fingerprint(folder: Path) -> bytes:
     """Digest of the names and sizes of all files below, and of what small JSON files say.
 
@@ -262,31 +379,20 @@ def fingerprint(folder: Path) -> bytes:
     Raises:
         DataError: the folder or a file cannot be read.
     """
-    digest = hashlib.sha256()
+    digest, found = hashlib.sha256(), dict[str, Path]()
+
+    def passed_on(error: OSError) -> None:
+        raise error
+
     try:
-        for name, size in sorted(_files(folder)):
+        for place, folders, names in os.walk(folder, onerror=passed_on, followlinks=True):
+            folders[:] = [name for name in folders if not name.startswith(".")]
+            paths = [Path(place) / name for name in names if not name.startswith(".")]
+            found |= {path.relative_to(folder).as_posix(): path for path in paths}
+        for name, size in sorted((name, path.stat().st_size) for name, path in found.items()):
             digest.update(f"{name} {size}\n".encode())
-            if name.endswith(_TOLD_BY) and size <= _SMALL_BYTES and (folder / name).is_file():
-                digest.update(hashlib.sha256((folder / name).read_bytes()).digest())
+            if name.endswith(".json") and size <= _SMALL_BYTES and found[name].is_file():
+                digest.update(hashlib.sha256(found[name].read_bytes()).digest())
     except OSError as error:
         raise DataError(f"{folder} cannot be read ({error}); look at the scene, or leave it out with --list") from error
     return digest.digest()
-
-
-def _files(folder: Path) -> list[tuple[str, int]]:
-    """Names below the folder, with slashes, and bytes."""
-    found: list[tuple[str, int]] = []
-    for place, folders, names in os.walk(folder, onerror=_passed_on, followlinks=True):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        here = Path(place)
-        found += [
-            ((here / name).relative_to(folder).as_posix(), (here / name).stat().st_size)
-            for name in names
-            if not name.startswith(".")
-        ]
-    return found
-
-
-def _passed_on(error: OSError) -> None:
-    """`os.walk` keeps errors to itself unless it is told not to."""
-    raise error

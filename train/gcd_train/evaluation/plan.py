@@ -1,22 +1,24 @@
-"""What a user asks of an evaluation, worked out: the clips, the methods, and what the run says of itself."""
+"""What a user asks of an evaluation, worked out: the clips, the methods, what the run says of itself, what it found."""
 
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import torch
 
-from gcd_model import Traits
-from gcd_train.baselines import VANILLA_SVD, BaselineSettings, TargetStatistics, fit_statistics
+from gcd_model import Quality, RenderOptions, SolverName, Traits
+from gcd_model.geometry import CameraMount
 from gcd_train.datasets.paired import PairedClips, require_apart
 from gcd_train.errors import RecipeError
-from gcd_train.evaluation.asked import Asked, SceneWishes
-from gcd_train.evaluation.clips import EvaluationSet
-from gcd_train.evaluation.held_out import require_same_kind
+from gcd_train.evaluation.baselines import BaselineSettings
+from gcd_train.evaluation.clips import EvaluationSet, PairedSet, class_grid, identity_of, require_same_kind
+from gcd_train.evaluation.galleries import Strip, contact_rows, write_sheet
+from gcd_train.evaluation.hexplane import HexPlaneSettings
+from gcd_train.evaluation.lpips import Lpips
 from gcd_train.evaluation.methods import (
     Method,
     Weights,
@@ -26,66 +28,113 @@ from gcd_train.evaluation.methods import (
     require_names_apart,
     require_views,
 )
-from gcd_train.evaluation.opening import Opened, SceneCuts, data_kind, open_pairs, open_scenes
-from gcd_train.evaluation.paired_set import PairedSet, identity_of
-from gcd_train.evaluation.record import LPIPS, RunNote
-from gcd_train.evaluation.scene_set import SceneSet
+from gcd_train.evaluation.opening import Choice, SceneCuts, data_kind, open_pairs, open_scenes, usual_samples
+from gcd_train.evaluation.predictors import TargetStatistics, fit_statistics
+from gcd_train.evaluation.protocol import FrameBounds, ProtocolName
+from gcd_train.evaluation.scene_clips import SceneSet
+from gcd_train.evaluation.statistics import FigureName, Selection
+from gcd_train.evaluation.store import LPIPS, ClipRecord, RunKeeper, RunNote
+from gcd_train.evaluation.summary import Conditions, MountNumbers, Shot, Summary, best_of, evaluation
+from gcd_train.evaluation.svd import VANILLA_SVD
 from gcd_train.layouts.manifest import package_version
-from gcd_train.metrics import Lpips
 
 ProgressBar: TypeAlias = Callable[[str, int], AbstractContextManager[Callable[[int], None]]]
 """Shows how far some work is: its name and its steps; gives what is called with the steps done."""
 
-_NEAR_DEG = 90.0
-"""Families that were trained up to this azimuth have goals drawn up to it, others up to 180 degrees."""
-
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Training:
-    """Pairs whose means stand in for what nobody saw. identity: of the clips."""
+class EvaluateOptions:
+    """What is asked of `gcd-train evaluate`: one field for each of its options, see there. None: left out."""
 
-    clips: PairedClips
-    identity: str
+    data: Sequence[Path]
+    weights: str | None = None
+    steps: Sequence[int] | None = None
+    samples: int | None = None
+    guidance: tuple[float, float] | None = None
+    quality: Quality = "exact"
+    solver: SolverName | None = None
+    guidance_interval: tuple[float, float] | None = None
+    train: Sequence[Path] | None = None
+    train_limit: int = 1000
+    baselines: bool = True
+    methods: Sequence[str] | None = None
+    svd: str | None = None
+    predictions: Sequence[str] | None = None
+    privileged: Sequence[str] | None = None
+    hexplane: HexPlaneSettings = HexPlaneSettings()  # noqa: RUF009  it is frozen
+    lpips: Path | None = None
+    protocol: ProtocolName = "paper"
+    controls: Path | None = None
+    split: str | None = None
+    listed: Path | None = None
+    limit: int | None = None
+    trajectories: int | None = None
+    frame_start: int | None = None
+    frame_skip: int | None = None
+    angles: Literal["max90", "max180"] | None = None
+    path: Literal["gradual", "direct"] | None = None
+    modality: Literal["rgb", "semantic"] | None = None
+    exact: bool = False
+    camera: Sequence[str] | None = None
+    declared_height: float | None = None
+    declared_tilt: float | None = None
+    seed: int = 0
+    device: str = "auto"
+    dtype: str | None = None
 
     @property
-    def count(self) -> int:
-        """How many clips."""
-        return len(self.clips)
+    def names(self) -> list[str] | None:
+        """The baselines that are asked for by name; None for the usual ones."""
+        if self.methods is None:
+            return None
+        return [name.strip() for name in ",".join(self.methods).split(",") if name.strip()]
+
+    @property
+    def mount(self) -> CameraMount | None:
+        """The mount that is declared; None for none. Raises OptionError for one that no camera has."""
+        given = {"height_m": self.declared_height, "tilt_deg": self.declared_tilt}
+        given = {name: value for name, value in given.items() if value is not None}
+        return CameraMount(**given) if given else None
+
+    @property
+    def sampling(self) -> RenderOptions:
+        """All but the steps."""
+        return RenderOptions(
+            quality=self.quality,
+            solver=self.solver,
+            guidance=self.guidance,
+            guidance_interval=self.guidance_interval,
+            samples=self.samples or usual_samples(self.data, self.protocol),
+            seed=self.seed,
+        )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Plan:
     """What is to be done.
 
-    models, baselines, saved: methods, in the order of the table; baselines that want means cannot be used before
-    `with_means`. model: what is known of the weights, None without. painted: targets are class maps in colours. lpips:
-    digest of its weights, None without.
+    notes: what is odd about the clips, line by line. models, baselines, saved: methods, in the order of the table;
+    baselines that want means cannot be used before `with_means`. model: what is known of the weights, None without.
+    training: pairs for means, of the identity `trained_on`. painted: targets are class maps in colours. lpips: digest
+    of its weights, None without.
     """
 
-    asked: Asked
-    opened: Opened
+    options: EvaluateOptions
+    clips: EvaluationSet
+    notes: tuple[str, ...]
     models: tuple[Method, ...]
     baselines: tuple[Method, ...]
     saved: tuple[Method, ...]
     model: Traits | None
-    training: Training | None
+    training: PairedClips | None
+    trained_on: str
     painted: bool
     lpips: str | None
 
     @property
-    def clips(self) -> EvaluationSet:
-        """To be measured on."""
-        return self.opened.clips
-
-    @property
-    def rivals(self) -> tuple[Method, ...]:
-        """What the weights are measured against."""
-        return self.baselines + self.saved
-
-    @property
     def methods(self) -> tuple[Method, ...]:
         """All, the weights first."""
-        return self.models + self.rivals
+        return self.models + self.baselines + self.saved
 
     def with_means(self, bar: ProgressBar) -> "Plan":
         """With the means of the training clips, all of which are read for it; the same plan where there are none.
@@ -94,163 +143,182 @@ class Plan:
         """
         if self.training is None:
             return self
-        clips = self.training.clips
-        with bar("training clips", len(clips)) as show:
-            statistics = fit_statistics(clips, progress=lambda done, _: show(done))
-        made = _baselines(self.asked, self.clips, self.training, statistics, painted=self.painted)
-        return replace(self, baselines=made)
+        with bar("training clips", len(self.training)) as show:
+            statistics = fit_statistics(self.training, progress=lambda done, _: show(done))
+        return replace(
+            self, baselines=_baselines(self.options, self.clips, statistics, self.trained_on, painted=self.painted)
+        )
+
+    def note(self, command: str) -> RunNote:
+        """What the run says of itself. command: the line that began it."""
+        clips, options = self.clips, self.options
+        lpips = {} if self.lpips is None else {LPIPS: self.lpips}
+        return RunNote(
+            command=command,
+            made=datetime.now(UTC).isoformat(timespec="seconds"),
+            versions={
+                "gcd-node": package_version(),
+                "torch": str(torch.__version__),
+                "python": platform.python_version(),
+            },
+            data=tuple(map(str, options.data)),
+            data_identity=clips.identity,
+            kind=clips.kind,
+            modality="semantic" if self.painted else "rgb",
+            protocol="pairs" if isinstance(clips, PairedSet) else options.protocol,
+            frames=clips.frames,
+            height=clips.height,
+            width=clips.width,
+            fps=clips.fps,
+            rates=tuple(clips.rates) if len(clips.rates) > 1 else (),
+            seed=options.seed,
+            classes=tuple(each.name for each in clips.classes),
+            methods={method.name: {**method.told, **lpips} for method in self.methods},
+        )
+
+    def summary(self, rows: Mapping[str, Sequence[ClipRecord]]) -> Summary:
+        """What was found. rows: records by method, of the same clips in their order."""
+        clips, options, model = self.clips, self.options, self.model
+        released, pairs = options.protocol == "released", clips if isinstance(clips, PairedSet) else None
+        selection = Selection(frames="all") if released else Selection()
+        found = {name: evaluation(records, selection, classes=len(clips.classes)) for name, records in rows.items()}
+        names = [method.name for method in self.models]
+        return Summary(
+            conditions=Conditions(
+                data=tuple(map(str, options.data)),
+                weights=None if model is None else model.name,
+                sha256_12=None if model is None else model.sha256_12,
+                steps=None if model is None else model.config.sampling.steps,
+                shots=tuple(Shot.of(clips, record) for record in next(iter(rows.values()))),
+                frames=clips.frames,
+                size=(clips.height, clips.width),
+                grid=class_grid(clips),
+                camera=clips.camera,
+                true_mount=MountNumbers.of(None if pairs is None else pairs.clips.mount),
+                declared_mount=MountNumbers.of(None if pairs is None else pairs.declared),
+                train=() if self.training is None else tuple(map(str, options.train or ())),
+                train_clips=0 if self.training is None else len(self.training),
+                samples=options.sampling.samples,
+                first_frame=1 if released else 2,
+            ),
+            classes=tuple(each.name for each in clips.classes),
+            model=tuple(found[name] for name in names if name in found),
+            baselines=tuple(each for name, each in found.items() if name not in names),
+        )
+
+    def write_sheet(self, path: Path, summary: Summary, keys: Sequence[str], keeper: RunKeeper) -> None:
+        """The contact sheet of the first clips of a summary. Raises RunError."""
+        clips: list[tuple[str, tuple[Strip, ...]]] = []
+        for each, key in zip(summary.conditions.shots, keys, strict=False):
+            methods = [(name, keeper.sheet_rows(name, key)) for name in _on_the_sheet(summary)]
+            clips.append((str(each), contact_rows(self.clips.clip(key), methods, self.clips.classes)))
+        write_sheet(clips, path)
 
 
-def planned(asked: Asked) -> Plan:
+def planned(options: EvaluateOptions) -> Plan:
     """Open the data and the weights, and choose the methods: all that is quick, so that faults are told at once.
 
     Raises:
         DataError: data or frames are missing, or do not fit together. RecipeError: options contradict each other, or
             there is nothing to measure. CheckpointError: weights cannot be opened.
     """
-    _require_used(asked)
-    lpips = None if asked.lpips is None else Lpips.open(asked.lpips).identity
-    if data_kind(asked.data) == "pairs":
-        _require_pairs_options(asked)
-        opened, model = open_pairs(asked.data, asked.choice, asked.mount), _model(asked)
-        painted = False
+    _require_used(options)
+    lpips = None if options.lpips is None else Lpips.open(options.lpips).identity
+    choice = Choice(split=options.split, listed=options.listed, limit=options.limit)
+    weights = None
+    if options.weights is not None:
+        weights = Weights(path=_resolved(options.weights), device=options.device, dtype=options.dtype)
+    painted = False
+    if data_kind(options.data) == "pairs":
+        _require_pairs_options(options)
+        clips, notes = open_pairs(options.data, choice, options.mount)
+        model = None if weights is None else weights.open().traits
     else:
-        model = _model(asked)
-        cuts = _cuts(asked, model)
-        opened, painted = open_scenes(asked.data[0], asked.choice, cuts), cuts.semantic
-    training = _training(asked, opened.clips)
-    models = (
-        ()
-        if model is None
-        else of_weights(_weights(asked), opened.clips, asked.tested.sampling, asked.tested.steps or ())
-    )
-    standing_in = None if training is None else _nothing_yet(opened.clips)
-    baselines = _baselines(asked, opened.clips, training, standing_in, painted=painted)
+        model = None if weights is None else weights.open().traits
+        cuts = _cuts(options, model)
+        clips, notes = open_scenes(options.data[0], choice, cuts)
+        painted = cuts.semantic
+    training = _training(options, clips)
+    trained_on = "nothing" if training is None else identity_of(training)
+    models = () if weights is None else of_weights(weights, clips, options.sampling, options.steps or ())
+    standing_in = None if training is None else _nothing_yet(clips)
+    baselines = _baselines(options, clips, standing_in, trained_on, painted=painted)
     saved = of_saved_frames(
-        asked.rivals.predictions or (),
-        opened.clips.classes if painted else (),
-        privileged=asked.rivals.privileged or (),
+        options.predictions or (), clips.classes if painted else (), privileged=options.privileged or ()
     )
     if not (models or baselines or saved):
         raise RecipeError("there is nothing to measure: give --weights, or leave out --no-baselines")
     require_names_apart([*models, *baselines, *saved])
     return Plan(
-        asked=asked,
-        opened=opened,
+        options=options,
+        clips=clips,
+        notes=notes,
         models=models,
         baselines=baselines,
         saved=saved,
         model=model,
         training=training,
+        trained_on=trained_on,
         painted=painted,
         lpips=lpips,
     )
 
 
-def note_of(plan: Plan, command: str) -> RunNote:
-    """What the run says of itself. command: the line that began it."""
-    clips, asked = plan.clips, plan.asked
-    lpips = {} if plan.lpips is None else {LPIPS: plan.lpips}
-    return RunNote(
-        command=command,
-        made=datetime.now(UTC).isoformat(timespec="seconds"),
-        versions={
-            "gcd-node": package_version(),
-            "torch": str(torch.__version__),
-            "python": platform.python_version(),
-        },
-        data=tuple(map(str, asked.data)),
-        data_identity=clips.identity,
-        kind=clips.kind,
-        modality="semantic" if plan.painted else "rgb",
-        protocol="pairs" if isinstance(clips, PairedSet) else asked.protocol,
-        frames=clips.frames,
-        height=clips.height,
-        width=clips.width,
-        fps=clips.fps,
-        rates=tuple(clips.rates) if len(clips.rates) > 1 else (),
-        seed=asked.tested.sampling.seed,
-        classes=tuple(each.name for each in clips.classes),
-        methods={method.name: {**method.told, **lpips} for method in plan.methods},
-    )
-
-
-def _weights(asked: Asked) -> Weights:
-    path = _resolved(asked.tested.weights or "")
-    return Weights(path=path, device=asked.tested.device, dtype=asked.tested.dtype)
-
-
 def _resolved(weights: str) -> str:
     """A path that does not depend on where a process stands; names of weights as they are."""
-    return str(Path(weights).resolve()) if weights and Path(weights).exists() else weights
+    return str(Path(weights).resolve()) if Path(weights).exists() else weights
 
 
-def _names(asked: Asked) -> list[str] | None:
-    """The baselines that are asked for by name; None for the usual ones."""
-    told = asked.rivals.names
-    return None if told is None else [name.strip() for name in ",".join(told).split(",") if name.strip()]
-
-
-def _require_used(asked: Asked) -> None:
+def _require_used(options: EvaluateOptions) -> None:
     """Raises RecipeError for what would be left aside without a word."""
-    told = asked.rivals
-    if told.names is not None and not told.usual:
+    if options.methods is not None and not options.baselines:
         raise RecipeError("--methods names baselines and --no-baselines wants none; leave one of the two out")
-    if told.svd is not None and VANILLA_SVD not in (_names(asked) or ()):
+    if options.svd is not None and VANILLA_SVD not in (options.names or ()):
         raise RecipeError(f"--svd is for {VANILLA_SVD}, which --methods does not name; name it, or leave out --svd")
 
 
-def _model(asked: Asked) -> Traits | None:
-    return None if asked.tested.weights is None else _weights(asked).open().traits
-
-
-def _require_pairs_options(asked: Asked) -> None:
+def _require_pairs_options(options: EvaluateOptions) -> None:
     """Pairs were cut when they were made."""
-    if asked.cut != SceneWishes() or asked.protocol != "paper":
+    of_scenes = ("controls", "trajectories", "frame_start", "frame_skip", "angles", "path", "modality")
+    given = any(getattr(options, name) is not None for name in of_scenes)
+    if given or options.exact or options.camera or options.protocol != "paper":
         raise RecipeError(
             "these are pairs, cut when they were made: leave out --protocol, --controls, --trajectories, "
             "--frame-start, --frame-skip, --angles, --path, --modality, --exact and --camera"
         )
 
 
-def _cuts(asked: Asked, model: Traits | None) -> SceneCuts:
+def _cuts(options: EvaluateOptions, model: Traits | None) -> SceneCuts:
     """What was asked for, and what suits the weights where nothing was."""
-    if asked.mount is not None:
+    if options.mount is not None:
         raise RecipeError("scenes tell where their cameras are: leave out --declared-height and --declared-tilt")
-    wishes, looks, form = asked.cut, asked.cut.looks, SceneCuts()
-    limits = None if model is None or model.family is None else model.family.limits
-    far = limits is not None and limits.azimuth_deg > _NEAR_DEG
-    semantic = model is not None and model.family is not None and model.family.output == "semantic"
-    config = form if model is None else model.config
-    return SceneCuts(
-        protocol=asked.protocol,
-        controls=wishes.controls,
-        clips=wishes.clips,
-        seed=asked.tested.sampling.seed,
-        bounds=wishes.bounds,
-        far=far if looks.angles is None else looks.angles == "max180",
-        gradual=(model is None or model.move_time > 0) if looks.path is None else looks.path == "gradual",
-        semantic=semantic if looks.modality is None else looks.modality == "semantic",
-        exact=wishes.exact,
-        cameras=tuple(wishes.cameras) if wishes.cameras else None,
-        frames=config.frames,
-        height=config.height,
-        width=config.width,
+    suiting = SceneCuts.suiting(model)
+    return replace(
+        suiting,
+        protocol=options.protocol,
+        controls=options.controls,
+        clips=options.trajectories,
+        seed=options.seed,
+        bounds=FrameBounds(start=options.frame_start, skip=options.frame_skip),
+        far=suiting.far if options.angles is None else options.angles == "max180",
+        gradual=suiting.gradual if options.path is None else options.path == "gradual",
+        semantic=suiting.semantic if options.modality is None else options.modality == "semantic",
+        exact=options.exact,
+        cameras=tuple(options.camera) if options.camera else None,
     )
 
 
-def _training(asked: Asked, clips: EvaluationSet) -> Training | None:
+def _training(options: EvaluateOptions, clips: EvaluationSet) -> PairedClips | None:
     """Raises DataError where the training clips are no measure for the held-out ones."""
-    told = asked.rivals
-    if not told.usual or not told.train:
+    if not options.baselines or not options.train:
         return None
     if not isinstance(clips, PairedSet):
         raise RecipeError("means are taken over pairs, and these are scenes: leave out --train")
-    training = PairedClips.open(list(told.train), told.train_limit)
+    training = PairedClips.open(list(options.train), options.train_limit)
     require_same_kind(training, clips.clips)
     if isinstance(clips.clips, PairedClips):
         require_apart(training, clips.clips)
-    return Training(clips=training, identity=identity_of(training))
+    return training
 
 
 def _nothing_yet(clips: EvaluationSet) -> TargetStatistics:
@@ -260,23 +328,22 @@ def _nothing_yet(clips: EvaluationSet) -> TargetStatistics:
     return TargetStatistics(mean=torch.zeros(clips.frames, 3, *frame), majority=majority)
 
 
-def _further_cameras(clips: EvaluationSet) -> int:
-    """How many cameras a scene has beside the source's; pairs have none."""
-    return len(clips.dataset.cameras) - 1 if isinstance(clips, SceneSet) else 0
-
-
 def _baselines(
-    asked: Asked,
+    options: EvaluateOptions,
     clips: EvaluationSet,
-    training: Training | None,
     statistics: TargetStatistics | None,
+    trained_on: str,
     *,
     painted: bool,
 ) -> tuple[Method, ...]:
     """Those that are wanted. statistics: of the training clips. Raises RecipeError as `of_baselines`."""
-    told = asked.rivals
-    if not told.usual:
+    if not options.baselines:
         return ()
+    if options.methods is None and statistics is None and isinstance(clips, PairedSet):
+        raise RecipeError(
+            "baselines want training clips for their means: give --train FOLDER, name some that need none with "
+            "--methods, or --no-baselines"
+        )
     settings = BaselineSettings(
         frames=clips.frames,
         height=clips.height,
@@ -284,19 +351,27 @@ def _baselines(
         classes=tuple(clips.classes),
         painted=painted,
         statistics=statistics,
-        svd=None if told.svd is None else _resolved(told.svd),
-        device=asked.tested.device,
-        dtype=asked.tested.dtype,
-        samples=asked.tested.sampling.samples,
-        seed=asked.tested.sampling.seed,
-        published=asked.protocol == "released",
-        hexplane=told.hexplane,
+        svd=None if options.svd is None else _resolved(options.svd),
+        device=options.device,
+        dtype=options.dtype,
+        samples=options.sampling.samples,
+        seed=options.seed,
+        published=options.protocol == "released",
+        hexplane=options.hexplane,
     )
-    names = _names(asked)
-    if names is None and training is None and isinstance(clips, PairedSet):
-        raise RecipeError(
-            "baselines want training clips for their means: give --train FOLDER, name some that need none with "
-            "--methods, or --no-baselines"
-        )
-    require_views(names or (), _further_cameras(clips))
-    return of_baselines(names, settings, "nothing" if training is None else training.identity)
+    further = len(clips.dataset.cameras) - 1 if isinstance(clips, SceneSet) else 0  # pairs have one camera
+    require_views(options.names or (), further)
+    return of_baselines(options.names, settings, trained_on)
+
+
+def _on_the_sheet(summary: Summary) -> list[str]:
+    """The model, and the best baselines with and without more than the source, by PSNR and by mIoU."""
+    names: tuple[FigureName, ...] = ("psnr_db", "miou")
+    wanted = [each.name for each in summary.model[:1]]
+    for name in names:
+        if summary.model and summary.model[0].value(name) != summary.model[0].value(name):
+            continue  # the model has no such figure
+        for privileged in (False, True):
+            best = best_of([each for each in summary.baselines if each.privileged == privileged], name)
+            wanted += [] if best is None else [best.name]
+    return [each.name for each in summary.evaluations if each.name in wanted]

@@ -1,119 +1,270 @@
-"""An evaluation as files: JSON for programs, Markdown tables for people."""
+"""The report as a folder: `report.md`, its tables as CSV, plots, galleries and videos."""
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
-import msgspec
+from gcd_train.errors import RecipeError, RunError
+from gcd_train.evaluation.comparison import (
+    Difference,
+    clips_csv,
+    differences,
+    differences_csv,
+    differences_markdown,
+    worst_clips,
+    worst_figure,
+    worst_markdown,
+)
+from gcd_train.evaluation.galleries import shown_clips, strips, write_sheet, write_video
+from gcd_train.evaluation.paper import is_model, tables_for
+from gcd_train.evaluation.plots import all_plots, curves_csv, draw, require_matplotlib
+from gcd_train.evaluation.runs import EvaluatedSet, Method, Run, gather, on_the_same_goals
+from gcd_train.evaluation.statistics import FEW_SCENES, Span
+from gcd_train.evaluation.store import folder_name, write_whole
+from gcd_train.evaluation.tables import (
+    STAR_OF_FIGURE,
+    Measured,
+    Table,
+    all_figures,
+    frames_csv,
+    frames_told,
+    main_tables,
+    markdown_rows,
+    region_table,
+    to_csv,
+    to_markdown,
+)
 
-from gcd_model.config import CameraControl
-from gcd_train.errors import RunError
-from gcd_train.evaluation.figures import Evaluation, Figures
-
-
-class MountNumbers(msgspec.Struct, frozen=True, kw_only=True):
-    """The part of a CameraMount that studies vary: height in metres, degrees down."""
-
-    height_m: float
-    tilt_deg: float
-
-    def __str__(self) -> str:
-        return f"{self.height_m:g} m, {self.tilt_deg:g} deg down"
-
-
-class Shot(msgspec.Struct, frozen=True, kw_only=True):
-    """One measured clip.
-
-    world, scene: the world and the seed of its scene. clip: its name in the shard, a number; of whole scenes its name
-        in the control list.
-    change: where its target camera goes, azimuth and elevation in degrees and radius in metres, target minus source;
-        None on the one path of driving.
-    """
-
-    world: str
-    scene: int
-    clip: str
-    change: tuple[float, float, float] | None = None
-
-    def __str__(self) -> str:
-        alike = self.clip.isdecimal() and int(self.clip) == self.scene
-        name = f"{self.world} {self.scene}" + ("" if alike else f" ({self.clip})")
-        if self.change is None:
-            return name
-        azimuth_deg, elevation_deg, radius_m = self.change
-        return f"{name} az {azimuth_deg:+.0f} el {elevation_deg:+.0f} r {radius_m:+.1f}"
-
-
-class Conditions(msgspec.Struct, frozen=True, kw_only=True):
-    """What the figures hold for.
-
-    data, train: folders. weights: name of the model, None for baselines alone. steps: of its sampler, as shipped.
-    samples: draws of each view, of what draws. first_frame: that is measured, counted from 1.
-    shots: the clips that were measured, in order. size, grid: height and width of pictures and of the class grid.
-    true_mount: of the source camera in the data. declared_mount: what the model and the baselines were told of it. Both
-    None where there is no vehicle.
-    train_clips: clips the mean and the majority map were fitted on, 0 without baselines.
-    """
-
-    data: tuple[str, ...]
-    weights: str | None
-    sha256_12: str | None
-    steps: int | None
-    shots: tuple[Shot, ...]
-    frames: int
-    size: tuple[int, int]
-    grid: tuple[int, int]
-    camera: CameraControl
-    true_mount: MountNumbers | None
-    declared_mount: MountNumbers | None
-    train: tuple[str, ...]
-    train_clips: int
-    samples: int = 1
-    first_frame: int = 2
+_SPANS: tuple[Span, ...] = ("2-last", "last")
+_RELEASED_SPANS: tuple[Span, ...] = ("all", *_SPANS)
+"""The released script's figures are over all frames, so they come first where a run used it."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Report:
-    """Everything an evaluation found.
+class Choices:
+    """What a report shows.
 
-    model: the weights with the settings that ship, then with other steps; empty for baselines alone.
-    classes: names of the ontology, by id.
+    leads: methods that are compared with all others; empty for every model, or the first method where there is none.
+    rows: method to its row in the paper's tables, where name and note do not tell. clips: in the gallery. worst: clips
+    of each lead among the failures. drawn: whether there are plots, which want matplotlib. seed: of the bootstrap.
     """
 
-    conditions: Conditions
-    classes: tuple[str, ...]
-    model: tuple[Evaluation, ...]
-    baselines: tuple[Evaluation, ...]
+    leads: tuple[str, ...] = ()
+    rows: Mapping[str, str] = field(default_factory=dict[str, str])
+    clips: int = 4
+    worst: int = 4
+    drawn: bool = True
+    seed: int = 0
+
+
+def make_report(folders: Sequence[Path], out: Path, choices: Choices | None = None, *, command: str = "") -> Path:
+    """Read runs and write everything about them. Nothing is measured again.
+
+    Args:
+        folders: of runs. command: the line that makes this report, for its first page.
+    Returns:
+        The path of `report.md`.
+    Raises:
+        RunError: a run cannot be read, two do not go together, or a file cannot be written.
+        RecipeError: a row is none of the paper's tables that its method's clips belong in.
+        RenderError: plots are wanted and matplotlib is not installed.
+    """
+    choices = choices or Choices()
+    if choices.drawn:
+        require_matplotlib()
+    runs = tuple(Run.read(folder) for folder in folders)
+    sets = gather(runs)
+    _require_known((*choices.leads, *choices.rows), sets)
+    _require_rows(choices.rows, sets)
+    pages = [_first_page(runs, command, choices)]
+    for number, each in enumerate(sets, start=1):
+        place = "." if len(sets) == 1 else f"{number}-{each.note.kind}-{each.note.modality}"
+        pages.append("\n".join(_Writer(of=each, out=out, place=place, choices=choices).sections()))
+    joined, notes = on_the_same_goals(sets)
+    for number, each in enumerate(joined, start=1):
+        writer = _Writer(of=each, out=out, place=f"last-frame-{number}", choices=choices)
+        pages.append("\n".join(writer.last_frames()))
+    if notes:
+        pages.append("\n".join(["## What is not compared\n", *(f"- {note}" for note in notes)]))
+    path = out / "report.md"
+    write_whole(path, ("\n".join(pages).rstrip() + "\n").encode())
+    return path
+
+
+def leads(of: EvaluatedSet, choices: Choices) -> tuple[Method, ...]:
+    """The methods of a set that are compared with all its others; those of the choice that it has."""
+    if choices.leads:
+        return tuple(method for name in choices.leads for method in of.methods if method.name == name)
+    models = tuple(method for method in of.methods if is_model(method.name, method.details))
+    return models or of.methods[:1]
+
+
+def _require_known(names: Sequence[str], sets: Sequence[EvaluatedSet]) -> None:
+    """Raises RunError for a method that none of the sets has."""
+    known = dict.fromkeys(method.name for each in sets for method in each.methods)
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise RunError(f"no method is called {unknown[0]!r} in these runs; there are {', '.join(known)}")
+
+
+def _require_rows(rows: Mapping[str, str], sets: Sequence[EvaluatedSet]) -> None:
+    """Raises RecipeError for a row that no table has which the method can stand in."""
+    for method, label in rows.items():
+        its = [each for each in sets if any(known.name == method for known in each.methods)]
+        labels = dict.fromkeys(row.label for each in its for table in tables_for(each.note) for row in table.rows)
+        if not labels:
+            raise RecipeError(
+                f"--row says where {method} stands in the paper's tables, and none of them is for these clips; "
+                "leave it out"
+            )
+        if label not in labels:
+            raise RecipeError(f"--row {method}: no row is called {label!r}; there are {'; '.join(labels)}")
+
+
+def _first_page(runs: Sequence[Run], command: str, choices: Choices) -> str:
+    """What the figures were made by: commands, seeds, digests."""
+    lines = ["# Report", ""]
+    if command:
+        lines += ["```bash", command, "```", ""]
+    lines += [f"Intervals: 95 %, 10 000 draws of scenes, seed {choices.seed}.", ""]
+    for run in runs:
+        lines += [f"## Run {run.folder.name}", "", "```bash", run.note.command, "```", "", *_note_lines(run), ""]
+    return "\n".join(lines)
+
+
+def _note_lines(run: Run) -> list[str]:
+    note = run.note
+    versions = ", ".join(f"{name} {version}" for name, version in note.versions.items())
+    facts = (
+        ("made", f"{note.made}, {versions}"),
+        ("clips", f"{', '.join(note.data)}, digest {note.data_identity}"),
+        ("protocol", f"{note.protocol}, seed {note.seed}"),
+        ("size", f"{note.frames} frames of {note.width}x{note.height} at {note.fps:g} fps"),
+    )
+    rows = [[name, ", ".join(f"{key} {value}" for key, value in told.items())] for name, told in note.methods.items()]
+    return [*(f"- {name}: {told}" for name, told in facts), "", *markdown_rows(["method", "what it is"], rows)]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Writer:
+    """One set's part of the report. place: its folder within `out`."""
+
+    of: EvaluatedSet
+    out: Path
+    place: str
+    choices: Choices
 
     @property
-    def evaluations(self) -> tuple[Evaluation, ...]:
-        """All rows, the model's first."""
-        return self.model + self.baselines
+    def spans(self) -> tuple[Span, ...]:
+        """Frames that tables are over."""
+        return _RELEASED_SPANS if self.of.note.protocol == "released" else _SPANS
 
+    def sections(self) -> Iterator[str]:
+        measured = Measured(of=self.of, seed=self.choices.seed, rows=self.choices.rows)
+        first = leads(self.of, self.choices)
+        yield f"## {self.of.title}\n"
+        yield from self._tables(measured)
+        yield from self._differences(measured, first, self.spans)
+        yield from self._plots(measured)
+        yield from self._gallery()
+        yield from self._failures(measured, first)
 
-def best_of(evaluations: Sequence[Evaluation], figure: Callable[[Figures], float]) -> Evaluation | None:
-    """The one with the highest figure; None where nobody has it."""
-    measured = [each for each in evaluations if not math.isnan(figure(each.total))]
-    return max(measured, key=lambda each: figure(each.total), default=None)
+    def last_frames(self) -> Iterator[str]:
+        """Only what the last frame tells, of methods that go there in different ways."""
+        measured = Measured(of=self.of, seed=self.choices.seed, rows=self.choices.rows)
+        yield f"## The last frame together: {self.of.title}\n"
+        yield "Clips of the same names end at the same goals here, so their last frames are comparable and no others.\n"
+        yield from map(self._table, main_tables(measured, ("last",)))
+        yield from self._differences(measured, leads(self.of, self.choices), ("last",))
 
+    def _table(self, table: Table) -> str:
+        self._write(f"tables/{table.name}.csv", to_csv(table))
+        return f"{to_markdown(table)}\n{self._link(f'tables/{table.name}.csv')}\n"
 
-def write_report(report: Report, text: str, folder: Path) -> None:
-    """`evaluation.json` (NaN as null) and `evaluation.md` with the text. Raises RunError if they cannot be written."""
-    every = {
-        "conditions": report.conditions,
-        "classes": report.classes,
-        "model": report.model,
-        "baselines": report.baselines,
-    }
-    write_file(folder / "evaluation.json", msgspec.json.format(msgspec.json.encode(every), indent=1))
-    write_file(folder / "evaluation.md", text.encode())
+    def _tables(self, measured: Measured) -> Iterator[str]:
+        yield from map(self._table, main_tables(measured, self.spans))
+        yield self._table(region_table(measured, self.spans[0]))
+        self._write("tables/figures.csv", all_figures(measured))
+        self._write("tables/frames.csv", frames_csv(measured))
+        self._write("tables/clips.csv", clips_csv(measured))
+        yield (
+            f"All figures with their intervals: {self._link('tables/figures.csv')}; "
+            f"frame by frame: {self._link('tables/frames.csv')}; "
+            f"clip by clip: {self._link('tables/clips.csv')}.\n"
+        )
 
+    def _differences(self, measured: Measured, first: Sequence[Method], spans: Sequence[Span]) -> Iterator[str]:
+        every: list[Difference] = []
+        for frames in spans:
+            told = frames_told(self.of, frames)
+            for lead in first:
+                found = differences(measured, lead, frames)
+                every += found
+                if found:
+                    yield f"### {lead.starred} against the others, {told}\n"
+                    yield differences_markdown(found, self.of)
+        if every:
+            self._write("tables/differences.csv", differences_csv(every))
+            yield (
+                "How far it lies above the other on the same clips; bold where zero lies outside the 95 % interval, "
+                f"which is paired over scenes. {self._link('tables/differences.csv')}\n"
+            )
+        if any(each.starred for each in every):
+            yield f"{STAR_OF_FIGURE}\n"
+        if every and self.of.scenes < FEW_SCENES:
+            yield f"Of {self.of.scenes} scenes alone: too few to rest a claim on, whatever is bold.\n"
 
-def write_file(path: Path, data: bytes) -> None:
-    """Write a file and the folders above it. Raises RunError if it cannot be written."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data)
-    except OSError as error:
-        raise RunError(f"cannot write {path}: {error.strerror}; choose another --out") from error
+    def _plots(self, measured: Measured) -> Iterator[str]:
+        for plot in all_plots(measured):
+            self._write(f"plots/{plot.name}.csv", curves_csv(plot))
+            told = f"{plot.up} by {plot.across}"
+            if self.choices.drawn:
+                draw(plot, self._path(f"plots/{plot.name}.png"))
+                yield f"### {plot.title}: {told}\n\n![{told}]({self._name(f'plots/{plot.name}.png')})\n"
+            yield f"The numbers: {self._link(f'plots/{plot.name}.csv')}\n"
+
+    def _gallery(self) -> Iterator[str]:
+        if not self.choices.clips:
+            return
+        keys = shown_clips(self.of, self.of.methods, self.choices.clips)
+        if keys:
+            yield "### Gallery\n"
+            yield from self._shown("gallery", keys)
+        else:
+            yield "No frames were kept, so there is no gallery: evaluate with `--views all`.\n"
+
+    def _failures(self, measured: Measured, first: Sequence[Method]) -> Iterator[str]:
+        for lead in first if self.choices.worst else ():
+            found = worst_clips(measured, lead, self.choices.worst)
+            yield f"### Worst clips of {lead.name}\n"
+            yield worst_markdown(worst_figure(lead), found)
+            kept = set(shown_clips(self.of, (lead,), len(self.of.keys)))
+            keys = tuple(each.key for each in found if each.key in kept)
+            if keys:
+                yield from self._shown(f"worst/{folder_name(lead.name)}", keys)
+
+    def _shown(self, folder: str, keys: Sequence[str]) -> Iterator[str]:
+        """A sheet of clips, and a video of each."""
+        clips = [(key, strips(self.of.methods, key)) for key in keys]
+        write_sheet(clips, self._path(f"{folder}/sheet.png"))
+        yield f"![{', '.join(keys)}]({self._name(f'{folder}/sheet.png')})\n"
+        names = [f"{folder}/{folder_name(key)}.mp4" for key in keys]
+        made = [
+            write_video(rows, self.of.fps(key), self._path(name))
+            for name, (key, rows) in zip(names, clips, strict=True)
+        ]
+        videos = [self._link(name) for name, done in zip(names, made, strict=True) if done]
+        if videos:
+            yield f"Videos: {', '.join(videos)}\n"
+
+    def _name(self, name: str) -> str:
+        return name if self.place == "." else f"{self.place}/{name}"
+
+    def _path(self, name: str) -> Path:
+        return self.out / self._name(name)
+
+    def _link(self, name: str) -> str:
+        return f"[{Path(name).name}]({self._name(name)})"
+
+    def _write(self, name: str, text: str) -> None:
+        write_whole(self._path(name), text.encode())

@@ -1,161 +1,365 @@
-"""A report as Markdown: what was measured, steps against steps, classes, scenes."""
+"""Tables of a set of clips: the paper's, or the same columns for clips of our own; as Markdown and as CSV."""
 
-import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from math import isnan, nan
+from statistics import fmean
+from typing import Any
 
-from gcd_train.baselines import FROM_EXACT_CLASSES
-from gcd_train.evaluation.figures import Evaluation, Figures, lead
-from gcd_train.evaluation.report import Report, best_of
+from gcd_train.evaluation.paper import (
+    CLASS_COLUMNS,
+    PICTURE_COLUMNS,
+    Column,
+    Gain,
+    PaperRow,
+    PaperTable,
+    row_label,
+    tables_for,
+)
+from gcd_train.evaluation.runs import EvaluatedSet, Method
+from gcd_train.evaluation.statistics import (
+    FIGURE_NAMES,
+    FIRST_MEASURED,
+    Array,
+    Bootstrap,
+    ClassCounts,
+    FigureName,
+    Interval,
+    Selection,
+    Span,
+    bootstrap,
+    class_counts,
+    clip_sums,
+)
+from gcd_train.evaluation.store import REGIONS, ClipRecord, Region
+
+NOT_RUN, NO_WEIGHTS, NOTHING = "not run", "no weights given", "-"
+_LINE = "———"
+_SPANS: tuple[Span, ...] = ("2-last", "last", "all")
+_OWN_NAMES: dict[Span, str] = {"2-last": "main", "last": "last_frame", "all": "all_frames"}
+_BRACKETS = "In brackets: 95 % interval, bootstrap over scenes. * is given more than the source video."
+STAR_OF_FIGURE = "A * behind a mIoU: these class maps are made from the source's exact ones, which no model is given."
+"""Stands below tables with such a star."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class _Column:
-    """One figure as a column. full: the same at picture size, shown in brackets. of_classes: of class maps."""
+class Cell:
+    """One figure of a table, or why there is none.
 
-    heading: str
-    figure: Callable[[Figures], float]
-    digits: int
-    full: Callable[[Figures], float] | None = None
-    of_classes: bool = False
+    digits: behind the point. note: stands in for the figure. paper: what the paper prints there, its own data. starred:
+    the method was given more for this figure than for its others.
+    """
 
-    def cell(self, each: Evaluation) -> str:
-        text = _with_error(self.figure(each.total), self.figure(each.error), self.digits)
-        full = math.nan if self.full is None else self.full(each.total)
-        text = text if math.isnan(full) else f"{text} ({full:.{self.digits}f})"
-        return f"{text} *" if self.of_classes and text != "-" and each.name in FROM_EXACT_CLASSES else text
+    figure: Interval | None = None
+    digits: int = 2
+    note: str = NOTHING
+    paper: float | None = None
+    starred: bool = False
 
-    def ahead(self, first: Evaluation, other: Evaluation) -> str:
-        return "-" if first is other else _with_error(*lead(first, other, self.figure), self.digits)
+    def __str__(self) -> str:
+        if self.figure is None or not self.figure.known:
+            return self.note
+        star, value = " *" if self.starred else "", f"{self.figure.value:.{self.digits}f}"
+        if isnan(self.figure.low):  # of one scene
+            return value + star
+        return f"{value} [{self.figure.low:.{self.digits}f}, {self.figure.high:.{self.digits}f}]{star}"
+
+    def numbers(self) -> tuple[str, str, str]:
+        """Value and bounds in full, empty for none."""
+        numbers = (nan,) * 3 if self.figure is None else (self.figure.value, self.figure.low, self.figure.high)
+        value, low, high = ("" if isnan(number) else f"{number:.6g}" for number in numbers)
+        return value, low, high
+
+    @property
+    def printed(self) -> str:
+        """What the paper prints, empty for nothing."""
+        return "" if self.paper is None else f"{self.paper:g}"
 
 
-_PSNR = _Column(heading="PSNR dB", figure=lambda f: f.psnr_db, digits=2)
-_SSIM = _Column(heading="SSIM", figure=lambda f: f.ssim, digits=3)
-_MIOU = _Column(heading="mIoU", figure=lambda f: f.miou, digits=3, full=lambda f: f.miou_full, of_classes=True)
-_COLUMNS = (
-    _PSNR,
-    _Column(heading="last frame", figure=lambda f: f.last_psnr_db, digits=2),
-    _SSIM,
-    _Column(heading="LPIPS", figure=lambda f: f.lpips, digits=3),
-    _Column(heading="diversity", figure=lambda f: f.diversity, digits=3),
-    _Column(heading="gradient energy", figure=lambda f: f.gradient_energy, digits=2),
-    _Column(heading="flicker", figure=lambda f: f.flicker, digits=2),
-    _MIOU,
-    _Column(heading="accuracy", figure=lambda f: f.accuracy, digits=3, of_classes=True),
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Row:
+    """label: of the row. method: whose figures these are, empty for none. clips: how many it was measured on."""
+
+    label: str
+    method: str = ""
+    clips: str = ""
+    cells: tuple[Cell, ...]
+
+    @property
+    def printed(self) -> str:
+        """What the paper prints in it, in one cell."""
+        each = [cell.printed for cell in self.cells]
+        return ", ".join(text or NOTHING for text in each) if any(each) else ""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Table:
+    """name: of its file. title, notes: above and below it. headings: of the cells' columns. below: under a line."""
+
+    name: str
+    title: str
+    headings: tuple[str, ...]
+    rows: tuple[Row, ...]
+    below: tuple[Row, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def to_markdown(table: Table) -> str:
+    """With a heading of the third level."""
+    every = (*table.rows, *table.below)
+    has_paper = any(row.printed for row in every)
+    heads = ["", "method", "clips", *table.headings, *(["paper (its own data)"] if has_paper else [])]
+    rows = [
+        [row.label, row.method, row.clips, *map(str, row.cells), *([row.printed] if has_paper else [])] for row in every
+    ]
+    if table.below:
+        rows.insert(len(table.rows), [_LINE] * len(heads))
+    lines = [f"### {table.title}", "", *markdown_rows(heads, rows)]
+    return "\n".join([*lines, *(f"\n{note}" for note in table.notes)]) + "\n"
+
+
+def to_csv(table: Table) -> str:
+    """For each column its value, the bounds and what the paper prints; what is missing is empty."""
+    parts = [f"{heading}{what}" for heading in table.headings for what in ("", " low", " high", " paper")]
+    rows: list[list[str]] = []
+    for row in (*table.rows, *table.below):
+        cells = [part for cell in row.cells for part in (*cell.numbers(), cell.printed)]
+        rows.append([row.label, row.method or NOT_RUN, row.clips, *cells])
+    return csv_text(["row", "method", "clips", *parts], rows)
+
+
+def csv_text(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """RFC 4180, with line feeds."""
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows([headings, *rows])
+    return out.getvalue()
+
+
+def markdown_rows(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """The lines of a table; a bar inside a cell is escaped."""
+    every = (headings, ["---"] * len(headings), *rows)
+    return [f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |" for cells in every]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Measured:
+    """A set of clips with the sums of its methods, each worked out once.
+
+    seed: of the bootstrap. rows: method to the row of the paper's tables that a user says it belongs in.
+    """
+
+    of: EvaluatedSet
+    seed: int = 0
+    rows: Mapping[str, str] = field(default_factory=dict[str, str])
+    _known: dict[object, Any] = field(default_factory=dict[object, Any], init=False, repr=False, compare=False)
+
+    def sums(self, method: Method, selection: Selection, records: Sequence[ClipRecord] | None = None) -> Bootstrap:
+        """A method's sums for some frames and pixels; of some of its records, or of all."""
+        if records is not None and tuple(record.key for record in records) != method.keys:
+            return bootstrap(records, selection, classes=len(self.of.note.classes), seed=self.seed)
+        at = (method.name, selection)
+        if at not in self._known:
+            self._known[at] = bootstrap(method.records, selection, seed=self.seed, counts=self._counts(method))
+        return self._known[at]
+
+    def by_clip(self, method: Method, region: Region, name: FigureName) -> Array:
+        """A figure of each clip of a method, [n], in frames 2 to the last."""
+        return clip_sums(method.records, Selection(region=region), counts=self._counts(method)).figure(name)
+
+    def _counts(self, method: Method) -> ClassCounts:
+        if method.name not in self._known:
+            self._known[method.name] = class_counts(method.records, len(self.of.note.classes))
+        return self._known[method.name]
+
+
+def frames_told(of: EvaluatedSet, frames: Span) -> str:
+    """Which frames a table is over, in words."""
+    return {"2-last": f"frames 2-{of.note.frames}", "last": "last frame", "all": f"all {of.note.frames} frames"}[frames]
+
+
+def main_tables(measured: Measured, spans: Sequence[Span] = ("2-last", "last")) -> tuple[Table, ...]:
+    """The paper's tables for clips of its sets, tables of the same columns under their own title for others.
+
+    Args:
+        spans: only tables over these frames. The paper has none over all frames, so that one is always our own.
+    """
+    of, papers = measured.of, {each.frames: each for each in tables_for(measured.of.note)}
+    pictures, classes = any(m.makes_pictures for m in of.methods), any(m.makes_classes for m in of.methods)
+    every = (*(PICTURE_COLUMNS if pictures else ()), *(CLASS_COLUMNS if classes else ()))
+    columns = tuple(column for column in every if column.region in of.regions)
+    ours = tuple(
+        _own_table(measured, columns, frames, _OWN_NAMES[frames], f"{of.title}: {frames_told(of, frames)}")
+        for frames in spans
+        if frames not in papers
+    )
+    return (*ours, *(_paper_table(measured, each) for frames, each in papers.items() if frames in spans))
+
+
+def region_table(measured: Measured, frames: Span = "2-last") -> Table:
+    """Every method on all, visible and occluded pixels side by side, with its diversity and sharpness on all."""
+    of = measured.of
+    columns = tuple(column for column in _REGION_COLUMNS if column.region in of.regions and _has(of, column))
+    title = f"Visible and occluded pixels, diversity, sharpness: {frames_told(of, frames)}"
+    figures = {column.figure for column in columns}
+    notes = {
+        "diversity": "Diversity: standard deviation over the draws of one view; of two draws or more.",
+        "gradient_energy": "Gradient energy: view over target, 1 is as sharp as the target.",
+    }
+    extra = tuple(note for figure, note in notes.items() if figure in figures)
+    return _own_table(measured, columns, frames, "regions", title, extra)
+
+
+def _own_table(
+    measured: Measured, columns: Sequence[Column], frames: Span, name: str, title: str, notes: tuple[str, ...] = ()
+) -> Table:
+    return Table(
+        name=name,
+        title=title,
+        headings=tuple(column.heading for column in columns),
+        rows=tuple(_row(measured, method, columns, frames, PaperRow(label="")) for method in measured.of.methods),
+        notes=(*_notes(measured.of, columns, frames), *notes),
+    )
+
+
+def _paper_table(measured: Measured, table: PaperTable) -> Table:
+    placed: dict[str, list[Method]] = {}
+    for method in measured.of.methods:
+        label = measured.rows.get(method.name) or row_label(method.name, method.details, table)
+        placed.setdefault(label or "", []).append(method)
+    rows: list[Row] = []
+    for row in table.rows:
+        found = placed.pop(row.label, [])
+        rows += [_row(measured, each, table.columns, table.frames, row) for each in found]
+        rows += [] if found else [Row(label=row.label, cells=_not_run(row, table.columns))]
+    below = [
+        _row(measured, each, table.columns, table.frames, PaperRow(label=_below(label)))
+        for label, methods in placed.items()
+        for each in methods
+    ]
+    return Table(
+        name=table.name,
+        title=f"{table.title} ({measured.of.title})",
+        headings=tuple(column.heading for column in table.columns),
+        rows=(*rows, *(_gain(rows, each, table.columns) for each in table.gains)),
+        below=tuple(below),
+        notes=_notes(measured.of, table.columns, table.frames),
+    )
+
+
+def _gain(rows: Sequence[Row], gain: Gain, columns: Sequence[Column]) -> Row:
+    """The mean difference of the first column, where every variant was measured; of several in a row the first."""
+    known = {row.label: row.cells[0].figure for row in reversed(rows)}
+    pairs = [(known[label], known[label.replace(gain.better, gain.worse)]) for label in known if gain.better in label]
+    apart = [one.value - other.value for one, other in pairs if one is not None and other is not None]
+    figure = Interval(value=fmean(apart), low=nan, high=nan) if len(apart) == len(pairs) else None
+    first = Cell(figure=figure, digits=columns[0].digits, note=NOT_RUN, paper=gain.printed)
+    return Row(
+        label=f"{gain.better} over {gain.worse}, mean of variants",
+        cells=(first, *(Cell(note=NOTHING) for _ in columns[1:])),
+    )
+
+
+def _below(label: str) -> str:
+    """How a method is called below the paper's rows. label: of its row in another of the paper's tables, or empty."""
+    return f"{label}, not in this table" if label else "not in the paper"
+
+
+def _row(measured: Measured, method: Method, columns: Sequence[Column], frames: Span, row: PaperRow) -> Row:
+    """A method's figures, beside what the paper prints in its row."""
+    cells = tuple(
+        Cell(
+            figure=measured.sums(method, Selection(frames=frames, region=column.region)).interval(column.figure),
+            digits=column.digits,
+            note=_why_not(measured.of, method, column),
+            paper=blank.paper,
+            starred=method.copies_classes and column.of_classes,
+        )
+        for column, blank in zip(columns, _not_run(row, columns), strict=True)
+    )
+    clips = f"{len(method.records)} of {len(measured.of.keys)}"
+    return Row(label=row.label, method=method.starred, clips=clips, cells=cells)
+
+
+def _not_run(row: PaperRow, columns: Sequence[Column]) -> tuple[Cell, ...]:
+    printed = (*row.printed, *(None,) * len(columns))
+    return tuple(Cell(note=NOT_RUN, paper=paper) for _, paper in zip(columns, printed, strict=False))
+
+
+def _why_not(of: EvaluatedSet, method: Method, column: Column) -> str:
+    """What stands where there is no figure."""
+    if column.figure == "lpips" and method.makes_pictures:
+        return NO_WEIGHTS
+    return NOTHING if column.region in of.regions else "unknown"
+
+
+def _notes(of: EvaluatedSet, columns: Sequence[Column], frames: Span) -> tuple[str, ...]:
+    """What stands below a table: its frames and clips, what brackets and stars mean, what is not known."""
+    told = frames_told(of, frames)
+    notes = [f"{told[0].upper()}{told[1:]} of {len(of.keys)} clips of {of.scenes} scenes. {_BRACKETS}"]
+    if any(column.of_classes for column in columns) and any(each.copies_classes for each in of.methods):
+        notes.append(STAR_OF_FIGURE)
+    if any(column.region not in of.regions for column in columns):
+        notes.append("Unknown: nobody knows which pixels of these clips the source camera saw.")
+    if any(column.figure == "lpips" for column in columns) and len(of.regions) > 1:
+        notes.append("LPIPS is over all pixels alone: its network sees patches, which no region cuts out.")
+    return tuple(notes)
+
+
+_BY_REGION: tuple[tuple[str, FigureName, int], ...] = (
+    ("PSNR", "psnr_db", 2),
+    ("SSIM", "ssim", 3),
+    ("mIoU", "miou_common", 3),
+)
+_REGION_COLUMNS = (
+    *(
+        Column(heading=f"{name} {region}", figure=figure, region=region, digits=digits)
+        for name, figure, digits in _BY_REGION
+        for region in REGIONS
+    ),
+    Column(heading="diversity", figure="diversity", digits=4),
+    Column(heading="gradient energy", figure="gradient_energy"),
 )
 
 
-def to_markdown(report: Report) -> str:
-    """All tables; what nobody has is left out."""
-    parts = [_conditions(report), _predictors(report.evaluations)]
-    if len(report.model) > 1:
-        parts.append(_steps(report))
-    if any(not math.isnan(each.total.miou) for each in report.evaluations):
-        parts.append(_classes(report))
-    if report.model:
-        parts.append(_clips(report))
-    return "\n\n".join("\n".join(part) for part in parts) + "\n"
+def _has(of: EvaluatedSet, column: Column) -> bool:
+    """Whether any method can have such a figure."""
+    if column.of_classes:
+        return any(method.makes_classes for method in of.methods)
+    shown = [method for method in of.methods if method.makes_pictures]
+    return (column.figure != "diversity" and bool(shown)) or any(
+        r.draws > 1 for method in shown for r in method.records
+    )
 
 
-def _conditions(report: Report) -> list[str]:
-    given, shots = report.conditions, report.conditions.shots
-    scenes = len({(shot.world, shot.scene) for shot in shots})
-    folders = ", ".join(f"`{folder}`" for folder in given.data)
-    lines = [
-        f"{len(shots)} clips of {scenes} scenes in {folders}, frames {given.first_frame}-{given.frames}; value ± "
-        "standard error over scenes. * is given more than the source video."
-    ]
-    if given.weights is not None:
-        steps, samples = _counted(given.steps or 0, "step"), _counted(given.samples, "sample")
-        lines.append(f"`{given.weights}` as it ships: {steps} of its sampler, {samples}.")
-    if given.true_mount is not None:
-        lines.append(f"Source camera at {given.true_mount}; declared: {given.declared_mount}.")
-    if report.classes:
-        height, width = given.grid
-        lines.append(f"Class figures at {width}x{height}, in brackets at picture size.")
-    totals = [each.total for each in report.evaluations]
-    if all(math.isnan(each.lpips) for each in totals) and any(not math.isnan(each.psnr_db) for each in totals):
-        lines.append("LPIPS: no weights given (`--lpips`).")
-    return lines
+def all_figures(measured: Measured) -> str:
+    """Every figure of every method, frames and pixels with its interval, as CSV: one figure a line."""
+    lines: list[list[str]] = []
+    for method in measured.of.methods:
+        for frames in _SPANS:
+            for region in measured.of.regions:
+                sums = measured.sums(method, Selection(frames=frames, region=region))
+                cells = {name: Cell(figure=sums.interval(name)).numbers() for name in FIGURE_NAMES}
+                clips = str(len(method.records))
+                lines += [[method.name, frames, region, name, *cell, clips] for name, cell in cells.items() if cell[0]]
+    return csv_text(["method", "frames", "pixels", "figure", "value", "low", "high", "clips"], lines)
 
 
-def _predictors(evaluations: Sequence[Evaluation]) -> list[str]:
-    first = evaluations[0]
-    columns = [each for each in _COLUMNS if not all(math.isnan(each.figure(row.total)) for row in evaluations)]
-    ahead = [each for each in (_PSNR, _MIOU) if not math.isnan(each.figure(first.total))]
-    rows = [
-        [
-            each.name + (" *" if each.privileged else ""),
-            *(column.cell(each) for column in columns),
-            *(column.ahead(first, each) for column in ahead),
-            f"{each.seconds_per_clip:.2f}",
-        ]
-        for each in evaluations
-    ]
-    headings = [*(each.heading for each in columns), *(f"first row ahead, {each.heading}" for each in ahead), "s/clip"]
-    return _table(["", *headings], rows)
+_BY_FRAME: tuple[FigureName, ...] = (
+    *("psnr_db", "ssim", "lpips", "diversity"),
+    *("gradient_energy", "flicker", "miou_common"),
+)
 
 
-def _steps(report: Report) -> list[str]:
-    shipped, *others = report.model
-    return ["The steps that ship against others, on the same clips:", "", *(_against(shipped, each) for each in others)]
-
-
-def _against(shipped: Evaluation, other: Evaluation) -> str:
-    told = [
-        f"{column.heading} {_with_error(*lead(shipped, other, column.figure), column.digits, sign='+')}"
-        for column in (_PSNR, _SSIM, _MIOU)
-        if not math.isnan(column.figure(shipped.total))
-    ]
-    return f"- over {other.name}: {', '.join(told)}"
-
-
-def _classes(report: Report) -> list[str]:
-    shown = [each for each in report.evaluations if not math.isnan(each.total.miou)]
-
-    def cell(each: Evaluation, label: int) -> str:
-        iou, full = each.total.class_iou[label], each.total.class_iou_full[label]
-        shown = tuple("-" if math.isnan(value) else f"{value:.2f}" for value in (iou, full))
-        return "-" if shown == ("-", "-") else f"{shown[0]} ({shown[1]})"
-
-    every = [[name, *(cell(each, i) for each in shown)] for i, name in enumerate(report.classes)]
-    rows = [row for row in every if set(row[1:]) != {"-"}]  # a class that nobody saw or said, as void
-    return ["IoU of each class:", "", *_table(["class", *(each.name for each in shown)], rows)]
-
-
-def _clips(report: Report) -> list[str]:
-    """Every clip by name, and where the model is ahead of the best baseline and where not."""
-    headings, columns = ["clip"], list[list[str]]()
-    for heading, column in _clip_columns(report):
-        headings.append(heading)
-        columns.append(column)
-    names = [str(shot) for shot in report.conditions.shots]
-    return ["Clips:", "", *_table(headings, [list(row) for row in zip(names, *columns, strict=True)])]
-
-
-def _clip_columns(report: Report) -> Iterator[tuple[str, list[str]]]:
-    model = report.model[0]
-    for column in (_PSNR, _MIOU):
-        if math.isnan(column.figure(model.total)):
-            continue
-        own = [column.figure(each) for each in model.clips]
-        yield column.heading, [_with_error(value, math.nan, column.digits) for value in own]
-        best = best_of(report.baselines, column.figure)
-        if best is not None:
-            apart = [value - column.figure(each) for value, each in zip(own, best.clips, strict=True)]
-            yield f"over {best.name}", [_with_error(value, math.nan, column.digits, sign="+") for value in apart]
-
-
-def _counted(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"
-
-
-def _with_error(value: float, error: float, digits: int, sign: str = "") -> str:
-    if math.isnan(value):
-        return "-"
-    return f"{value:{sign}.{digits}f}" + ("" if math.isnan(error) else f" ± {error:.{digits}f}")
-
-
-def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    rule = ["---"] * len(headings)
-    return [f"| {' | '.join(cells)} |" for cells in (headings, rule, *rows)]
+def frames_csv(measured: Measured) -> str:
+    """Every figure of every method in each frame from the second on: one figure a line, without intervals."""
+    lines: list[list[str]] = []
+    for method in measured.of.methods:
+        for frame in range(FIRST_MEASURED + 1, measured.of.note.frames + 1):
+            for region in measured.of.regions:
+                sums = measured.sums(method, Selection(frames=frame, region=region))
+                values = {name: sums.value(name) for name in _BY_FRAME}
+                of_frame = [method.name, str(frame), region]
+                lines += [[*of_frame, name, f"{value:.6g}"] for name, value in values.items() if not isnan(value)]
+    return csv_text(["method", "frame", "pixels", "figure", "value"], lines)

@@ -15,13 +15,7 @@ from gcd_train.lerobot.writer import ExportOptions, LeRobotWriter, LoggedEpisode
 from gcd_train.scenes.drop import HFOV_DEG, orbit_cameras
 from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.renderer import Renderer
-from gcd_train.scenes.tabletop import (
-    FPS,
-    UNITS_A_METRE,
-    Episode,
-    tabletop_episode,
-    upright_base,
-)
+from gcd_train.scenes.tabletop import FPS, UNITS_A_METRE, Episode, tabletop_episode, upright_base
 
 WRIST = "wrist"
 _IMAGES = "observation.images."

@@ -15,12 +15,12 @@ from torch import Tensor, nn
 from gcd_model.live.depth_net import DepthOutput, depth_inputs, read_depth
 from gcd_model.live.paint_net import filled
 from gcd_model.live.view import LiveNetworks
+from gcd_train.evaluation.metrics import class_iou, confusion_matrix
 from gcd_train.live.batches import to_video, with_true_references
 from gcd_train.live.clips import read_clip
 from gcd_train.live.measure_figures import SpreadHistogram, fit_spread
 from gcd_train.live.measure_methods import LiveModel
 from gcd_train.live.paint_training import HeldOutViews
-from gcd_train.metrics.classes import class_iou, confusion_matrix
 
 _SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 _FRAMES = slice(1, 14, 4)

@@ -14,12 +14,18 @@ from torch import Tensor
 
 from gcd_model.config import SemanticClass
 from gcd_model.geometry import Intrinsics, invert_rigid
+from gcd_train.evaluation.metrics import (
+    class_iou,
+    confusion_matrix,
+    gradient_map,
+    majority_classes,
+    psnr,
+    ssim_map,
+    window_mask,
+)
 from gcd_train.live.batches import to_video
 from gcd_train.live.clips import SKY_M, LiveClip
 from gcd_train.live.judge import CELL, JudgeNet, Moments, frechet_distance
-from gcd_train.metrics.classes import class_iou, confusion_matrix, majority_classes
-from gcd_train.metrics.pictures import gradient_map, psnr
-from gcd_train.metrics.structure import ssim_map, window_mask
 
 NEVER, BEFORE, NOW = 0, 1, 2
 STATES = ("painted", "before", "now")

@@ -27,8 +27,8 @@ from gcd_model.live.paint_net import filled, seen_of
 from gcd_model.live.splat import splat, unproject
 from gcd_model.live.view import Floor, FrameGeometry, LiveNetworks, LiveView
 from gcd_model.small_files import decode_json
-from gcd_train.baselines.depth_reprojection import splat as splat_points
 from gcd_train.errors import DataError
+from gcd_train.evaluation.reprojection import splat as splat_points
 from gcd_train.live.batches import Pictures, pictures_of, training_paths
 from gcd_train.live.clips import LiveClip, read_clip
 from gcd_train.live.measure_figures import NEVER, NOW, MethodViews

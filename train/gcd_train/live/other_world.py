@@ -16,9 +16,9 @@ from gcd_model.geometry import Intrinsics
 from gcd_model.live.synthesizer import LiveSynthesizer
 from gcd_model.live.view import LiveView
 from gcd_train.errors import DataError
-from gcd_train.gallery.real_video import WindowChoice, find_videos, read_windows
 from gcd_train.live.batches import to_video
 from gcd_train.live.clips import clip_paths, read_clip
+from gcd_train.look.real_video import WindowChoice, find_videos, read_windows
 
 _ASSUMED_HFOV_DEG = 70.0
 """Of a video whose lens nobody knows."""

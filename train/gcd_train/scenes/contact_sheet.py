@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from gcd_train.datasets.paired import PairedClip, PairedClips
 from gcd_train.errors import DataError
-from gcd_train.show.colours import instance_colour
+from gcd_train.look.clip import instance_colour
 
 Bytes = NDArray[np.uint8]
 

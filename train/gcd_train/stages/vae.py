@@ -15,8 +15,8 @@ from gcd_model.vae import Encoder, Posterior, TemporalDecoder
 from gcd_train.datasets.clip_source import Bytes, ClipSource, KeptClips, to_network
 from gcd_train.draws import Draws
 from gcd_train.errors import RecipeError
+from gcd_train.evaluation.metrics import mean_iou, named_confusion, psnr
 from gcd_train.loop import Progress, StepLoss
-from gcd_train.metrics import mean_iou, named_confusion, psnr
 from gcd_train.picture_losses import gradient_l1, kl_to_normal, ssim
 from gcd_train.pictures import write_sheet
 from gcd_train.precision import Precision

@@ -1,0 +1,189 @@
+"""Every baseline by name, and what it is built from."""
+
+import difflib
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+
+import torch
+
+from gcd_model.config import SemanticClass
+from gcd_train.errors import RecipeError
+from gcd_train.evaluation.hexplane import HexPlaneSettings
+from gcd_train.evaluation.hexplane_learning import HexPlane
+from gcd_train.evaluation.metrics import NO_CLASS
+from gcd_train.evaluation.predictors import (
+    CopySource,
+    Fixed,
+    GroundHomography,
+    Prediction,
+    Predictor,
+    SourceClip,
+    TargetStatistics,
+)
+from gcd_train.evaluation.reprojection import (
+    REPROJECT_RGBD,
+    REPROJECT_SEMD,
+    DepthReprojection,
+    ReprojectRgbd,
+    ReprojectSemd,
+)
+from gcd_train.evaluation.svd import VANILLA_SVD, VanillaSVD, weights_named
+
+DEPTH_ON_MEAN = "depth_reprojection_on_mean"
+"""Depth reprojection with holes as in the mean target and the majority map."""
+HEXPLANE_VIEWS = (1, 2, 4, 8)
+"""Numbers of input views that a HexPlane is usually given; any other number goes too."""
+FROM_EXACT_CLASSES = ("copy_source", "ground_homography")
+"""Baselines that are not privileged in their pictures, but make their class maps from the source's exact ones."""
+
+_HEXPLANE = re.compile(r"hexplane_([1-9]\d*)")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class BaselineSettings:
+    """What baselines are built from; may be sent to another process.
+
+    frames, height, width: T, H and W of the clips. classes: of the clips, by id; empty for none. painted: the targets
+    are painted in the colours of the classes, and all that counts is class maps.
+    statistics: of training targets; None where there are none, and then holes are black.
+    svd: the published weights, for vanilla SVD. device, dtype: see `gcd_model.load_synthesizer`. samples: draws of
+    what draws. seed: of all noise. published: points are counted as released, see `SplatOptions`. hexplane: what is
+    learnt of each clip.
+    """
+
+    frames: int
+    height: int
+    width: int
+    classes: tuple[SemanticClass, ...] = ()
+    painted: bool = False
+    statistics: TargetStatistics | None = None
+    svd: str | None = None
+    device: str = "auto"
+    dtype: str | None = None
+    samples: int = 1
+    seed: int = 0
+    published: bool = False
+    hexplane: HexPlaneSettings = field(default_factory=HexPlaneSettings)
+
+    @property
+    def fill(self) -> TargetStatistics:
+        """What stands in holes: means over training targets, or black and no class."""
+        if self.statistics is not None:
+            return self.statistics
+        black = torch.zeros(self.frames, 3, self.height, self.width)
+        nothing = torch.full((self.frames, self.height, self.width), NO_CLASS, dtype=torch.uint8)
+        return TargetStatistics(mean=black, majority=nothing if self.classes else None)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ClassesAlone:
+    """A predictor whose pictures do not count, as the targets are class maps."""
+
+    inner: Predictor
+
+    @property
+    def name(self) -> str:
+        """See Predictor."""
+        return self.inner.name
+
+    @property
+    def privileged(self) -> bool:
+        """See Predictor."""
+        return self.inner.privileged
+
+    def predict(self, clip: SourceClip) -> Prediction:
+        """See Predictor."""
+        made = self.inner.predict(clip)
+        return replace(made, video=None, more=tuple(replace(each, video=None) for each in made.more))
+
+
+def baseline_names(*, hexplane: Sequence[int] = HEXPLANE_VIEWS) -> tuple[str, ...]:
+    """All there are, in the order of the tables. hexplane: numbers of views that are listed."""
+    return (*_NAMES, *(f"hexplane_{views}" for views in hexplane))
+
+
+def build(name: str, settings: BaselineSettings) -> Predictor:
+    """A baseline by its name.
+
+    Raises:
+        RecipeError: there is none of this name, or what it needs is not there.
+        CheckpointError: vanilla SVD's weights cannot be used.
+    """
+    views = _HEXPLANE.fullmatch(name)
+    if name not in _NAMES and not views:
+        near = difflib.get_close_matches(name, baseline_names(), n=1)
+        meant = f"did you mean {near[0]}? " if near else ""
+        raise RecipeError(f"no baseline is called {name!r}; {meant}there are {', '.join(baseline_names())}")
+    if settings.painted and (views or name in _PICTURES_ALONE):
+        raise RecipeError(f"{name} makes no class maps, and these targets are class maps; leave it out")
+    if views:
+        return HexPlane(views=int(views[1]), settings=settings.hexplane, seed=settings.seed, device=settings.device)
+    made = _made(name, settings)
+    return ClassesAlone(inner=made) if settings.painted else made
+
+
+def described(name: str, settings: BaselineSettings, trained_on: str = "nothing") -> dict[str, str]:
+    """What a baseline is and works with, for the record of a run: it is the same method wherever this is the same.
+
+    Args:
+        trained_on: identity of the training clips, "nothing" without.
+    Raises: CheckpointError for vanilla SVD's weights.
+    """
+    told, hexplane, svd = {"baseline": name}, _HEXPLANE.fullmatch(name), name == VANILLA_SVD
+    told |= {"samples": str(settings.samples)} if svd else {}
+    told |= {"seed": str(settings.seed)} if svd or hexplane else {}
+    told |= {"means of": trained_on} if name in _OF_MEANS else {}
+    told |= {"published rounding": "yes"} if settings.published and name in (REPROJECT_RGBD, REPROJECT_SEMD) else {}
+    told |= {"weights": weights_named(settings.svd)} if svd and settings.svd is not None else {}
+    told |= {key: str(value) for key, value in asdict(settings.hexplane).items()} if hexplane else {}
+    filled = settings.statistics is not None and name != REPROJECT_SEMD
+    return told | ({"holes": "of no class"} if settings.classes and name in _WITH_HOLES and not filled else {})
+
+
+def usual_baselines(settings: BaselineSettings) -> tuple[str, ...]:
+    """Names of those that need nothing but the clips and, for means, training targets."""
+    means = () if settings.statistics is None else ("mean_target", "majority_map", DEPTH_ON_MEAN)
+    always = ("copy_source", "ground_homography", "depth_reprojection", REPROJECT_RGBD, REPROJECT_SEMD)
+    wanted = {*means, *always}
+    if not settings.classes:
+        wanted -= {"majority_map", REPROJECT_SEMD}
+    if settings.painted:
+        wanted -= set(_PICTURES_ALONE)
+    return tuple(name for name in _NAMES if name in wanted)
+
+
+def _made(name: str, settings: BaselineSettings) -> Predictor:
+    """Raises RecipeError where what it needs is not there."""
+    classes, trained = settings.classes, settings.statistics
+    if trained is None and name in ("mean_target", "majority_map", DEPTH_ON_MEAN):
+        raise RecipeError(f"{name} wants training clips for its means: give --train FOLDER, or leave it out")
+    fill = settings.fill
+    if name in ("majority_map", REPROJECT_SEMD) and not (classes and fill.majority is not None):
+        raise RecipeError(f"{name} wants clips with class maps, got some without; leave it out")
+    if name == "majority_map":
+        return Fixed(name=name, prediction=Prediction(classes=fill.majority))
+    if name == VANILLA_SVD:
+        if settings.svd is None:
+            raise RecipeError(f"{VANILLA_SVD} wants its weights: give the path of svd.safetensors")
+        opened = VanillaSVD.open(settings.svd, device=settings.device, dtype=settings.dtype)
+        return replace(opened, samples=settings.samples, seed=settings.seed)
+    makers: dict[str, Callable[[], Predictor]] = {
+        "copy_source": CopySource,
+        "mean_target": lambda: Fixed(name=name, prediction=Prediction(video=fill.mean)),
+        "ground_homography": lambda: GroundHomography(fill=fill),
+        "depth_reprojection": lambda: DepthReprojection(fill=fill.constant, classes=len(classes)),
+        DEPTH_ON_MEAN: lambda: DepthReprojection(fill=fill, classes=len(classes), name=DEPTH_ON_MEAN),
+        REPROJECT_RGBD: lambda: ReprojectRgbd(published=settings.published),
+        REPROJECT_SEMD: lambda: ReprojectSemd(classes=classes, published=settings.published),
+    }
+    return makers[name]()
+
+
+_NAMES = (
+    *("copy_source", "mean_target", "majority_map", "ground_homography", "depth_reprojection", DEPTH_ON_MEAN),
+    *(REPROJECT_RGBD, REPROJECT_SEMD, VANILLA_SVD),
+)
+_OF_MEANS = ("mean_target", "majority_map", "ground_homography", "depth_reprojection", DEPTH_ON_MEAN)
+_WITH_HOLES = ("ground_homography", "depth_reprojection", REPROJECT_SEMD)
+_PICTURES_ALONE = ("mean_target", REPROJECT_RGBD, VANILLA_SVD)

@@ -1,0 +1,296 @@
+"""Clips as pictures and videos: frames that a run keeps, contact sheets, galleries."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from textwrap import wrap
+from typing import Literal, TypeAlias
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gcd_model.colours import palette
+from gcd_model.config import SemanticClass
+from gcd_train.errors import DataError, RunError
+from gcd_train.evaluation.clips import HeldOutClip
+from gcd_train.evaluation.predictors import Prediction, to_labels
+from gcd_train.evaluation.runs import EvaluatedSet, Method
+from gcd_train.evaluation.store import RunKeeper, write_whole
+
+Pictures = NDArray[np.uint8]
+
+KeptViews: TypeAlias = Literal["none", "last", "all"]
+"""Which frames are kept: none, the last of each clip, or all."""
+
+SHOWN_FRAMES = 6
+"""Frames that a row of a sheet has at most."""
+
+
+def write_views(
+    folder: Path, clip: HeldOutClip, prediction: Prediction, which: KeptViews, classes: Sequence[SemanticClass]
+) -> None:
+    """Write `source/`, `target/` and `sample_0/` and so on, each frame under its number from 0000.png on.
+
+    A method that makes class maps alone has them painted there; one that makes both has `classes_0/` and
+    `target_classes/` beside. The target is written last: where it is whole, all is. classes: the ontology. Raises
+    RunError if a file cannot be written.
+    """
+    strips = {"source": clip.seen.source}
+    for number, draw in enumerate(prediction.draws):
+        labels = None if draw.classes is None or not classes else painted(draw.classes, classes)
+        if draw.video is not None:
+            strips[f"sample_{number}"] = to_bytes(draw.video)
+        if labels is not None:
+            strips[f"sample_{number}" if draw.video is None else f"classes_{number}"] = labels
+    true = to_labels(clip.target_classes)
+    if true is not None and classes and "classes_0" in strips:
+        strips["target_classes"] = painted(true, classes)
+    strips["target"] = clip.target
+    for name, frames in strips.items():
+        for t in _wanted(which, len(frames)):
+            write_whole(folder / name / f"{t:04d}.png", png(frames[t]))
+
+
+def has_views(folder: Path, which: KeptViews, frames: int) -> bool:
+    """Whether all that `write_views` writes of a clip of so many frames is there."""
+    if which == "none":
+        return True
+    strips = {place.name: {path.name for path in place.iterdir()} for place in folder.glob("*/")}
+    wanted = {f"{t:04d}.png" for t in _wanted(which, frames)}
+    return "target" in strips and all(wanted <= there for there in strips.values())
+
+
+def _wanted(which: KeptViews, frames: int) -> range:
+    return {"none": range(0), "last": range(frames - 1, frames), "all": range(frames)}[which]
+
+
+def write_rows(place: Path, prediction: Prediction, classes: Sequence[SemanticClass]) -> None:
+    """Keep what a method has on the contact sheet: `KEY.png` of its pictures, `KEY.classes.png` of its class maps.
+
+    place: of both, without a suffix.
+    """
+    if prediction.classes is not None and classes:
+        write_whole(Path(f"{place}.classes.png"), png(_in_a_row(painted(prediction.classes, classes))))
+    if prediction.video is not None:
+        write_whole(Path(f"{place}.png"), png(_in_a_row(to_bytes(prediction.video))))
+
+
+def has_rows(place: Path) -> bool:
+    """Whether a method has any row at this place."""
+    return any(Path(f"{place}{suffix}").exists() for suffix in (".png", ".classes.png"))
+
+
+def read_row(path: Path, width: int) -> Pictures:
+    """Frames [N, H, W, 3] of a row. Raises RunError if it is damaged."""
+    picture = cv2.imread(str(path))
+    if picture is None or picture.shape[1] % width:
+        raise RunError(f"{path} is damaged; delete it, and run the same line again")
+    rows = np.ascontiguousarray(picture[..., ::-1]).astype(np.uint8)
+    return rows.reshape(len(rows), -1, width, 3).swapaxes(0, 1)
+
+
+def shown_frames(count: int) -> list[int]:
+    """Those of so many frames that a row of a sheet shows, evenly among them."""
+    return np.linspace(0, count - 1, min(SHOWN_FRAMES, count)).round().astype(int).tolist()
+
+
+def _in_a_row(frames: Pictures) -> Pictures:
+    return np.concatenate([frames[t] for t in shown_frames(len(frames))], axis=1)
+
+
+def painted(labels: Tensor, classes: Sequence[SemanticClass]) -> Pictures:
+    """Class ids uint8 [T, H, W] in colours, uint8 [T, H, W, 3]; what is of no class is black."""
+    colours = torch.zeros(256, 3, dtype=torch.uint8)
+    known = palette(tuple(classes))
+    colours[: len(known)] = known
+    return colours[labels.long()].numpy()
+
+
+def to_bytes(video: Tensor) -> Pictures:
+    """float32 [T, 3, H, W] in [0, 1] -> uint8 [T, H, W, 3]."""
+    return (video.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
+
+
+def png(picture: Pictures) -> bytes:
+    """A PNG file of an RGB picture, uint8 [H, W, 3]."""
+    done, data = cv2.imencode(".png", cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2BGR))
+    assert done, "PNG takes any picture"
+    return data.tobytes()
+
+
+_GAP, _MARGIN, _INK = 4, 140, (40, 40, 40)
+_LINE, _LETTERS, _FONT = 14, 20, cv2.FONT_HERSHEY_SIMPLEX
+_SCALE, _SMALL = 0.38, 0.3  # of captions; the small one where the other would be broken
+HOLD_S = 0.7
+"""How long a video shows its last frame."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Strip:
+    """One row of a gallery. frames: uint8 [H, W, 3] RGB by number, counted from 0."""
+
+    name: str
+    frames: dict[int, Pictures]
+
+    @classmethod
+    def of(cls, name: str, frames: Pictures) -> "Strip":
+        """All of [T, H, W, 3]."""
+        return cls(name=name, frames=dict(enumerate(frames)))
+
+
+def shown_clips(of: EvaluatedSet, methods: Sequence[Method], count: int) -> tuple[str, ...]:
+    """So many clips whose frames were kept, evenly among them; one of a scene before a second of another."""
+    kept = [key for key in of.keys if any(_folder(method, key).is_dir() for method in methods)]
+    scenes = {record.key: record.scene for method in methods for record in method.records}
+    first = list({scenes.get(key, key): key for key in reversed(kept)}.values())[::-1]
+    chosen = first if len(first) >= count else kept
+    places = np.linspace(0, len(chosen) - 1, min(count, len(chosen))).round().astype(int)
+    return tuple(chosen[place] for place in places)
+
+
+def strips(methods: Sequence[Method], key: str) -> tuple[Strip, ...]:
+    """Source, each method that kept frames of this clip, target. Raises DataError for a damaged picture."""
+    made = [Strip(name=method.name, frames=_read(_folder(method, key) / "sample_0")) for method in methods]
+    seen = {side: _side(methods, key, side) for side in ("source", "target")}
+    every = [Strip(name="source", frames=seen["source"]), *made, Strip(name="target", frames=seen["target"])]
+    return tuple(strip for strip in every if strip.frames)
+
+
+def contact_rows(
+    clip: HeldOutClip, methods: Sequence[tuple[str, Path]], classes: Sequence[SemanticClass]
+) -> tuple[Strip, ...]:
+    """A clip's rows of the contact sheet: source, each method's picture and class map, the true ones.
+
+    Args:
+        methods: by name, each with the place of its rows, see `write_rows`. classes: the ontology, empty for none.
+    Raises: RunError if a row is damaged.
+    """
+    shown, width = shown_frames(len(clip.target)), clip.target.shape[2]
+    rows = [("source", clip.seen.source[shown])]
+    for name, place in methods:
+        files = {name: Path(f"{place}.png"), f"{name}: classes": Path(f"{place}.classes.png")}
+        rows += [(kind, read_row(file, width)) for kind, file in files.items() if file.exists()]
+    true = to_labels(clip.target_classes if classes else None)
+    rows += [] if true is None else [("true classes", painted(true[shown], classes))]
+    rows.append(("target", clip.target[shown]))
+    return tuple(Strip.of(kind, frames) for kind, frames in rows)
+
+
+def write_sheet(clips: Sequence[tuple[str, Sequence[Strip]]], out: Path) -> None:
+    """PNG of clips, one below the other, each with its name; rows strips, columns frames. Raises RunError."""
+    blocks = [_row(label, strip) for label, rows in clips for strip in rows]
+    if not blocks:
+        raise RunError(f"there is nothing to show in {out}; evaluate with --views all")
+    width = max(block.shape[1] for block in blocks)
+    sheet = [np.pad(block, ((0, 0), (0, width - block.shape[1]), (0, 0)), constant_values=255) for block in blocks]
+    write_whole(out, png(np.concatenate(sheet)))
+
+
+def write_mp4(frames: Iterable[Pictures], fps: float, out: Path) -> None:
+    """Pictures of one even size, as MPEG-4 part 2. Raises RunError if it cannot be written."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    video: cv2.VideoWriter | None = None
+    for frame in frames:
+        if video is None:
+            size = (frame.shape[1], frame.shape[0])
+            video = cv2.VideoWriter(str(out), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
+            if not video.isOpened():
+                raise RunError(f"{out} cannot be written; give a folder that takes files with --out")
+        video.write(frame[..., ::-1])
+    if video is not None:
+        video.release()
+
+
+def write_video(rows: Sequence[Strip], fps: float, out: Path) -> bool:
+    """MP4 of a clip, all rows side by side, the last frame held; False where only single frames were kept.
+
+    Raises RunError if it cannot be written.
+    """
+    moments = sorted(set.intersection(*(set(row.frames) for row in rows))) if rows else []
+    if len(moments) < 2:
+        return False
+    frames = [_beside(rows, moment) for moment in moments]
+    write_mp4([*frames, *frames[-1:] * round(HOLD_S * fps)], max(fps, 1.0), out)
+    return True
+
+
+def _folder(method: Method, key: str) -> Path:
+    return RunKeeper(method.folder).views(method.name, key)
+
+
+def _side(methods: Sequence[Method], key: str, side: str) -> dict[int, Pictures]:
+    """The source or the target, from whichever method it was kept beside."""
+    return next((found for method in methods if (found := _read(_folder(method, key) / side))), {})
+
+
+def _read(folder: Path) -> dict[int, Pictures]:
+    """Frames by number; none where there is no such folder."""
+    found: dict[int, Pictures] = {}
+    for path in sorted(folder.glob("*.png")):
+        picture = cv2.imread(str(path))
+        if picture is None or not path.stem.isdigit():
+            raise DataError(f"{path} is no frame of a clip; delete it, and evaluate with --views again")
+        found[int(path.stem)] = np.ascontiguousarray(picture[..., ::-1]).astype(np.uint8)
+    return found
+
+
+def _row(label: str, strip: Strip) -> Pictures:
+    numbers = sorted(strip.frames)
+    pictures = [strip.frames[numbers[place]] for place in shown_frames(len(numbers))]
+    lines = (*wrap(strip.name, _LETTERS), *wrap(label, _LETTERS))
+    height = max(pictures[0].shape[0], max(3, len(lines)) * _LINE)
+    margin = np.full((height + _GAP, _MARGIN, 3), 255, np.uint8)
+    for line, text in enumerate(lines):
+        cv2.putText(margin, text, (4, _LINE * (1 + line)), _FONT, _SCALE, _INK, 1, cv2.LINE_AA)
+    framed = [
+        cv2.copyMakeBorder(p, 0, height + _GAP - p.shape[0], 0, _GAP, cv2.BORDER_CONSTANT, value=(255,) * 3)
+        for p in pictures
+    ]
+    return np.concatenate([margin, *(each.astype(np.uint8) for each in framed)], axis=1)
+
+
+def _beside(rows: Sequence[Strip], moment: int) -> Pictures:
+    """All rows' pictures of one moment with their names above, of even size as codecs want it."""
+    pictures = [row.frames[moment] for row in rows]
+    captions = [caption(row.name, each.shape[1]) for row, each in zip(rows, pictures, strict=True)]
+    most, named = max(len(lines) for lines, _ in captions), list[Pictures]()
+    for (lines, scale), picture in zip(captions, pictures, strict=True):
+        above = np.full((_LINE * most + _GAP, picture.shape[1], 3), 255, np.uint8)
+        for line, words in enumerate(lines, start=1 + most - len(lines)):
+            cv2.putText(above, words, (2, _LINE * line - 1), _FONT, scale, _INK, 1, cv2.LINE_AA)
+        named.append(np.concatenate([above, picture]))
+    height = max(each.shape[0] for each in named)
+    panels = [np.pad(each, ((0, height - each.shape[0]), (0, _GAP), (0, 0)), constant_values=255) for each in named]
+    whole = np.concatenate(panels, axis=1)
+    odd = whole.shape[0] % 2, whole.shape[1] % 2
+    return np.pad(whole, ((0, odd[0]), (0, odd[1]), (0, 0)), constant_values=255)
+
+
+def caption(name: str, width: int) -> tuple[tuple[str, ...], float]:
+    """A name over a picture of so many pixels: in one line, else in smaller letters, else broken into lines.
+
+    Returns: the lines, and the scale of their letters.
+    """
+    for scale in (_SCALE, _SMALL):
+        if _width(name, scale) <= width - 2:
+            return (name,), scale
+    return _broken(name, width), _SMALL
+
+
+def _broken(name: str, width: int) -> tuple[str, ...]:
+    """Lines that fit, broken behind a space, underscore or hyphen where there is one; a letter at the least."""
+    lines, rest = list[str](), name
+    while rest:
+        fitting = max([count for count in range(1, len(rest) + 1) if _width(rest[:count], _SMALL) <= width - 2] or [1])
+        ends = [count for count in range(1, fitting + 1) if count == len(rest) or rest[count - 1] in " _-"]
+        taken = ends[-1] if ends else fitting
+        lines.append(rest[:taken].strip())
+        rest = rest[taken:].lstrip()
+    return tuple(lines)
+
+
+def _width(text: str, scale: float) -> int:
+    return cv2.getTextSize(text, _FONT, scale, 1)[0][0] + 2  # the margin before it

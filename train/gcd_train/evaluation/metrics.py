@@ -1,0 +1,228 @@
+"""How near views are to what the camera would have seen: PSNR, SSIM, sharpness, flicker, class maps.
+
+Pictures are float [T, 3, H, W] in [0, 1]; masks are bool [T, H, W]; class maps are uint8 [..., H, W] of class ids.
+"""
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from kornia.filters import spatial_gradient
+from torch import Tensor
+
+from gcd_model.errors import ShapeError
+
+NO_CLASS = 255
+"""Id of pixels that belong to no class, unless an ontology has 256: not counted in targets, wrong in predictions."""
+
+_VOID_NAMES = frozenset({"void", "unlabelled", "unlabeled"})
+_SMALLEST_ERROR = 1e-10  # equal pictures score 100 dB, so that means stay finite
+_WINDOW, _BORDER = 7, 3  # pixels
+_SAMPLE = _WINDOW**2 / (_WINDOW**2 - 1)
+_C1, _C2 = 0.01**2, 0.03**2
+
+
+def require_same_shape(first: Tensor, second: Tensor) -> None:
+    """Raises ShapeError unless a view and its target have one shape."""
+    if first.shape != second.shape:
+        raise ShapeError(f"view and target must have one shape, got {list(first.shape)} and {list(second.shape)}")
+
+
+def psnr(views: Tensor, targets: Tensor) -> Tensor:
+    """Peak signal-to-noise ratio of each frame over all its pixels and colours, dB: [T]. Equal frames score 100."""
+    require_same_shape(views, targets)
+    return _to_db(((views - targets) ** 2).mean(dim=(1, 2, 3)))
+
+
+def masked_psnr(views: Tensor, targets: Tensor, mask: Tensor) -> Tensor:
+    """`psnr` with the squared error averaged over the pixels of a mask and all colours: [T]; NaN where it is empty."""
+    require_same_shape(views, targets)
+    return _to_db(masked_mean(((views - targets) ** 2).mean(dim=1), mask))
+
+
+def _to_db(error: Tensor) -> Tensor:
+    """Mean squared error of pictures in [0, 1] as a signal-to-noise ratio; NaN stays NaN."""
+    return -10.0 * torch.log10(error.clamp(min=_SMALLEST_ERROR))
+
+
+def diversity(draws: Tensor, mask: Tensor | None = None) -> Tensor:
+    """How far apart several draws of one view are: population standard deviation over draws, mean over the frame: [T].
+
+    Args:
+        draws: [S, T, 3, H, W], S at least 2. mask: the pixels that count; NaN where it is empty. None for all.
+    """
+    spread = draws.std(dim=0, correction=0).mean(dim=1)  # [T, H, W]
+    return spread.mean(dim=(1, 2)) if mask is None else masked_mean(spread, mask)
+
+
+def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Mean over a mask's pixels of each frame: values and mask [T, H, W] -> [T]; NaN where the mask is empty."""
+    if mask.shape != values.shape:
+        raise ShapeError(f"a mask must be [T, H, W] = {list(values.shape)}, got {list(mask.shape)}")
+    return torch.where(mask, values, 0.0).sum(dim=(1, 2)) / mask.sum(dim=(1, 2))
+
+
+def gradient_map(pictures: Tensor) -> Tensor:
+    """Length of the Sobel gradient at each pixel, mean over colours, in brightness per pixel: [T, H, W].
+
+    A view's mean over its target's is the gradient energy: 1 is as sharp as the target, below blurred, above noisy.
+    """
+    gradient = spatial_gradient(pictures, mode="sobel", order=1, normalized=True)  # [T, 3, 2, H, W]
+    across, down = gradient.unbind(dim=2)
+    return torch.hypot(across, down).mean(dim=1)  # a norm over two of five dimensions takes ten times as long
+
+
+def frame_change(pictures: Tensor) -> Tensor:
+    """Mean absolute difference between each frame and the next: [T-1].
+
+    A view's over its target's is the flicker: above 1 the view changes more than the scene does.
+    """
+    return (pictures[1:] - pictures[:-1]).abs().mean(dim=(1, 2, 3))
+
+
+def ssim_map(views: Tensor, targets: Tensor) -> Tensor:
+    """Structural similarity around each pixel that has a whole window, mean over colours: float64 [T, H-6, W-6].
+
+    As scikit-image defines it by default: windows of 7 x 7 pixels of equal weight, sample covariances (N - 1), K1 =
+    0.01, K2 = 0.03 and a data range of 1. Differences of nearly equal squares are taken, so it is done in float64.
+
+    Raises: ShapeError: shapes differ, or a picture is smaller than the window.
+    Source: Wang et al. 2004, Eq. 13.
+    """
+    require_same_shape(views, targets)
+    if min(views.shape[-2:]) < _WINDOW:
+        raise ShapeError(f"SSIM wants pictures of at least {_WINDOW} pixels a side, got {list(views.shape[-2:])}")
+    return torch.stack([_likeness(*both) for both in zip(views.double(), targets.double(), strict=True)])
+
+
+def _likeness(view: Tensor, target: Tensor) -> Tensor:
+    """`ssim_map` of one frame, [3, H, W] each; of a whole clip at once it takes half as long again."""
+    mean_a, mean_b = _window_mean(view), _window_mean(target)
+    both, squares = mean_a * mean_b, mean_a**2 + mean_b**2
+    covariance = _SAMPLE * (_window_mean(view * target) - both)
+    variances = _SAMPLE * (_window_mean(view * view + target * target) - squares)
+    return ((2 * both + _C1) * (2 * covariance + _C2) / ((squares + _C1) * (variances + _C2))).mean(dim=0)
+
+
+def _window_mean(values: Tensor) -> Tensor:
+    """Mean of each whole window: [C, H, W] -> [C, H-6, W-6]; sums of seven as 4 + 2 + 1, along each axis."""
+    for axis in (-1, -2):
+        long = values.shape[axis]
+        pairs = values.narrow(axis, 0, long - 1) + values.narrow(axis, 1, long - 1)
+        fours = pairs.narrow(axis, 0, long - 3) + pairs.narrow(axis, 2, long - 3)
+        count = long - _WINDOW + 1
+        values = fours.narrow(axis, 0, count) + pairs.narrow(axis, 4, count) + values.narrow(axis, 6, count)
+    return values / _WINDOW**2
+
+
+def window_mask(mask: Tensor) -> Tensor:
+    """The pixels of `ssim_map` that count for a mask: bool [T, H, W] -> [T, H-6, W-6].
+
+    The mask is eroded three times by a cross, so that windows lie mostly inside it.
+    """
+    for _ in range(_BORDER):
+        middle, beside = mask[..., 1:-1, 1:-1], mask[..., 1:-1, :-2] & mask[..., 1:-1, 2:]
+        mask = middle & beside & mask[..., :-2, 1:-1] & mask[..., 2:, 1:-1]
+    return mask
+
+
+def void_ids(names: Sequence[str]) -> tuple[int, ...]:
+    """Ids of the entries of an ontology that stand for no class: "Void", "unlabelled", whatever the case.
+
+    None of an ontology with 256 entries, which leaves no id for what has no class.
+    """
+    if len(names) > NO_CLASS:
+        return ()
+    return tuple(label for label, name in enumerate(names) if name.strip().lower() in _VOID_NAMES)
+
+
+def without_classes(labels: Tensor, void: Sequence[int]) -> Tensor:
+    """A class map, uint8 of any shape, with `NO_CLASS` where an id of `void` stood."""
+    if not void:
+        return labels
+    return labels.masked_fill(torch.isin(labels, torch.tensor(void, dtype=labels.dtype)), NO_CLASS)
+
+
+def majority_classes(classes: Tensor, height: int, width: int, count: int) -> Tensor:
+    """Class maps at a coarser grid: the commonest class of each cell, the lowest id where two are as common.
+
+    Args:
+        classes: uint8 [..., H, W], ids below `count`. height, width: of the grid; they divide H and W.
+    Returns:
+        uint8 [..., height, width]; 0 where none of the classes is in a cell.
+    """
+    *leading, rows, columns = classes.shape
+    if rows % height or columns % width:
+        raise ShapeError(f"a grid must divide the class map: wanted {height}x{width} from {rows}x{columns}")
+    flat = classes.reshape(-1, rows, columns)
+    there = torch.bincount(flat.flatten(), minlength=count)[:count] > 0
+    there[0] = True  # what a cell becomes that none of the classes is in
+    labels = there.nonzero()[:, 0]
+    cell = (rows // height, columns // width)
+    shares = torch.stack([F.avg_pool2d((flat == label).float(), cell) for label in labels.tolist()])
+    return labels[shares.argmax(dim=0)].to(torch.uint8).reshape(*leading, height, width)
+
+
+def confusion_matrix(predicted: Tensor, target: Tensor, count: int) -> Tensor:
+    """Pixels of each target class (rows) by predicted class (columns): int64 [count, count].
+
+    Matrices of several pictures add up. Raises ShapeError where shapes differ or an id is `count` or more.
+    """
+    require_same_shape(predicted, target)
+    _require_known(predicted, target, count)
+    pairs = target.long().flatten() * count + predicted.long().flatten()
+    return torch.bincount(pairs, minlength=count * count).view(count, count)
+
+
+def frame_confusions(predicted: Tensor, target: Tensor, count: int, mask: Tensor | None = None) -> Tensor:
+    """`confusion_matrix` of each frame, without pixels whose target has no class: int64 [T, count, count + 1].
+
+    The last column holds pixels whose prediction has no class: they are wrong, and taken for none of the others.
+
+    Args:
+        predicted, target: uint8 [T, H, W]. mask: bool [T, H, W], the pixels that count; None for all.
+    Raises:
+        ShapeError: shapes differ, or an id other than `NO_CLASS` is `count` or more.
+    """
+    require_same_shape(predicted, target)
+    counted = _of_a_class(target, count)
+    counted = counted if mask is None else counted & mask
+    said, true = predicted[counted], target[counted]
+    known = _of_a_class(said, count)
+    _require_known(said[known], true, count)
+    frames, columns = len(target), count + 1
+    frame = torch.arange(frames).view(-1, 1, 1).expand(target.shape)[counted]
+    cells = (frame * count + true.long()) * columns + torch.where(known, said.long(), count)
+    return torch.bincount(cells, minlength=frames * count * columns).view(frames, count, columns)
+
+
+def named_confusion(predicted: Tensor, target: Tensor, names: Sequence[str]) -> Tensor:
+    """`frame_confusions` of all frames together, int64 [K, K + 1], for the K classes of these names: those that stand
+    for no class do not count where they are true."""
+    void = void_ids(names)
+    said, true = (without_classes(labels.cpu(), void) for labels in (predicted, target))
+    return frame_confusions(said, true, len(names)).sum(dim=0)
+
+
+def class_iou(confusion: Tensor) -> Tensor:
+    """Intersection over union of each class, float64 [K]; NaN for one that is neither predicted nor there.
+
+    confusion: [K, K], or [K, K + 1] with a last column for predictions of no class.
+    """
+    both = confusion.diagonal().double()
+    return both / (confusion.sum(dim=0)[: len(confusion)] + confusion.sum(dim=1) - both)
+
+
+def mean_iou(confusion: Tensor) -> float:
+    """Mean over the classes that are predicted or there, of the confusions of a whole set; NaN if none is."""
+    return float(class_iou(confusion).nanmean())
+
+
+def _of_a_class(labels: Tensor, count: int) -> Tensor:
+    """Where ids are those of a class, or of none that is known."""
+    return labels != NO_CLASS if count <= NO_CLASS else torch.ones_like(labels, dtype=torch.bool)
+
+
+def _require_known(predicted: Tensor, target: Tensor, count: int) -> None:
+    if any(labels.numel() and int(labels.max()) >= count for labels in (predicted, target)):
+        raise ShapeError(f"class ids must be below {count}; are the two ontologies the same?")

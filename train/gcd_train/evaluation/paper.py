@@ -1,0 +1,232 @@
+"""The paper's tables 1 to 6: their rows, their columns, and the figures that the paper prints.
+
+Printed figures stand beside measured ones as the paper's own data and are never put in their place.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from gcd_train.evaluation.statistics import FigureName, Span
+from gcd_train.evaluation.store import Region, RunNote
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Column:
+    """One figure on some pixels. digits: behind the point."""
+
+    heading: str
+    figure: FigureName
+    region: Region = "all"
+    digits: int = 2
+
+    @property
+    def of_classes(self) -> bool:
+        """Whether it tells how good class maps are, not pictures."""
+        return self.figure in ("miou", "miou_full", "miou_common", "accuracy")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PaperRow:
+    """One row of a paper's table. label: as it stands there. printed: its figures, by column; None for none."""
+
+    label: str
+    printed: tuple[float | None, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Gain:
+    """What the paper's text says of a table: how much better one half of the variants is than the other, in the mean.
+
+    better, worse: words that tell the two rows of a pair apart. printed: difference of the first column.
+    """
+
+    better: str
+    worse: str
+    printed: float
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PaperTable:
+    """One table of the paper. name: of its file. kind, modality: of the runs it is for. frames: that it is over.
+
+    gains: of its rows, in the text.
+    """
+
+    name: str
+    title: str
+    kind: Literal["kubric", "driving"]
+    modality: Literal["rgb", "semantic"]
+    frames: Span
+    columns: tuple[Column, ...]
+    rows: tuple[PaperRow, ...]
+    gains: tuple[Gain, ...] = ()
+
+
+PICTURE_COLUMNS = (
+    Column(heading="PSNR all", figure="psnr_db"),
+    Column(heading="SSIM all", figure="ssim", digits=3),
+    Column(heading="LPIPS all", figure="lpips", digits=3),
+    Column(heading="PSNR occluded", figure="psnr_db", region="occluded"),
+    Column(heading="SSIM occluded", figure="ssim", region="occluded", digits=3),
+)
+CLASS_COLUMNS = (
+    Column(heading="mIoU all", figure="miou_common", digits=3),
+    Column(heading="mIoU occluded", figure="miou_common", region="occluded", digits=3),
+)
+
+
+def _row(label: str, *printed: float | None) -> PaperRow:
+    return PaperRow(label=label, printed=printed)
+
+
+PAPER_TABLES = (
+    PaperTable(
+        name="table1",
+        title="Table 1: Kubric-4D, ablation, last frame",
+        kind="kubric",
+        modality="rgb",
+        frames="last",
+        columns=PICTURE_COLUMNS,
+        rows=(
+            _row("GCD (direct, max 90, scratch)", 15.96, 0.450, 0.575, 15.85, 0.470),
+            _row("GCD (direct, max 180, scratch)", 14.71, 0.426, 0.611, 15.15, 0.458),
+            _row("GCD (gradual, max 90, scratch)", 16.92, 0.486, 0.542, 16.59, 0.494),
+            _row("GCD (gradual, max 180, scratch)", 16.63, 0.479, 0.552, 16.34, 0.491),
+            _row("GCD (direct, max 90, finetuned)", 17.23, 0.494, 0.507, 16.69, 0.492),
+            _row("GCD (direct, max 180, finetuned)", 16.65, 0.471, 0.529, 16.18, 0.470),
+            _row("GCD (gradual, max 90, finetuned)", 17.88, 0.521, 0.486, 17.33, 0.514),
+            _row("GCD (gradual, max 180, finetuned)", 17.81, 0.521, 0.488, 17.20, 0.515),
+        ),
+        gains=(
+            Gain(better="gradual", worse="direct", printed=1.17),
+            Gain(better="max 90", worse="max 180", printed=0.55),
+            Gain(better="finetuned", worse="scratch", printed=1.34),
+        ),
+    ),
+    PaperTable(
+        name="table2",
+        title="Table 2: ParallelDomain-4D, RGB, ablation, last frame",
+        kind="driving",
+        modality="rgb",
+        frames="last",
+        columns=PICTURE_COLUMNS,
+        rows=(
+            _row("GCD (direct, scratch)", 22.49, 0.622, 0.487, 22.62, 0.653),
+            _row("GCD (gradual, scratch)", 22.73, 0.632, 0.467, 22.76, 0.664),
+            _row("GCD (direct, finetuned)", 23.32, 0.664, 0.440, 23.29, 0.691),
+            _row("GCD (gradual, finetuned)", 23.47, 0.670, 0.425, 23.52, 0.696),
+        ),
+    ),
+    PaperTable(
+        name="table3",
+        title="Table 3: ParallelDomain-4D, semantic, ablation, last frame",
+        kind="driving",
+        modality="semantic",
+        frames="last",
+        columns=CLASS_COLUMNS,
+        rows=(
+            _row("GCD (direct, scratch)", 0.312, 0.286),
+            _row("GCD (gradual, scratch)", 0.344, 0.321),
+            _row("GCD (direct, finetuned)", 0.367, 0.354),
+            _row("GCD (gradual, finetuned)", 0.390, 0.377),
+        ),
+    ),
+    PaperTable(
+        name="table4",
+        title="Table 4: Kubric-4D, baselines",
+        kind="kubric",
+        modality="rgb",
+        frames="2-last",
+        columns=PICTURE_COLUMNS,
+        rows=(
+            _row("HexPlane", 15.38, 0.428, 0.568, 14.71, 0.428),
+            _row("4D-GS", 14.92, 0.388, 0.584, 14.55, 0.392),
+            _row("DynIBaR", 12.86, 0.356, 0.646, 12.78, 0.358),
+            _row("Vanilla SVD", 13.85, 0.312, 0.556, 13.66, 0.326),
+            _row("ZeroNVS", 15.68, 0.396, 0.508, 14.18, 0.368),
+            _row("GCD (gradual, max 90, finetuned)", 20.30, 0.587, 0.408, 18.60, 0.527),
+            _row("Reproject RGB-D", 12.51, 0.537, 0.416, None, None),
+        ),
+    ),
+    PaperTable(
+        name="table5",
+        title="Table 5: ParallelDomain-4D, RGB, baselines",
+        kind="driving",
+        modality="rgb",
+        frames="2-last",
+        columns=PICTURE_COLUMNS,
+        rows=(
+            _row("Vanilla SVD", 12.88, 0.400, 0.658, 13.96, 0.466),
+            _row("ZeroNVS", 18.88, 0.490, 0.555, 19.29, 0.552),
+            _row("GCD (gradual, finetuned)", 25.04, 0.731, 0.358, 24.70, 0.733),
+            _row("Reproject RGB-D", 17.66, 0.459, 0.441, None, None),
+        ),
+    ),
+    PaperTable(
+        name="table6",
+        title="Table 6: ParallelDomain-4D, semantic, baselines",
+        kind="driving",
+        modality="semantic",
+        frames="2-last",
+        columns=CLASS_COLUMNS,
+        rows=(
+            _row("GCD (gradual, finetuned)", 0.434, 0.382),
+            _row("Reproject Sem-D", 0.373, None),
+        ),
+    ),
+)
+"""All six, in the paper's order, with all that they print. Source: Van Hoorick et al. 2024 (GCD), section 5."""
+
+
+def tables_for(note: RunNote) -> tuple[PaperTable, ...]:
+    """The paper's tables that a run belongs in; none for pairs of our own."""
+    if note.protocol == "pairs":
+        return ()
+    return tuple(each for each in PAPER_TABLES if (each.kind, each.modality) == (note.kind, note.modality))
+
+
+_BASELINES = (
+    ("hexplane", "HexPlane"),
+    ("4dgs", "4D-GS"),
+    ("4dgaussian", "4D-GS"),
+    ("dynibar", "DynIBaR"),
+    ("vanillasvd", "Vanilla SVD"),
+    ("zeronvs", "ZeroNVS"),
+    ("reprojectrgbd", "Reproject RGB-D"),
+    ("reprojectsemd", "Reproject Sem-D"),
+)
+
+
+def row_label(method: str, details: Mapping[str, str], table: PaperTable) -> str | None:
+    """The row of a table that a method belongs in; None for a method that the paper does not have.
+
+    A baseline is known by its name. A model is known by the words of its name and of its family: gradual or direct, 90
+    or 180, scratch; without "direct" it is gradual, without "scratch" finetuned.
+    """
+    known = _baseline(method)
+    if known is not None:
+        return known
+    told = f"{method} {details.get('family', '')}".lower()
+    if not is_model(method, details) and not re.search(r"gcd|gradual|direct", method.lower()):
+        return None
+    parts = ["direct" if re.search(r"direct|jumpy", told) else "gradual"]
+    if table.kind == "kubric":
+        reach = re.search(r"(?<!\d)(90|180)(?!\d)", method) or re.search(r"(?:kubric|max)[ _-]?(90|180)(?!\d)", told)
+        if reach is None:
+            return None
+        parts.append(f"max {reach[1]}")
+    parts.append("scratch" if "scratch" in told else "finetuned")
+    return f"GCD ({', '.join(parts)})"
+
+
+def is_model(method: str, details: Mapping[str, str]) -> bool:
+    """Whether it is a model of ours, with weights of its own, and no baseline."""
+    return "weights" in details and _baseline(method) is None
+
+
+def _baseline(method: str) -> str | None:
+    """The row of a baseline of the paper, by its name."""
+    plain = re.sub(r"[^a-z0-9]", "", method.lower())
+    return next((label for start, label in _BASELINES if plain.startswith(start)), None)

@@ -1,0 +1,234 @@
+"""Which clips of whole scenes are measured: as in the paper, or as its released test script does.
+
+Paper: four clips of each scene. In Kubric-4D the source is the camera at azimuth 15 and elevation 5 degrees, 15 m away,
+and goals are drawn; a control list fixes both, and the frames. Source: Van Hoorick et al. 2024 (GCD), section 5.
+Released: the first clip of each scene's controls, or the script's own angles; frames of the command line win.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, Protocol, TypeAlias
+
+import numpy as np
+
+from gcd_model.geometry import Spherical, SphericalDelta
+from gcd_train.datasets.clip_frames import FrameSampling
+from gcd_train.datasets.controls import Control, Controls
+from gcd_train.datasets.dataset4d import Dataset4D
+from gcd_train.datasets.skips import Skips
+from gcd_train.datasets.trajectories import OrbitSampling, generator
+from gcd_train.errors import DataError
+from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
+
+ProtocolName: TypeAlias = Literal["paper", "released"]
+
+PAPER_SOURCE = Spherical(azimuth_deg=15.0, elevation_deg=5.0, radius_m=15.0)
+"""Where the source camera stands in Kubric-4D's evaluation: the data set's view 4."""
+RELEASED_SOURCE = Spherical(azimuth_deg=20.0, elevation_deg=10.0, radius_m=15.0)
+"""Where the released script's source camera stands without controls."""
+RELEASED_CHANGE = SphericalDelta(azimuth_deg=30.0, elevation_deg=15.0, radius_m=0.0)
+"""Where it goes from there."""
+RELEASED_START, RELEASED_SKIP = 0, 2
+"""First frame and stride of the released script."""
+CLIPS: dict[ProtocolName, int] = {"paper": 4, "released": 1}
+"""Clips of each scene."""
+SAMPLES: dict[ProtocolName, int] = {"paper": 4, "released": 2}
+"""Draws of each clip of a scene; of pairs, which no protocol cuts, there is one."""
+
+
+class ClipControls(Protocol):
+    """Which clips are cut from each scene; the same for a scene whatever others there are."""
+
+    def names(self, scene: str, /) -> Sequence[str]:
+        """Of the clips of a scene, in order: `sample_00`."""
+        ...
+
+    def control(self, scene: str, name: str, frames: int, /) -> Control:
+        """One of them, for a scene of so many time steps. Raises DataError if the scene is too short."""
+        ...
+
+    def strides(self, scene: str, /) -> Sequence[int]:
+        """That clips of a scene may have."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class FrameBounds:
+    """First frame and stride of every clip, from the command line; None for those of the protocol."""
+
+    start: int | None = None
+    skip: int | None = None
+
+    def of(self, control: Control) -> Control:
+        """The control with these."""
+        return replace(
+            control,
+            frame_start=control.frame_start if self.start is None else self.start,
+            frame_skip=control.frame_skip if self.skip is None else self.skip,
+        )
+
+
+AS_PLANNED = FrameBounds()
+"""No bounds."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ListedControls:
+    """Clips that a control list names, the first so many of each scene. See ClipControls."""
+
+    controls: Controls
+    clips: int
+    bounds: FrameBounds
+
+    def names(self, scene: str, /) -> Sequence[str]:
+        """None for a scene that is not listed."""
+        return tuple(control.name for control in self.controls.get(scene, ())[: self.clips])
+
+    def control(self, scene: str, name: str, frames: int, /) -> Control:
+        """As listed. Raises DataError for a clip that is not."""
+        for control in self.controls.get(scene, ()):
+            if control.name == name:
+                return self.bounds.of(control)
+        raise DataError(f"{scene} has no control {name}; look at the control list")
+
+    def strides(self, scene: str, /) -> Sequence[int]:
+        """As listed, or as bound."""
+        names = self.names(scene)
+        return [self.bounds.of(each).frame_skip for each in self.controls.get(scene, ()) if each.name in names]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DrawnControls:
+    """Clips drawn from a seed and the scene's number, so that a scene has the same ones in any list.
+
+    clips: of each scene. orbit: bounds of the goals; None in driving, whose path is fixed. frames: how the first frame
+    and the stride are drawn. source: where the source camera stands. bounds: win over what is drawn.
+    """
+
+    seed: int
+    clips: int
+    frames: FrameSampling
+    orbit: OrbitSampling | None = None
+    source: Spherical = PAPER_SOURCE
+    bounds: FrameBounds = AS_PLANNED
+
+    def names(self, scene: str, /) -> Sequence[str]:
+        """As many for every scene."""
+        del scene
+        return tuple(f"sample_{number:02d}" for number in range(self.clips))
+
+    def control(self, scene: str, name: str, frames: int, /) -> Control:
+        """The same whenever it is asked for. Raises DataError if the scene is too short."""
+        rng = generator(self.seed, _number(scene), self.names(scene).index(name))
+        change = None if self.orbit is None else self.orbit.change(rng, self.source)
+        start, skip = self._frames(rng, frames)
+        return Control(
+            name=name,
+            frame_start=start,
+            frame_skip=skip,
+            start=None if change is None else self.source,
+            goal=None if change is None else self.source + change,
+        )
+
+    def strides(self, scene: str, /) -> Sequence[int]:
+        """Those that are drawn from, or the one that is bound."""
+        del scene
+        return self.frames.strides if self.bounds.skip is None else (self.bounds.skip,)
+
+    def _frames(self, rng: np.random.Generator, frames: int) -> tuple[int, int]:
+        start, skip = self.bounds.start, self.bounds.skip
+        if start is not None and skip is not None:
+            return start, skip
+        strides = self.frames.strides if skip is None else (skip,)
+        chosen = FrameSampling(clip=self.frames.clip, strides=strides, latest_start=self.frames.latest_start)
+        numbers, stride, _ = chosen.draw(rng, frames)
+        return numbers[0] if start is None else start, stride
+
+
+def released_controls(scenes: Sequence[str], *, orbit: bool) -> Controls:
+    """The one clip of each scene that the released script makes without a control list. orbit: False in driving."""
+    control = Control(
+        name="sample_00",
+        frame_start=RELEASED_START,
+        frame_skip=RELEASED_SKIP,
+        start=RELEASED_SOURCE if orbit else None,
+        goal=RELEASED_SOURCE + RELEASED_CHANGE if orbit else None,
+    )
+    return dict.fromkeys(scenes, (control,))
+
+
+def _number(scene: str) -> int:
+    """Of a scene's folder, in either layout."""
+    number = kubric4d_names.scene_number(scene)
+    number = parallel_domain4d_names.scene_number(scene) if number is None else number
+    if number is None:
+        raise DataError(f"{scene} is no scene's name; wanted scn00042 or scene_000042")
+    return number
+
+
+_NAMED = 4  # cameras in a message
+
+
+def controlled(
+    scenes: Sequence[str], controls: ClipControls, listed: Path | None, folder: Path, notes: Skips
+) -> tuple[str, ...]:
+    """Scenes that have clips; the others are noted.
+
+    Args:
+        listed: the control list, None without. folder: where the scenes lie.
+    Raises:
+        DataError: there are scenes, and the list has none of them.
+    """
+    there = tuple(scene for scene in scenes if controls.names(scene))
+    if scenes and not there:
+        raise DataError(
+            f"the control list {listed} has none of the {len(scenes)} scenes in {folder}, first {scenes[0]}; "
+            "give the list of these scenes"
+        )
+    for scene in scenes:
+        if scene not in there:
+            notes.add(scene, str(listed), "has no control for it")
+    return there
+
+
+def require_cameras(data: Dataset4D) -> None:
+    """Raises DataError, with the first fault, where no scene can be opened with all of its cameras."""
+    faults: list[DataError] = []
+    for scene in data.scenes:
+        try:
+            data.frames(scene)
+        except DataError as fault:
+            faults.append(fault)
+        else:
+            return
+    if faults:
+        few = len(data.cameras) <= _NAMED
+        cameras = f"the cameras {', '.join(data.cameras)}" if few else f"its {len(data.cameras)} cameras"
+        raise DataError(
+            f"none of {len(faults)} scenes can be opened with {cameras}: {faults[0]}; name those there are with "
+            "--camera"
+        ) from faults[0]
+
+
+def orbit_notes(controls: ListedControls, scenes: Sequence[str], listed: Path) -> tuple[str, ...]:
+    """What is odd in the cameras of an orbit's control list, in words.
+
+    Raises: DataError: a control has no cameras: the list is for driving.
+    """
+    chosen = [(scene, each) for scene in scenes for each in controls.controls[scene][: controls.clips]]
+    below: list[str] = []
+    for scene, control in chosen:
+        if control.start is None or control.goal is None:
+            raise DataError(
+                f"{listed}: {scene}, {control.name} has no spherical_start: it is a driving control, and these scenes "
+                "are seen along orbits; give Kubric-4D's controls"
+            )
+        if min(control.start.elevation_deg, control.goal.elevation_deg) < 0:
+            below.append(f"{scene}, {control.name}")
+    if not below:
+        return ()
+    return (
+        f"{listed}: {len(below)} of {len(chosen)} clips have a camera below the ground, first {below[0]}; see its "
+        "angles",
+    )

@@ -1,0 +1,304 @@
+"""Runs of evaluations put together: what was measured on the same clips stands in the same tables."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from gcd_train.errors import RunError
+from gcd_train.evaluation.baselines import FROM_EXACT_CLASSES
+from gcd_train.evaluation.statistics import Selection, Span
+from gcd_train.evaluation.store import FRAMES_IN, LPIPS, REGIONS, ClipRecord, Counted, Frames, Region, RunNote, read_run
+
+COMPARABLE = ("kind", "modality", "protocol", "frames", "height", "width", "fps", "classes")
+"""What the notes of two runs must have alike before any of their figures are compared."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Run:
+    """One run as it lies on the disk. folder: where its `run.json`, records and views are."""
+
+    folder: Path
+    note: RunNote
+    records: tuple[ClipRecord, ...]
+
+    @classmethod
+    def read(cls, folder: Path) -> "Run":
+        """Raises RunError where there is none, or none of its clips is measured yet."""
+        note, records = read_run(folder)
+        if not records:
+            raise RunError(f"{folder} holds no record yet; run `gcd-train evaluate --out {folder}` to its end")
+        return cls(folder=folder, note=note, records=records)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Method:
+    """One method on the clips of a set.
+
+    details: what the run's note says of it. folder: of the run that its views are in.
+    """
+
+    name: str
+    details: dict[str, str]
+    folder: Path
+    records: tuple[ClipRecord, ...]
+
+    @property
+    def privileged(self) -> bool:
+        """Whether it was given the exact depth, or further cameras."""
+        return self.records[0].privileged
+
+    @property
+    def starred(self) -> str:
+        """Its name, with a star where it was given more than the source video."""
+        return f"{self.name} *" if self.privileged else self.name
+
+    @property
+    def copies_classes(self) -> bool:
+        """Whether its class maps, and nothing else of it, are made from the source's exact ones."""
+        return not self.privileged and self.details.get("baseline") in FROM_EXACT_CLASSES
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Of the clips it was measured on."""
+        return tuple(record.key for record in self.records)
+
+    @property
+    def makes_pictures(self) -> bool:
+        """Whether it has PSNR, and not class maps alone."""
+        return any(record.regions["all"].psnr_db is not None for record in self.records)
+
+    @property
+    def makes_classes(self) -> bool:
+        """Whether it has class maps that were compared."""
+        return any(record.regions["all"].confusion is not None for record in self.records)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class EvaluatedSet:
+    """Methods that were measured on the same clips, by one run or by several.
+
+    note: of the first run. runs: all of them. methods: in the order of the runs.
+    """
+
+    note: RunNote
+    runs: tuple[Run, ...]
+    methods: tuple[Method, ...]
+
+    @property
+    def title(self) -> str:
+        """What the clips are, in a few words."""
+        names = ", ".join(dict.fromkeys("/".join(Path(folder).parts[-2:]) or folder for folder in self.note.data))
+        return f"{_KINDS[self.note.kind]} ({names}), {_PROTOCOLS[self.note.protocol]}"
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Of all clips that any method was measured on."""
+        return tuple(dict.fromkeys(key for method in self.methods for key in method.keys))
+
+    @property
+    def scenes(self) -> int:
+        """How many scenes these clips are of."""
+        return len({record.scene for method in self.methods for record in method.records})
+
+    @property
+    def regions(self) -> tuple[Region, ...]:
+        """All, and the others where somebody knows which they are."""
+        records = [record for method in self.methods for record in method.records]
+        return tuple(region for region in REGIONS if any(region in record.regions for record in records))
+
+    def fps(self, key: str) -> float:
+        """Frames per second of a clip."""
+        return next(record.fps for method in self.methods for record in method.records if record.key == key)
+
+    def method(self, name: str) -> Method:
+        """Raises RunError where there is none of the name."""
+        for each in self.methods:
+            if each.name == name:
+                return each
+        known = ", ".join(each.name for each in self.methods)
+        raise RunError(f"no method is called {name!r} in these runs; there are {known}")
+
+
+_KINDS = {"kubric": "Kubric-4D layout", "driving": "Driving", "orbit": "Orbits"}
+_PROTOCOLS = {"paper": "the paper's protocol", "released": "the released script's protocol", "pairs": "pairs of clips"}
+
+
+def gather(runs: Sequence[Run]) -> tuple[EvaluatedSet, ...]:
+    """Sets of clips, in the order of the runs; runs on the same clips make one set.
+
+    Raises:
+        RunError: two runs on the same clips were made in other ways, or name two different methods alike.
+    """
+    groups: dict[str, list[Run]] = {}
+    for run in runs:
+        groups.setdefault(run.note.data_identity, []).append(run)
+    return tuple(_set(tuple(members)) for members in groups.values())
+
+
+def _set(runs: tuple[Run, ...]) -> EvaluatedSet:
+    first = runs[0]
+    for run, name in ((run, name) for run in runs[1:] for name in COMPARABLE):
+        was, now = getattr(first.note, name), getattr(run.note, name)
+        if was != now:
+            raise RunError(
+                f"{run.folder} has {name} {now}, {first.folder} has {was}, on the same clips; report them apart"
+            )
+    found: dict[str, Method] = {}
+    for run in runs:
+        records: dict[str, list[ClipRecord]] = {}
+        for record in run.records:
+            records.setdefault(record.method, []).append(record)
+        for name, own in records.items():
+            details = run.note.methods.get(name, {})
+            method = Method(name=name, details=details, folder=run.folder, records=tuple(own))
+            other = found.setdefault(name, method)
+            if not _same_method(other.details, details):
+                raise RunError(
+                    f"{name} is another method in {other.folder} than in {run.folder}: {other.details} and "
+                    f"{details}; measure it alike in both, give one another name, or report the runs apart"
+                )
+    return EvaluatedSet(note=first.note, runs=runs, methods=tuple(found.values()))
+
+
+def _same_method(first: Mapping[str, str], other: Mapping[str, str]) -> bool:
+    """Whether two notes are of one method: frames from elsewhere are known by their content, wherever they lie, and
+    LPIPS may have been left out of one of the two runs."""
+    left_out = {FRAMES_IN} if LPIPS in first and LPIPS in other else {FRAMES_IN, LPIPS}
+    return all(first.get(name) == other.get(name) for name in (first.keys() | other.keys()) - left_out)
+
+
+_SAME_CHANGE = 0.01  # degrees and metres
+_SAME_FIGURE = 1e-4  # of the larger one: two cameras at one goal see one picture, the next moment differs by 1e-3
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Goal:
+    """Where a clip's camera goes, and what is known of the target's pictures, whatever the method.
+
+    change: azimuth, elevation, radius; None for the fixed path of driving. target: figures by name, frame by frame.
+    """
+
+    change: tuple[float, float, float] | None
+    target: Mapping[str, Frames]
+
+    @classmethod
+    def of(cls, records: Sequence[ClipRecord]) -> "Goal":
+        """Of one clip, from the records of any methods on it."""
+        target: dict[str, Frames] = {}
+        for record in records:
+            target = {**_of_target(record), **target}
+        return cls(change=records[0].change, target=target)
+
+    def apart_from(self, other: "Goal", frames: Span = "last") -> str:
+        """Why the two targets are not the same in these frames, in words; empty where they are."""
+        both = (self.change, other.change)
+        near = self.change is not None and other.change is not None
+        near = near and bool(np.allclose(self.change or (), other.change or (), rtol=0.0, atol=_SAME_CHANGE))
+        if not near and both != (None, None):
+            return "the camera goes {} and {}".format(*map(_told, both))
+        chosen, known = Selection(frames=frames).frame_slice(), self.target.keys() & other.target.keys()
+        if not known and self.change is None:
+            return "nobody knows whether the targets are the same"
+        for name in known:
+            values = [np.array(each.target[name][chosen], np.float64) for each in (self, other)]  # NaN for None
+            if (
+                values[0].shape != values[1].shape
+                or not np.isclose(*values, rtol=_SAME_FIGURE, atol=1e-9, equal_nan=True).all()
+            ):
+                return "the target's pictures differ: other moments, or another path"
+        return ""
+
+
+def on_the_same_goals(sets: Sequence[EvaluatedSet]) -> tuple[tuple[EvaluatedSet, ...], tuple[str, ...]]:
+    """Sets with clips of one name that end at the same goal, put together, for figures of the last frame.
+
+    A gradual and a direct path end at the same goal, so their last frames can be compared and no others. Clips of the
+    same name that go elsewhere are left out. A method that several of the sets have is taken from the first.
+
+    Returns: the sets, each put together from several; and what is not compared, and why, line by line.
+    """
+    groups: list[list[EvaluatedSet]] = []
+    notes: list[str] = []
+    for each in sets:
+        _place(each, groups, notes)
+    together = [_put_together(group, notes) for group in groups if len(group) > 1]
+    return tuple(together), tuple(notes)
+
+
+def _place(each: EvaluatedSet, groups: list[list[EvaluatedSet]], notes: list[str]) -> None:
+    """Into the first group that it has goals in common with, or into one of its own."""
+    for group in groups:
+        why = _compared(group[0], each)
+        apart = {key: reason for key, reason in why.items() if reason}
+        if apart:
+            first, other = (", ".join(dict.fromkeys(str(run.folder) for run in of.runs)) for of in (group[0], each))
+            key, reason = next(iter(apart.items()))
+            notes.append(
+                f"{first} and {other}: of {len(why)} clips of the same names {len(apart)} do not end at the same goal, "
+                f"so they are not compared. In {key} {reason}."
+            )
+        if len(apart) < len(why):
+            wanted = why.keys() - apart.keys()
+            kept = [replace(m, records=tuple(r for r in m.records if r.key in wanted)) for m in each.methods]
+            group.append(replace(each, methods=tuple(method for method in kept if method.records)))
+            return
+    groups.append([each])
+
+
+def _compared(first: EvaluatedSet, other: EvaluatedSet) -> dict[str, str]:
+    """For each clip that both have by name why it is not the same; empty for sets that are made in other ways."""
+    if any(getattr(first.note, name) != getattr(other.note, name) for name in COMPARABLE):
+        return {}
+    ours, theirs = _goals(first), _goals(other)
+    return {key: goal.apart_from(theirs[key]) for key, goal in ours.items() if key in theirs}
+
+
+def _goals(of: EvaluatedSet) -> dict[str, Goal]:
+    by_key: dict[str, list[ClipRecord]] = {}
+    for record in (record for method in of.methods for record in method.records):
+        by_key.setdefault(record.key, []).append(record)
+    return {key: Goal.of(records) for key, records in by_key.items()}
+
+
+def _put_together(sets: Sequence[EvaluatedSet], notes: list[str]) -> EvaluatedSet:
+    """One set of all; methods that share a name and nothing else are noted, and only the first of each is kept."""
+    methods: dict[str, Method] = {}
+    for method in (method for each in sets for method in each.methods):
+        other = methods.setdefault(method.name, method)
+        if other.details != method.details:
+            notes.append(
+                f"{method.name} is another method in {method.folder} than in {other.folder}, and only the latter "
+                "stands in the table of both; rename one of the two to compare them"
+            )
+    return EvaluatedSet(
+        note=msgspec.structs.replace(sets[0].note, data=tuple(folder for each in sets for folder in each.note.data)),
+        runs=tuple(run for each in sets for run in each.runs),
+        methods=tuple(methods.values()),
+    )
+
+
+def _of_target(record: ClipRecord) -> dict[str, Frames]:
+    """What a record tells of the target alone, by region: how much is of it, how sharp it is, its classes' mean id."""
+    found: dict[str, Frames] = {}
+    for name, region in record.regions.items():
+        if name != "all":
+            found[f"{name} share"] = region.pixels
+        if region.gradient_target is not None:
+            found[f"{name} gradient"] = region.gradient_target
+        if region.confusion is not None:
+            found[f"{name} classes"] = tuple(_mean_class(counted) for counted in region.confusion)
+    return found
+
+
+def _mean_class(counted: Counted) -> float | None:
+    pixels = sum(count for _, _, count in counted)
+    return sum(true * count for true, _, count in counted) / pixels if pixels else None
+
+
+def _told(change: tuple[float, float, float] | None) -> str:
+    if change is None:
+        return "its fixed path"
+    return "by azimuth {:+.1f}, elevation {:+.1f}, radius {:+.1f}".format(*change)

@@ -1,0 +1,260 @@
+"""A run's folder: what it says of itself, one record for each method and clip, and the frames that are kept.
+
+    run.json                         what all records have in common (RunNote)
+    records/METHOD/KEY.json          one method on one clip (ClipRecord)
+    views/METHOD/KEY/sample_0/0000.png
+                                     frames that a method made; source/ and target/ beside. views/METHOD is a folder
+                                     that `--predictions` reads.
+
+Files appear whole or not at all, so a run that was killed goes on where it stopped.
+"""
+
+import fcntl
+import os
+import re
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeAlias, get_args
+
+import msgspec
+
+from gcd_model.errors import FileError
+from gcd_model.small_files import read_json
+from gcd_train.errors import RunError
+
+Region: TypeAlias = Literal["all", "visible", "occluded"]
+"""Which pixels of the target: all, those the source camera saw too, or the others."""
+
+REGIONS: tuple[Region, ...] = get_args(Region)
+
+FRAMES_IN, LPIPS = "frames in", "lpips"
+"""In what a note says of a method: where another method's frames lie, and which LPIPS it was measured with."""
+
+Frames: TypeAlias = tuple[float | None, ...]
+"""A value of each frame, from the first; None where there is no pixel to measure."""
+
+Counted: TypeAlias = tuple[tuple[int, int, int], ...]
+"""Pixels of one frame as (true class, predicted class, how many), only what occurs; predicted 255 is no class."""
+
+
+class RegionRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One method's figures on some pixels of one clip.
+
+    pixels: share of the frame that they are, T. psnr_db, ssim: [S][T]. diversity: T, None for fewer than two draws.
+    gradient, gradient_target: [S][T] and T, mean length of the gradient. confusion: [T], summed over draws; None where
+    there are no classes.
+    """
+
+    pixels: tuple[float, ...]
+    psnr_db: tuple[Frames, ...] | None = None
+    ssim: tuple[Frames, ...] | None = None
+    diversity: Frames | None = None
+    gradient: tuple[Frames, ...] | None = None
+    gradient_target: Frames | None = None
+    confusion: tuple[Counted, ...] | None = None
+
+
+class ClipRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One method on one clip of T frames, in S draws.
+
+    method: its name. privileged: whether it is given the exact depth, or further cameras. key: of the clip in its set.
+    scene: the clip's; errors are over scenes. change: azimuth and elevation in degrees and radius in metres from source
+    to goal; None for the fixed path of driving. fps: of the clip. seconds: that the method took. regions: by name;
+    "visible" and "occluded" are missing where nobody knows what the source camera saw.
+    lpips: [S][T], None where no weights were given. step, step_target: [S][T-1] and T-1, mean change from frame to
+    frame. grid_confusion: as in a region, at the class grid. Where the method makes no pictures all else is None.
+    """
+
+    method: str
+    privileged: bool
+    key: str
+    scene: str
+    change: tuple[float, float, float] | None
+    frames: int
+    fps: float
+    draws: int
+    seconds: float
+    regions: dict[Region, RegionRecord]
+    lpips: tuple[Frames, ...] | None = None
+    step: tuple[tuple[float, ...], ...] | None = None
+    step_target: tuple[float, ...]
+    grid_confusion: tuple[Counted, ...] | None = None
+
+
+class RunNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What all records of a run have in common; `run.json`.
+
+    command: the line that began it. made: UTC, ISO 8601. versions: of gcd-node, torch, python. data: folders.
+    data_identity: digest of the clips. kind: "kubric", "driving" or "orbit": which tables they belong to.
+    modality: of the target pictures. protocol: "paper", "released" or "pairs". fps: frames per second of the clips.
+    rates: empty where all have that one; else all that clips may have, of which `fps` is the highest, and each record
+    tells its clip's. classes: names, empty for none.
+    methods: name to what it is: a weight file's digest, steps, guidance, draws, seed, views; all as text.
+    """
+
+    command: str
+    made: str
+    versions: dict[str, str]
+    data: tuple[str, ...]
+    data_identity: str
+    kind: Literal["kubric", "driving", "orbit"]
+    modality: Literal["rgb", "semantic"]
+    protocol: Literal["paper", "released", "pairs"]
+    frames: int
+    height: int
+    width: int
+    fps: float
+    rates: tuple[float, ...] = ()
+    seed: int
+    classes: tuple[str, ...] = ()
+    methods: dict[str, dict[str, str]] = {}
+
+
+RUN_FILE = "run.json"
+_MOST_RECORD = 1 << 24
+_SAME = ("data_identity", "kind", "modality", "protocol", "frames", "height", "width", "seed", "classes")
+_PACKAGE = "gcd-node"
+_SHOWN = 48  # letters of a value in a message
+
+
+def folder_name(name: str) -> str:
+    """A method's or a clip's name as the name of a folder or file: letters, digits, dots, underscores, hyphens."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("_.") or "_"
+
+
+@dataclass(frozen=True, slots=True)
+class RunKeeper:
+    """Keeps the records of one run in its folder."""
+
+    folder: Path
+
+    @contextmanager
+    def in_use(self, note: RunNote) -> Generator[None]:
+        """`begin`, one line at a time; lines that begin before the block is left keep its methods. Raises as it."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with (self.folder / ".in_use").open("a") as measuring:
+            with (self.folder / ".begin").open("a") as turn:
+                fcntl.flock(turn, fcntl.LOCK_EX)
+                try:
+                    fcntl.flock(measuring, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    alone = True
+                except BlockingIOError:
+                    alone = False
+                self.begin(note, alone=alone)
+                fcntl.flock(measuring, fcntl.LOCK_SH)
+            yield
+
+    def begin(self, note: RunNote, *, alone: bool = True) -> RunNote:
+        """Write `run.json`, or add this note's methods to the one that is there, whose command and time stay.
+
+        What has no record binds nobody, if no other line measures now (alone): a note of which nothing was measured is
+        written anew, and a method without records is corrected, or dropped where this note does not name it.
+
+        Returns: what now stands there.
+        Raises:
+            RunError: the folder holds records of another evaluation, two methods would share a folder, or nothing can
+                be written.
+        """
+        path = self.folder / RUN_FILE
+        if path.exists():
+            found = _read_note(path)
+            if alone:
+                places = {name: self.folder / "records" / folder_name(name) for name in found.methods}
+                kept = {name: found.methods[name] for name, place in places.items() if any(place.glob("*.json"))}
+                found = msgspec.structs.replace(found, methods=kept)
+            note = _joined(self.folder, found, note) if found.methods else note
+        owners: dict[str, str] = {}
+        for method in note.methods:
+            other = owners.setdefault(folder_name(method), method)
+            if other != method:
+                raise RunError(
+                    f"the methods {other!r} and {method!r} would share the folder {folder_name(method)}; rename one"
+                )
+        write_whole(path, msgspec.json.format(msgspec.json.encode(note), indent=1))
+        return note
+
+    def sheet_rows(self, method: str, key: str) -> Path:
+        """Where the rows of a method on a clip of the contact sheet lie, without a suffix."""
+        return self.folder / ".sheet" / folder_name(method) / folder_name(key)
+
+    def has(self, method: str, key: str) -> bool:
+        """Whether there is a record."""
+        return self._record(method, key).exists()
+
+    def read(self, method: str, key: str) -> ClipRecord:
+        """A record that there is. Raises RunError if it is damaged."""
+        return _read_record(self._record(method, key))
+
+    def keep(self, record: ClipRecord) -> None:
+        """Write a record; one that is there is replaced. Raises RunError if it cannot be written."""
+        write_whole(self._record(record.method, record.key), msgspec.json.encode(record))
+
+    def views(self, method: str, key: str) -> Path:
+        """Where the frames of a method on a clip lie."""
+        return self.folder / "views" / folder_name(method) / folder_name(key)
+
+    def _record(self, method: str, key: str) -> Path:
+        return self.folder / "records" / folder_name(method) / f"{folder_name(key)}.json"
+
+
+def read_run(folder: Path | str) -> tuple[RunNote, tuple[ClipRecord, ...]]:
+    """What a run says of itself, and its records: method by method in the note's order, clips by name.
+
+    Raises:
+        RunError: there is no run, or a file of it is damaged.
+    """
+    folder = Path(folder)
+    if not (folder / RUN_FILE).exists():
+        raise RunError(f"{folder} holds no {RUN_FILE}; make a run with `gcd-train evaluate --out {folder}`")
+    note = _read_note(folder / RUN_FILE)
+    places = [folder / "records" / folder_name(method) for method in note.methods]
+    return note, tuple(_read_record(path) for place in places for path in sorted(place.glob("*.json")))
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file under its name only once it is complete. Raises RunError if it cannot be written."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_bytes(data)
+        partial.replace(path)
+    except OSError as error:
+        raise RunError(f"cannot write {path}: {error.strerror}; free some space, or choose another --out") from error
+
+
+def _read_note(path: Path) -> RunNote:
+    try:
+        return read_json(path, RunNote)
+    except FileError as error:
+        raise RunError(f"{path} {error}; delete the run, or choose another folder") from error
+
+
+def _read_record(path: Path) -> ClipRecord:
+    try:
+        return read_json(path, ClipRecord, _MOST_RECORD)
+    except FileError as error:
+        raise RunError(f"{path} {error}; delete it and evaluate again, the others are kept") from error
+
+
+def _joined(folder: Path, found: RunNote, new: RunNote) -> RunNote:
+    """The note that is there with the new methods. Raises RunError where records of both would not go together."""
+    differ = {name: (getattr(found, name), getattr(new, name)) for name in _SAME}
+    differ[_PACKAGE] = (found.versions.get(_PACKAGE), new.versions.get(_PACKAGE))
+    for method in found.methods.keys() & new.methods.keys():
+        was, now = found.methods[method], new.methods[method]
+        names = dict.fromkeys([*was, *now])
+        names.pop(FRAMES_IN, None)  # the digest says if frames are the same
+        differ |= {f"{name} of {method}": (was.get(name, "not told"), now.get(name, "not told")) for name in names}
+    told = [f"{name} was {_short(was)}, is {_short(now)}" for name, (was, now) in differ.items() if was != now]
+    if told:
+        raise RunError(
+            f"{folder} holds records of another evaluation: {'; '.join(told)}. Choose another --out, or delete it"
+        )
+    return msgspec.structs.replace(found, fps=new.fps, rates=new.rates, methods={**found.methods, **new.methods})
+
+
+def _short(value: object) -> str:
+    text = ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
+    return text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"

@@ -1,0 +1,1 @@
+"""Scenes and real videos to look at: contact sheets, videos, a page."""

@@ -1,0 +1,160 @@
+"""Views of real videos, for which there is no ground truth: sheets, videos and a page."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from html import escape
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gcd_model import CameraMount, Clip, RenderOptions, SphericalDelta, Traits, Trajectory, View, ViewSynthesizer
+from gcd_train.datasets.clip_source import to_network
+from gcd_train.evaluation.galleries import Strip, painted, to_bytes, write_sheet, write_video
+from gcd_train.evaluation.store import write_whole
+from gcd_train.look.real_video import Bytes, Windowed
+
+DEFAULT_ANGLES = (SphericalDelta(azimuth_deg=30.0, elevation_deg=10.0), SphericalDelta(azimuth_deg=-30.0))
+"""Where steered models look from unless somebody says: to the right and from above, and to the left."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ViewRecipe:
+    """How windows are viewed.
+
+    angles: goals of steered models, target minus source; empty for the one view of others. samples: draws of each;
+    all are shown, and from two on where they differ. steps: None as shipped. seed: of the noise.
+    height_m, tilt_deg: of the camera on its vehicle, above the ground and down; None as trained.
+    """
+
+    angles: tuple[SphericalDelta, ...] = ()
+    samples: int = 1
+    steps: int | None = None
+    seed: int = 0
+    height_m: float | None = None
+    tilt_deg: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Viewed:
+    """A window and what was made of it.
+
+    strips: rows of the sheet. notes: what a viewer should know, in words.
+    """
+
+    window: Windowed
+    strips: tuple[Strip, ...]
+    notes: tuple[str, ...]
+
+
+def paths(traits: Traits, recipe: ViewRecipe, hfov_deg: float | None = None) -> tuple[tuple[str, Trajectory], ...]:
+    """Name and camera path of each goal, or of a model's one view.
+
+    hfov_deg: of the pictures, if known. Raises: ViewFixedError, ViewRangeError, OptionError as `Traits.plan_view`.
+    """
+    mount = mounted(traits, recipe, hfov_deg)
+    if traits.config.camera == "none" and not recipe.angles:
+        return (("view", traits.plan_view(mount=mount)),)
+    return tuple((_told(each), traits.plan_view(each, mount=mount)) for each in recipe.angles or DEFAULT_ANGLES)
+
+
+def mounted(traits: Traits, recipe: ViewRecipe, hfov_deg: float | None) -> CameraMount | None:
+    """How the camera sits on its vehicle, for the live model where somebody says it; else None."""
+    if not traits.live or (recipe.height_m is None and recipe.tilt_deg is None):
+        return None
+    usual = CameraMount()
+    return replace(
+        usual,
+        height_m=usual.height_m if recipe.height_m is None else recipe.height_m,
+        tilt_deg=usual.tilt_deg if recipe.tilt_deg is None else recipe.tilt_deg,
+        hfov_deg=usual.hfov_deg if hfov_deg is None else hfov_deg,
+    )
+
+
+def view_window(synthesizer: ViewSynthesizer, window: Windowed, recipe: ViewRecipe) -> Viewed:
+    """Encode a window once and render every goal. Raises: ModelError and its kind."""
+    traits = synthesizer.traits
+    mount = mounted(traits, recipe, window.hfov_deg)
+    features = synthesizer.encode(Clip(video=to_network(window.pictures), fps=window.fps, mount=mount))
+    options = RenderOptions(samples=recipe.samples, steps=recipe.steps, seed=recipe.seed)
+    strips = [Strip.of("input", window.pictures)]
+    for told, path in paths(traits, recipe, window.hfov_deg):
+        (view,) = synthesizer.render(features, [path], options)
+        strips += _view_strips(traits, told, view)
+    return Viewed(window=window, strips=tuple(strips), notes=_notes(window, traits.name))
+
+
+def write_viewed(viewed: Viewed, folder: Path) -> None:
+    """`NAME.png`, the sheet, and `NAME.mp4`, all rows side by side. Raises RunError if they cannot be written."""
+    told = f"{viewed.window.video} from {viewed.window.start_s:.1f} s"
+    write_sheet([(told, viewed.strips)], folder / f"{viewed.window.name}.png")
+    write_video(viewed.strips, viewed.window.fps, folder / f"{viewed.window.name}.mp4")
+
+
+def _view_strips(traits: Traits, told: str, view: View) -> list[Strip]:
+    strips = [
+        Strip.of(told if number == 0 else f"{told} sample {number + 1}", to_bytes(sample))
+        for number, sample in enumerate(view.samples)
+    ]
+    deviation, word = (view.uncertainty, "uncertainty") if view.uncertainty is not None else (view.std, "deviation")
+    if deviation is not None:
+        strips.append(Strip.of(f"{word}, white {float(deviation.max()):.2g}", heat(deviation.numpy())))
+    if view.classes is not None:
+        strips.append(Strip.of("classes", painted(view.classes[0], traits.classes)))
+    return strips
+
+
+def heat(values: NDArray[np.float32]) -> Bytes:
+    """Numbers [T, H, W] as pictures [T, H, W, 3]: black is 0, the brightest is their largest."""
+    grey = np.rint(values / max(float(values.max()), 1e-6) * 255).clip(0, 255).astype(np.uint8)
+    return np.stack([np.asarray(cv2.applyColorMap(each, cv2.COLORMAP_INFERNO)[..., ::-1], np.uint8) for each in grey])
+
+
+def _told(delta: SphericalDelta) -> str:
+    return f"az {delta.azimuth_deg:+g} el {delta.elevation_deg:+g} r {delta.radius_m:+g}"
+
+
+def _notes(window: Windowed, model: str) -> tuple[str, ...]:
+    width, height = window.size
+    rate = "" if window.trained_rate else f", a rate {model} was not trained with"
+    return (
+        f"from {window.start_s:.1f} s, {len(window.pictures)} frames at {window.fps:g} a second{rate}",
+        f"cut from {width} x {height} to {window.pictures.shape[2]} x {window.pictures.shape[1]}",
+    )
+
+
+_STYLE = (
+    "body{font:15px/1.45 sans-serif;margin:2em auto;max-width:1080px;padding:0 1em;color:#222}"
+    "img{max-width:100%;border:1px solid #ddd}h2{margin-top:2em}.note{color:#666}.fault{color:#a02020}"
+)
+
+
+def write_page(viewed: Sequence[Viewed], faults: Sequence[str], facts: Sequence[tuple[str, str]], out: Path) -> None:
+    """Write the page.
+
+    Args:
+        viewed: windows in order, whose files lie beside the page. faults: what could not be shown, a line each. facts:
+            name and value of what holds for all: the command, the weights, the options.
+    Raises:
+        RunError: it cannot be written.
+    """
+    rows = "".join(f"<tr><th align=left>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in facts)
+    parts = [
+        "<!doctype html><html lang=en><meta charset=utf-8><title>Views of real videos</title>",
+        f"<style>{_STYLE}</style><h1>Views of real videos</h1>",
+        "<p>Every pixel of a view is generated. Nobody knows what was really there: a view that looks right is no "
+        f"evidence that it is.</p><table>{rows}</table>",
+        *(f"<p class=fault>{escape(fault)}</p>" for fault in faults),
+        *map(_section, viewed),
+    ]
+    write_whole(out, ("\n".join(parts) + "</html>\n").encode())
+
+
+def _section(viewed: Viewed) -> str:
+    name = escape(viewed.window.name, quote=True)
+    notes = escape("; ".join(viewed.notes))
+    return (
+        f"<h2>{escape(viewed.window.video)}, window {viewed.window.number + 1}</h2><p class=note>{notes}; "
+        f'<a href="{name}.mp4">video</a></p><a href="{name}.png"><img src="{name}.png" alt="{name}"></a>'
+    )
