@@ -204,7 +204,7 @@ class AllowList:
         self._version = _version(path)
         self._clients = load_clients(path)
         if not self._clients:
-            raise ConfigError(f"{path} names no client, so nobody could connect; add one, see docs/control.md")
+            raise ConfigError(f"{path} names no client, so nobody could connect; add one, see docs/node.md")
 
     def find(self, key: str) -> Client | None:
         """Whose key this is; None for a stranger. From any thread."""
@@ -240,9 +240,9 @@ def load_clients(path: Path) -> dict[str, Client]:
         for name, entry in entries.items():
             check_key(entry.key, f"{path}: the key of {name}")
     except FileError as error:
-        raise ConfigError(f"cannot read the allow-list {path}: it {error}; see docs/control.md") from error
+        raise ConfigError(f"cannot read the allow-list {path}: it {error}; see docs/node.md") from error
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{path}: {str(error).replace('`$.', '`')}; see docs/control.md") from error
+        raise ConfigError(f"{path}: {str(error).replace('`$.', '`')}; see docs/node.md") from error
     except SetupError as error:
         raise ConfigError(str(error)) from error
     clients: dict[str, Client] = {}

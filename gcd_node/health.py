@@ -16,10 +16,10 @@ SourceState: TypeAlias = Literal["closed", "connecting", "streaming", "stalled",
 ModelState: TypeAlias = Literal["absent", "loading", "warming", "ready", "busy", "degraded", "failed"]
 RecordState: TypeAlias = Literal["off", "recording", "stopping", "failed"]
 Stage: TypeAlias = Literal["capture_gap", "window", "encode", "render", "publish", "age"]
-"""What takes time, in order; docs/reliability.md says from where to where."""
+"""What takes time, in order; docs/deploy.md says from where to where."""
 
 Hop: TypeAlias = Literal["source", "window", "slot", "model", "queue"]
-"""Where frames, windows and messages are given up, in order; docs/reliability.md says why."""
+"""Where frames, windows and messages are given up, in order; docs/deploy.md says why."""
 
 Count: TypeAlias = Hop | Literal["oom_count", "nan_windows", "bad_depths", "sent", "subs", "bytes"]
 """A hop, a fault of the model, or what the publisher has sent and to how many subscribers."""
@@ -84,7 +84,7 @@ class StageSummary:
 class Snapshot:
     """A node's health at one moment.
 
-    findings: every reason with its level, the worst first (docs/reliability.md explains each).
+    findings: every reason with its level, the worst first (docs/deploy.md explains each).
     missing: what keeps the node from being ready; empty if it is.
     status: the fields of a status message (wire protocol, section 4) but its heartbeat; what is unknown is left out.
     frames: arrived whole since the start.

@@ -1,4 +1,4 @@
-"""The viewer: serves the page and its feed on loopback, one event loop for all browsers (docs/viewer.md).
+"""The viewer: serves the page and its feed on loopback, one event loop for all browsers (docs/deploy.md).
 
 Loopback alone is no protection: every page of the web that is open in a browser of this machine can send requests
 there. So the Host header must name this machine (a foreign name that was made to point here does not), and a feed is

@@ -1,6 +1,5 @@
-"""Reads the pages: their blocks, links, commands, and the errors they quote."""
+"""Reads the pages: their blocks, links and commands."""
 
-import ast
 import re
 import shlex
 import types
@@ -19,9 +18,7 @@ from gcd_train.cli.main import app as train_app
 
 ROOT = Path(__file__).parent.parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-SOURCES = [ROOT / "client", ROOT / "gcd_node", ROOT / "model" / "gcd_model", ROOT / "train" / "gcd_train"]
 SHELL = ("", "sh", "bash", "console")
-GAP = "\0"  # stands for what a message fills in
 WHOLE = ("source.kind=synthetic", "model.weights=random:driving", "view.topdown.kind=fixed")
 """What a launch file cannot do without, as changes."""
 SOURCES_AND_KEYS = {
@@ -152,36 +149,3 @@ def wrong_commands(page: str, text: str) -> list[str]:
     shell = [block.text for block in read_blocks(page, text) if block.language in SHELL]
     calls = [*quoted_commands(text), *(call for each in shell for call in said_commands(each))]
     return [f"{page}: {' '.join(words)}: {wrong}" for words in calls if (wrong := mistakes(words))]
-
-
-def said_texts() -> set[str]:
-    """Every text in the sources, with a gap where something is filled in."""
-    texts: set[str] = set()
-    for path in (path for root in SOURCES for path in root.rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Constant) and isinstance(node.value, str):
-                texts.add(re.sub(r"%[sdg]|%\.\d+[fg]", GAP, node.value) if "%" in node.value else node.value)
-            elif isinstance(node, ast.JoinedStr):
-                texts.add("".join(str(v.value) if isinstance(v, ast.Constant) else GAP for v in node.values))
-    return texts
-
-
-def is_said(quoted: str, texts: set[str]) -> bool:
-    """Whether the parts of a quotation, in their order, stand in one text of the sources."""
-    first, *others = [part.strip() for part in quoted.split("…") if part.strip()]
-
-    def follows(text: str) -> bool:
-        at = text.find(first) + len(first)
-        for part in others:
-            at = text.find(part, at) + len(part)
-            if at < len(part):
-                return False
-        return True
-
-    return any(first in text and follows(text) for text in texts)
-
-
-def quoted_errors(text: str) -> list[str]:
-    """What stands between backticks in the first column of the tables."""
-    rows = re.findall(r"^\| `([^`]+)` \|", text, re.MULTILINE)
-    return [row for row in rows if row != "Message"]

@@ -133,7 +133,7 @@ def test_every_metric_is_explained_in_the_docs(
     health.measure("gpu_mem_mb", 1.0)
     body = get(server, "/metrics")[2].decode()
     ours = {family.name for family in text_string_to_metric_families(body) if family.name.startswith("gcd_")}
-    text = (request.config.rootpath / "docs" / "reliability.md").read_text()
+    text = (request.config.rootpath / "docs" / "deploy.md").read_text()
     assert len(ours) > 20
     assert [name for name in sorted(ours) if f"`{name}" not in text] == []
 

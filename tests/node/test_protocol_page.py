@@ -70,7 +70,8 @@ def test_every_code_is_there() -> None:
 
 
 def test_every_row_of_the_failure_table_is_there_once() -> None:
-    rows = re.findall(r"^\| (F\d+) \|", section("## 7 When things go wrong"), re.MULTILINE)
+    page = (ROOT / "docs" / "node.md").read_text()
+    rows = re.findall(r"^\| (F\d+) \|", page, re.MULTILINE)
     assert rows == [f"F{number}" for number in range(1, 26)]
 
 
