@@ -33,7 +33,7 @@ from gcd_client.protocol import ClassRecord
 from gcd_client.subscriber import ReceivedView
 from gcd_node.auth import AllowFile
 from gcd_node.config import NodeConfig, ViewConfig, parse_config
-from gcd_node.source_config import SourceConfig, SourcePose
+from gcd_node.sources import SourceConfig, SourcePose
 
 pytestmark = pytest.mark.timeout(120)
 

@@ -8,7 +8,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gcd_model import palette
 from gcd_model.colours import nearest_classes, palette
 from gcd_model.config import SemanticClass
 from gcd_model.geometry import Intrinsics, invert_rigid
