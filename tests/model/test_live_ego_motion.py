@@ -102,6 +102,25 @@ def test_depth_of_another_scale_scales_the_motion() -> None:
     assert float(motion.world_from_camera[2, 3]) == pytest.approx(0.88, rel=0.02)
 
 
+def test_points_of_unsure_depth_count_less() -> None:
+    """One half of the picture is 40 % too far away; where the spread says so, the way is right."""
+    step, last = 0.2, 4
+    wrong = torch.arange(LENS.width) < LENS.width // 2
+    spread = torch.where(wrong, 0.3, 0.005).expand(LENS.height, LENS.width)
+
+    def way(told: Tensor | None) -> float:
+        ego = EgoMotion()
+        motions: list[Motion] = []
+        for n in range(last + 1):
+            picture, depth = filmed(pose(right=step * n))
+            motions.append(ego.follow(picture, LENS, None))
+            ego.settle(torch.where(wrong, 1.4 * depth, depth), STATIC, told)
+        return float(motions[-1].world_from_camera[0, 3])
+
+    assert abs(way(spread) - step * last) < 0.1 * step * last
+    assert abs(way(None) - step * last) > 2 * abs(way(spread) - step * last)
+
+
 def test_of_odometry_only_the_differences_count() -> None:
     elsewhere = pose(right=100.0, yaw_deg=70.0)
     steps = [pose(ahead=0.7 * n, yaw_deg=3.0 * n) for n in range(4)]

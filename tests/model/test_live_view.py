@@ -1,5 +1,6 @@
 """The live view frame by frame: state, reset, lenses, and what may be called seen."""
 
+import msgspec
 import pytest
 import torch
 from live_room import FRAMES, HEIGHT, LENS, WIDTH, one_thread, path, room  # noqa: F401  a fixture
@@ -19,7 +20,7 @@ HERE = torch.eye(4, dtype=torch.float64)
 
 @pytest.fixture(scope="module")
 def networks() -> LiveNetworks:
-    return random_networks(LIVE_TINY, seed=0)
+    return random_networks(LIVE_TINY, seed=2)
 
 
 def aside(x: float) -> Tensor:
@@ -151,9 +152,22 @@ def test_what_points_do_not_cover_is_never_marked_seen(networks: LiveNetworks) -
         assert bool((~covered).any())
 
 
+@pytest.mark.parametrize("carries", [True, False])
+def test_what_was_painted_is_seen_again_only_where_the_weights_carry_it(carries: bool) -> None:
+    config = msgspec.structs.replace(LIVE_TINY, carry_painted=carries, memory=0)
+    view = LiveView(random_networks(config, seed=2))
+    frame = room().video[0]
+    half = torch.where(torch.arange(WIDTH) < WIDTH // 2, 3.0, 0.0).expand(HEIGHT, WIDTH)
+    first, second = (view.step(frame, [aside(0.3)], lens=LENS, depth=half, odometry=HERE).views[0] for _ in range(2))
+    assert bool((first.visibility == 0).any())
+    changed = float((first.picture - second.picture).abs().max())  # by what an earlier frame tells of depth and class
+    assert (changed > 0.01) == carries, changed
+    assert torch.equal(first.visibility, second.visibility)
+
+
 @pytest.mark.parametrize(("sky", "metres"), [(1e6, SKY_M), (-1e6, 0.0)])
 def test_holes_are_filled_by_nobody_but_the_sky(sky: float, metres: float) -> None:
-    networks = random_networks(LIVE_TINY, seed=0)
+    networks = random_networks(LIVE_TINY, seed=2)
     bias = networks.depth.head.out.bias
     assert bias is not None
     bias.data[LIVE_TINY.depth.bins - 1] = sky

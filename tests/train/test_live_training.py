@@ -36,7 +36,7 @@ from gcd_train.live.measure_figures import SpreadHistogram
 from gcd_train.live.measure_methods import LiveModel
 from gcd_train.live.paint_training import HeldOutViews, PaintTask
 from gcd_train.live.recipe import LiveRecipe, LiveStage, live_recipes, load_live_recipe
-from gcd_train.live.target_views import ViewBatches, carry, views_of
+from gcd_train.live.target_views import ViewBatches, carried_through, carry, views_of
 from gcd_train.live.training import LivePlaces, train_live
 from gcd_train.loop import Progress
 from gcd_train.recipe import Budget, ComputeRecipe, LogRecipe, OptimiserRecipe
@@ -44,8 +44,8 @@ from gcd_train.recipe import Budget, ComputeRecipe, LogRecipe, OptimiserRecipe
 TINY = LiveConfig(
     height=HEIGHT,
     width=WIDTH,
-    depth=DepthConfig(widths=(8, 16, 16), fine_width=8, bins=8),
-    paint=PaintConfig(widths=(8, 16, 16), fine_width=8, embedding_width=16),
+    depth=DepthConfig(widths=(8, 16, 16), mixers=1, fine_width=8, half_width=8, bins=8),
+    paint=PaintConfig(widths=(8, 16, 16), fine_width=8, half_width=8, embedding_width=16),
     memory=2000,
 )
 
@@ -317,6 +317,26 @@ def test_what_was_painted_is_carried_to_where_the_camera_sees_it(places: LivePla
     car = torch.zeros(17, dtype=torch.bool)
     car[1] = True
     assert not carry(replace(true, classes=road), before, now, car).seen.painted_coverage.any()
+
+
+def test_painted_pixels_of_several_frames_in_a_row_drift_and_no_others(places: LivePlaces) -> None:
+    path = training_paths(places.data)[0]
+    make_inputs(places.out, [path], None, TINY, 0)
+    batches = ViewBatches([path], [places.out], TINY, 3, 0, carried=0.7)
+    net = PaintNet(TINY.paint, len(TINY.classes)).eval()
+    runs: set[int] = set()
+    for update in range(12):
+        before, now, random = batches.batch(update)
+        runs.add(len(before))
+        made = carried_through(
+            lambda seen: net.first_step(seen, filled(seen), TINY.sigma_max), before, now, torch.zeros(17).bool(), random
+        ).seen
+        carried = len(before[0].poses) if before else 0
+        assert all(len(views.poses) == carried for views in before)
+        assert not made.painted_coverage[carried:].any()
+        assert not made.painted[(made.painted_coverage == 0)[:, None].expand_as(made.painted)].any()
+        assert made.painted.abs().max() <= 1
+    assert {1, 2, 3} <= runs
 
 
 def test_paint_losses_are_lowest_at_the_truth(places: LivePlaces) -> None:

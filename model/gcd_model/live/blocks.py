@@ -10,6 +10,7 @@ from gcd_model.layers import Layers, zeroed
 from gcd_model.live.config import Widths
 
 _GROUPS, _HEADS = 8, 4
+_MIXER_RATIO = 3
 
 
 class Block(nn.Module):
@@ -50,11 +51,27 @@ class Attention(nn.Module):
         return x + self.out(mixed.transpose(-1, -2).reshape(n, channels, height, width))
 
 
+class Mixer(nn.Module):
+    """A transformer layer of the coarsest level: attention, then two layers on every patch."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.attention = Attention(channels)
+        self.norm = nn.GroupNorm(_GROUPS, channels)
+        self.widen = nn.Conv2d(channels, _MIXER_RATIO * channels, 1)
+        self.narrow = zeroed(nn.Conv2d(_MIXER_RATIO * channels, channels, 1))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """x: [N, C, h, w]."""
+        x = self.attention(x)
+        return x + self.narrow(F.silu(self.widen(self.norm(x))))
+
+
 class Trunk(nn.Module):
     """A U of several levels, each of half the size of the one before: patches in, features of every patch out.
 
-    patch: side in pixels of what the first level calls a pixel. widths: channels of the levels. beside: channels that
-    are given patch by patch.
+    patch: side in pixels of what the first level calls a pixel. widths: channels of the levels. mixers: transformer
+    layers on the coarsest. beside: channels that are given patch by patch.
     """
 
     def __init__(
@@ -63,6 +80,7 @@ class Trunk(nn.Module):
         widths: Widths,
         patch: int,
         *,
+        mixers: int = 0,
         embedding_width: int = 0,
         stem_kernel: int = 3,
         beside: int = 0,
@@ -76,6 +94,7 @@ class Trunk(nn.Module):
             [nn.Conv2d(fine, coarse, 3, stride=2, padding=1) for fine, coarse in pairwise(widths)]
         )
         self.attention = Attention(last)
+        self.mixers = Layers[Mixer]([Mixer(last) for _ in range(mixers)])
         self.middle = Block(last, last, e)
         ways = [(coarse, fine) for fine, coarse in reversed(list(pairwise(widths)))]
         self.up = Layers[Block](
@@ -90,7 +109,10 @@ class Trunk(nn.Module):
         for shrink, block in zip(self.shrink, list(self.down)[1:-1], strict=True):
             kept.append(x)
             x = block(shrink(x), embedding)
-        x = self.middle(self.attention(self.down[-1](x, embedding)), embedding)
+        x = self.attention(self.down[-1](x, embedding))
+        for mixer in self.mixers:
+            x = mixer(x)
+        x = self.middle(x, embedding)
         blocks = list(self.up)
         for joining, after, fine in zip(blocks[::2], blocks[1::2], reversed(kept), strict=True):
             x = torch.cat([F.interpolate(x, scale_factor=2.0, mode="nearest"), fine], dim=1)
@@ -99,15 +121,28 @@ class Trunk(nn.Module):
 
 
 class FineHead(nn.Module):
-    """From patches back to pixels: the trunk's features beside a few features of the full picture."""
+    """From patches back to pixels: the trunk's features beside features of the picture, at half and at full size.
+
+    half_width: channels at half the size, where edges within a patch are worked out; 0 leaves that out. It begins as
+    nothing added.
+    """
 
     def __init__(
-        self, in_channels: int, trunk_width: int, fine_width: int, out_channels: int, patch: int, *, zero: bool = False
+        self,
+        in_channels: int,
+        trunk_width: int,
+        fine_width: int,
+        out_channels: int,
+        patch: int,
+        *,
+        half_width: int = 0,
+        zero: bool = False,
     ) -> None:
         super().__init__()
         self.patch = patch
         self.fine = nn.Conv2d(in_channels, fine_width // 2, 3, padding=1)
         self.spread = nn.Conv2d(trunk_width, fine_width * patch**2, 1)
+        self.half_size = _HalfSize(in_channels, trunk_width, half_width, fine_width, patch // 2) if half_width else None
         self.mix = nn.Conv2d(fine_width + fine_width // 2, fine_width, 3, padding=1)
         self.out = nn.Conv2d(fine_width, out_channels, 1)
         if zero:
@@ -118,8 +153,29 @@ class FineHead(nn.Module):
 
         pixels: int64 [N, M], flat numbers of the only pixels that are computed: -> [N, out_channels, M, 1].
         """
-        spread = F.pixel_shuffle(self.spread(F.silu(features)), self.patch)
+        features = F.silu(features)
+        spread = F.pixel_shuffle(self.spread(features), self.patch)
+        if self.half_size is not None:
+            spread = spread + self.half_size(pictures, features)
         x = self.mix(F.silu(torch.cat([spread, self.fine(pictures)], dim=1)))
         if pixels is not None:
             x = x.flatten(2).gather(2, pixels[:, None].expand(-1, x.shape[1], -1))[..., None]
         return self.out(F.silu(x))
+
+
+class _HalfSize(nn.Module):
+    """A block at half the size between a head's patches and its pixels."""
+
+    def __init__(self, in_channels: int, trunk_width: int, width: int, out_channels: int, patch: int) -> None:
+        super().__init__()
+        self.patch = patch
+        self.spread = nn.Conv2d(trunk_width, width * patch**2, 1)
+        self.picture = nn.Conv2d(in_channels * 4, width, 3, padding=1)
+        self.block = Block(2 * width, width)
+        self.out = zeroed(nn.Conv2d(width, out_channels * 4, 1))
+
+    def forward(self, pictures: Tensor, features: Tensor) -> Tensor:
+        """pictures: [N, C, H, W], features: [N, trunk_width, h, w] -> [N, out_channels, H, W]."""
+        spread = F.pixel_shuffle(self.spread(features), self.patch)
+        beside = self.picture(F.pixel_unshuffle(pictures, 2))
+        return F.pixel_shuffle(self.out(F.silu(self.block(torch.cat([spread, beside], dim=1), None))), 2)

@@ -17,17 +17,21 @@ SIZE_FACTOR = 32
 """Height and width of pictures must be multiples of this."""
 _Side = Annotated[int, Meta(ge=SIZE_FACTOR, le=8192, multiple_of=SIZE_FACTOR)]
 _Channels = Annotated[int, Meta(ge=8, le=4096)]
+_HalfWidth = Annotated[int, Meta(ge=0, le=4096, multiple_of=8)]
 
 
 class DepthConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The depth network. bins are even in the logarithm from nearest_m to farthest_m; the last one is the sky.
 
-    patch: side of the trunk's patches in pixels.
+    patch: side of the trunk's patches in pixels. mixers: transformer layers on its coarsest level. half_width:
+    channels of the head at half the size, 0 for none.
     """
 
     patch: Literal[2, 4] = 4
     widths: Widths = (64, 128, 192)
+    mixers: Annotated[int, Meta(ge=0, le=64)] = 2
     fine_width: _Channels = 24
+    half_width: _HalfWidth = 32
     bins: Annotated[int, Meta(ge=4, le=1024)] = 32
     nearest_m: Annotated[float, Meta(gt=0)] = 0.25
     farthest_m: float = 256.0
@@ -38,11 +42,12 @@ class DepthConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 class PaintConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The paint network. embedding_width: of the noise level."""
+    """The paint network; see DepthConfig. embedding_width: of the noise level."""
 
     patch: Literal[2, 4] = 4
     widths: Widths = (56, 104, 160)
     fine_width: _Channels = 16
+    half_width: _HalfWidth = 24
     embedding_width: _Channels = 128
 
 
@@ -101,8 +106,8 @@ class LiveConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 LIVE_TINY = LiveConfig(
     height=64,
     width=96,
-    depth=DepthConfig(widths=(8, 16, 16), fine_width=8, bins=8),
-    paint=PaintConfig(widths=(8, 16, 16), fine_width=8, embedding_width=16),
+    depth=DepthConfig(widths=(8, 16, 16), mixers=1, fine_width=8, half_width=8, bins=8),
+    paint=PaintConfig(widths=(8, 16, 16), fine_width=8, half_width=8, embedding_width=16),
     memory=20_000,
 )
 """For tests, and for random weights."""

@@ -76,9 +76,12 @@ class DepthNet(nn.Module):
     def __init__(self, config: DepthConfig, classes: int) -> None:
         super().__init__()
         self.config, self.classes = config, classes
-        self.trunk = Trunk(INPUTS, config.widths, config.patch, beside=sweep_channels(config) * self._sweep_patch**2)
+        beside = sweep_channels(config) * self._sweep_patch**2
+        self.trunk = Trunk(INPUTS, config.widths, config.patch, mixers=config.mixers, beside=beside)
         outputs = 2 * config.bins - 1 + classes + 3
-        self.head = FineHead(INPUTS, config.widths[0], config.fine_width, outputs, config.patch)
+        self.head = FineHead(
+            INPUTS, config.widths[0], config.fine_width, outputs, config.patch, half_width=config.half_width
+        )
 
     @property
     def _sweep_patch(self) -> int:

@@ -9,6 +9,7 @@ Source: Karras et al. 2022, Eq. 7, about the base instead of zero; c_noise as in
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -116,13 +117,13 @@ class PaintNet(nn.Module):
     def __init__(self, config: PaintConfig, classes: int) -> None:
         super().__init__()
         self.config, self.classes = config, classes
-        first, fine = config.widths[0], config.fine_width
+        head = partial(FineHead, INPUTS, config.widths[0], config.fine_width, patch=config.patch, zero=True)
         self.votes = nn.Conv2d(classes, _VOTE_CHANNELS, 1)
         self.noise_level = embedding_mlp(config.embedding_width, config.embedding_width, config.embedding_width)
         self.camera = embedding_mlp(_CAMERA_FEATURES, config.embedding_width, config.embedding_width)
         self.trunk = Trunk(INPUTS, config.widths, config.patch, embedding_width=config.embedding_width, stem_kernel=1)
-        self.head = FineHead(INPUTS, first, fine, 3 + classes + 1 + 1 + 3, config.patch, zero=True)
-        self.detail = FineHead(INPUTS, first, fine, 3, config.patch, zero=True)
+        self.head = head(out_channels=3 + classes + 1 + 1 + 3, half_width=config.half_width)
+        self.detail = head(out_channels=3, half_width=config.half_width)
 
     def inputs(self, seen: Seen, base: Tensor, noisy: Tensor | None) -> Tensor:
         """All channels, [N, INPUTS, H, W]."""

@@ -21,7 +21,7 @@ from gcd_model.live.paint_net import Painted, PaintNet, Seen, filled
 from gcd_model.live.view import movable_classes
 from gcd_train.live.batches import Ahead, autocast, on
 from gcd_train.live.paint_training import HeldOutViews
-from gcd_train.live.target_views import ViewBatches, Views, carry, mirrored
+from gcd_train.live.target_views import ViewBatches, Views, carried_through, mirrored
 from gcd_train.loop import Progress, StepLoss
 from gcd_train.schedule import ParameterGroup
 
@@ -110,10 +110,7 @@ class DetailTask:
     def step_loss(self, progress: Progress) -> StepLoss:
         """Of the detail against the critic, and of the critic: their gradients do not meet."""
         before, now, random = on(self._device, self._batch(progress.updates))
-        if before is not None:
-            with torch.no_grad():
-                painted = self._first_step(before.seen)
-            now = carry(painted, before, now, self._movable)
+        now = carried_through(self._first_step, before, now, self._movable, random)
         if random.random() < 0.5:
             now = mirrored(now)
         self._net.train()

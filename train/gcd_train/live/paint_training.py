@@ -1,6 +1,7 @@
 """How the paint network learns: the mean of every pixel, its spread, its class and depth, and what was seen of it."""
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from types import EllipsisType
 
@@ -16,7 +17,7 @@ from gcd_train.live.batches import Ahead, Random, autocast, class_weights, on
 from gcd_train.live.clips import read_clip
 from gcd_train.live.inputs import read_inputs
 from gcd_train.live.look import picture, write_rows
-from gcd_train.live.target_views import VIEW_ARRAYS, ViewBatches, Views, carry, halved, mirrored, views_of
+from gcd_train.live.target_views import VIEW_ARRAYS, ViewBatches, Views, carried_through, halved, mirrored, views_of
 from gcd_train.loop import Progress, StepLoss
 from gcd_train.picture_losses import gradient_l1, ssim
 from gcd_train.schedule import ParameterGroup
@@ -78,12 +79,10 @@ class PaintTask:
         """Of one batch of views."""
         before, now, random = on(self._device, self._batches[progress.part](progress.updates))
         if progress.share < self._small_share:
-            before, now = None if before is None else halved(before), halved(now)
+            before, now = tuple(halved(each) for each in before), halved(now)
         later = progress.share >= _MEAN_ALONE
-        if before is not None and later:
-            with torch.no_grad():
-                painted = self._first_step(before.seen, self._net)
-            now = carry(painted, before, now, self._movable)
+        if later:
+            now = carried_through(partial(self._first_step, network=self._net), before, now, self._movable, random)
         if random.random() < 0.5:
             now = mirrored(now)
         self._net.train()

@@ -1,13 +1,13 @@
 """What the paint network learns from: target views of clips with what is seen of them, in batches by number."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, interpolate
 
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.config import LiveConfig
@@ -20,6 +20,10 @@ from gcd_train.live.inputs import read_inputs
 
 VIEW_ARRAYS = ("source.pose", *(f"target.{name}" for name in ("pose", "rgb", "depth", "labels", "visibility")))
 """What is read of a clip."""
+_MOST_CARRIED = 3
+"""Frames in a row of which each sees what was painted in the one before."""
+_DRIFT = 0.15
+"""Largest standard deviation of the colours' drift, for colours in [-1, 1]."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -153,17 +157,22 @@ class ViewBatches:
     def __len__(self) -> int:
         return len(self._clips)
 
-    def batch(self, update: int) -> tuple[Views | None, Views, Random]:
-        """N views; before them the frames before of the first of them, which see what was painted there.
+    def batch(self, update: int) -> tuple[tuple[Views, ...], Views, Random]:
+        """N views; before them the frames before of the first of them, in order, which see what was painted there.
 
         And the generator for what else is drawn.
         """
         random = np.random.default_rng([self._seed, update])
         carried = int(random.binomial(self._size, self._carried))
-        made = [self._views(random, 2 if i < carried else 1) for i in range(self._size)]
-        before = [frame_of(views, torch.tensor([0])) for views in made[:carried]]
-        now = [*(frame_of(views, torch.tensor([1])) for views in made[:carried]), *made[carried:]]
-        return together(before) if before else None, together(now), random
+        earlier = min(int(random.integers(1, _MOST_CARRIED + 1)), self._config.frames - 1)
+        made = [self._views(random, earlier + 1 if i < carried else 1) for i in range(self._size)]
+        rows = [
+            [frame_of(views, torch.tensor([t])) for views in made[:carried]]
+            for t in range(earlier + 1 if carried else 0)
+        ]
+        before = tuple(together(row) for row in rows[:-1])
+        now = [*(rows[-1] if rows else []), *made[carried:]]
+        return before, together(now), random
 
     def _views(self, random: Random, count: int) -> Views:
         """Frames in a row of some clip."""
@@ -205,6 +214,30 @@ def mirrored(views: Views) -> Views:
         log_depth=views.log_depth.flip(-1),
         visibility=views.visibility.flip(-1),
     )
+
+
+@torch.no_grad()
+def carried_through(
+    first_step: Callable[[Seen], Painted], before: Sequence[Views], now: Views, movable: Tensor, random: Random
+) -> Views:
+    """`now` with what is painted frame after frame before the first of its views; colours drift a little on the way.
+
+    Without the drift a painter learns to believe what it painted, and its errors add up over many frames.
+    Source: the noise on past frames of Valevski et al. 2024 (GameNGen), section 3.2.
+    """
+    if not before:
+        return now
+    views = before[0]
+    for after in (*before[1:], now):
+        views = carry(first_step(views.seen), views, after, movable)
+    seen, count = views.seen, len(before[0].poses)
+    strength = _DRIFT * random.random((count, 1, 1, 1))
+    rough = [random.normal(size=(count, 3, *cells)) * strength for cells in ((1, 1), (4, 6))]
+    size = seen.painted.shape[-2:]
+    drift = sum(interpolate(torch.from_numpy(each).to(seen.painted), size=size, mode="bilinear") for each in rough)
+    painted = seen.painted.clone()
+    painted[:count] = (painted[:count] + drift).clamp(-1, 1) * (seen.painted_coverage[:count, None] > 0)
+    return replace(views, seen=replace(seen, painted=painted))
 
 
 @torch.no_grad()
