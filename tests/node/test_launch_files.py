@@ -77,7 +77,7 @@ def test_a_launch_file_is_short_and_says_what_it_is_for(path: Path) -> None:
 
 def test_weights_nobody_has_here_are_named_before_anything_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
     config = load_config(LAUNCH / "oak-orbit.toml")
-    monkeypatch.setattr(checking, "open_session", _nothing)
+    monkeypatch.setattr(checking, "open_publisher", _nothing)
     monkeypatch.setattr(checking, "open_source", _nothing)
     findings = {each.topic: each for each in check_launch(config)}
     assert "kubric_gradual_max90.ckpt" in findings["weights"].detail
