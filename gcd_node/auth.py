@@ -263,8 +263,9 @@ def _version(path: Path) -> tuple[int, int, int] | None:
 
 
 def _report(on_event: EventSink | None, code: str, fields: dict[str, object]) -> None:
-    _LOG.warning("%s: %s", code, fields)
-    if on_event is not None:
+    if on_event is None:
+        _LOG.warning("%s: %s", code, fields)
+    else:  # who publishes it logs it
         on_event(code, fields)
 
 

@@ -156,10 +156,8 @@ class ControlServer:
             return
         reply, refusal = self._answer([part.bytes for part in parts], client, received_ns)
         if refusal is Code.TOO_LARGE:
-            _LOG.warning("TOO_LARGE: refused a request of %d bytes", len(parts[0]))
             self._on_event("TOO_LARGE", {"level": 1, "channel": "control"})
         if refusal in _MALFORMED and self._flood.bad(peer.bytes, time.monotonic()):
-            _LOG.warning("CONTROL_FLOOD: a client sends nonsense and is ignored for %g s", self._ignore_s)
             self._on_event("CONTROL_FLOOD", {"level": 1, "client": client.name, "ignored_s": self._ignore_s})
             return
         self._socket.send_multipart((peer.bytes, reply), zmq.NOBLOCK)  # to a peer that left: thrown away

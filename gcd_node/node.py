@@ -112,9 +112,9 @@ class Node:
         self._announcer.event(code, level, fields)
 
     def event(self, code: str, fields: dict[str, object]) -> None:
-        """Publish what another part of the process has noticed, and logged; a warning if it gives no `level`."""
+        """Publish what another part of the process has noticed; a warning if it gives no `level`."""
         level = fields.get("level")
-        self._announcer.event(code, Level(level) if isinstance(level, int) else Level.WARN, fields, is_logged=True)
+        self._announcer.event(code, Level(level) if isinstance(level, int) else Level.WARN, fields)
 
     def request(self, verb: Verb, dry_run: bool) -> Outcome:
         """Begin a transition; an event tells how it ends."""

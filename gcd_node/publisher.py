@@ -86,7 +86,8 @@ class Publisher:
         self._last_sent_s = time.monotonic()
         self._ends: list[bytes] = []  # those since the last view
         self._last_notes: dict[bytes, bytes] = {}
-        self._topics: dict[bytes, int] = {}  # subscriptions on the data socket; never changed, only replaced
+        self._topics: Counter[bytes] = Counter()  # subscriptions on the data socket; of the publisher's thread alone
+        self._readers = (0, 0, 0)  # all, of views, of previews; never changed, only replaced
         self._wake_fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         weakref.finalize(self, os.close, self._wake_fd)  # no sooner: then it may mean another file to who wakes late
         self._context: Context = zmq.Context()
@@ -174,15 +175,14 @@ class Publisher:
     @property
     def stats(self) -> PublisherStats:
         """Counters since the start."""
-        topics = self._topics.items()
-        # ZeroMQ matches prefixes: who subscribes to everything gets views and previews.
+        subscribers, watchers, previews = self._readers
         return PublisherStats(
             sent=self._sent,
             dropped=self._dropped,
             bytes=self._bytes,
-            subscribers=sum(count for _, count in topics),
-            watchers=sum(count for topic, count in topics if topic == b"" or not _PREVIEW_KEY.startswith(topic)),
-            previews=sum(count for topic, count in topics if _PREVIEW_KEY.startswith(topic)),
+            subscribers=subscribers,
+            watchers=watchers,
+            previews=previews,
         )
 
     def close(self, *, orderly: bool = True) -> None:
@@ -322,7 +322,7 @@ class Publisher:
         meanwhile: ZeroMQ skips them where a reader has no room."""
         until, ends = time.monotonic(), cycle(self._ends)
         until += self._left_s(until)
-        while self._ends and self._topics and time.monotonic() < until:
+        while self._ends and self._readers[0] and time.monotonic() < until:
             self._serve_sockets()
             self._wait(_REPEAT_MS)
             self._try_send(next(ends))
@@ -361,10 +361,15 @@ class Publisher:
         must not make readers disappear.
         """
         topic, change = event[1:], 1 if event[0] else -1
-        is_noise = (topic and topic == WELCOME[: len(topic)]) or (change < 0 and topic not in self._topics)
-        if not is_noise:
-            topics = {**self._topics, topic: self._topics.get(topic, 0) + change}
-            self._topics = {each: count for each, count in topics.items() if count > 0}
+        if (topic and topic == WELCOME[: len(topic)]) or (change < 0 and topic not in self._topics):
+            return
+        self._topics[topic] += change
+        if not self._topics[topic]:
+            del self._topics[topic]
+        # ZeroMQ matches prefixes: who subscribes to everything gets views and previews.
+        is_preview = _PREVIEW_KEY.startswith(topic)
+        gained = (change, change * (topic == b"" or not is_preview), change * is_preview)
+        self._readers = tuple(map(sum, zip(self._readers, gained, strict=True)))
 
     def _undelivered(self) -> str:
         count, seconds, readers = self._queue.qsize() + 1, self._drain_ms / 1000, self.stats.watchers

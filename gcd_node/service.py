@@ -274,4 +274,7 @@ def _plain(value: object) -> Any:
     if value is None or isinstance(value, bool) or (isinstance(value, float) and math.isfinite(value)):
         return value
     whole = isinstance(value, int) and abs(value) <= _LARGEST_INTEGER
-    return value if whole else str(value)[:_LONGEST]
+    try:
+        return value if whole else str(value)[:_LONGEST]
+    except Exception:  # nothing that a record holds costs its line
+        return f"<{type(value).__name__}>"

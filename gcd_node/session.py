@@ -99,6 +99,8 @@ def open_session(
     def emit(code: str, fields: dict[str, object]) -> None:
         for node in nodes:
             node.event(code, fields)
+        if not nodes:
+            _LOG.warning("%s: %s", code, fields)
 
     security = load_server_security(config.security, emit)
     with ExitStack() as stack:

@@ -204,9 +204,11 @@ class EndOfStream:
 
     def announce_removed(self, last_window_id: int) -> None:
         """End views that were taken out."""
-        config = self._live.config
-        for view_id in [each for each in self._open if each not in config.view]:
+        there = self._live.config.view
+        for view_id in [each for each in self._open if each not in there]:
             self._end(view_id, self._live.revision(view_id), self._topics(view_id), last_window_id, delay_ms=0)
+        for view_id in there:  # that came meanwhile: they end, too, when they go
+            self._open.setdefault(view_id, set())
 
     def announce_all(self, last_window_id: int, *, delay_ms: int | None) -> None:
         """End everything. delay_ms: see MessageSink."""

@@ -175,7 +175,8 @@ def engine_named(name: str, networks: Networks) -> Engine:
     if name == "ours":
         networks.requires_grad_(False)
         prepare(networks)
-        arrange(networks)
+        if next(networks.unet.parameters()).device.type == "cpu":
+            arrange(networks)
         return TorchEngine(networks)
     if name in VARIANTS:
         from gcd_model.engines.cuda import CudaEngine, CudaOptions, twin

@@ -10,6 +10,7 @@ import functools
 import io
 import logging
 import re
+import stat
 import struct
 import time
 import zlib
@@ -119,7 +120,10 @@ class LogReader:
         """
         for file in self._files:
             try:
-                yield from self._bag(file) if _kind_of_log(file) in (".bag", ".db3") else self._mcap(file)
+                kind = _kind_of_log(file)
+                if kind is None and not file.is_file():
+                    raise SourceError(f"{file} is no log; take it out of the folder")
+                yield from self._bag(file) if kind in (".bag", ".db3") else self._mcap(file)
             except OSError as error:
                 raise SourceError(f"cannot read {file}: {error.strerror or error}; check the disk") from error
 
@@ -173,7 +177,13 @@ class LogReader:
             if in_chunk and isinstance(error, EndOfFile):
                 return  # of the chunk
             what = "a part is left out" if in_chunk else "it was not finished, or is damaged, and is read up to there"
-            _LOG.log(logging.DEBUG if self.damaged else logging.WARNING, "%s: %s: %s", self._path, what, line_of(error))
+            _LOG.log(
+                logging.DEBUG if in_chunk and self.damaged else logging.WARNING,
+                "%s: %s: %s",
+                self._path,
+                what,
+                line_of(error),
+            )
             self.damaged += in_chunk
 
     def _kept(self, record: _Record) -> _Record:
@@ -298,6 +308,8 @@ def _kind_of_log(path: Path) -> str | None:
     if path.is_dir():
         named = (path / "metadata.yaml").is_file() or any(path.glob("*.mcap")) or any(path.glob("*.db3"))
         return ".db3" if named else None
+    if not stat.S_ISREG(path.stat().st_mode):  # to open a pipe would wait for its writer
+        return None
     with path.open("rb") as file:
         head = file.read(max(map(len, _HEADS)))
     return next((kind for begin, kind in _HEADS.items() if head.startswith(begin)), None)

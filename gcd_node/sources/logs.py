@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gcd_model import printable
 from gcd_node.calibration import LensModel, lens_of_message
-from gcd_node.errors import ConfigError, SourceError, TooShortError
+from gcd_node.errors import SourceError, TooShortError
 from gcd_node.frame import MAX_FPS, Frame, SourceInfo
 from gcd_node.sources.depth import clean_depth
 from gcd_node.sources.files import Pace, Recording
@@ -364,8 +364,8 @@ class Cameras:
         try:
             lens = lens_of_message(self._infos[name][1], rectified=rectified)
             return None if lens is None else lens.resized(*size)
-        except ConfigError as error:
-            _LOG.warning("the calibration on %s is not used, state one in [source]: %s", name, error)
+        except Exception as error:  # the log's own definition may lack anything
+            _LOG.warning("the calibration on %s is not used, state one in [source]: %s", name, line_of(error))
             return None
 
     def body_from_camera(self, body: str, camera: str) -> NDArray[np.float64]:

@@ -250,7 +250,10 @@ def _open_device(wanted: str | None) -> "dai.Device":
 
     free = dai.Device.getAllAvailableDevices()
     reason = "there must be one"
-    if wanted is not None or len(free) == 1:
+    is_id = wanted is not None and "." not in wanted  # neither an address nor a USB path
+    if is_id and wanted not in {each.deviceId for each in free}:
+        reason = "it is not there"
+    elif wanted is not None or len(free) == 1:
         try:
             return dai.Device(free[0] if wanted is None else dai.DeviceInfo(wanted))
         except RuntimeError as error:

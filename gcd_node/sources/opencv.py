@@ -8,6 +8,7 @@ import contextlib
 import logging
 import math
 import os
+import re
 import socket
 import stat
 import threading
@@ -259,12 +260,14 @@ def parse_address(url: str) -> StreamAddress:
         ConfigError: no URL of a stream. The message does not repeat it.
     """
     with contextlib.suppress(ValueError):  # of a port, or of brackets
-        parts = urlsplit(url)
+        scheme, _, rest = url.partition("://")
+        authority = re.split("[/?#]", rest, maxsplit=1)[0]
+        parts = urlsplit(f"{scheme}://{authority.rpartition('@')[2]}")  # users and passwords may hold brackets
         host, port = parts.hostname or "", parts.port
-        is_plain = parts.netloc.count("@") < 2 and "@" not in f"{parts.path}{parts.query}{parts.fragment}"
-        if parts.scheme in _DEFAULT_PORTS and (host or parts.scheme == "udp") and is_plain and len(url.split()) == 1:
+        is_plain = rest.count("@") == authority.count("@") < 2 and url.split() == [url]
+        if parts.scheme in _DEFAULT_PORTS and (host or parts.scheme == "udp") and is_plain:
             host = f"[{host}]" if ":" in host else host
-            return StreamAddress(parts.scheme, host, port or _DEFAULT_PORTS[parts.scheme])
+            return StreamAddress(parts.scheme, host, _DEFAULT_PORTS[parts.scheme] if port is None else port)
     raise ConfigError(
         f"the url of a stream is scheme://user:password@host:port/path with one of {', '.join(_DEFAULT_PORTS)}; in a "
         "user name or password write @ as %40, / as %2F and : as %3A"

@@ -198,7 +198,7 @@ class Synthesizer:
         self._config = networks.config
         networks.requires_grad_(False)
         prepare(networks)
-        if engine is None:
+        if engine is None and next(networks.unet.parameters()).device.type == "cpu":
             arrange(networks)
         self._engine: Engine = engine or TorchEngine(networks)
 

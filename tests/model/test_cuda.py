@@ -66,9 +66,9 @@ def test_a_clip_may_lie_on_the_gpu() -> None:
 
 def test_a_full_device_is_our_own_error_and_leaves_the_device_usable() -> None:
     from gcd_model.errors import DeviceMemoryError
-    from gcd_model.synthesizer import _out_of_memory_is_our_error
+    from gcd_model.synthesizer import out_of_memory_is_our_error
 
-    @_out_of_memory_is_our_error
+    @out_of_memory_is_our_error
     def greedy() -> torch.Tensor:
         return torch.empty(2**50, device="cuda")
 

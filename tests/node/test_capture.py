@@ -131,6 +131,21 @@ def test_who_waits_works_meanwhile_until_nothing_is_left_to_do_and_again_when_mo
     assert got == [7]
 
 
+def test_what_is_shown_while_there_is_work_under_way_is_not_lost() -> None:
+    slot, calls = WindowSlot(), []
+
+    def work() -> bool:
+        calls.append(len(calls))
+        if len(calls) == 1:
+            slot.show(None)  # from another thread, just now
+        else:
+            slot.put(7)
+        return False
+
+    assert slot.take(work) == 7
+    assert calls == [0, 1]
+
+
 # --- the reader --------------------------------------------------------------------------------------------------
 
 

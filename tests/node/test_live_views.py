@@ -8,11 +8,12 @@ from pathlib import Path
 
 import zmq
 from cameras import until
-from fakes import FakeSynthesizer, Steady, painting_traits
+from fakes import FakeSynthesizer, Steady, painting_traits, traits
 from rig import Rig
 
 from gcd_client.control import Code
 from gcd_client.protocol import EndMessage, StatusMessage, ViewMessage, decode
+from gcd_model import RenderOptions
 
 LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
 TWO_VIEWS = '[view.top]\n[view.swing]\nkind = "orbit"\nrate_deg_s = 24.0\namplitude_deg = 60.0'
@@ -131,3 +132,22 @@ def test_no_number_in_a_view_can_end_the_stream(tmp_path: Path) -> None:
             assert reply.code in (Code.OK, Code.OUT_OF_RANGE, Code.BAD_ARG)
             rig.await_views(len(rig.of()) + 3)
         assert rig.events("MODEL_FAILED") == []
+
+
+def test_a_view_removed_in_the_last_window_still_ends(tmp_path: Path) -> None:
+    begun = threading.Event()
+
+    def slow(options: RenderOptions) -> None:
+        begun.set()
+        assert options.cancel is not None
+        until(options.cancel.is_set)
+
+    model = FakeSynthesizer(traits(), slow)
+    with taped(tmp_path) as tape, Rig(tmp_path, lambda _: Steady(), model, config=LOCKSTEP, views=TWO_VIEWS) as rig:
+        heard_by_the_tape(rig)
+        assert begun.wait(30)
+        assert rig.ask("remove_view", view="swing").code is Code.OK
+        assert rig.ask("deactivate").code is Code.ACCEPTED
+        rig.await_state("inactive")
+        until(lambda: tape.ends("view/swing/win") != [] and tape.ends("view/top/win") != [])
+    assert all(isinstance(each, EndMessage) for each in tape.said)  # what was in work when it was told to stop is lost

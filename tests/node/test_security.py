@@ -318,7 +318,7 @@ def test_a_broken_list_leaves_in_who_was_in_and_is_reported_once(
     assert events.codes() == ["ALLOW_REFUSED", "ALLOW_CHANGED"]
 
 
-def test_a_refused_list_is_in_the_nodes_log_once_and_as_a_warning(
+def test_a_refused_list_is_in_the_nodes_log_once_as_an_error(
     list_path: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     box = Box()
@@ -328,7 +328,7 @@ def test_a_refused_list_is_in_the_nodes_log_once_and_as_a_warning(
     for _ in range(3):
         assert listed.find(VIEWER.public) is not None
     (record,) = caplog.records
-    assert (record.levelname, "ALLOW_REFUSED" in record.getMessage()) == ("WARNING", True)
+    assert (record.levelname, "ALLOW_REFUSED" in record.getMessage()) == ("ERROR", True)
     assert [(fields["code"], fields["level"]) for _, fields in box.notes] == [("ALLOW_REFUSED", 2)]
 
 

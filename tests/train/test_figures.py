@@ -62,7 +62,7 @@ def test_interval_and_error_of_a_mean_are_those_of_a_plain_bootstrap_over_scenes
     interval = found.interval("psnr_db")
     assert interval.value == pytest.approx(of_scenes.mean())
     assert (interval.low, interval.high) == pytest.approx(tuple(np.quantile(drawn, [0.025, 0.975])), abs=0.15)
-    assert found.error("psnr_db") == pytest.approx(of_scenes.std() / 2, rel=0.03)
+    assert found.error("psnr_db") == pytest.approx(of_scenes.std(ddof=1) / 2, rel=0.03)
 
 
 def test_a_difference_is_paired_so_a_constant_lead_has_no_error() -> None:

@@ -46,8 +46,6 @@ ExportPrecision = Literal["float32", "float16"]
 Report = Callable[[str, int, int], None]
 """Called with (graph that is next, graphs done, graphs)."""
 
-# --- graphs --------------------------------------------------------------------------------------------------------
-
 
 class Embeddings(nn.Module):
     """Noise level [1], micro-conditioning [T, V] and camera features [T, F], projected for every stage of the U-Net."""
@@ -173,9 +171,6 @@ def _graph(name: str, module: nn.Module, inputs: dict[str, Tensor], *outputs: st
     return Graph(name=name, module=module, inputs=inputs, outputs=outputs)
 
 
-# --- what an export says about itself ------------------------------------------------------------------------------
-
-
 class TensorRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One input or output of a graph."""
 
@@ -239,6 +234,8 @@ def read_manifest(folder: str | Path) -> Manifest:
         manifest = decode_json(read_small(folder / MANIFEST), Manifest)
         if manifest.format != FORMAT:
             raise FileError(f"has format {manifest.format!r}, this version reads {FORMAT!r}")
+        if not manifest.graphs or not all(graph.files for graph in manifest.graphs.values()):
+            raise FileError("names no files of its graphs")
         for file in (file for graph in manifest.graphs.values() for file in graph.files):
             path = folder / file.name
             if Path(file.name).name != file.name or not path.is_file():
@@ -252,9 +249,6 @@ def read_manifest(folder: str | Path) -> Manifest:
     except OSError as error:
         raise CheckpointError(f"{folder}: cannot be read: {error.strerror or error}; export it again") from error
     return manifest
-
-
-# --- exporting -----------------------------------------------------------------------------------------------------
 
 
 def export_onnx(
@@ -344,7 +338,12 @@ def _halve(path: Path, beside: Path, *, apart: bool) -> None:
     import onnx
     from onnxruntime.transformers.float16 import convert_float_to_float16
 
-    model: Any = convert_float_to_float16(onnx.load(path), keep_io_types=True, op_block_list=_SUMS)
+    inferred = path.with_suffix(".inferred")  # by path: a graph of over 2 GiB is no single message
+    onnx.shape_inference.infer_shapes_path(str(path), str(inferred))
+    model: Any = convert_float_to_float16(
+        onnx.load(inferred), keep_io_types=True, disable_shape_infer=True, op_block_list=_SUMS
+    )
+    inferred.unlink()
     nodes, there = list(model.graph.node), set[str]()
     del model.graph.node[:]
     for node in nodes:  # the converter casts a value once for each of its readers, every time under the same name

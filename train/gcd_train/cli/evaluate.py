@@ -152,12 +152,11 @@ def _evaluate(
     text = to_markdown(summary)
     write_summary(summary, text, out)
     keys = [record.key for record in next(iter(rows.values())) if record.key in work.sheet]
+    (out / "contact_sheet.png").unlink(missing_ok=True)
     if keys:
         plan.write_sheet(out / "contact_sheet.png", summary, keys, keeper)
     typer.echo(text)
-    _say(
-        f"wrote {out}/run.json, records, evaluation.json, evaluation.md" + " and contact_sheet.png" * (sheet_clips > 0)
-    )
+    _say(f"wrote {out}/run.json, records, evaluation.json, evaluation.md" + " and contact_sheet.png" * bool(keys))
     if account.failures:
         raise typer.Exit(account.exit_code)
 

@@ -289,8 +289,8 @@ class Bootstrap:
         return _interval(self.value(name), lambda: self.again(name))
 
     def error(self, name: FigureName) -> float:
-        """Standard error of a figure."""
-        return float(deviation(self.again(name)))
+        """Standard error of a figure; NaN where fewer than two scenes have it."""
+        return float(deviation(self.again(name)) * unbiased(self.scenes.figure(name)))
 
     @property
     def weights(self) -> Array | None:
@@ -325,7 +325,11 @@ def difference(first: Bootstrap, other: Bootstrap, name: FigureName) -> Interval
 
 def lead(first: Bootstrap, other: Bootstrap, name: FigureName) -> tuple[float, float]:
     """How far `first` lies above `other`, and the paired standard error of that."""
-    return first.value(name) - other.value(name), float(deviation(first.again(name) - other.again(name)))
+    ahead = first.value(name) - other.value(name)
+    if len(first.scenes) != len(other.scenes):
+        return ahead, float("nan")
+    by_scene = first.scenes.figure(name) - other.scenes.figure(name)
+    return ahead, float(deviation(first.again(name) - other.again(name)) * unbiased(by_scene))
 
 
 def common_clips(
@@ -345,6 +349,12 @@ def _interval(value: float, again: Callable[[], Array]) -> Interval:
         return Interval(value=value, low=float("nan"), high=float("nan"))
     low, high = np.quantile(known, [(1 - COVERAGE) / 2, (1 + COVERAGE) / 2])
     return Interval(value=value, low=float(low), high=float(high))
+
+
+def unbiased(by_scene: Array) -> Array:
+    """What a bootstrap's standard error is short of, by how many scenes, the first axis, have the figure; NaN: one."""
+    known = np.count_nonzero(~np.isnan(by_scene), axis=0)
+    return np.where(known > 1, np.sqrt(known / np.maximum(known - 1, 1)), np.nan)
 
 
 def deviation(drawn: Array) -> Array:

@@ -24,6 +24,7 @@ from gcd_train.evaluation.statistics import (
     clip_sums,
     deviation,
     lead,
+    unbiased,
     weighted,
 )
 from gcd_train.evaluation.store import ClipRecord, RunKeeper, write_whole
@@ -58,8 +59,10 @@ class Evaluation:
         weights, scenes = self.of_all.weights, self.of_all.scenes
         for key, of_clips, of_scenes in (("class_iou", grid, scenes.grid), ("class_iou_full", full, scenes.full)):
             total[key] = class_iou(of_clips.sum(axis=0)).tolist()
-            spread = np.full(of_clips.shape[-1], np.nan)
-            error[key] = (spread if weights is None else deviation(class_iou(weighted(of_scenes, weights)))).tolist()
+            error[key] = np.full(of_clips.shape[-1], np.nan).tolist()
+            if weights is not None:
+                spread = deviation(class_iou(weighted(of_scenes, weights)))
+                error[key] = (spread * unbiased(class_iou(of_scenes))).tolist()
         return {
             "name": self.name,
             "privileged": self.privileged,
