@@ -380,6 +380,7 @@ def test_the_launch_file_starts_the_package_with_parameters_it_knows(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ros = MagicMock()
+    ros.LaunchConfiguration = lambda name: (name,)
     for name in ("", ".actions", ".substitutions", "_ros.actions", "_ros.parameter_descriptions"):
         monkeypatch.setitem(sys.modules, f"launch{name}", ros)
     launch = runpy.run_path(str(PACKAGE / "launch" / "gcd_views.launch.py"))
@@ -393,5 +394,11 @@ def test_the_launch_file_starts_the_package_with_parameters_it_knows(
     bridge.GcdViews().stop()
     assert set(values) <= known
     parts = ros.PythonExpression.call_args_list[0].args[0]
-    for folder, endpoint in (("", "ipc"), ("/run/gcd/left", "ipc:///run/gcd/left/data")):
-        assert eval("".join(part if isinstance(part, str) else folder for part in parts)) == endpoint
+    assert {"keys", "node_key"} <= set(values)
+    for folder, host, endpoint in (
+        ("", "", "ipc"),
+        ("/run/gcd/left", "", "ipc:///run/gcd/left/data"),
+        ("", "robot", "tcp://robot:5580"),
+    ):
+        given = {"folder": folder, "host": host}
+        assert eval("".join(part if isinstance(part, str) else given[part[0]] for part in parts)) == endpoint

@@ -131,6 +131,7 @@ def test_views_that_never_come_are_an_error(tmp_path: Path, capsys: pytest.Captu
     assert run_app(["view", f"ipc://{tmp_path}/nobody", "--timeout", "0.3"]) == 69
     said = capsys.readouterr()
     assert "is the node running?" in said.out
+    assert said.out.endswith("\n")  # an error that follows begins its own line
     assert said.err.startswith(f"error: no view from ipc://{tmp_path}/nobody within 0.3 s")
 
 
