@@ -1,6 +1,6 @@
 """`gcd-node synthesize` and `export`: one clip seen from another camera, and a checkpoint as ONNX graphs."""
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -20,6 +20,7 @@ from gcd_model import (
     Quality,
     RenderOptions,
     SolverName,
+    Traits,
     Trajectory,
     ViewSynthesizer,
     export_weights,
@@ -30,7 +31,7 @@ from gcd_node.cli.weights import FamilyOption, HeadWidth, ImageHeads
 from gcd_node.errors import SourceError, UsageError
 from gcd_node.image_io import write_npz
 from gcd_node.messages import ontology
-from gcd_node.offline import ClipRequest, plan, read_clip, read_noise, write_view
+from gcd_node.offline import ClipRequest, OfflineClip, plan, read_clip, read_noise, write_view
 from gcd_node.preprocess import require_usable
 from gcd_node.sources import SourcePose
 
@@ -220,6 +221,8 @@ def _run(
     console = Console(markup=False)
     if not traits.trained:
         console.print(f"{traits.name}: these weights are random, so the picture is noise.")
+    for each in _assumed(clip, pose, traits, source, trajectory):
+        console.print(each, soft_wrap=True)
     written = write_view(out, source, view, ontology(traits))
     if save is not None:
         frames = view.video.permute(0, 2, 3, 1).contiguous()
@@ -227,6 +230,21 @@ def _run(
         written.append(save)
     for each in written:
         console.print(f"wrote {each}", soft_wrap=True)
+
+
+def _assumed(
+    clip: ClipRequest, pose: SourcePose | None, traits: Traits, source: OfflineClip, trajectory: Trajectory
+) -> Iterator[str]:
+    """What nobody stated of the source camera, and what it is taken to be."""
+    start = trajectory.source
+    is_stated = pose is not None and (pose.on_vehicle or None not in (pose.elevation_deg, pose.radius))
+    if start is not None and trajectory.delta is not None and not is_stated:
+        yield (
+            f"The source camera is taken to stand at an elevation of {start.elevation_deg:g} degrees and a radius of "
+            f"{start.radius_m:g}; say where with --source-elevation-deg and --source-radius."
+        )
+    if traits.live and clip.hfov_deg is None and clip.calibration is None and source.hfov_deg is not None:
+        yield f"The pictures are taken to be {source.hfov_deg:.4g} degrees wide; say it with --hfov-deg."
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from gcd_model.engines.onnx import (
     TENSORRT_PROVIDER,
     OnnxEngine,
     Sessions,
+    load_export,
     provider_options,
 )
 from gcd_model.engines.onnx_export import (
@@ -190,6 +191,7 @@ def test_the_digest_names_weights_precision_and_size_and_nothing_else() -> None:
         b"{}",
         msgspec.json.encode(manifest()).replace(FORMAT.encode(), b"gcd-onnx-9"),
         msgspec.json.encode(manifest()).replace(b'"opset"', b'"opzet"'),
+        msgspec.json.encode(manifest()),  # its graph has no file
     ],
 )
 def test_a_manifest_that_cannot_be_used_is_refused(tmp_path: Path, text: bytes) -> None:
@@ -214,6 +216,11 @@ def test_a_manifest_names_no_file_outside_its_folder(tmp_path: Path) -> None:
     (tmp_path / "export").mkdir()
     with pytest.raises(CheckpointError, match="lacks its file"):
         read_manifest(an_export(tmp_path / "export", "../secret"))
+
+
+def test_an_export_without_all_graphs_of_its_model_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="must name"):
+        load_export(an_export(tmp_path))
 
 
 # --- loading, exporting --------------------------------------------------------------------------------------------

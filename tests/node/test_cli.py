@@ -97,6 +97,16 @@ def test_synthesize_writes_frames_video_strip_and_arrays(clip: Path, tmp_path: P
     assert 0.0 <= arrays["frames"].min() <= arrays["frames"].max() <= 1.0
 
 
+def test_what_nobody_stated_of_the_camera_is_said(
+    clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_app([str(a) for a in synthesize(clip, tmp_path / "out", *KUBRIC)]) == 0
+    assert "an elevation of 5 degrees and a radius of 15" in capsys.readouterr().out
+    stated = ["--source-elevation-deg", "20", "--source-radius", "15"]
+    assert run_app([str(a) for a in synthesize(clip, tmp_path / "stated", *KUBRIC, *stated)]) == 0
+    assert "is taken to stand" not in capsys.readouterr().out
+
+
 def test_injected_noise_replaces_every_random_draw(clip: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     np.savez(

@@ -1,6 +1,7 @@
 """Damaged robot logs: what is damaged costs no more than itself, and what is no log is refused in one line."""
 
 import logging
+import os
 from itertools import islice
 from pathlib import Path
 
@@ -8,6 +9,10 @@ import numpy as np
 import pytest
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from google.protobuf import timestamp_pb2
+from google.protobuf.descriptor_pb2 import FileDescriptorProto
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message_factory import GetMessageClass
 from mcap.writer import CompressionType
 from media import HEIGHT, WIDTH, flat, ramp
 from mutations import BYTE_PIECES, ROUNDS, Mutator, outcomes
@@ -89,10 +94,35 @@ def test_what_is_no_log_is_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "bag").mkdir()
     (tmp_path / "bag" / "metadata.yaml").write_text("rosbag2_bagfile_information: [")
-    for name in (*cases, "folder", "bag", "none.mcap", "a" * 5000, "nul\0"):
+    (tmp_path / "pipes").mkdir()
+    for pipe in ("pipe.mcap", "pipes/a.mcap"):
+        os.mkfifo(tmp_path / pipe)
+    (tmp_path / "zeros.mcap").symlink_to("/dev/zero")
+    odd = ("folder", "bag", "none.mcap", "a" * 5000, "nul\0", "pipe.mcap", "pipes", "zeros.mcap")
+    for name in (*cases, *odd):
         with pytest.raises(SourceError) as caught:
             LogSource(tmp_path / name)
         assert "\n" not in str(caught.value)
+
+
+def test_a_calibration_that_lacks_what_its_name_promises_is_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Of protobuf messages the log itself says what fields there are."""
+    stamp, pool = timestamp_pb2.DESCRIPTOR, DescriptorPool()
+    file = FileDescriptorProto(name="odd.proto", package="foxglove", syntax="proto3", dependency=[stamp.name])
+    fields = file.message_type.add(name="CameraCalibration").field
+    fields.add(name="timestamp", number=1, type=11, label=1, type_name=".google.protobuf.Timestamp")
+    fields.add(name="frame_id", number=2, type=9, label=1)
+    pool.AddSerializedFile(stamp.serialized_pb)
+    pool.Add(file)
+    odd = GetMessageClass(pool.FindMessageTypeByName("foxglove.CameraCalibration"))(frame_id="cam")
+    picture = CompressedImage(frame_id="cam", data=coded(flat(9, 9, 9)), format="jpeg")
+    drawn = [stamped(CompressedImage.FromString(picture.SerializeToString()), at(i)) for i in range(3)]
+    log = LogSource(write_foxglove(tmp_path / "log.mcap", [odd, *drawn]))
+    assert len(list(log.frames())) == 3
+    assert log.info.lens is None
+    assert "is not used" in caplog.text
 
 
 def mutation_seeds(folder: Path) -> list[bytes]:

@@ -16,8 +16,8 @@ from gcd_model.clip import RenderOptions
 from gcd_model.conditioning import Conditioning, camera_features
 from gcd_model.config import ModelConfig
 from gcd_model.diffusion import Schedule, planned_denoiser, sample
-from gcd_model.engines.onnx_export import read_manifest
-from gcd_model.errors import DeviceMemoryError, ModelError, OptionError
+from gcd_model.engines.onnx_export import MANIFEST, read_manifest
+from gcd_model.errors import CheckpointError, DeviceMemoryError, ModelError, OptionError
 from gcd_model.geometry import Trajectory
 from gcd_model.image_encoder import clip_pixels
 from gcd_model.networks import empty_networks
@@ -30,6 +30,8 @@ from gcd_model.weights.families import family_named
 CPU_PROVIDER, CUDA_PROVIDER = "CPUExecutionProvider", "CUDAExecutionProvider"
 TENSORRT_PROVIDER = "TensorrtExecutionProvider"
 _MISSING = "an export needs onnxruntime, which is not installed: pip install 'gcd-node[onnx]'"
+_GRAPHS = {"condition_encoder", "embeddings", "step", "decoder"}
+_TOWER_GRAPHS = {"image_encoder", "crosses"}
 _MEMORY_WORDS = ("failed to allocate", "bad allocation", "out of memory")
 
 Provider = tuple[str, dict[str, str]]
@@ -47,6 +49,9 @@ def load_export(folder: str | Path, *, device: str = "auto", providers: Sequence
     """
     folder, manifest = Path(folder), read_manifest(folder)
     card = Card.from_metadata(manifest.card)
+    wanted = _GRAPHS if card.diffusion.image_encoder is None else _GRAPHS | _TOWER_GRAPHS
+    if manifest.graphs.keys() != wanted:
+        raise CheckpointError(f"{folder}: its {MANIFEST} must name {', '.join(sorted(wanted))}; export it again")
     chosen = provider_options(device, providers, folder / "tensorrt", half=manifest.precision == "float16")
     files = {name: folder / record.files[0].name for name, record in manifest.graphs.items()}
     traits = Traits(

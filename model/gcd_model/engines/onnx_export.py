@@ -33,7 +33,7 @@ from gcd_model.weights.load import digest
 
 MANIFEST = "manifest.json"
 """The file that makes a folder an export."""
-FORMAT = "gcd-onnx-1"
+FORMAT = "gcd-onnx-2"
 OPSET = 20
 """Of the ONNX operators: what TensorRT 10 and onnxruntime 1.20 know."""
 APART_ABOVE = 1 << 30  # bytes of weights beside a graph instead of in it; one file of ONNX holds 2 GiB at most
@@ -231,11 +231,12 @@ def read_manifest(folder: str | Path) -> Manifest:
     """
     folder = Path(folder)
     try:
-        manifest = decode_json(read_small(folder / MANIFEST), Manifest)
-        if manifest.format != FORMAT:
-            raise FileError(f"has format {manifest.format!r}, this version reads {FORMAT!r}")
-        if not manifest.graphs or not all(graph.files for graph in manifest.graphs.values()):
-            raise FileError("names no files of its graphs")
+        text = read_small(folder / MANIFEST)
+        if (found := decode_json(text, dict[str, Any]).get("format")) != FORMAT:
+            raise FileError(f"has format {found!r}, this version reads {FORMAT!r}")
+        manifest = decode_json(text, Manifest)
+        if not all(graph.files for graph in manifest.graphs.values()):
+            raise FileError("names no files of a graph")
         for file in (file for graph in manifest.graphs.values() for file in graph.files):
             path = folder / file.name
             if Path(file.name).name != file.name or not path.is_file():

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from gcd_model import ModelConfig
+from gcd_model.engines.cpu import arrange
 from gcd_model.image_encoder import ImageEncoder, clip_pixels
 from gcd_model.loading import packaged_weights, random_weights
 from gcd_model.networks import Networks, weights_digest
@@ -76,6 +77,8 @@ def load_encoders(choice: EncoderChoice) -> Encoders:
     device, digest = _device(choice.device), encoders_digest(networks)
     for module in _parts(networks).values():
         module.to(device, precision(choice.dtype)).requires_grad_(False).eval()
+        if device.type == "cpu":
+            arrange(module)
     return Encoders(
         config=networks.config,
         target=networks.target_encoder,
