@@ -40,7 +40,8 @@ from gcd_node.messages import PublisherStats
 
 _LOG = logging.getLogger(__name__)
 _DATA_HWM, _STATUS_HWM = 4, 100
-_MAX_SUBSCRIPTION = 4096
+_MAX_SUBSCRIPTION = 1024  # a handshake with keys takes some hundred bytes
+_MOST_EVENTS = 256  # of subscriptions between two sendings
 _PREVIEW_KEY = topic_key(PREVIEW_TOPIC)
 _RETRY_MS, _REPEAT_MS = 3, 10
 _LEAST_LINGER_MS = 100
@@ -382,7 +383,7 @@ class Publisher:
 def _pending_events(socket: Socket) -> list[bytes]:
     """Pending subscribe (first byte 1) and unsubscribe (first byte 0) events; anything else a peer sends is ignored."""
     events: list[bytes] = []
-    while socket.poll(0):
+    while len(events) < _MOST_EVENTS and socket.poll(0):
         event = socket.recv(zmq.NOBLOCK)
         if event[:1] in (b"\0", b"\1"):
             events.append(event)

@@ -8,10 +8,8 @@ import hashlib
 import importlib.util
 import logging
 import os
-import shutil
 import warnings
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -30,6 +28,7 @@ from gcd_model.temporal import SpatialBlock, TemporalBlock
 from gcd_model.unet import StageInputs, VideoUNet
 from gcd_model.weights.card import FULL_PRECISION, Card
 from gcd_model.weights.load import digest
+from gcd_model.weights.save import whole_folder
 
 MANIFEST = "manifest.json"
 """The file that makes a folder an export."""
@@ -224,6 +223,15 @@ def is_export(path: str | Path) -> bool:
     return os.path.lexists(Path(path) / MANIFEST)
 
 
+def _is_export_of_ours(folder: Path) -> bool:
+    """Whether nothing else would be lost with it: other programs have a manifest.json, too, and so have replays."""
+    try:
+        stated = decode_json(read_small(folder / MANIFEST), dict[str, Any])
+    except (FileError, OSError):
+        return False
+    return str(stated.get("format")).startswith("gcd-onnx-")
+
+
 def read_manifest(folder: str | Path) -> Manifest:
     """What an export says about itself; every file it names is there, whole and as it was written.
 
@@ -276,7 +284,7 @@ def export_onnx(
     require_onnx()
     networks = _at_size(loaded, height, width)
     records: dict[str, GraphRecord] = {}
-    with _whole_folder(Path(out), overwrite=overwrite) as folder:
+    with whole_folder(Path(out), is_ours=_is_export_of_ours if overwrite else None) as folder:
         wanted = list(graphs(networks))
         for graph in wanted:
             if progress is not None:
@@ -378,23 +386,3 @@ def _exported(graph: Graph) -> Any:
     for node in model.graph.all_nodes():
         node.metadata_props.clear()  # file names and lines of this machine
     return model
-
-
-@contextmanager
-def _whole_folder(out: Path, *, overwrite: bool) -> Generator[Path]:
-    """A folder that appears under its name only once it is complete."""
-    if not out.parent.is_dir():
-        raise OptionError(f"{out}: there is no folder {out.parent}; make it first")
-    if out.exists() and not (overwrite and is_export(out)):
-        raise OptionError(f"{out} exists; give another name, or allow an export to be overwritten")
-    partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
-    try:
-        partial.mkdir()
-        yield partial
-        if out.exists():
-            shutil.rmtree(out)
-        partial.rename(out)
-    except OSError as error:
-        raise CheckpointError(f"{out}: cannot be written: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)

@@ -16,6 +16,8 @@ SKY_M = 1000.0
 SIZE_FACTOR = 32
 """Height and width of pictures must be multiples of this."""
 _Side = Annotated[int, Meta(ge=SIZE_FACTOR, le=8192, multiple_of=SIZE_FACTOR)]
+_Sigma = Annotated[float, Meta(ge=1e-4, le=1e4)]
+_MOST_PIXELS = 2**22
 _Channels = Annotated[int, Meta(ge=8, le=4096)]
 _HalfWidth = Annotated[int, Meta(ge=0, le=4096, multiple_of=8)]
 
@@ -33,8 +35,8 @@ class DepthConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     fine_width: _Channels = 24
     half_width: _HalfWidth = 32
     bins: Annotated[int, Meta(ge=4, le=1024)] = 32
-    nearest_m: Annotated[float, Meta(gt=0)] = 0.25
-    farthest_m: float = 256.0
+    nearest_m: Annotated[float, Meta(ge=1e-3, le=100)] = 0.25
+    farthest_m: Annotated[float, Meta(le=SKY_M)] = 256.0
 
     def __post_init__(self) -> None:
         if not self.farthest_m > self.nearest_m:
@@ -69,16 +71,18 @@ class LiveConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     paint: PaintConfig = PaintConfig()
     memory: Annotated[int, Meta(ge=0, le=10_000_000)] = 60_000
     memory_frames: Annotated[int, Meta(ge=0)] = 50
-    steps: Annotated[int, Meta(ge=1, le=1000)] = 1
-    sigma_max: Annotated[float, Meta(gt=0)] = 80.0
-    sigma_start: Annotated[float, Meta(gt=0)] = 2.0
-    sigma_min: Annotated[float, Meta(gt=0)] = 0.05
+    steps: Annotated[int, Meta(ge=1, le=50)] = 1
+    sigma_max: _Sigma = 80.0
+    sigma_start: _Sigma = 2.0
+    sigma_min: _Sigma = 0.05
     carry_painted: bool = True
     spread_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ood_threshold: Annotated[float, Meta(ge=0, le=1)] = 0.35
 
     def __post_init__(self) -> None:
         require_ontology("the live model", self.classes)
+        if self.height * self.width > _MOST_PIXELS:
+            raise OptionError(f"pictures have at most {_MOST_PIXELS} pixels, got {self.height} x {self.width}")
 
     @property
     def size_factor(self) -> int:

@@ -62,6 +62,8 @@ class Card:
         scale = self.uncertainty_scale
         if scale is not None and not 0 < scale < math.inf:
             raise OptionError(f"the uncertainty scale must be a positive number, got {scale:g}; measure it again")
+        if not 0 <= self.move_time < self.config.frames:
+            raise OptionError(f"move_time must be one of the {self.config.frames} frames, got {self.move_time}")
 
     @property
     def diffusion(self) -> ModelConfig:

@@ -5,6 +5,7 @@ rebuilding is real; every other name becomes an inert placeholder, which takes w
 keeps none of it. So foreign classes (a trainer's callbacks, an option container) do not stop us, and nothing runs.
 """
 
+import functools
 import io
 import pickle
 import zipfile
@@ -148,6 +149,8 @@ def check_storages(archive: zipfile.ZipFile) -> None:
     """
     entries = {entry.filename: entry.file_size for entry in archive.infolist()}
     pickled = next(name for name in entries if name.endswith("/data.pkl"))
+    if entries[pickled] > _LARGEST_PICKLE:
+        raise CheckpointError(f"its pickle has {entries[pickled]} bytes, more than {_LARGEST_PICKLE}: refused")
     for key, claimed in claimed_storages(archive.read(pickled)).items():
         there = entries.get(f"{pickled.removesuffix('data.pkl')}data/{key}", 0)
         if there < claimed:
@@ -156,6 +159,8 @@ def check_storages(archive: zipfile.ZipFile) -> None:
             )
 
 
+_LARGEST_PICKLE = 16 * 2**20
+"""Of a torch zip, in bytes; the pickle of a full-size training with its optimizer has two million."""
 _STORAGE_BYTES = {
     **dict.fromkeys(("DoubleStorage", "LongStorage", "ComplexFloatStorage"), 8),
     **dict.fromkeys(("FloatStorage", "IntStorage"), 4),
@@ -165,6 +170,7 @@ _STORAGE_BYTES = {
 """Bytes per element of torch's typed storages; 1 for all others."""
 
 
+@functools.lru_cache(maxsize=4096)
 def _placeholder_class(origin: str) -> type[Placeholder]:
     return type("Placeholder", (Placeholder,), {"__slots__": (), "origin": origin})
 

@@ -4,6 +4,7 @@ Every file appears under its name only once it is complete, and replaces another
 """
 
 import os
+import shutil
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -194,3 +195,28 @@ def _require_told(state: Mapping[str, Tensor], config: ModelConfig) -> None:
             f"the published layout cannot say this architecture: its {wrong[0]} would be read as "
             f"{getattr(told, wrong[0])}; keep our own .safetensors for it"
         )
+
+
+@contextmanager
+def whole_folder(out: Path, *, is_ours: Callable[[Path], bool] | None) -> Generator[Path]:
+    """A folder that appears under its name only once it is complete.
+
+    is_ours: whether a folder that is there may be replaced; None: never.
+    Raises: OptionError, CheckpointError where it cannot be.
+    """
+    if not out.parent.is_dir():
+        raise OptionError(f"{out}: there is no folder {out.parent}; make it first")
+    if os.path.lexists(out) and (is_ours is None or not is_ours(out)):
+        raise OptionError(f"{out} exists; give another name, or allow an export to be overwritten")
+    partial, former = (out.with_name(f".{out.name}.{os.getpid()}.{end}") for end in ("partial", "former"))
+    try:
+        partial.mkdir()
+        yield partial
+        if out.exists():
+            out.rename(former)
+        partial.rename(out)
+        shutil.rmtree(former, ignore_errors=True)
+    except OSError as error:
+        raise CheckpointError(f"{out}: cannot be written: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
