@@ -4,7 +4,6 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Literal, ParamSpec, TypeAlias
 
@@ -24,6 +23,7 @@ from gcd_model import (
     inspect_weights,
     is_export,
     load_synthesizer,
+    weights_path,
 )
 from gcd_node.auth import load_server_security
 from gcd_node.config import ModelSection, NodeConfig
@@ -35,7 +35,7 @@ from gcd_node.mcap_file import RoomError, check_room
 from gcd_node.preprocess import in_words
 from gcd_node.session import load_model, metrics_server, model_threads, open_publisher, viewer_arguments
 from gcd_node.sources import open_source
-from gcd_node.stream_context import StreamContext, drawing_options, prepare_stream, sampler_in_use
+from gcd_node.stream_context import StreamContext, drawing_options, family_name, prepare_stream, sampler_in_use
 from gcd_node.views import LiveConfig, VirtualViews
 
 Verdict: TypeAlias = Literal["ok", "warning", "failed"]
@@ -166,8 +166,7 @@ class _Look:
         # Only loading says whether weights and adapter belong together.
         traits = _traits(report, section) if section.adapter is None else load_model(section).traits
         self.traits, self.weight_bytes = traits.streaming(), report.parameters * _BYTES.get(traits.precision, 4)
-        family = "unknown" if traits.family is None else traits.family.name
-        return f"{traits.name}, family {family}, {report.parameters / 1e6:.1f} M parameters"
+        return f"{traits.name}, family {family_name(traits)}, {report.parameters / 1e6:.1f} M parameters"
 
     def memory(self, traits: Traits) -> str:
         needed, free = self.weight_bytes, self._free_memory
@@ -208,17 +207,6 @@ class _Look:
             f"a {unit} every {period_s:.2f} s, {runs} network evaluations each, so {1000 * period_s / runs:.1f} ms for "
             f"one if none is to be left out; {model_threads(model)} CPU threads"
         )
-
-
-def weights_path(weights: str) -> Path:
-    """The file that weights are in; `package:NAME` ships with the model package. Raises CheckpointError."""
-    kind, _, name = weights.partition(":")
-    if kind != "package":
-        return Path(weights)
-    path = Path(str(files("gcd_model").joinpath("weights", f"{name}.safetensors")))
-    if "/" in name or not path.is_file():
-        raise CheckpointError(f"no weights called {name!r} ship with the package; give a path, or random:driving")
-    return path
 
 
 def _traits(report: WeightsReport, section: ModelSection) -> Traits:

@@ -18,10 +18,10 @@ from gcd_model import (
     inspect_weights,
     load_synthesizer,
     sampler_of,
+    weights_path,
 )
 from gcd_model.colours import nearest_classes
 from gcd_model.config import SemanticClass
-from gcd_model.loading import packaged_weights
 from gcd_train.datasets.clip_source import to_network
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.baselines import BaselineSettings, build, described, usual_baselines
@@ -251,10 +251,7 @@ def of_saved_frames(
 def _require_image_to_video(weights: str) -> None:
     """Raises RecipeError for weights that say they do something else; CheckpointError if they cannot be opened."""
     kind, _, name = weights.partition(":")
-    if kind == "random":
-        family = name
-    else:
-        family = inspect_weights(packaged_weights(name) if kind == "package" else weights).family or _SVD
+    family = name if kind == "random" else inspect_weights(weights_path(weights)).family or _SVD
     if family != _SVD:
         raise RecipeError(
             f"{VANILLA_SVD} wants weights that make a video out of a picture, {weights} is of the family {family}; "
