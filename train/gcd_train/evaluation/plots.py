@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from gcd_train.errors import RenderError
 from gcd_train.evaluation.runs import Method
 from gcd_train.evaluation.statistics import FIRST_MEASURED, FigureName, Interval, Selection, bootstrap
-from gcd_train.evaluation.store import ClipRecord, Region, write_whole
+from gcd_train.evaluation.store import ClipRecord, Region
 from gcd_train.evaluation.tables import Cell, Measured, csv_text
+from gcd_train.files import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

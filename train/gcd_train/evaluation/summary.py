@@ -27,8 +27,9 @@ from gcd_train.evaluation.statistics import (
     unbiased,
     weighted,
 )
-from gcd_train.evaluation.store import ClipRecord, RunKeeper, write_whole
+from gcd_train.evaluation.store import ClipRecord, RunKeeper
 from gcd_train.evaluation.tables import counted, markdown_rows
+from gcd_train.files import write_whole
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

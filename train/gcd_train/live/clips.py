@@ -12,7 +12,6 @@ and in its metadata the lenses, the frame rate, the world, the height of its flo
 """
 
 import json
-import os
 from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cache, partial
@@ -27,6 +26,7 @@ from safetensors.numpy import save_file
 from gcd_model.live.ontology import LIVE_CLASSES
 from gcd_model.small_files import decode_json
 from gcd_train.errors import DataError, RenderError
+from gcd_train.files import whole
 from gcd_train.live.draws import FLOOR_Z_M, METRES_A_UNIT, LiveDraw, LiveWorld, Poses, TargetPath, live_scene
 from gcd_train.map_items import map_items, one_thread_each
 from gcd_train.scenes.description import Scene
@@ -106,9 +106,8 @@ def film_scene(folder: Path, world: LiveWorld, settings: ClipSettings, seed: int
     for number, draw in reversed(list(enumerate(draws))):
         arrays, facts = _film(renderer, scene, draw, world)
         path = folder / f"{seed:07d}-{number}.safetensors"
-        partial_path = path.with_suffix(f".{os.getpid()}.partial")
-        save_file(arrays, partial_path, metadata={"facts": json.dumps(facts)})
-        partial_path.replace(path)
+        with whole(path) as unfinished:
+            save_file(arrays, unfinished, metadata={"facts": json.dumps(facts)})
 
 
 @cache

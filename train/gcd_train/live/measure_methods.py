@@ -1,7 +1,6 @@
 """Everything that is measured beside the live model, and the live model itself: a clip in, its target views out."""
 
 import json
-import os
 import time
 from collections.abc import Sequence
 from copy import deepcopy
@@ -29,6 +28,7 @@ from gcd_model.live.view import Floor, FrameGeometry, LiveNetworks, LiveView
 from gcd_model.small_files import decode_json
 from gcd_train.errors import DataError
 from gcd_train.evaluation.reprojection import splat as splat_points
+from gcd_train.files import whole
 from gcd_train.live.batches import Pictures, pictures_of, training_paths
 from gcd_train.live.clips import LiveClip, read_clip
 from gcd_train.live.measure_figures import NEVER, NOW, MethodViews
@@ -104,11 +104,9 @@ class Kept:
         names = ("classes", "visibility", "log_variance", "inverse_depth")
         tensors = {name: tensor for name in names if (tensor := getattr(views, name)) is not None}
         tensors["video"] = (views.video.clamp(0, 1) * 255).round().to(torch.uint8)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = path.with_suffix(f".{os.getpid()}.partial")
         facts = json.dumps({"within": views.within, "cpu_s": views.cpu_s})
-        save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, unfinished, {"facts": facts})
-        unfinished.replace(path)
+        with whole(path) as unfinished:
+            save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, unfinished, {"facts": facts})
 
 
 def _lens(clip: LiveClip, camera: str) -> Intrinsics:
