@@ -4,8 +4,9 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Literal, ParamSpec, TypeAlias
+from typing import Literal, TypeAlias
 
 import psutil
 import torch
@@ -40,7 +41,6 @@ from gcd_node.views import LiveConfig, VirtualViews
 
 Verdict: TypeAlias = Literal["ok", "warning", "failed"]
 
-_P = ParamSpec("_P")
 _MUCH_MEMORY = 0.7
 _BYTES = {"float32": 4, "bfloat16": 2, "float16": 2}
 
@@ -73,16 +73,16 @@ def check_launch(config: NodeConfig, free_memory: int | None = None) -> Iterator
     yield _finding("source", look.source)
     yield _finding("weights", look.weights)
     if look.traits is not None:
-        yield _finding("memory", look.memory, look.traits)
+        yield _finding("memory", partial(look.memory, look.traits))
     if look.traits is not None and look.info is not None:
-        yield _finding("views", look.views, look.traits, look.info)
+        yield _finding("views", partial(look.views, look.traits, look.info))
     if look.context is not None:
-        yield _finding("time", look.time, look.context)
+        yield _finding("time", partial(look.time, look.context))
 
 
-def _finding(topic: str, look: Callable[_P, str], *args: _P.args, **kwargs: _P.kwargs) -> Finding:
+def _finding(topic: str, look: Callable[[], str]) -> Finding:
     try:
-        return Finding(topic=topic, verdict="ok", detail=look(*args, **kwargs))
+        return Finding(topic=topic, verdict="ok", detail=look())
     except _DoubtfulError as doubt:
         return Finding(topic=topic, verdict="warning", detail=str(doubt))
     except (NodeError, ClientError, ModelError) as error:

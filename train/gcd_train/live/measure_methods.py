@@ -24,7 +24,9 @@ from gcd_model.live.config import SKY_M, LiveConfig
 from gcd_model.live.depth_net import pixel_rays
 from gcd_model.live.paint_net import filled, seen_of
 from gcd_model.live.splat import splat, unproject
-from gcd_model.live.view import Floor, FrameGeometry, LiveNetworks, LiveView
+from gcd_model.live.synthesizer import LiveSynthesizer
+from gcd_model.live.view import COVERED, Floor, FrameGeometry, LiveNetworks, LiveView
+from gcd_model.loading import load_synthesizer
 from gcd_model.small_files import decode_json
 from gcd_train.errors import DataError
 from gcd_train.evaluation.reprojection import splat as splat_points
@@ -34,8 +36,6 @@ from gcd_train.live.clips import LiveClip, read_clip
 from gcd_train.live.measure_figures import NEVER, NOW, MethodViews
 
 Array = NDArray[Any]
-_COVERED = 0.5
-"""From this coverage a pixel counts as seen."""
 _SAMPLE = 60
 """Training clips that the fill of holes is read off."""
 _FEWEST_PAIRS, _MOST_PAIRS = 8, 3000
@@ -144,7 +144,7 @@ class ExactSplat:
         return MethodViews(
             video=torch.stack(video),
             classes=torch.where(covered > 0, torch.stack(votes), label).to(torch.uint8),
-            visibility=torch.where(covered >= _COVERED, NOW, NEVER).to(torch.uint8),
+            visibility=torch.where(covered >= COVERED, NOW, NEVER).to(torch.uint8),
             inverse_depth=torch.stack(inverse),
         )
 
@@ -318,6 +318,14 @@ def _exact(source: Pictures, t: int) -> FrameGeometry:
     return FrameGeometry(
         metres=source.metres[t], labels=source.labels[t].to(torch.uint8), static=source.moves[t] < 0.5, ood=0.0
     )
+
+
+def live_model(weights: str, *, device: str = "auto") -> LiveSynthesizer:
+    """A live model. Raises DataError for weights of another."""
+    loaded = load_synthesizer(weights, device=device)
+    if not isinstance(loaded, LiveSynthesizer):
+        raise DataError(f"{weights} is no live model; give the weights of one")
+    return loaded
 
 
 def live_methods(networks: LiveNetworks) -> dict[str, LiveModel]:
