@@ -1,5 +1,5 @@
 """The model a node has loaded: how it is tried, interrupted and left idle, what it gives up, level by level, when its
-device has no memory left (wire protocol, section 7, F11), and when it counts as failed."""
+device has no memory left (docs/node.md, F11), and when it counts as failed."""
 
 import contextlib
 import logging
