@@ -29,7 +29,7 @@ from gcd_train.live.batches import (
     on,
     with_true_references,
 )
-from gcd_train.live.clips import read_clip
+from gcd_train.live.clips import evenly, read_clip
 from gcd_train.live.look import depth_sheet
 from gcd_train.loop import Progress, StepLoss
 from gcd_train.schedule import ParameterGroup
@@ -190,7 +190,7 @@ def measure_depth(
                 shown.append((truth.video[0], true[0], metres[0], classes[0]))
     together, small = torch.cat(errors), torch.cat(thin)
     if sheet is not None:
-        depth_sheet(shown[:: max(len(shown) // 8, 1)][:8], config.classes, sheet)
+        depth_sheet(evenly(shown, 8), config.classes, sheet)
     iou, occurs = class_iou(confusion), confusion.sum(1) > 0
     return {
         "mean_relative": float(together.mean()),

@@ -25,7 +25,7 @@ from gcd_model import hatched
 from gcd_model.live.config import LiveConfig
 from gcd_model.live.view import LiveNetworks
 from gcd_train.errors import DataError
-from gcd_train.live.clips import LiveClip, clip_paths, read_clip
+from gcd_train.live.clips import LiveClip, clip_paths, evenly, read_clip
 from gcd_train.live.judge import JudgeNet, load_judge, random_judge
 from gcd_train.live.measure_figures import STATES, MethodViews, Tally, fit_spread, scene_interval, truth_of
 from gcd_train.live.measure_methods import (
@@ -293,7 +293,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     results: list[SetResult] = []
     for name in options.sets.split(","):
         paths = clip_paths(options.heldout / name)
-        paths = paths if options.clips is None else paths[:: max(len(paths) // options.clips, 1)][: options.clips]
+        paths = paths if options.clips is None else evenly(paths, options.clips)
         splat, *run = [
             _kept(method, options.keep, name) for method in (ExactSplat(training=options.training), *methods)
         ]

@@ -34,7 +34,7 @@ STATES = ("painted", "before", "now")
 NAMED_CLASSES = ("person", "cyclist", "car", "pole")
 """Classes whose IoU is reported apart."""
 COARSE = (64, 96)
-"""Height and width at which the old models' card has its classes."""
+"""Height and width of the grid on which class maps of small models are compared."""
 INTERVAL, _Z = 0.9, 1.6448536269514722
 _FULL_CELL = 0.8
 """A cell counts as never seen from this share of its pixels."""

@@ -32,7 +32,7 @@ from gcd_train.errors import DataError
 from gcd_train.evaluation.reprojection import splat as splat_points
 from gcd_train.files import whole
 from gcd_train.live.batches import Pictures, pictures_of, training_paths
-from gcd_train.live.clips import LiveClip, read_clip
+from gcd_train.live.clips import LiveClip, evenly, read_clip
 from gcd_train.live.measure_figures import NEVER, NOW, MethodViews
 
 Array = NDArray[Any]
@@ -68,7 +68,7 @@ def fill_of(training: Path, world: str) -> Fill:
     if not paths:
         raise DataError(f"{training} holds no training clips of {world!r}; holes are filled as they are on average")
     counts, total, pixels = np.zeros(256), np.zeros(3), 0
-    for path in paths[:: max(len(paths) // _SAMPLE, 1)][:_SAMPLE]:
+    for path in evenly(paths, _SAMPLE):
         arrays = read_clip(path, slice(6, 7)).arrays
         counts += np.bincount(arrays["target.labels"].ravel(), minlength=256)
         total += arrays["target.rgb"].reshape(-1, 3).sum(axis=0)
@@ -151,7 +151,7 @@ class ExactSplat:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PointSplat:
-    """The project's older exact splat: bilinear points, holes in the mean colour."""
+    """The exact splat that other models are measured beside: bilinear points, holes in the mean colour."""
 
     training: Path
     classes: int = len(LiveConfig().classes)

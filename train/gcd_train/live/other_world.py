@@ -15,7 +15,7 @@ from gcd_model.geometry import Intrinsics
 from gcd_model.live.synthesizer import LiveSynthesizer
 from gcd_model.live.view import LiveView
 from gcd_train.live.batches import to_video
-from gcd_train.live.clips import clip_paths, read_clip
+from gcd_train.live.clips import clip_paths, evenly, read_clip
 from gcd_train.live.measure_methods import live_model
 from gcd_train.look.real_video import WindowChoice, find_videos, read_windows
 
@@ -39,7 +39,7 @@ def known_scores(synthesizer: LiveSynthesizer, folder: Path, clips: int) -> Iter
     """Of at most so many clips, evenly chosen, each world."""
     for world in sorted(path for path in folder.iterdir() if path.is_dir()):
         paths = sorted(world.glob("*.safetensors"))
-        for path in paths[:: max(len(paths) // clips, 1)][:clips]:
+        for path in evenly(paths, clips):
             clip = read_clip(path, names=["source.rgb"])
             video = to_video(clip.arrays["source.rgb"])
             lens = Intrinsics.from_hfov(clip.hfov_deg("source"), video.shape[-1], video.shape[-2])
