@@ -4,9 +4,9 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
-from importlib.resources import files
+from functools import partial
 from pathlib import Path
-from typing import Literal, ParamSpec, TypeAlias
+from typing import Literal, TypeAlias
 
 import psutil
 import torch
@@ -24,6 +24,7 @@ from gcd_model import (
     inspect_weights,
     is_export,
     load_synthesizer,
+    weights_path,
 )
 from gcd_node.auth import load_server_security
 from gcd_node.config import ModelSection, NodeConfig
@@ -35,12 +36,11 @@ from gcd_node.mcap_file import RoomError, check_room
 from gcd_node.preprocess import in_words
 from gcd_node.session import load_model, metrics_server, model_threads, open_publisher, viewer_arguments
 from gcd_node.sources import open_source
-from gcd_node.stream_context import StreamContext, drawing_options, prepare_stream, sampler_in_use
+from gcd_node.stream_context import StreamContext, drawing_options, family_name, prepare_stream, sampler_in_use
 from gcd_node.views import LiveConfig, VirtualViews
 
 Verdict: TypeAlias = Literal["ok", "warning", "failed"]
 
-_P = ParamSpec("_P")
 _MUCH_MEMORY = 0.7
 _BYTES = {"float32": 4, "bfloat16": 2, "float16": 2}
 
@@ -73,16 +73,16 @@ def check_launch(config: NodeConfig, free_memory: int | None = None) -> Iterator
     yield _finding("source", look.source)
     yield _finding("weights", look.weights)
     if look.traits is not None:
-        yield _finding("memory", look.memory, look.traits)
+        yield _finding("memory", partial(look.memory, look.traits))
     if look.traits is not None and look.info is not None:
-        yield _finding("views", look.views, look.traits, look.info)
+        yield _finding("views", partial(look.views, look.traits, look.info))
     if look.context is not None:
-        yield _finding("time", look.time, look.context)
+        yield _finding("time", partial(look.time, look.context))
 
 
-def _finding(topic: str, look: Callable[_P, str], *args: _P.args, **kwargs: _P.kwargs) -> Finding:
+def _finding(topic: str, look: Callable[[], str]) -> Finding:
     try:
-        return Finding(topic=topic, verdict="ok", detail=look(*args, **kwargs))
+        return Finding(topic=topic, verdict="ok", detail=look())
     except _DoubtfulError as doubt:
         return Finding(topic=topic, verdict="warning", detail=str(doubt))
     except (NodeError, ClientError, ModelError) as error:
@@ -166,8 +166,7 @@ class _Look:
         # Only loading says whether weights and adapter belong together.
         traits = _traits(report, section) if section.adapter is None else load_model(section).traits
         self.traits, self.weight_bytes = traits.streaming(), report.parameters * _BYTES.get(traits.precision, 4)
-        family = "unknown" if traits.family is None else traits.family.name
-        return f"{traits.name}, family {family}, {report.parameters / 1e6:.1f} M parameters"
+        return f"{traits.name}, family {family_name(traits)}, {report.parameters / 1e6:.1f} M parameters"
 
     def memory(self, traits: Traits) -> str:
         needed, free = self.weight_bytes, self._free_memory
@@ -208,17 +207,6 @@ class _Look:
             f"a {unit} every {period_s:.2f} s, {runs} network evaluations each, so {1000 * period_s / runs:.1f} ms for "
             f"one if none is to be left out; {model_threads(model)} CPU threads"
         )
-
-
-def weights_path(weights: str) -> Path:
-    """The file that weights are in; `package:NAME` ships with the model package. Raises CheckpointError."""
-    kind, _, name = weights.partition(":")
-    if kind != "package":
-        return Path(weights)
-    path = Path(str(files("gcd_model").joinpath("weights", f"{name}.safetensors")))
-    if "/" in name or not path.is_file():
-        raise CheckpointError(f"no weights called {name!r} ship with the package; give a path, or random:driving")
-    return path
 
 
 def _traits(report: WeightsReport, section: ModelSection) -> Traits:

@@ -16,7 +16,6 @@ from gcd_node.health import IDLE, Level
 from gcd_node.messages import Rendered, messages, newest_ns, utc_offset_ns, world_flags
 from gcd_node.model import (
     FULL,
-    Condition,
     FailureCounter,
     IdleTimer,
     ModelSlot,
@@ -26,7 +25,7 @@ from gcd_node.model import (
     oom_levels,
     render_grey,
 )
-from gcd_node.status import Announcer
+from gcd_node.status import Announcer, Condition
 from gcd_node.stream_context import StreamContext, drawing_options, sampler_in_use
 from gcd_node.views import EndOfStream, LiveConfig, Settings, VirtualView, VirtualViews
 from gcd_node.window import FrameWindow, PartialWindow, WindowSlot

@@ -268,7 +268,7 @@ def _matrices(path: Trajectory) -> tuple[tuple[float, ...], ...]:
 
 
 def _input_flags(window: FrameWindow) -> tuple[str, ...]:
-    """What is wrong with the input picture itself (wire protocol, section 7, F13)."""
+    """What is wrong with the input picture itself (docs/node.md, F13)."""
     is_exposed = 8 <= float(window.images[:, ::16, ::8].mean()) <= 247
     return (*(() if is_exposed else ("exposure",)), *(("static",) if window.static else ()))
 

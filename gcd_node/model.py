@@ -1,5 +1,5 @@
-"""The model a node has loaded, what it gives up, level by level, when its device has no memory left (wire protocol,
-section 7, F11), and when it counts as failed."""
+"""The model a node has loaded: how it is tried, interrupted and left idle, what it gives up, level by level, when its
+device has no memory left (docs/node.md, F11), and when it counts as failed."""
 
 import contextlib
 import logging
@@ -251,26 +251,3 @@ class FailureCounter:
                 f"{self._bad_in_a_row} windows in a row came out with NaN; none was published. "
                 'Try dtype = "float32", and look at them with `gcd-node weights inspect`'
             )
-
-
-class Condition:
-    """A reason in the node's health while something is wrong with what comes in; announced once each time it begins.
-
-    hold_s: how long it must be right again: frames, unlike windows, may be wrong every second time.
-    """
-
-    def __init__(self, code: str, announcer: Announcer, *, hold_s: float) -> None:
-        self._code, self._announcer, self._hold_s = code, announcer, hold_s
-        self._wrong_s: float | None = None
-
-    def update(self, problem: Mapping[str, object] | None) -> None:
-        """Of the newest input. problem: fields of the event that announces its begin; None if all is right."""
-        now_s = time.monotonic()
-        if problem is not None:
-            if self._wrong_s is None:
-                self._announcer.health.raise_reason(self._code, Level.WARN)
-                self._announcer.event(self._code, Level.WARN, problem)
-            self._wrong_s = now_s
-        elif self._wrong_s is not None and now_s - self._wrong_s >= self._hold_s:
-            self._announcer.health.clear_reason(self._code)
-            self._wrong_s = None

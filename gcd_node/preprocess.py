@@ -38,7 +38,7 @@ class Fit:
     resize: the name published as `src.resize`.
     share: how much of the picture's width may be used; less than 1 narrows the field of view.
     allow_upscale: enlarge pictures that are too small instead of refusing them.
-    Source: Generative Camera Dolly, loading of custom videos, as released; wire protocol, section 7, F7.
+    Source: Generative Camera Dolly, loading of custom videos, as released; docs/node.md, F7.
     """
 
     width: int

@@ -140,7 +140,7 @@ class Watchdog:
 
 
 class ClockWatch:
-    """Notices when somebody sets this machine's clock (wire protocol, section 7, F24). Ages are not affected."""
+    """Notices when somebody sets this machine's clock (docs/node.md, F24). Ages are not affected."""
 
     def __init__(
         self, utc_ns: Callable[[], int] = lambda: time.time_ns(), monotonic_ns: Callable[[], int] = time.monotonic_ns

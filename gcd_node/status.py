@@ -1,4 +1,4 @@
-"""What the node tells of itself: status, events and metadata (wire protocol, section 4)."""
+"""What the node tells of itself: status, events, lasting conditions and metadata (wire protocol, section 4)."""
 
 import logging
 import threading
@@ -74,6 +74,29 @@ class Announcer:
 
     def _origin(self) -> OriginHeader:
         return OriginHeader(node_id=self.node_id, boot_id=self.boot_id, t_publish_ns=time.time_ns())
+
+
+class Condition:
+    """A reason in the node's health while something is wrong with what comes in; announced once each time it begins.
+
+    hold_s: how long it must be right again: frames, unlike windows, may be wrong every second time.
+    """
+
+    def __init__(self, code: str, announcer: Announcer, *, hold_s: float) -> None:
+        self._code, self._announcer, self._hold_s = code, announcer, hold_s
+        self._wrong_s: float | None = None
+
+    def update(self, problem: Mapping[str, object] | None) -> None:
+        """Of the newest input. problem: fields of the event that announces its begin; None if all is right."""
+        now_s = time.monotonic()
+        if problem is not None:
+            if self._wrong_s is None:
+                self._announcer.health.raise_reason(self._code, Level.WARN)
+                self._announcer.event(self._code, Level.WARN, problem)
+            self._wrong_s = now_s
+        elif self._wrong_s is not None and now_s - self._wrong_s >= self._hold_s:
+            self._announcer.health.clear_reason(self._code)
+            self._wrong_s = None
 
 
 def metadata(context: StreamContext, settings: Settings) -> dict[str, object]:

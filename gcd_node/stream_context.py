@@ -120,7 +120,7 @@ def prepare_stream(
 
 def choose_fps(source_fps: float, trained: Sequence[float]) -> tuple[float, bool]:
     """The highest trained rate the source can give, False; without one, the source's own rate, True: it lies outside
-    what the network was trained with. trained: empty if any will do. Source: wire protocol, section 7, F8."""
+    what the network was trained with. trained: empty if any will do. Source: docs/node.md, F8."""
     if not trained:
         return source_fps, False
     reachable = [fps for fps in trained if fps <= source_fps * (1 + RATE_TOLERANCE)]

@@ -1,4 +1,5 @@
-"""The views a node gives: what is asked for now, the path of each one's camera, and the end of its topics."""
+"""The views a node gives: what is asked for now, the path of each one's camera, the end of its topics; and the preview
+of the input."""
 
 import threading
 import time

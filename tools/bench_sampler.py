@@ -8,7 +8,7 @@ way (the first row) and its paired standard error over scenes. `runs` counts eva
 """
 
 import argparse
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from statistics import mean
 
@@ -18,25 +18,13 @@ from gcd_train.evaluation.measure import predicted_and_measured
 from gcd_train.evaluation.methods import SynthesizedViews
 from gcd_train.evaluation.metrics import psnr
 from gcd_train.evaluation.opening import Choice, open_pairs
-from gcd_train.evaluation.predictors import Prediction
+from gcd_train.evaluation.predictors import Fixed
 from gcd_train.evaluation.statistics import lead
 from gcd_train.evaluation.summary import evaluation
 
 UNGUIDED = (1.0, 1.0)
 HEADS = ["steps", "solver", "guidance", "runs", "latents from Euler", "dB to Euler", "latents from fine", "dB to fine"]
 HEADS += ["PSNR dB", "ahead", "gradient", "mIoU", "ahead"]
-
-
-@dataclass
-class Drawn:
-    """A view that is drawn already, as one of the methods that are measured."""
-
-    name: str
-    prediction: Prediction
-    privileged: bool = False
-
-    def predict(self, clip):
-        return self.prediction
 
 
 def main():
@@ -100,7 +88,7 @@ def measure(views, clips, ways, references):
         drawn = {way: draw(options_of(way, views.options.seed)) for way in dict.fromkeys([*references, *ways])}
         for way in ways:
             apart[way].append([number for each in references for number in distance(drawn[way], drawn[each])])
-            shown = Drawn(str(way), views.shown(drawn[way]))
+            shown = Fixed(name=str(way), prediction=views.shown(drawn[way]))
             records[way].append(predicted_and_measured(shown, clip, classes=clips.classes)[1])
     truth = {way: evaluation(rows, classes=len(clips.classes)) for way, rows in records.items()}
     return {way: ([mean(column) for column in zip(*apart[way], strict=True)], truth[way]) for way in ways}

@@ -9,8 +9,7 @@ from rich.table import Table
 from rich.text import Text
 from typer import Argument, Option, Typer
 
-from gcd_model import ModelConfig, WeightsReport, convert_weights, inspect_weights
-from gcd_node.check import weights_path
+from gcd_model import ModelConfig, WeightsReport, convert_weights, inspect_weights, weights_path
 
 weights = Typer(no_args_is_help=True, help="Look into checkpoints, convert them.")
 

@@ -1,4 +1,4 @@
-"""Live cameras: read in a thread of their own, and opened again when they are lost (wire protocol, F1 to F4).
+"""Live cameras: read in a thread of their own, and opened again when they are lost (docs/node.md, F1 to F4).
 
 A `LiveCamera` is one opening of a camera, a `SourceWatch` makes one source of one opening after another; what differs
 from kind to kind is a driver. Any call into a driver may take for ever: it belongs to a daemon thread, which is left

@@ -40,7 +40,7 @@ from gcd_model.geometry import (
 )
 from gcd_model.live.ego_motion import require_motion
 from gcd_model.live.synthesizer import visibility_of
-from gcd_model.loading import EngineName, default_precision, export_weights, load_synthesizer
+from gcd_model.loading import EngineName, default_precision, export_weights, load_synthesizer, weights_path
 from gcd_model.small_files import decode_toml, explain_settings_error, printable, read_json, read_small
 from gcd_model.synthesizer import FrameSynthesizer, Synthesizer, ViewSynthesizer, synthesize
 from gcd_model.traits import ASSUMED_SOURCE, Traits
@@ -107,4 +107,5 @@ __all__ = [
     "sampler_of",
     "synthesize",
     "visibility_of",
+    "weights_path",
 ]

@@ -80,8 +80,7 @@ def loaded_weights(source: str | Path, *, adapter: str | Path | None = None, **t
             raise OptionError(f"{source} takes neither family, head width nor image heads; leave them out")
         loaded = random_weights(name, frames=told.get("frames"))
     else:
-        path = packaged_weights(name) if isinstance(source, str) and kind == "package" else Path(source)
-        loaded = load_weights(path, ask_family=adapter is None, **told)
+        loaded = load_weights(weights_path(source), ask_family=adapter is None, **told)
     return loaded if adapter is None else load_adapted(loaded, read_adapter(adapter))
 
 
@@ -112,8 +111,11 @@ def placed_synthesizer(loaded: LoadedWeights, *, device: str = "auto", dtype: st
     return _synthesizer(loaded, place)
 
 
-def packaged_weights(name: str) -> Path:
-    """File of weights that ship with the package. Raises CheckpointError, listing what there is."""
+def weights_path(source: str | Path) -> Path:
+    """File of weights; `package:NAME` ships with the package. Raises CheckpointError, listing what there is."""
+    kind, _, name = str(source).partition(":")
+    if not isinstance(source, str) or kind != "package":
+        return Path(source)
     path = PACKAGED / f"{name}.safetensors"
     if Path(name).name == name and path.is_file():
         return path

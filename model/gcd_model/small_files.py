@@ -8,6 +8,8 @@ import difflib
 import math
 import re
 import tomllib
+from collections.abc import Generator
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from typing import Literal, TypeVar, get_args, get_origin
@@ -64,21 +66,13 @@ def decode_json(text: str | bytes, kind: type[Kind]) -> Kind:
     Raises: FileError if it is not UTF-8, no JSON (NaN is none), nested deeper than Python goes, holds an integer beyond
         64 bits or a NUL character, or is not of that type.
     """
-    try:
+    with _faults("cannot be used"):
         content = text.encode() if isinstance(text, str) else text
         if b"0" * 20 in content.translate(_DIGITS) and _LONG_NUMBER.search(content):
             raise FileError("holds an integer of 20 digits or more")
         if _NUL in content:
             raise FileError("holds a NUL character")
         return msgspec.json.decode(content, type=kind)
-    except FileError:
-        raise
-    except RecursionError as error:
-        raise FileError("is nested too deep") from error
-    except UnicodeError as error:
-        raise FileError("is not UTF-8 text") from error
-    except ValueError as error:
-        raise FileError(f"cannot be used: {printable(error)}") from error
 
 
 def decode_toml(text: str | bytes) -> dict[str, object]:
@@ -87,13 +81,22 @@ def decode_toml(text: str | bytes) -> dict[str, object]:
     Raises: FileError if it is not UTF-8, no TOML, larger than any that people write, nested deeper than MOST_DEPTH, or
         holds an integer beyond 64 bits, NaN, infinity or a NUL character.
     """
-    try:
+    with _faults("is not valid TOML"):
         if len(text) > _MOST_TOML:
             raise FileError(f"is larger than {_MOST_TOML} bytes: it is something else")
         text = text if isinstance(text, str) else text.decode()
         if any(line.count(".") > _MOST_DOTS for line in text.split("\n")):
             raise FileError(f"has a line with more than {_MOST_DOTS} dots")
         table = tomllib.loads(text)
+    _check_plain(table)
+    return table
+
+
+@contextmanager
+def _faults(otherwise: str) -> Generator[None]:
+    """What reading text raises, as FileError. otherwise: begins its message for what is neither text nor too deep."""
+    try:
+        yield
     except FileError:
         raise
     except RecursionError as error:
@@ -101,9 +104,7 @@ def decode_toml(text: str | bytes) -> dict[str, object]:
     except UnicodeError as error:
         raise FileError("is not UTF-8 text") from error
     except ValueError as error:
-        raise FileError(f"is not valid TOML: {printable(error)}") from error
-    _check_plain(table)
-    return table
+        raise FileError(f"{otherwise}: {printable(error)}") from error
 
 
 def printable(text: object, most: int = _MOST_SHOWN) -> str:

@@ -245,18 +245,10 @@ def test_the_guide_brakes_for_what_is_seen_and_for_nothing_painted() -> None:
 def test_the_obstacles_of_the_guide_follow_a_node(tmp_path: Path) -> None:
     obstacles = planner("obstacles")["SeenObstacles"](f"ipc://{tmp_path}/data", "main", max_age_ms=1e9)
     model = FakeSynthesizer(painting_traits(), holds=("visibility", "inverse_depth"))
-    found: list[Any] = []
-    stamps = itertools.count(time.monotonic_ns() - 1_000_000_000_000, 100_000_000)
     with Rig(tmp_path, Bench(camera := Camera(fps=10.0)), model, views="[view.main]", watched=False):
-
-        def look() -> bool:
-            camera.shoot(stamp_ns=next(stamps))
-            found.append(obstacles.poll(wait_ms=10.0))
-            return found[-1] is not None
-
-        until(look)
+        found = held(obstacles, camera)
     maps = fake_maps()
-    assert len(found[-1]) == ((maps["visibility"] == 2) & (maps["inverse_depth"] > 0))[-1].sum()
+    assert len(found) == ((maps["visibility"] == 2) & (maps["inverse_depth"] > 0))[-1].sum()
     until(lambda: obstacles.poll(wait_ms=10.0) is None and obstacles.maps.ended)
     obstacles.maps.close()
 

@@ -301,7 +301,7 @@ def test_a_disk_that_fills_up_names_the_shard_and_leaves_nothing_behind(
             raise OSError(errno.ENOSPC, "No space left on device")
         real(descriptor)
 
-    monkeypatch.setattr("gcd_train.latent_cache.index.os.fsync", full)
+    monkeypatch.setattr("gcd_train.files.os.fsync", full)
     (step,) = cached(tmp_path, pictures)
     assert step.error is not None
     assert "a.safetensors: No space left on device" in step.error

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 import torch
 from live_clips import HEIGHT, WIDTH, write_clip
@@ -23,7 +24,7 @@ from gcd_model.live.depth_net import (
     plane_depth,
     read_depth,
 )
-from gcd_model.live.paint_net import PaintNet, Seen, filled
+from gcd_model.live.paint_net import Painted, PaintNet, Seen, filled
 from gcd_model.live.view import LiveNetworks
 from gcd_train.engine.processes import processes_of
 from gcd_train.errors import DataError, Interrupted, RecipeError
@@ -36,7 +37,7 @@ from gcd_train.live.measure_figures import SpreadHistogram
 from gcd_train.live.measure_methods import LiveModel
 from gcd_train.live.paint_training import HeldOutViews, PaintTask
 from gcd_train.live.recipe import LiveRecipe, LiveStage, live_recipes, load_live_recipe
-from gcd_train.live.target_views import ViewBatches, carried_through, carry, views_of
+from gcd_train.live.target_views import ViewBatches, Views, carried_through, carry, views_of
 from gcd_train.live.training import LivePlaces, train_live
 from gcd_train.loop import Progress
 from gcd_train.recipe import Budget, ComputeRecipe, LogRecipe, OptimiserRecipe
@@ -325,18 +326,26 @@ def test_painted_pixels_of_several_frames_in_a_row_drift_and_no_others(places: L
     batches = ViewBatches([path], [places.out], TINY, 3, 0, carried=0.7)
     net = PaintNet(TINY.paint, len(TINY.classes)).eval()
     runs: set[int] = set()
+    drifted = 0
+
+    def through(before: tuple[Views, ...], now: Views, random: np.random.Generator) -> Seen:
+        def first_step(seen: Seen) -> Painted:
+            return net.first_step(seen, filled(seen), TINY.sigma_max)
+
+        return carried_through(first_step, before, now, torch.zeros(17).bool(), random).seen
+
     for update in range(12):
         before, now, random = batches.batch(update)
         runs.add(len(before))
-        made = carried_through(
-            lambda seen: net.first_step(seen, filled(seen), TINY.sigma_max), before, now, torch.zeros(17).bool(), random
-        ).seen
+        made, other = through(before, now, random), through(before, now, np.random.default_rng(99))
+        drifted += int((made.painted != other.painted).sum())
         carried = len(before[0].poses) if before else 0
         assert all(len(views.poses) == carried for views in before)
         assert not made.painted_coverage[carried:].any()
         assert not made.painted[(made.painted_coverage == 0)[:, None].expand_as(made.painted)].any()
         assert made.painted.abs().max() <= 1
     assert {1, 2, 3} <= runs
+    assert drifted > 0
 
 
 def test_paint_losses_are_lowest_at_the_truth(places: LivePlaces) -> None:

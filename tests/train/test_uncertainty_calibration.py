@@ -23,11 +23,11 @@ from gcd_train.evaluation.calibration import (
     best_scale,
     calibrate,
     coverage,
-    deviation,
     distances,
     miscoverage,
 )
 from gcd_train.evaluation.clips import HeldOutClip
+from gcd_train.evaluation.metrics import pixel_deviation
 from gcd_train.evaluation.predictors import CameraPair, Prediction, SourceClip
 
 T, H, W = 4, 48, 64
@@ -74,7 +74,7 @@ def test_the_deviation_is_that_of_a_view() -> None:
     view = View(samples=samples, latents=torch.zeros(1), trajectory=path, motion_bucket=0.0, uncertainty_scale=2.5)
     assert view.std is not None
     assert view.uncertainty is not None
-    assert torch.equal(deviation(samples), view.std)
+    assert torch.equal(pixel_deviation(samples), view.std)
     assert torch.equal(view.uncertainty, 2.5 * view.std)
     assert replace(view, uncertainty_scale=None).uncertainty is None
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gcd_train.errors import RunError
+from gcd_train.files import write_whole
 
 _GAP = 4  # pixels between the pictures of a sheet
 
@@ -22,12 +22,8 @@ def write_sheet(path: Path, rows: Sequence[Sequence[Tensor]]) -> None:
             top, left = y * (height + _GAP), x * (width + _GAP)
             sheet[top : top + height, left : left + width] = _to_bytes(picture)
     done, data = cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data.tobytes())
-    except OSError as error:
-        raise RunError(f"cannot write {path}: {error.strerror}; choose another --out") from error
     assert done, "PNG takes any picture"
+    write_whole(path, data.tobytes())
 
 
 def _to_bytes(picture: Tensor) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:

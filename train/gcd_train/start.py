@@ -11,9 +11,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gcd_model import ModelConfig
+from gcd_model import ModelConfig, weights_path
 from gcd_model.errors import CheckpointError
-from gcd_model.loading import packaged_weights
 from gcd_model.networks import LoadedWeights, Networks
 from gcd_model.weights.adapter import DIFFUSION, carried_over
 from gcd_model.weights.load import load_weights
@@ -57,5 +56,4 @@ def carried_leftovers(recipe: ModelRecipe) -> Mapping[str, Tensor]:
 
 def loaded_base(path: str) -> LoadedWeights:
     """A weight file of any layout, or `package:NAME`, whatever its family. Raises CheckpointError."""
-    kind, _, name = path.partition(":")
-    return load_weights(packaged_weights(name) if kind == "package" else path, ask_family=False)
+    return load_weights(weights_path(path), ask_family=False)

@@ -4,8 +4,6 @@
 `svd.safetensors` (both use the names of Stability's code); `diffusers_source(name, levels)` where in a diffusers
 folder, whose three parts we write as `unet/NAME`, `vae/NAME` and `image_encoder/NAME`. `Levels.of(config)` holds the
 counts that block numbers depend on. `assembled` makes our tensor of the published ones.
-
-Longer than other files because it is one table: our name, Stability's and diffusers' stand side by side.
 """
 
 from collections.abc import Iterator, Sequence

@@ -99,16 +99,15 @@ def _clips(data: Sequence[Path], choice: "Choice", model: "ViewSynthesizer", see
 
 def _weights_file(weights: str, store: Path, steps: int | None) -> Path:
     """The file whose copy gets the scale; what is wrong with --store is said before anything is measured."""
-    from gcd_model.loading import packaged_weights
+    from gcd_model import weights_path
 
     if steps is not None:
         raise RecipeError("a stored scale is for the steps that ship: leave out --steps, or --store")
     if store.exists() or store.suffix != ".safetensors" or not store.parent.is_dir():
         raise RecipeError(f"--store wants the name of a new .safetensors file in a folder that exists, got {store}")
-    kind, _, name = weights.partition(":")
-    if kind == "random":
+    if weights.startswith("random:"):
         raise RecipeError(f"{weights} is no file that a scale could be stored with; leave out --store")
-    return packaged_weights(name) if kind == "package" else Path(weights)
+    return weights_path(weights)
 
 
 def _measured(clips: "EvaluationSet", views: "Predictor") -> "tuple[Sequence[Distances], tuple[str, ...]]":

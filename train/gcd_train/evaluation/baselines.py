@@ -37,8 +37,6 @@ HEXPLANE_VIEWS = (1, 2, 4, 8)
 FROM_EXACT_CLASSES = ("copy_source", "ground_homography")
 """Baselines that are not privileged in their pictures, but make their class maps from the source's exact ones."""
 
-_HEXPLANE = re.compile(r"hexplane_([1-9]\d*)")
-
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class BaselineSettings:
@@ -103,6 +101,12 @@ def baseline_names(*, hexplane: Sequence[int] = HEXPLANE_VIEWS) -> tuple[str, ..
     return (*_NAMES, *(f"hexplane_{views}" for views in hexplane))
 
 
+def hexplane_views(name: str) -> int | None:
+    """How many views the HexPlane of this name is given; None for another method."""
+    found = re.fullmatch(r"hexplane_([1-9]\d*)", name)
+    return None if found is None else int(found[1])
+
+
 def build(name: str, settings: BaselineSettings) -> Predictor:
     """A baseline by its name.
 
@@ -110,7 +114,7 @@ def build(name: str, settings: BaselineSettings) -> Predictor:
         RecipeError: there is none of this name, or what it needs is not there.
         CheckpointError: vanilla SVD's weights cannot be used.
     """
-    views = _HEXPLANE.fullmatch(name)
+    views = hexplane_views(name)
     if name not in _NAMES and not views:
         near = difflib.get_close_matches(name, baseline_names(), n=1)
         meant = f"did you mean {near[0]}? " if near else ""
@@ -118,7 +122,7 @@ def build(name: str, settings: BaselineSettings) -> Predictor:
     if settings.painted and (views or name in _PICTURES_ALONE):
         raise RecipeError(f"{name} makes no class maps, and these targets are class maps; leave it out")
     if views:
-        return HexPlane(views=int(views[1]), settings=settings.hexplane, seed=settings.seed, device=settings.device)
+        return HexPlane(views=views, settings=settings.hexplane, seed=settings.seed, device=settings.device)
     made = _made(name, settings)
     return ClassesAlone(inner=made) if settings.painted else made
 
@@ -130,7 +134,7 @@ def described(name: str, settings: BaselineSettings, trained_on: str = "nothing"
         trained_on: identity of the training clips, "nothing" without.
     Raises: CheckpointError for vanilla SVD's weights.
     """
-    told, hexplane, svd = {"baseline": name}, _HEXPLANE.fullmatch(name), name == VANILLA_SVD
+    told, hexplane, svd = {"baseline": name}, hexplane_views(name), name == VANILLA_SVD
     told |= {"samples": str(settings.samples)} if svd else {}
     told |= {"seed": str(settings.seed)} if svd or hexplane else {}
     told |= {"means of": trained_on} if name in _OF_MEANS else {}

@@ -23,11 +23,13 @@ from torch import Tensor
 
 from gcd_train.errors import DataError
 from gcd_train.evaluation.clips import HeldOutClip
+from gcd_train.evaluation.metrics import pixel_deviation
 from gcd_train.evaluation.plots import new_figure, save
 from gcd_train.evaluation.predictors import Prediction, to_pictures
 from gcd_train.evaluation.statistics import FEW_SCENES, FIRST_MEASURED
-from gcd_train.evaluation.store import Region, write_whole
-from gcd_train.evaluation.tables import markdown_rows
+from gcd_train.evaluation.store import Region
+from gcd_train.evaluation.tables import counted, markdown_rows
+from gcd_train.files import write_whole
 
 LEVELS = tuple(round(0.05 * step, 2) for step in range(1, 20))
 """Shares of pixels that intervals are meant to hold, 5 % to 95 %."""
@@ -98,7 +100,8 @@ class CalibrationNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     @property
     def warning(self) -> str:
         """What the scale should not be trusted for; empty for nothing."""
-        few = f"Measured on {_scenes(self.scenes)}: of fewer than {FEW_SCENES} no claim can rest on this scale."
+        scenes = counted(self.scenes, "scene")
+        few = f"Measured on {scenes}: of fewer than {FEW_SCENES} no claim can rest on this scale."
         return few if self.scenes < FEW_SCENES else ""
 
 
@@ -125,7 +128,7 @@ def distances(clip: HeldOutClip, prediction: Prediction) -> Distances:
     truth = to_pictures(clip.target)[FIRST_MEASURED:]
     spread = np.random.default_rng(zlib.crc32(clip.key.encode())).random(truth.shape, np.float32)
     truth = truth + (torch.from_numpy(spread) - 0.5) / 255.0
-    far = (truth - drawn.mean(dim=0)).abs() / deviation(drawn)[:, None]  # [T-1, 3, H, W]; no deviation: infinitely far
+    far = (truth - drawn.mean(dim=0)).abs() / pixel_deviation(drawn)[:, None]  # [T-1, 3, H, W]; without any: infinite
     exact = (far.nan_to_num(nan=0.0, posinf=torch.inf).log2() - _LOWEST) * _PER_OCTAVE + 1
     places = exact.clamp(0, _BINS - 1).floor().long()  # NaN (0 / 0) is no distance at all
     parts: dict[Region, Tensor] = {"all": places}
@@ -136,11 +139,6 @@ def distances(clip: HeldOutClip, prediction: Prediction) -> Distances:
         name: np.bincount(part.flatten().numpy(), minlength=_BINS).astype(np.int64) for name, part in parts.items()
     }
     return Distances(scene=clip.scene, counts=counts)
-
-
-def deviation(draws: Tensor) -> Tensor:
-    """As `View.std`: population standard deviation over draws [S, T, 3, H, W], channel mean: [T, H, W]."""
-    return draws.std(dim=0, correction=0).mean(dim=1)
 
 
 def coverage(counts: Counts, level: float, scale: float = 1.0) -> float:
@@ -236,9 +234,9 @@ def _text(note: CalibrationNote) -> str:
         f"# Calibration of {note.weights}",
         "",
         f"Weights {note.sha256_12}, {note.samples} samples, steps {note.steps}, seed {note.seed}; {note.clips} clips "
-        f"({note.data_identity}) of {_scenes(note.scenes)} in {', '.join(note.data)}.",
+        f"({note.data_identity}) of {counted(note.scenes, 'scene')} in {', '.join(note.data)}.",
         "",
-        f"**Scale {found.scale:.3g}**, chosen on {_scenes(len(found.fitted))}; the table is of the other "
+        f"**Scale {found.scale:.3g}**, chosen on {counted(len(found.fitted), 'scene')}; the table is of the other "
         f"{len(found.reported)}.",
         "",
         *([f"{note.warning}\n"] if note.warning else []),
@@ -264,7 +262,3 @@ def _write_plot(found: Calibration, out: Path) -> None:
     axes.grid(color="#eeeeee")
     axes.legend(fontsize=8, loc="upper left")
     save(figure, out)
-
-
-def _scenes(count: int) -> str:
-    return f"{count} scene" + "s" * (count != 1)

@@ -99,7 +99,7 @@ def _told(each: Difference) -> str:
         f"{number:+.{each.column.digits}f}" for number in (each.apart.value, each.apart.low, each.apart.high)
     )
     star = " *" if each.starred else ""
-    if each.apart.low != each.apart.low:  # NaN: one scene tells nothing of it
+    if np.isnan(each.apart.low):  # one scene tells nothing of it
         return value + star
     text = f"{value} [{low}, {high}]"
     return (text if each.verdict == "open" else f"**{text}** {each.verdict}") + star

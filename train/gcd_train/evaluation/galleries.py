@@ -18,7 +18,8 @@ from gcd_train.errors import DataError, RunError
 from gcd_train.evaluation.clips import HeldOutClip
 from gcd_train.evaluation.predictors import Prediction, to_labels
 from gcd_train.evaluation.runs import EvaluatedSet, Method
-from gcd_train.evaluation.store import RunKeeper, write_whole
+from gcd_train.evaluation.store import RunKeeper
+from gcd_train.files import write_whole
 
 Pictures = NDArray[np.uint8]
 

@@ -18,13 +18,13 @@ from gcd_model import (
     inspect_weights,
     load_synthesizer,
     sampler_of,
+    weights_path,
 )
 from gcd_model.colours import nearest_classes
 from gcd_model.config import SemanticClass
-from gcd_model.loading import packaged_weights
 from gcd_train.datasets.clip_source import to_network
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.evaluation.baselines import BaselineSettings, build, described, usual_baselines
+from gcd_train.evaluation.baselines import BaselineSettings, build, described, hexplane_views, usual_baselines
 from gcd_train.evaluation.clips import ClipFacts, names_of
 from gcd_train.evaluation.predictors import CameraPair, Prediction, Predictor, SourceClip
 from gcd_train.evaluation.runner import Maker
@@ -148,8 +148,6 @@ def _require_fit(synthesizer: ViewSynthesizer, clips: ClipFacts) -> None:
         raise DataError(f"{traits.name} has classes {names_of(traits.classes)}, the clips {names_of(clips.classes)}")
 
 
-HEXPLANE = "hexplane_"
-"""What the name of every HexPlane begins with; the number of its views follows."""
 _SVD = "svd"
 """The family of image-to-video weights."""
 _DIGITS = 12
@@ -217,11 +215,11 @@ def of_baselines(names: Sequence[str] | None, settings: BaselineSettings, traine
 def require_views(names: Sequence[str], others: int) -> None:
     """Raises RecipeError where a HexPlane wants more views than there are. others: cameras beside the source."""
     for name in names:
-        views = name.removeprefix(HEXPLANE)
-        if name != views and views.isdecimal() and int(views) > others + 1:
+        views = hexplane_views(name)
+        if views is not None and views > others + 1:
             there = f"{others} beside the source" if others else "the source alone"
             raise RecipeError(
-                f"{name} wants {views} cameras, and these clips have {there}; give {HEXPLANE}{others + 1} or less"
+                f"{name} wants {views} cameras, and these clips have {there}; give hexplane_{others + 1} or less"
             )
 
 
@@ -251,10 +249,7 @@ def of_saved_frames(
 def _require_image_to_video(weights: str) -> None:
     """Raises RecipeError for weights that say they do something else; CheckpointError if they cannot be opened."""
     kind, _, name = weights.partition(":")
-    if kind == "random":
-        family = name
-    else:
-        family = inspect_weights(packaged_weights(name) if kind == "package" else weights).family or _SVD
+    family = name if kind == "random" else inspect_weights(weights_path(weights)).family or _SVD
     if family != _SVD:
         raise RecipeError(
             f"{VANILLA_SVD} wants weights that make a video out of a picture, {weights} is of the family {family}; "

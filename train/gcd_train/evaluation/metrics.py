@@ -51,8 +51,13 @@ def diversity(draws: Tensor, mask: Tensor | None = None) -> Tensor:
     Args:
         draws: [S, T, 3, H, W], S at least 2. mask: the pixels that count; NaN where it is empty. None for all.
     """
-    spread = draws.std(dim=0, correction=0).mean(dim=1)  # [T, H, W]
+    spread = pixel_deviation(draws)
     return spread.mean(dim=(1, 2)) if mask is None else masked_mean(spread, mask)
+
+
+def pixel_deviation(draws: Tensor) -> Tensor:
+    """As `View.std`: population standard deviation over draws [S, T, 3, H, W], channel mean: [T, H, W]."""
+    return draws.std(dim=0, correction=0).mean(dim=1)
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:

@@ -38,6 +38,7 @@ from gcd_train.evaluation.protocol import (
     orbit_notes,
     released_controls,
     require_cameras,
+    scene_number,
 )
 from gcd_train.evaluation.scene_clips import SceneSet
 from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
@@ -144,12 +145,12 @@ def wanted_scenes(folder: Path, there: Sequence[str], choice: Choice, notes: Ski
 
 
 def _of_public_split(folder: Path, there: Sequence[str], split: PublicSplit, notes: Skips) -> tuple[str, ...]:
-    scenes = tuple(scene for scene in there if _seed(scene) in split)
+    scenes = tuple(scene for scene in there if scene_number(scene) in split)
     for scene in scenes or there[:1]:
         world = _world(folder / scene)
         if world != split.world:
             raise _of_another_world(split, f"{folder / scene} is of {world}")
-    _note_missing(split, {_seed(scene) for scene in scenes}, notes)
+    _note_missing(split, {scene_number(scene) for scene in scenes}, notes)
     return scenes
 
 
@@ -168,11 +169,6 @@ def _note_missing(split: PublicSplit, there: set[int], notes: Skips) -> None:
     """A part that is open-ended in practice, as `train`, is not missed."""
     if there and len(there) < len(split) and not split.name.endswith("-train"):
         notes.add(split.name, "--data", f"has {len(there)} of its {len(split)} scenes")
-
-
-def _seed(scene: str) -> int:
-    number = kubric4d_names.scene_number(scene)
-    return (parallel_domain4d_names.scene_number(scene) or 0) if number is None else number
 
 
 DataKind: TypeAlias = Literal["pairs", "kubric4d", "parallel_domain4d"]
@@ -260,14 +256,9 @@ def open_pairs(
     """
     if choice.listed is not None:
         raise RecipeError("--list names whole scenes, and these are pairs; give --split NAME, or leave it out")
-    clips, notes = (
-        PairedClips.open([folder.resolve() for folder in folders]),
-        Skips(logged=False),
-    )  # processes may stand elsewhere
-    scenes = [clips.scene(number) for number in range(len(clips))]
-    wanted = None
-    if choice.split is not None:
-        wanted = pairs_of_split(choice.split, scenes, notes)
+    clips = PairedClips.open([folder.resolve() for folder in folders])  # processes may stand elsewhere
+    notes, scenes = Skips(logged=False), [clips.scene(number) for number in range(len(clips))]
+    wanted = None if choice.split is None else pairs_of_split(choice.split, scenes, notes)
     some = chosen(clips, scenes=wanted, limit=choice.limit)
     return PairedSet.of(some, declared=_declared(mount, clips)), tuple(notes.plain_lines())
 

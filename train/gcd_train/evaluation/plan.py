@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from math import isnan
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -369,7 +370,7 @@ def _on_the_sheet(summary: Summary) -> list[str]:
     names: tuple[FigureName, ...] = ("psnr_db", "miou")
     wanted = [each.name for each in summary.model[:1]]
     for name in names:
-        if summary.model and summary.model[0].value(name) != summary.model[0].value(name):
+        if summary.model and isnan(summary.model[0].value(name)):
             continue  # the model has no such figure
         for privileged in (False, True):
             best = best_of([each for each in summary.baselines if each.privileged == privileged], name)

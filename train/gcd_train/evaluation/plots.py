@@ -16,6 +16,7 @@ from gcd_train.evaluation.runs import Method
 from gcd_train.evaluation.statistics import FIRST_MEASURED, FigureName, Interval, Selection, bootstrap
 from gcd_train.evaluation.store import ClipRecord, Region
 from gcd_train.evaluation.tables import Cell, Measured, csv_text
+from gcd_train.files import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -53,11 +54,10 @@ def to_pixels(figure: "Figure") -> NDArray[np.uint8]:
 
 
 def save(figure: "Figure", out: Path) -> None:
-    """Write a figure as PNG, in one piece."""
+    """Write a figure as PNG, in one piece. Raises RunError if it cannot be written."""
     drawn = io.BytesIO()
     figure.savefig(drawn, format="png", dpi=DPI)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_bytes(drawn.getvalue())
+    write_whole(out, drawn.getvalue())
 
 
 ANGLE_STEP_DEG = 15.0

@@ -13,6 +13,7 @@ from torch import Tensor
 from gcd_model.geometry import CameraMount, Intrinsics, Trajectory, driving_trajectory, to_pose
 from gcd_train.datasets.clip_source import Bytes, ClipSource
 from gcd_train.errors import DataError
+from gcd_train.pointcloud.unproject import tangents
 from gcd_train.scene_view import SceneView
 
 
@@ -68,9 +69,7 @@ class CameraPair:
 
 def pixel_rays(camera: Intrinsics) -> Tensor:
     """Rays through the pixel centres in the camera's axes, 1 along the optical axis: float64 [H, W, 3]."""
-    u = torch.arange(camera.width, dtype=torch.float64) + 0.5
-    v = torch.arange(camera.height, dtype=torch.float64) + 0.5
-    down, right = torch.meshgrid((v - camera.cy) / camera.fy, (u - camera.cx) / camera.fx, indexing="ij")
+    right, down = torch.meshgrid(*map(torch.from_numpy, tangents(camera, 0.5)), indexing="xy")
     return torch.stack([right, down, torch.ones_like(right)], dim=-1)
 
 

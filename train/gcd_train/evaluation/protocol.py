@@ -120,7 +120,7 @@ class DrawnControls:
 
     def control(self, scene: str, name: str, frames: int, /) -> Control:
         """The same whenever it is asked for. Raises DataError if the scene is too short."""
-        rng = generator(self.seed, _number(scene), self.names(scene).index(name))
+        rng = generator(self.seed, scene_number(scene), self.names(scene).index(name))
         change = None if self.orbit is None else self.orbit.change(rng, self.source)
         start, skip = self._frames(rng, frames)
         return Control(
@@ -158,8 +158,8 @@ def released_controls(scenes: Sequence[str], *, orbit: bool) -> Controls:
     return dict.fromkeys(scenes, (control,))
 
 
-def _number(scene: str) -> int:
-    """Of a scene's folder, in either layout."""
+def scene_number(scene: str) -> int:
+    """By the name of its folder, in either layout. Raises DataError for another name."""
     number = kubric4d_names.scene_number(scene)
     number = parallel_domain4d_names.scene_number(scene) if number is None else number
     if number is None:

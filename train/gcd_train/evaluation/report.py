@@ -20,7 +20,7 @@ from gcd_train.evaluation.paper import is_model, tables_for
 from gcd_train.evaluation.plots import all_plots, curves_csv, draw, require_matplotlib
 from gcd_train.evaluation.runs import EvaluatedSet, Method, Run, gather, on_the_same_goals
 from gcd_train.evaluation.statistics import FEW_SCENES, Span
-from gcd_train.evaluation.store import folder_name, write_whole
+from gcd_train.evaluation.store import folder_name
 from gcd_train.evaluation.tables import (
     STAR_OF_FIGURE,
     Measured,
@@ -34,6 +34,7 @@ from gcd_train.evaluation.tables import (
     to_csv,
     to_markdown,
 )
+from gcd_train.files import write_whole
 
 _SPANS: tuple[Span, ...] = ("2-last", "last")
 _RELEASED_SPANS: tuple[Span, ...] = ("all", *_SPANS)

@@ -114,12 +114,8 @@ class EvaluatedSet:
         return next(record.fps for method in self.methods for record in method.records if record.key == key)
 
     def method(self, name: str) -> Method:
-        """Raises RunError where there is none of the name."""
-        for each in self.methods:
-            if each.name == name:
-                return each
-        known = ", ".join(each.name for each in self.methods)
-        raise RunError(f"no method is called {name!r} in these runs; there are {known}")
+        """The one of this name, which there must be."""
+        return next(each for each in self.methods if each.name == name)
 
 
 _KINDS = {"kubric": "Kubric-4D layout", "driving": "Driving", "orbit": "Orbits"}

@@ -10,7 +10,6 @@ Files appear whole or not at all, so a run that was killed goes on where it stop
 """
 
 import fcntl
-import os
 import re
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -23,6 +22,7 @@ import msgspec
 from gcd_model.errors import FileError
 from gcd_model.small_files import read_json
 from gcd_train.errors import RunError
+from gcd_train.files import write_whole
 
 Region: TypeAlias = Literal["all", "visible", "occluded"]
 """Which pixels of the target: all, those the source camera saw too, or the others."""
@@ -211,17 +211,6 @@ def read_run(folder: Path | str) -> tuple[RunNote, tuple[ClipRecord, ...]]:
     note = _read_note(folder / RUN_FILE)
     places = [folder / "records" / folder_name(method) for method in note.methods]
     return note, tuple(_read_record(path) for place in places for path in sorted(place.glob("*.json")))
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file under its name only once it is complete. Raises RunError if it cannot be written."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(data)
-        partial.replace(path)
-    except OSError as error:
-        raise RunError(f"cannot write {path}: {error.strerror}; free some space, or choose another --out") from error
 
 
 def _read_note(path: Path) -> RunNote:

@@ -1,4 +1,4 @@
-"""From the records of a run to what `evaluate` prints and writes: tables, JSON, a contact sheet."""
+"""From the records of a run to what `evaluate` prints and writes: tables and JSON."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,8 +27,9 @@ from gcd_train.evaluation.statistics import (
     unbiased,
     weighted,
 )
-from gcd_train.evaluation.store import ClipRecord, RunKeeper, write_whole
-from gcd_train.evaluation.tables import markdown_rows
+from gcd_train.evaluation.store import ClipRecord, RunKeeper
+from gcd_train.evaluation.tables import counted, markdown_rows
+from gcd_train.files import write_whole
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -266,7 +267,7 @@ def _conditions(summary: Summary) -> list[str]:
         "standard error over scenes. * is given more than the source video."
     ]
     if given.weights is not None:
-        steps, samples = _counted(given.steps or 0, "step"), _counted(given.samples, "sample")
+        steps, samples = counted(given.steps or 0, "step"), counted(given.samples, "sample")
         lines.append(f"`{given.weights}` as it ships: {steps} of its sampler, {samples}.")
     if given.true_mount is not None:
         lines.append(f"Source camera at {given.true_mount}; declared: {given.declared_mount}.")
@@ -345,10 +346,6 @@ def _clip_columns(summary: Summary) -> Iterator[tuple[str, list[str]]]:
         if best is not None:
             apart = own - best.clips.figure(column.figure)
             yield f"over {best.name}", [_with_error(value, math.nan, column.digits, "+") for value in apart]
-
-
-def _counted(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def _with_error(value: float, error: float, digits: int, sign: str = "") -> str:

@@ -18,9 +18,9 @@ from gcd_model import (
     inspect_weights,
     load_synthesizer,
     pose_trajectory,
+    weights_path,
 )
 from gcd_model.diffusion import unit_noise
-from gcd_model.loading import packaged_weights
 from gcd_train.datasets.clip_source import to_network
 from gcd_train.errors import DataError
 from gcd_train.evaluation.predictors import Prediction, SourceClip
@@ -114,8 +114,7 @@ def weights_named(weights: str) -> str:
     """What names weights in a record: 12 digits of their digest, or `random:...` as it is. Raises CheckpointError."""
     if weights.startswith("random:"):
         return weights
-    kind, _, name = weights.partition(":")
-    return inspect_weights(packaged_weights(name) if kind == "package" else weights).digest[:12]
+    return inspect_weights(weights_path(weights)).digest[:12]
 
 
 def _stretched(pictures: Tensor, height: int, width: int, *, low: float = 0.0) -> Tensor:

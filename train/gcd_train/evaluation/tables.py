@@ -143,6 +143,11 @@ def markdown_rows(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> lis
     return [f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |" for cells in every]
 
 
+def counted(number: int, what: str) -> str:
+    """ "1 scene", "2 scenes"."""
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Measured:
     """A set of clips with the sums of its methods, each worked out once.

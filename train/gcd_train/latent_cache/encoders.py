@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 import msgspec
 import torch
@@ -11,7 +10,7 @@ from torch import Tensor, nn
 from gcd_model import ModelConfig
 from gcd_model.engines.cpu import arrange
 from gcd_model.image_encoder import ImageEncoder, clip_pixels
-from gcd_model.loading import packaged_weights, random_weights
+from gcd_model.loading import random_weights, weights_path
 from gcd_model.networks import Networks, weights_digest
 from gcd_model.vae import Encoder, Posterior
 from gcd_model.weights.card import precision
@@ -105,8 +104,7 @@ def _networks(choice: EncoderChoice) -> Networks:
     kind, _, name = choice.weights.partition(":")
     if kind == "random":
         return random_weights(name).diffusion
-    path = packaged_weights(name) if kind == "package" else Path(choice.weights)
-    return load_weights(path, family=choice.family).diffusion
+    return load_weights(weights_path(choice.weights), family=choice.family).diffusion
 
 
 def _device(name: str) -> torch.device:

@@ -1,7 +1,6 @@
 """What a cache folder says about itself: `index.json`, one entry a scene, replaced as a whole."""
 
 import hashlib
-import os
 from pathlib import Path
 from typing import Literal
 
@@ -10,6 +9,7 @@ import msgspec
 from gcd_model.errors import FileError
 from gcd_model.small_files import read_json
 from gcd_train.errors import RunError
+from gcd_train.files import write_whole
 from gcd_train.latent_cache.plan import ClipPlan
 
 INDEX = "index.json"
@@ -91,23 +91,7 @@ def read_index(folder: Path) -> CacheIndex | None:
 
 def write_index(folder: Path, index: CacheIndex) -> None:
     """Replace the index; a reader sees the old one or the new one."""
-    write_whole(folder / INDEX, msgspec.json.format(msgspec.json.encode(index)))
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file that appears complete and stays through a power cut. Raises RunError naming it."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise RunError(
-            f"cannot write {path}: {error.strerror}; see to the disk, then run the same line again"
-        ) from error
+    write_whole(folder / INDEX, msgspec.json.format(msgspec.json.encode(index)), lasting=True)
 
 
 def require_same(folder: Path, there: CacheIdentity, wanted: CacheIdentity) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from safetensors.torch import save
 
 from gcd_train.errors import RunError
+from gcd_train.files import write_whole
 from gcd_train.latent_cache.encoders import EncoderChoice, Encoders, load_encoders
 from gcd_train.latent_cache.index import (
     CacheIdentity,
@@ -22,7 +23,6 @@ from gcd_train.latent_cache.index import (
     read_index,
     require_same,
     write_index,
-    write_whole,
 )
 from gcd_train.latent_cache.pictures import PathPictures
 from gcd_train.latent_cache.plan import ClipPlan
@@ -70,7 +70,7 @@ class CacheJob:
         encoded = encode_scene(encoders, self.pictures, self.identity, scene)
         content = save(encoded.tensors)
         file = f"{scene}.safetensors"
-        write_whole(self.folder / file, content)
+        write_whole(self.folder / file, content, lasting=True)
         return ShardEntry(
             file=file,
             sha256=digest(content),

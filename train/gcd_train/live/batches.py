@@ -18,7 +18,7 @@ from gcd_model.live.config import SKY_M, DepthConfig, LiveConfig
 from gcd_model.live.depth_net import pixel_rays, plane_depth
 from gcd_model.live.sweep import LONGEST, Reference, References, sweep_costs
 from gcd_model.loading import default_precision
-from gcd_train.live.clips import LiveClip, clip_paths, read_clip
+from gcd_train.live.clips import LiveClip, clip_paths, evenly, read_clip
 from gcd_train.live.draws import Poses
 
 Random = np.random.Generator
@@ -32,6 +32,7 @@ _TURN_NOISE_DEG, _MOVE_NOISE = 0.03, 0.001
 """Errors of the motion between two frames; of the move in parts of the median depth."""
 _TARGET_SHARE = 0.25  # of the pictures that depth learns from: targets see the world from above
 _NO_MOUNT, _EXACT_MOUNT = 0.35, 0.35
+_COUNTED = 48  # clips that say how common classes are
 _HEIGHT_SPREAD, _TILT_SPREAD_DEG = 0.05, 0.7  # of the other mounts that are declared
 
 
@@ -276,14 +277,11 @@ def other_camera(random: Random, n: int) -> Callable[[Tensor, Random], Tensor]:
     return look
 
 
-def class_weights(paths: Sequence[Path], config: LiveConfig, power: float, sample: int = 48) -> Tensor:
-    """Weights of the classes in a loss, [K]: a power of how much of the pictures they fill, 1 for a mean pixel.
-
-    sample: so many evenly chosen clips are looked at.
-    """
+def class_weights(paths: Sequence[Path], config: LiveConfig, power: float) -> Tensor:
+    """Weights of the classes in a loss, [K]: a power of how much of the pictures they fill, 1 for a mean pixel."""
     classes = len(config.classes)
     counts = np.ones(classes)
-    for path in list(paths)[:: max(len(paths) // sample, 1)][:sample]:
+    for path in evenly(paths, _COUNTED):
         labels: NDArray[Any] = read_clip(path, slice(0, 1)).arrays["source.labels"]
         counts += np.bincount(labels.ravel(), minlength=classes)
     shares = torch.from_numpy(counts / counts.sum()).float()

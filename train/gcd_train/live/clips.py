@@ -12,12 +12,11 @@ and in its metadata the lenses, the frame rate, the world, the height of its flo
 """
 
 import json
-import os
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +26,7 @@ from safetensors.numpy import save_file
 from gcd_model.live.ontology import LIVE_CLASSES
 from gcd_model.small_files import decode_json
 from gcd_train.errors import DataError, RenderError
+from gcd_train.files import whole
 from gcd_train.live.draws import FLOOR_Z_M, METRES_A_UNIT, LiveDraw, LiveWorld, Poses, TargetPath, live_scene
 from gcd_train.map_items import map_items, one_thread_each
 from gcd_train.scenes.description import Scene
@@ -42,6 +42,7 @@ _SAME_SURFACE = 0.02
 _STANDS_M = 1e-3
 """A body whose pose changes by less than this a frame stands still, metres (and radians at a metre)."""
 Array = NDArray[Any]
+Item = TypeVar("Item")
 
 
 def encode_depth(metres: Array) -> Array:
@@ -106,9 +107,8 @@ def film_scene(folder: Path, world: LiveWorld, settings: ClipSettings, seed: int
     for number, draw in reversed(list(enumerate(draws))):
         arrays, facts = _film(renderer, scene, draw, world)
         path = folder / f"{seed:07d}-{number}.safetensors"
-        partial_path = path.with_suffix(f".{os.getpid()}.partial")
-        save_file(arrays, partial_path, metadata={"facts": json.dumps(facts)})
-        partial_path.replace(path)
+        with whole(path) as unfinished:
+            save_file(arrays, unfinished, metadata={"facts": json.dumps(facts)})
 
 
 @cache
@@ -247,12 +247,17 @@ class LiveClip:
         return decode_depth(self.arrays[f"{camera}.depth"])
 
 
-def clip_paths(folder: Path, worlds: tuple[str, ...] | None = None) -> list[Path]:
+def clip_paths(folder: Path) -> list[Path]:
     """All clips of a data folder, in order. Raises DataError if there are none."""
-    paths = sorted(path for path in folder.glob("*/*.safetensors") if worlds is None or path.parent.name in worlds)
+    paths = sorted(folder.glob("*/*.safetensors"))
     if not paths:
         raise DataError(f"{folder} holds no live clips; make some with `gcd-train generate live {folder}`")
     return paths
+
+
+def evenly(items: Sequence[Item], most: int) -> Sequence[Item]:
+    """At most so many of them, evenly chosen."""
+    return items[:: max(len(items) // most, 1)][:most]
 
 
 def read_clip(path: Path, frames: slice = slice(None), names: Collection[str] | None = None) -> LiveClip:

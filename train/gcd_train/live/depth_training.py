@@ -17,6 +17,7 @@ from gcd_model.live.depth_net import (
     first_bin,
     read_depth,
 )
+from gcd_train.evaluation.metrics import class_iou, confusion_matrix
 from gcd_train.live.batches import (
     PART_SEED,
     Ahead,
@@ -28,7 +29,7 @@ from gcd_train.live.batches import (
     on,
     with_true_references,
 )
-from gcd_train.live.clips import read_clip
+from gcd_train.live.clips import evenly, read_clip
 from gcd_train.live.look import depth_sheet
 from gcd_train.loop import Progress, StepLoss
 from gcd_train.schedule import ParameterGroup
@@ -148,7 +149,7 @@ class DepthTask:
 
     @torch.no_grad()
     def measure(self, picture: Path) -> dict[str, float]:
-        """Kill test 1 on every fourth held-out clip's middle frames."""
+        """Of held-out clips, see `measure_depth`."""
         self._net.eval()
         return measure_depth(self._net, self._config, self._held_out, picture)
 
@@ -165,7 +166,8 @@ def measure_depth(
     errors: list[Tensor] = []
     thin: list[Tensor] = []
     edges = torch.zeros(3)
-    confusion = torch.zeros(len(config.classes), len(config.classes))
+    count = len(config.classes)
+    confusion = torch.zeros(count, count, dtype=torch.int64)
     names = [entry.name for entry in config.classes]
     is_thin = torch.tensor([name in ("person", "pole") for name in names])
     shown: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
@@ -183,17 +185,13 @@ def measure_depth(
             thin.append(relative[is_thin[truth.labels] & near])
             edges += edge_matches(metres, true)
             classes = output.classes.argmax(1)
-            index = truth.labels * len(config.classes) + classes
-            confusion += torch.bincount(index.flatten(), minlength=confusion.numel()).view_as(confusion)
+            confusion += confusion_matrix(classes, truth.labels, count)
             if frame == frames[0]:
                 shown.append((truth.video[0], true[0], metres[0], classes[0]))
     together, small = torch.cat(errors), torch.cat(thin)
     if sheet is not None:
-        depth_sheet(shown[:: max(len(shown) // 8, 1)][:8], config.classes, sheet)
-    inside = confusion.diagonal()
-    union = confusion.sum(0) + confusion.sum(1) - inside
-    iou = inside / union.clamp(min=1)
-    occurs = confusion.sum(1) > 0
+        depth_sheet(evenly(shown, 8), config.classes, sheet)
+    iou, occurs = class_iou(confusion), confusion.sum(1) > 0
     return {
         "mean_relative": float(together.mean()),
         "median_relative": float(together.median()),

@@ -4,7 +4,6 @@
 (tenths of frames, at most 25.5) u8 [T, H, W], log_depth u16 (see `encode_depth`), label and label_share u8 [T, H, W].
 """
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from gcd_model.live.config import SKY_M, LiveConfig
 from gcd_model.live.depth_net import DepthNet, depth_inputs, read_depth
 from gcd_model.live.seen_world import SeenWorld
 from gcd_model.live.splat import Splat
+from gcd_train.files import whole
 from gcd_train.live.batches import Pictures, Random, autocast, pictures_of, with_true_references
 from gcd_train.live.clips import LiveClip, decode_depth, encode_depth, read_clip
 
@@ -100,10 +100,8 @@ def write_inputs(path: Path, splats: Sequence[Splat]) -> None:
         "label": label.to(torch.uint8).numpy(),
         "label_share": _byte(share),
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_suffix(f".{os.getpid()}.partial")
-    save_file(arrays, unfinished)
-    unfinished.replace(path)
+    with whole(path) as unfinished:
+        save_file(arrays, unfinished)
 
 
 def _byte(share: Tensor) -> Array:

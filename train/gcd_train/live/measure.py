@@ -23,11 +23,9 @@ from torch import Tensor
 
 from gcd_model import hatched
 from gcd_model.live.config import LiveConfig
-from gcd_model.live.synthesizer import LiveSynthesizer
 from gcd_model.live.view import LiveNetworks
-from gcd_model.loading import load_synthesizer
 from gcd_train.errors import DataError
-from gcd_train.live.clips import LiveClip, clip_paths, read_clip
+from gcd_train.live.clips import LiveClip, clip_paths, evenly, read_clip
 from gcd_train.live.judge import JudgeNet, load_judge, random_judge
 from gcd_train.live.measure_figures import STATES, MethodViews, Tally, fit_spread, scene_interval, truth_of
 from gcd_train.live.measure_methods import (
@@ -37,6 +35,7 @@ from gcd_train.live.measure_methods import (
     Method,
     PointSplat,
     live_methods,
+    live_model,
 )
 
 _SHEET_FRAMES, _SHEET_CLIPS = (5, 9, 13), 4
@@ -255,10 +254,7 @@ def open_networks(weights: str) -> LiveNetworks:
     if weights == "init":
         torch.manual_seed(0)
         return LiveNetworks(LiveConfig()).eval()
-    loaded = load_synthesizer(weights, device="cpu")
-    if not isinstance(loaded, LiveSynthesizer):
-        raise DataError(f"{weights} is no live model")
-    return loaded.networks
+    return live_model(weights, device="cpu").networks
 
 
 def methods_of(names: Sequence[str], weights: str, training: Path) -> list[Method]:
@@ -297,7 +293,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     results: list[SetResult] = []
     for name in options.sets.split(","):
         paths = clip_paths(options.heldout / name)
-        paths = paths if options.clips is None else paths[:: max(len(paths) // options.clips, 1)][: options.clips]
+        paths = paths if options.clips is None else evenly(paths, options.clips)
         splat, *run = [
             _kept(method, options.keep, name) for method in (ExactSplat(training=options.training), *methods)
         ]

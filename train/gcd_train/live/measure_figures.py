@@ -23,6 +23,7 @@ from gcd_train.evaluation.metrics import (
     ssim_map,
     window_mask,
 )
+from gcd_train.evaluation.predictors import pixel_rays
 from gcd_train.live.batches import to_video
 from gcd_train.live.clips import SKY_M, LiveClip
 from gcd_train.live.judge import CELL, JudgeNet, Moments, frechet_distance
@@ -33,7 +34,7 @@ STATES = ("painted", "before", "now")
 NAMED_CLASSES = ("person", "cyclist", "car", "pole")
 """Classes whose IoU is reported apart."""
 COARSE = (64, 96)
-"""Height and width at which the old models' card has its classes."""
+"""Height and width of the grid on which class maps of small models are compared."""
 INTERVAL, _Z = 0.9, 1.6448536269514722
 _FULL_CELL = 0.8
 """A cell counts as never seen from this share of its pixels."""
@@ -113,13 +114,7 @@ def surface_motion(metres: Tensor, moves: Tensor, poses: Tensor, lens: Intrinsic
         metres: [T, H, W]. moves: bool [T, H, W]. poses: float64 [T, 4, 4], world_from_camera.
     """
     then_from_now = invert_rigid(poses[:-1]) @ poses[1:]
-    v, u = torch.meshgrid(
-        torch.arange(lens.height, dtype=torch.float64) + 0.5,
-        torch.arange(lens.width, dtype=torch.float64) + 0.5,
-        indexing="ij",
-    )
-    rays = torch.stack([(u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy, torch.ones_like(u)], dim=-1)
-    points = rays * metres[1:, ..., None].double()  # [T-1, H, W, 3]
+    points = pixel_rays(lens) * metres[1:, ..., None].double()  # [T-1, H, W, 3]
     turned = torch.einsum("tij,thwj->thwi", then_from_now[:, :3, :3], points) + then_from_now[:, None, None, :3, 3]
     z = turned[..., 2].clamp(min=1e-3)
     place = torch.stack(

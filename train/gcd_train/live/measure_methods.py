@@ -1,7 +1,6 @@
 """Everything that is measured beside the live model, and the live model itself: a clip in, its target views out."""
 
 import json
-import os
 import time
 from collections.abc import Sequence
 from copy import deepcopy
@@ -25,17 +24,18 @@ from gcd_model.live.config import SKY_M, LiveConfig
 from gcd_model.live.depth_net import pixel_rays
 from gcd_model.live.paint_net import filled, seen_of
 from gcd_model.live.splat import splat, unproject
-from gcd_model.live.view import Floor, FrameGeometry, LiveNetworks, LiveView
+from gcd_model.live.synthesizer import LiveSynthesizer
+from gcd_model.live.view import COVERED, Floor, FrameGeometry, LiveNetworks, LiveView
+from gcd_model.loading import load_synthesizer
 from gcd_model.small_files import decode_json
 from gcd_train.errors import DataError
 from gcd_train.evaluation.reprojection import splat as splat_points
+from gcd_train.files import whole
 from gcd_train.live.batches import Pictures, pictures_of, training_paths
-from gcd_train.live.clips import LiveClip, read_clip
+from gcd_train.live.clips import LiveClip, evenly, read_clip
 from gcd_train.live.measure_figures import NEVER, NOW, MethodViews
 
 Array = NDArray[Any]
-_COVERED = 0.5
-"""From this coverage a pixel counts as seen."""
 _SAMPLE = 60
 """Training clips that the fill of holes is read off."""
 _FEWEST_PAIRS, _MOST_PAIRS = 8, 3000
@@ -68,7 +68,7 @@ def fill_of(training: Path, world: str) -> Fill:
     if not paths:
         raise DataError(f"{training} holds no training clips of {world!r}; holes are filled as they are on average")
     counts, total, pixels = np.zeros(256), np.zeros(3), 0
-    for path in paths[:: max(len(paths) // _SAMPLE, 1)][:_SAMPLE]:
+    for path in evenly(paths, _SAMPLE):
         arrays = read_clip(path, slice(6, 7)).arrays
         counts += np.bincount(arrays["target.labels"].ravel(), minlength=256)
         total += arrays["target.rgb"].reshape(-1, 3).sum(axis=0)
@@ -104,11 +104,9 @@ class Kept:
         names = ("classes", "visibility", "log_variance", "inverse_depth")
         tensors = {name: tensor for name in names if (tensor := getattr(views, name)) is not None}
         tensors["video"] = (views.video.clamp(0, 1) * 255).round().to(torch.uint8)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = path.with_suffix(f".{os.getpid()}.partial")
         facts = json.dumps({"within": views.within, "cpu_s": views.cpu_s})
-        save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, unfinished, {"facts": facts})
-        unfinished.replace(path)
+        with whole(path) as unfinished:
+            save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, unfinished, {"facts": facts})
 
 
 def _lens(clip: LiveClip, camera: str) -> Intrinsics:
@@ -146,14 +144,14 @@ class ExactSplat:
         return MethodViews(
             video=torch.stack(video),
             classes=torch.where(covered > 0, torch.stack(votes), label).to(torch.uint8),
-            visibility=torch.where(covered >= _COVERED, NOW, NEVER).to(torch.uint8),
+            visibility=torch.where(covered >= COVERED, NOW, NEVER).to(torch.uint8),
             inverse_depth=torch.stack(inverse),
         )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PointSplat:
-    """The project's older exact splat: bilinear points, holes in the mean colour."""
+    """The exact splat that other models are measured beside: bilinear points, holes in the mean colour."""
 
     training: Path
     classes: int = len(LiveConfig().classes)
@@ -320,6 +318,14 @@ def _exact(source: Pictures, t: int) -> FrameGeometry:
     return FrameGeometry(
         metres=source.metres[t], labels=source.labels[t].to(torch.uint8), static=source.moves[t] < 0.5, ood=0.0
     )
+
+
+def live_model(weights: str, *, device: str = "auto") -> LiveSynthesizer:
+    """A live model. Raises DataError for weights of another."""
+    loaded = load_synthesizer(weights, device=device)
+    if not isinstance(loaded, LiveSynthesizer):
+        raise DataError(f"{weights} is no live model; give the weights of one")
+    return loaded
 
 
 def live_methods(networks: LiveNetworks) -> dict[str, LiveModel]:

@@ -11,13 +11,12 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from gcd_model import load_synthesizer
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.synthesizer import LiveSynthesizer
 from gcd_model.live.view import LiveView
-from gcd_train.errors import DataError
 from gcd_train.live.batches import to_video
-from gcd_train.live.clips import clip_paths, read_clip
+from gcd_train.live.clips import clip_paths, evenly, read_clip
+from gcd_train.live.measure_methods import live_model
 from gcd_train.look.real_video import WindowChoice, find_videos, read_windows
 
 _ASSUMED_HFOV_DEG = 70.0
@@ -40,7 +39,7 @@ def known_scores(synthesizer: LiveSynthesizer, folder: Path, clips: int) -> Iter
     """Of at most so many clips, evenly chosen, each world."""
     for world in sorted(path for path in folder.iterdir() if path.is_dir()):
         paths = sorted(world.glob("*.safetensors"))
-        for path in paths[:: max(len(paths) // clips, 1)][:clips]:
+        for path in evenly(paths, clips):
             clip = read_clip(path, names=["source.rgb"])
             video = to_video(clip.arrays["source.rgb"])
             lens = Intrinsics.from_hfov(clip.hfov_deg("source"), video.shape[-1], video.shape[-2])
@@ -54,14 +53,6 @@ def other_scores(synthesizer: LiveSynthesizer, paths: Sequence[Path], windows: i
     for video in find_videos(paths):
         for window in read_windows(video, traits, WindowChoice(count=windows)):
             yield f"{window.name} at {window.start_s:.1f} s", score(synthesizer, to_video(window.pictures), lens)
-
-
-def live_model(weights: str) -> LiveSynthesizer:
-    """Raises DataError for weights of another model."""
-    loaded = load_synthesizer(weights)
-    if not isinstance(loaded, LiveSynthesizer):
-        raise DataError(f"{weights} is no live model; only live models have a score")
-    return loaded
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gcd_model import CameraMount, Clip, RenderOptions, SphericalDelta, Traits, Trajectory, View, ViewSynthesizer
 from gcd_train.datasets.clip_source import to_network
 from gcd_train.evaluation.galleries import Strip, painted, to_bytes, write_sheet, write_video
-from gcd_train.evaluation.store import write_whole
+from gcd_train.files import write_whole
 from gcd_train.look.real_video import Bytes, Windowed
 
 DEFAULT_ANGLES = (SphericalDelta(azimuth_deg=30.0, elevation_deg=10.0), SphericalDelta(azimuth_deg=-30.0))

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from gcd_model.errors import FileError
@@ -220,8 +221,6 @@ def _frame_numbers(frames: int, sampling: FrameSampling, options: ShowOptions) -
 
 def _orbit(world_from_source: NDArray[np.float64], frames: int, seed: int) -> tuple[Poses, Poses, str]:
     """The source's pose, the target's and the path in words: as training draws it (max90, gradual)."""
-    import torch
-
     start = from_pose(torch.from_numpy(world_from_source))
     change = MAX90.change(generator(seed, 1), start)
     path = spherical_trajectory(start, change, frames=frames, move_time=frames - 1)

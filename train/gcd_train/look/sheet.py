@@ -166,7 +166,7 @@ def rows_of(footage: Footage) -> list[Row]:
 
 
 def write_sheet(footage: Footage, out: Path, facts: Sequence[tuple[str, str]]) -> None:
-    """One page as PNG. Raises: RenderError without matplotlib, OSError where it cannot be written."""
+    """One page as PNG. Raises: RenderError without matplotlib, RunError where it cannot be written."""
     rows = rows_of(footage)
     height, width = footage.source.shape[1:3]
     tall = 1.84 * height / width

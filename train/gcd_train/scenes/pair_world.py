@@ -13,6 +13,7 @@ from gcd_model.errors import FileError
 from gcd_model.geometry import CameraMount
 from gcd_model.small_files import read_json
 from gcd_train.errors import DataError, RecipeError
+from gcd_train.files import write_whole
 from gcd_train.scenes.driving import FPS as DRIVING_FPS
 from gcd_train.scenes.driving import HFOV_DEG as DRIVING_HFOV_DEG
 from gcd_train.scenes.worlds import SceneWorld, WorldOptions
@@ -176,8 +177,6 @@ def agree(folder: Path, world: World) -> None:
     """Write `world.json`, or make sure that the one that is there says the same. Raises DataError."""
     path = folder / "world.json"
     if not path.exists():
-        partial = path.with_suffix(".partial")
-        partial.write_bytes(msgspec.json.format(msgspec.json.encode(world)))
-        partial.replace(path)
+        write_whole(path, msgspec.json.format(msgspec.json.encode(world)))
     elif read_world(folder) != world:
         raise DataError(f"{folder} holds clips of another world or size (see its world.json); choose another folder")

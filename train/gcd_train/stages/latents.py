@@ -1,7 +1,6 @@
 """Every clip encoded once; resumable clip by clip, finished when meta.json is there."""
 
 import logging
-import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from gcd_train.datasets.clip_source import ClipSource, numbers_of, to_network
 from gcd_train.datasets.latents import MOST_META, LatentsMeta
 from gcd_train.draws import Draws
 from gcd_train.errors import DataError, Interrupted, RunError
+from gcd_train.files import write_whole
 from gcd_train.losses import ClassWeight, class_emphasis
 from gcd_train.precision import Precision
 from gcd_train.recipe import LatentsRecipe
@@ -214,7 +214,7 @@ def _target(job: LatentsJob, frames: Tensor, draws: Draws, mirrored: bool) -> Te
 def _keep(job: LatentsJob, meta: LatentsMeta, arrays: Mapping[str, Any], done: int) -> None:
     for array in arrays.values():
         array.flush()
-    _write(job.folder / "clips.json", msgspec.json.encode(_Begun(meta=meta, done=done)))
+    write_whole(job.folder / "clips.json", msgspec.json.encode(_Begun(meta=meta, done=done)), lasting=True)
 
 
 def _finish(job: LatentsJob, meta: LatentsMeta, arrays: dict[str, Any]) -> None:
@@ -231,7 +231,7 @@ def _finish(job: LatentsJob, meta: LatentsMeta, arrays: dict[str, Any]) -> None:
         unfinished = job.folder / f"{name}.npy.part"
         if unfinished.exists():
             unfinished.replace(job.folder / f"{name}.npy")
-    _write(job.folder / "meta.json", msgspec.json.format(msgspec.json.encode(meta)))
+    write_whole(job.folder / "meta.json", msgspec.json.format(msgspec.json.encode(meta)), lasting=True)
     (job.folder / "clips.json").unlink()
 
 
@@ -253,12 +253,3 @@ def _sensitivity(job: LatentsJob, latents: Tensor) -> Tensor:
         changes.append(((decoder(nudged, None) - plain) ** 2).mean())
     total = torch.stack(changes).cpu()
     return total / total.mean()
-
-
-def _write(path: Path, content: bytes) -> None:
-    unfinished = path.with_name(path.name + ".part")
-    with unfinished.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    unfinished.replace(path)
