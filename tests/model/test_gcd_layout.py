@@ -30,7 +30,7 @@ from gcd_model.weights.save import gcd_state, write_published
 
 
 def card(config: ModelConfig, family: str = "kubric90") -> Card:
-    return Card(name="mine", config=config, family=family, move_time=7)
+    return Card(name="mine", config=config, family=family, move_time=min(7, config.frames - 1))
 
 
 def written(path: Path, networks: Networks, family: str = "kubric90", overwrite: bool = False) -> Path:
@@ -137,6 +137,7 @@ def test_a_note_that_lies_about_the_networks_is_refused(tmp_path: Path) -> None:
     root["hyper_parameters"]["gcd_node"] |= {
         "gcd.config": msgspec.json.encode(TINY_DRIVING).decode(),
         "gcd.family": "",
+        "gcd.move_time": "2",
     }
     torch.save(root, path)
     with pytest.raises(Exception, match="weights are missing"):
