@@ -18,8 +18,17 @@ from gcd_model.weights.load import save_weights
 from gcd_train.cli.main import app
 from gcd_train.errors import RunError
 from gcd_train.evaluation.clips import PairedSet
-from gcd_train.evaluation.galleries import Strip, contact_rows, has_rows, write_rows, write_sheet
-from gcd_train.evaluation.predictors import CopySource
+from gcd_train.evaluation.galleries import (
+    Strip,
+    contact_rows,
+    has_rows,
+    has_views,
+    write_rows,
+    write_sheet,
+    write_views,
+)
+from gcd_train.evaluation.measure import predicted_and_measured
+from gcd_train.evaluation.predictors import CopySource, Prediction
 from gcd_train.evaluation.summary import Conditions, MountNumbers, Shot, Summary, to_markdown, write_summary
 
 
@@ -105,8 +114,9 @@ def test_a_contact_sheet_stacks_source_views_and_target(tmp_path: Path) -> None:
     pairs, sheet = PairedSet(clips=clips, identity="plane"), list[tuple[str, Sequence[Strip]]]()
     for key in pairs.keys:
         clip = pairs.clip(key)
-        write_rows(tmp_path / key, CopySource().predict(clip.seen), clips.classes)
-        assert has_rows(tmp_path / key)
+        prediction, record = predicted_and_measured(CopySource(), clip, classes=clips.classes)
+        write_rows(tmp_path / key, prediction, clips.classes)
+        assert has_rows(tmp_path / key, record)
         sheet.append((key, contact_rows(clip, [("copy", tmp_path / key)], clips.classes)))
     write_sheet(sheet, tmp_path / "sheet.png")
     shown = cv2.imread(str(tmp_path / "sheet.png"))
@@ -116,6 +126,17 @@ def test_a_contact_sheet_stacks_source_views_and_target(tmp_path: Path) -> None:
     assert np.array_equal(shown[:32, 140:188, ::-1], clips[0].source[0])
     assert np.array_equal(shown[height : height + 32, 296:344, ::-1], clips[0].source[3])
     assert np.array_equal(shown[4 * height : 4 * height + 32, 296:344, ::-1], clips[0].target[3])
+    (tmp_path / f"{key}.png").unlink()  # killed in between
+    assert not has_rows(tmp_path / key, record)
+
+
+def test_kept_views_are_those_of_the_last_prediction_alone(tmp_path: Path) -> None:
+    clip = PairedSet(clips=PlaneClips.make(1), identity="plane").clip("plane-00000000")
+    (draw,) = CopySource().predict(clip.seen).draws
+    for draws in ((draw, draw), (draw,)):
+        write_views(tmp_path, clip, Prediction(draws=draws), "last", ())
+        assert has_views(tmp_path, "last", len(clip.target))
+        assert len(list(tmp_path.glob("sample_*"))) == len(draws)
 
 
 def run(*arguments: object) -> tuple[int, str]:

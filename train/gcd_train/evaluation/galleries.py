@@ -1,5 +1,6 @@
 """Clips as pictures and videos: frames that a run keeps, contact sheets, galleries."""
 
+import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,7 @@ from gcd_train.errors import DataError, RunError
 from gcd_train.evaluation.clips import HeldOutClip
 from gcd_train.evaluation.predictors import Prediction, to_labels
 from gcd_train.evaluation.runs import EvaluatedSet, Method
-from gcd_train.evaluation.store import RunKeeper
+from gcd_train.evaluation.store import ClipRecord, RunKeeper
 from gcd_train.files import write_whole
 
 Pictures = NDArray[np.uint8]
@@ -50,6 +51,9 @@ def write_views(
     if true is not None and classes and "classes_0" in strips:
         strips["target_classes"] = painted(true, classes)
     strips["target"] = clip.target
+    shutil.rmtree(folder / "target", ignore_errors=True)  # until all is whole again
+    for stale in [place for place in folder.glob("*/") if place.name not in strips]:
+        shutil.rmtree(stale)  # of more draws, or of a run that was killed
     for name, frames in strips.items():
         for t in _wanted(which, len(frames)):
             write_whole(folder / name / f"{t:04d}.png", png(frames[t]))
@@ -79,9 +83,10 @@ def write_rows(place: Path, prediction: Prediction, classes: Sequence[SemanticCl
         write_whole(Path(f"{place}.png"), png(_in_a_row(to_bytes(prediction.video))))
 
 
-def has_rows(place: Path) -> bool:
-    """Whether a method has any row at this place."""
-    return any(Path(f"{place}{suffix}").exists() for suffix in (".png", ".classes.png"))
+def has_rows(place: Path, record: ClipRecord) -> bool:
+    """Whether there is a row at this place of all that a method made."""
+    made = {".png": record.step is not None, ".classes.png": record.grid_confusion is not None}
+    return all(Path(f"{place}{suffix}").exists() for suffix, is_made in made.items() if is_made)
 
 
 def read_row(path: Path, width: int) -> Pictures:

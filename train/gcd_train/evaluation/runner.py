@@ -96,7 +96,7 @@ class ClipWork:
             if name not in lacking
             and not (
                 has_views(keeper.views(name, key), self.views, self.clips.frames)
-                and (key not in self.sheet or has_rows(keeper.sheet_rows(name, key)))
+                and (key not in self.sheet or has_rows(keeper.sheet_rows(name, key), keeper.read(name, key)))
             )
         ]
         return ClipItem(key=key, methods=lacking, unseen=tuple(unseen))
