@@ -228,6 +228,12 @@ def _run(
         frames = view.video.permute(0, 2, 3, 1).contiguous()
         write_npz(save, {"latents": view.latents[0].numpy(), "frames": frames.numpy()})
         written.append(save)
+    if traits.ood_threshold is not None and view.ood is not None and view.ood > traits.ood_threshold:
+        console.print(
+            f"To {traits.name} this is another world than the one it learned from ({view.ood:.2f}, its own are below "
+            f"{traits.ood_threshold:.2f}): depth and classes are guesses.",
+            soft_wrap=True,
+        )
     for each in written:
         console.print(f"wrote {each}", soft_wrap=True)
 

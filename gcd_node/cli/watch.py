@@ -101,6 +101,8 @@ def view(
             saver = stack.enter_context(ViewSaver(save, hatch=hatch))
         views = stack.enter_context(ViewSubscriber(endpoint, name, kinds, conflate=False, keys=keys))
         live = stack.enter_context(Live(console=console, auto_refresh=False)) if console.is_terminal else None
+        if live is None:  # the last picture of it, also after Ctrl-C
+            stack.callback(lambda: console.print(table.render(time.monotonic(), ended=views.ended, endpoint=endpoint)))
         patience_s = math.inf if timeout is None else timeout
         until_s = time.monotonic() + patience_s
         while not (views.ended or views.received >= (limit or math.inf) or time.monotonic() >= until_s):
@@ -115,8 +117,6 @@ def view(
                     damaged += 1
             if live is not None:
                 live.update(table.render(time.monotonic(), ended=views.ended, endpoint=endpoint), refresh=True)
-    if not console.is_terminal:  # the last picture of it, whole lines
-        console.print(table.render(time.monotonic(), ended=views.ended, endpoint=endpoint))
     if timeout is not None and views.received == 0 and not views.ended:
         where = resolve_endpoint(endpoint, "data")
         raise StaleError(f"no view from {where} within {timeout:g} s: is the node running, and has it such a view?")

@@ -1,4 +1,5 @@
 from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -191,6 +192,16 @@ def test_a_declared_mount_reaches_the_live_models_clip_and_the_baselines() -> No
     assert synthesizer.clips[0].mount == mount
     (true,) = evaluated([homography], clips)
     assert told.value("psnr_db") < true.value("psnr_db")
+
+
+def test_a_class_that_the_clips_do_not_have_is_none_of_theirs() -> None:
+    """The live model knows robots and tables, streets have none: 16 is no driving class."""
+    clips = PlaneClips.make(1)
+    model = SynthesizedViews.of(fake(clips), clips)
+    labels = torch.tensor([1, 12, 16], dtype=torch.uint8).expand(1, 2, 4, 3)
+    shown = model.shown(SimpleNamespace(samples=torch.zeros(1, 2, 3, 4, 3), classes=labels))
+    assert shown.classes is not None
+    assert shown.classes[0, 0].tolist() == [1, 12, 255]
 
 
 CHANGES = (SphericalDelta(azimuth_deg=40.0, elevation_deg=10.0), SphericalDelta(azimuth_deg=-60.0, radius_m=1.5))

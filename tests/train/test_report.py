@@ -28,7 +28,7 @@ from gcd_train.evaluation.galleries import (
     write_views,
 )
 from gcd_train.evaluation.measure import predicted_and_measured
-from gcd_train.evaluation.predictors import CopySource, Prediction
+from gcd_train.evaluation.predictors import CopySource
 from gcd_train.evaluation.summary import Conditions, MountNumbers, Shot, Summary, to_markdown, write_summary
 
 
@@ -134,7 +134,7 @@ def test_kept_views_are_those_of_the_last_prediction_alone(tmp_path: Path) -> No
     clip = PairedSet(clips=PlaneClips.make(1), identity="plane").clip("plane-00000000")
     (draw,) = CopySource().predict(clip.seen).draws
     for draws in ((draw, draw), (draw,)):
-        write_views(tmp_path, clip, Prediction(draws=draws), "last", ())
+        write_views(tmp_path, clip, replace(draws[0], more=draws[1:]), "last", ())
         assert has_views(tmp_path, "last", len(clip.target))
         assert len(list(tmp_path.glob("sample_*"))) == len(draws)
 

@@ -166,3 +166,9 @@ def test_a_scale_that_cannot_be_stored_is_refused_before_measuring(
     assert code == 78
     assert said in " ".join(shown.split())
     assert not (tmp_path / "out").exists()
+
+
+def test_a_model_that_states_its_own_spread_is_refused_before_measuring(tmp_path: Path) -> None:
+    code, shown = run("--data", tmp_path / "none", "--weights", "random:live", "--out", tmp_path / "out")
+    assert code == 78
+    assert "states its own spread" in " ".join(shown.split())

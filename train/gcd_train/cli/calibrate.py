@@ -48,6 +48,10 @@ def calibrate_command(
         require_matplotlib()  # now, not after an hour
         path = None if store is None else _weights_file(weights, store, steps)
         model = load_synthesizer(weights, device=device, dtype=dtype)
+        if model.traits.live:
+            raise RecipeError(
+                f"{model.traits.name} states its own spread; gcd_train.live.measure says how well it holds"
+            )
         clips = _clips(data, Choice(split=split, limit=limit), model, seed)
         views = SynthesizedViews.of(model, clips, RenderOptions(steps=steps, samples=samples, seed=seed))
         if views.paints_classes:

@@ -7,6 +7,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Self
 
+import torch
 from torch import Tensor
 
 from gcd_model import (
@@ -26,6 +27,7 @@ from gcd_train.datasets.clip_source import to_network
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.baselines import BaselineSettings, build, described, hexplane_views, usual_baselines
 from gcd_train.evaluation.clips import ClipFacts, names_of
+from gcd_train.evaluation.metrics import NO_CLASS
 from gcd_train.evaluation.predictors import CameraPair, Prediction, Predictor, SourceClip
 from gcd_train.evaluation.runner import Maker
 from gcd_train.evaluation.saved_frames import SavedFrames
@@ -42,11 +44,13 @@ class SynthesizedViews:
 
     options: instead of what the weights ship with. The noise of their seed is the same for every clip, as in a live
     node. painted: classes that its colours are read by, where it paints class maps and its file does not say which.
+    classes: so many the clips have, None for any; what a model sees of others, as a robot on a street, is none of them.
     """
 
     synthesizer: ViewSynthesizer
     options: RenderOptions = RenderOptions()  # noqa: RUF009  it is frozen
     painted: tuple[SemanticClass, ...] = ()
+    classes: int | None = None
     privileged: bool = False
 
     @classmethod
@@ -56,7 +60,11 @@ class SynthesizedViews:
         Raises DataError where model and clips do not fit together.
         """
         _require_fit(synthesizer, clips)
-        made = cls(synthesizer=synthesizer, options=RenderOptions() if options is None else options)
+        made = cls(
+            synthesizer=synthesizer,
+            options=RenderOptions() if options is None else options,
+            classes=len(clips.classes) or None,
+        )
         if not made.paints_classes or synthesizer.traits.classes:
             return made
         if not clips.classes:
@@ -101,6 +109,8 @@ class SynthesizedViews:
     def _draw(self, video: Tensor, classes: Tensor | None) -> Prediction:
         if self.painted:
             return Prediction(classes=nearest_classes(video, self.painted))
+        if classes is not None and self.classes is not None:
+            classes = torch.where(classes < self.classes, classes, NO_CLASS)
         return Prediction(video=None if self.paints_classes else video, classes=classes)
 
     def _path(self, cameras: CameraPair) -> Trajectory:
@@ -283,11 +293,13 @@ def _of_weights(weights: Weights, clips: ClipFacts, options: RenderOptions) -> M
     }
     if used.guidance_interval is not None:
         told["guided from"] = "{:g} to {:g}".format(*used.guidance_interval)
-    return Method(name=made.name, make=partial(_synthesized, weights, options, made.painted), told=told)
+    return Method(name=made.name, make=partial(_synthesized, weights, options, made.painted, made.classes), told=told)
 
 
-def _synthesized(weights: Weights, options: RenderOptions, painted: tuple[SemanticClass, ...]) -> Predictor:
-    return SynthesizedViews(synthesizer=weights.open(), options=options, painted=painted)
+def _synthesized(
+    weights: Weights, options: RenderOptions, painted: tuple[SemanticClass, ...], classes: int | None
+) -> Predictor:
+    return SynthesizedViews(synthesizer=weights.open(), options=options, painted=painted, classes=classes)
 
 
 @lru_cache(maxsize=1)

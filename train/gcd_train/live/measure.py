@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gcd_model import hatched
+from gcd_model.errors import ModelError
 from gcd_model.live.config import LiveConfig
 from gcd_model.live.view import LiveNetworks
-from gcd_train.errors import DataError
+from gcd_train.errors import DataError, TrainError
 from gcd_train.live.clips import LiveClip, clip_paths, evenly, read_clip
 from gcd_train.live.judge import JudgeNet, load_judge, random_judge
 from gcd_train.live.measure_figures import STATES, MethodViews, Tally, fit_spread, scene_interval, truth_of
@@ -117,6 +118,8 @@ def measure_set(
             try:
                 views = method.views(clip)
             except DataError as error:
+                if method is splat:  # all are measured beside it
+                    raise
                 result.missing[method.name] = str(error)
                 result.tallies.pop(method.name, None)
                 continue
@@ -287,6 +290,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--clips", type=int, help="at most so many a set, evenly chosen")
     options = parser.parse_args(arguments)
+    try:
+        _measured(options)
+    except (TrainError, ModelError) as error:
+        raise SystemExit(f"error: {error}") from error
+
+
+def _measured(options: argparse.Namespace) -> None:
     methods = methods_of(options.methods.split(","), options.weights, options.training)
     judges = {"random": random_judge()} | ({} if options.judge is None else {"judge": load_judge(options.judge)})
     options.out.mkdir(parents=True, exist_ok=True)
