@@ -40,8 +40,7 @@ from gcd_node.messages import PublisherStats
 
 _LOG = logging.getLogger(__name__)
 _DATA_HWM, _STATUS_HWM = 4, 100
-_MAX_SUBSCRIPTION = 1024  # a handshake with keys takes some hundred bytes
-_MOST_EVENTS = 256  # of subscriptions between two sendings
+_MAX_SUBSCRIPTION, _MOST_EVENTS = 1024, 256  # bytes, as a handshake with keys takes hundreds; between two sendings
 _PREVIEW_KEY = topic_key(PREVIEW_TOPIC)
 _RETRY_MS, _REPEAT_MS = 3, 10
 _LEAST_LINGER_MS = 100

@@ -214,7 +214,7 @@ def _object(text: bytes) -> dict[str, Any]:
 
 
 def _types() -> Any:
-    from gcd_node.sources.log_reader import ros2_types  # only now: a node that records nothing needs none
+    from gcd_node.sources.ros_bags import ros2_types  # only now: a node that records nothing needs none
 
     return ros2_types()
 

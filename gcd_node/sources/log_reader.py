@@ -10,17 +10,16 @@ import functools
 import io
 import logging
 import re
-import stat
 import struct
 import time
 import zlib
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, TypeVar, cast
 
 import cv2
-import lz4.frame
 import msgspec
 import numpy as np
 import zstandard
@@ -29,20 +28,25 @@ from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, Metadata,
 from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
 from numpy.typing import NDArray
-from rosbags.rosbag1 import Reader as Ros1Reader
-from rosbags.rosbag2 import Reader as Ros2Reader
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
-from gcd_model import FileError, printable, read_small
+from gcd_model import printable
 from gcd_node.errors import SourceError
 from gcd_node.frame import MAX_PIXELS, Image
 from gcd_node.sources.files import decode_picture, raw_picture, raw_rows
+from gcd_node.sources.ros_bags import (
+    MAX_BYTES,
+    bag_messages,
+    files_of,
+    kind_of_log,
+    ros1_types,
+    ros2_types,
+    unfolded,
+    unpacked,
+)
 
 _LOG = logging.getLogger(__name__)
 _Record = TypeVar("_Record", Schema, Channel, Metadata)
 
-_HEADS = {b"\x89MCAP0\r\n": ".mcap", b"#ROSBAG V": ".bag", b"SQLite format 3\0": ".db3"}
 CODED_IMAGES = frozenset({"sensor_msgs/msg/CompressedImage", "foxglove.CompressedImage"})
 VIDEOS = frozenset({"foxglove.CompressedVideo", "foxglove_msgs/msg/CompressedVideo"})
 IMAGES = CODED_IMAGES | VIDEOS | {"sensor_msgs/msg/Image", "foxglove.RawImage"}
@@ -50,9 +54,7 @@ CAMERAS = frozenset({"sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration"}
 ODOMETRY, TRANSFORMS = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
 _READABLE = IMAGES | CAMERAS | {ODOMETRY, TRANSFORMS}
 
-_MAX_BYTES = 96 * 2**20  # of a record, and of an unfolded chunk
 _MAX_KEPT = 16 * 2**20  # of all topics and definitions together
-_PACKED_MESSAGES = re.compile(r"compression_mode:\s*[\"']?message", re.IGNORECASE)
 _ROS1_TYPE = re.compile(r"^(\w+)/(\w+)$")
 _COLOUR = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 _CODECS = ("jpeg", "png", "webp")
@@ -97,8 +99,8 @@ class LogReader:
         """
         self._path, self._search_s, self._stopped = path, search_s, stopped
         try:
-            self._files = _files_in(path) if path.is_dir() else (path,)
-            if _kind_of_log(path) is None:
+            self._files, self._packed = files_of(path) if path.is_dir() else ((path,), "")
+            if kind_of_log(path) is None:
                 raise SourceError(f"{path} is no log, or empty; give an MCAP file, a ROS bag or the folder of one")
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or error
@@ -120,12 +122,18 @@ class LogReader:
         """
         for file in self._files:
             try:
-                kind = _kind_of_log(file)
-                if kind is None and not file.is_file():
-                    raise SourceError(f"{file} is no log; take it out of the folder")
-                yield from self._bag(file) if kind in (".bag", ".db3") else self._mcap(file)
+                with unpacked(file) if self._packed == "file" else nullcontext(file) as plain:
+                    yield from self._messages(plain)
+            except zstandard.ZstdError as error:
+                raise SourceError(f"{file} cannot be unpacked: {line_of(error)}") from error
             except OSError as error:
                 raise SourceError(f"cannot read {file}: {error.strerror or error}; check the disk") from error
+
+    def _messages(self, file: Path) -> Iterator[LogMessage]:
+        kind = kind_of_log(file)
+        if kind is None and not file.is_file():
+            raise SourceError(f"{file} is no log; take it out of the folder")
+        yield from self._bag(file, is_ros1=kind == ".bag") if kind in (".bag", ".db3") else self._mcap(file)
 
     def _check(self) -> None:
         if time.monotonic() > self._end_s or self._stopped():
@@ -145,7 +153,7 @@ class LogReader:
                         sequence=record.sequence,
                         log_ns=record.log_time,
                         sent_ns=record.publish_time,
-                        decode=functools.partial(decode, record.data),
+                        decode=functools.partial(self._unpacked, decode, record.data),
                     )
             elif isinstance(record, Schema) and schemas.get(record.id) != record:  # many writers repeat them
                 schemas[record.id] = self._kept(record)
@@ -163,7 +171,7 @@ class LogReader:
         try:
             with open_stream() as stream:
                 limited = cast(IO[bytes], _LimitedStream(stream, self._check))
-                reader = StreamReader(limited, skip_magic=in_chunk, emit_chunks=True, record_size_limit=_MAX_BYTES)
+                reader = StreamReader(limited, skip_magic=in_chunk, emit_chunks=True, record_size_limit=MAX_BYTES)
                 for record in reader.records:
                     if isinstance(record, DataEnd):
                         return
@@ -193,29 +201,23 @@ class LogReader:
             raise LogLimitError(f"topics and definitions alone are more than {_MAX_KEPT} bytes")
         return record
 
-    def _bag(self, path: Path) -> Iterator[LogMessage]:
-        is_ros1 = _kind_of_log(path) == ".bag"
+    def _bag(self, path: Path, *, is_ros1: bool) -> Iterator[LogMessage]:
         decode = ros1_types().deserialize_ros1 if is_ros1 else ros2_types().deserialize_cdr
         try:
-            with Ros1Reader(path) if is_ros1 else Ros2Reader(path) as reader:
-                self.topics |= {each.topic: each.msgtype for each in reader.connections}
-                wanted = [each for each in reader.connections if each.msgtype in _READABLE]
-                for connection, at_ns, data in reader.messages(connections=wanted) if wanted else ():
-                    self._check()
-                    yield LogMessage(
-                        topic=connection.topic,
-                        kind=connection.msgtype,
-                        sequence=0,
-                        log_ns=at_ns,
-                        sent_ns=at_ns,
-                        decode=functools.partial(decode, data, connection.msgtype),
-                    )
+            for topic, kind, at_ns, data in bag_messages(path, is_ros1=is_ros1, topics=self.topics, kinds=_READABLE):
+                self._check()
+                read = functools.partial(self._unpacked, functools.partial(decode, typename=kind), data)
+                yield LogMessage(topic=topic, kind=kind, sequence=0, log_ns=at_ns, sent_ns=at_ns, decode=read)
         except (LogLimitError, OSError):
             raise
-        except Exception as error:  # of rosbags, SQLite, YAML or a decompressor
+        except Exception as error:  # of rosbags, SQLite or a decompressor
             raise SourceError(
                 f"{path} cannot be read as a ROS bag: {line_of(error)}; try ros2 bag reindex, or rosbag reindex"
             ) from error
+
+    def _unpacked(self, decode: Callable[[bytes], Any], data: bytes) -> Any:
+        """What a message says, unfolded first where each is packed for itself."""
+        return decode(unfolded(data, "zstd") if self._packed == "message" else data)
 
 
 class _LimitedStream:
@@ -227,23 +229,17 @@ class _LimitedStream:
     def read(self, size: int) -> bytes:
         """As of a file. Raises LogLimitError; EndOfFile for a length that cannot be."""
         self._check()
-        if size > _MAX_BYTES:
-            raise EndOfFile(f"{size} bytes at once, more than {_MAX_BYTES}")
+        if size > MAX_BYTES:
+            raise EndOfFile(f"{size} bytes at once, more than {MAX_BYTES}")
         return self._stream.read(size)
 
 
 def _unfolded(chunk: Chunk) -> IO[bytes]:
     """Its records. The library itself would let a decompressor write more than the chunk states."""
     size = chunk.uncompressed_size
-    if size > _MAX_BYTES:
-        raise SourceError(f"a chunk states {size} bytes, more than {_MAX_BYTES}")
-    if chunk.compression == "zstd":
-        with zstandard.ZstdDecompressor().stream_reader(chunk.data, read_across_frames=True) as unfolding:
-            records = io.BufferedReader(cast(io.RawIOBase, unfolding)).read(size)
-    elif chunk.compression == "lz4":
-        records = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size)
-    else:
-        records = chunk.data
+    if size > MAX_BYTES:
+        raise SourceError(f"a chunk states {size} bytes, more than {MAX_BYTES}")
+    records = unfolded(chunk.data, chunk.compression, size) if chunk.compression in ("zstd", "lz4") else chunk.data
     if len(records) != size:
         raise SourceError(f"a chunk states {size} bytes and holds {len(records)}: it is damaged")
     if chunk.uncompressed_crc and zlib.crc32(records) != chunk.uncompressed_crc:
@@ -265,54 +261,6 @@ def _decoder_of(channel: Channel, schema: Schema) -> tuple[str, Callable[[bytes]
     except Exception as error:  # of protobuf: the definition is damaged
         _LOG.warning("messages of type %s cannot be read: %s", kind, line_of(error))
         return kind, None
-
-
-@functools.cache
-def ros2_types() -> Typestore:
-    """ROS 2 messages: those in this file are the same in every distribution."""
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    video = "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format"
-    store.register(get_types_from_msg(video, "foxglove_msgs/msg/CompressedVideo"))
-    return store
-
-
-@functools.cache
-def ros1_types() -> Typestore:
-    """The same of ROS 1."""
-    store = get_typestore(Stores.ROS1_NOETIC)
-    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
-    return store
-
-
-def _files_in(folder: Path) -> tuple[Path, ...]:
-    """What is read one after another: the files of one recording, in the order of their numbers; or the folder itself,
-    if rosbags is to make sense of its metadata.yaml. Raises SourceError: there are several logs."""
-    metadata, found = (
-        folder / "metadata.yaml",
-        sorted(folder.glob("*.mcap"), key=lambda file: (len(file.name), file.name)),
-    )
-    if metadata.is_file():
-        try:
-            is_packed = _PACKED_MESSAGES.search(read_small(metadata)) is not None
-        except FileError as error:
-            raise SourceError(f"{metadata} {error}; run ros2 bag reindex") from error
-        return (folder,) if is_packed or not found else tuple(found)
-    found = found or sorted(folder.glob("*.db3"), key=lambda file: (len(file.name), file.name))
-    if len({re.sub(r"_?\d*$", "", file.stem) for file in found}) > 1:
-        raise SourceError(f"{folder} is a folder of several logs; give one of them, such as {found[0].name}")
-    return tuple(found)
-
-
-def _kind_of_log(path: Path) -> str | None:
-    """By its first bytes: ".mcap", ".bag" of ROS 1, ".db3" of ROS 2 or the folder of a bag; None if it is none."""
-    if path.is_dir():
-        named = (path / "metadata.yaml").is_file() or any(path.glob("*.mcap")) or any(path.glob("*.db3"))
-        return ".db3" if named else None
-    if not stat.S_ISREG(path.stat().st_mode):  # to open a pipe would wait for its writer
-        return None
-    with path.open("rb") as file:
-        head = file.read(max(map(len, _HEADS)))
-    return next((kind for begin, kind in _HEADS.items() if head.startswith(begin)), None)
 
 
 def line_of(error: Exception) -> str:
@@ -338,13 +286,13 @@ class ImageDecoder:
             SourceError: damaged, too large, in a layout that is not read, or PyAV is not installed.
         """
         if kind in VIDEOS:
-            return self._decode_video(str(fields.format).lower(), bytes(fields.data))
+            return self._decode_video(str(fields.format).lower(), _bytes_of(fields.data))
         if kind not in CODED_IMAGES:
             return raw_picture(fields), str(fields.encoding)
         format_ = str(fields.format)
         if format_.startswith(_DEPTH) or "compressedDepth" in format_:
             raise SourceError(f"{format_[:40]!r} is a map of depths, not a picture")
-        picture = decode_picture(bytes(fields.data), _COLOUR)
+        picture = decode_picture(_bytes_of(fields.data), _COLOUR)
         if "compressed rgb" not in format_:  # the order image_transport handed to the coder, which takes all for BGR
             picture = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
         codec = next((each for each in _CODECS if each in format_.lower()), "jpeg")
@@ -372,7 +320,7 @@ def depth_of(kind: str, fields: Any) -> NDArray[Any]:
         SourceError: damaged, or no depth.
     """
     if kind in CODED_IMAGES:
-        return _decoded_depth(str(fields.format), bytes(fields.data))
+        return _decoded_depth(str(fields.format), _bytes_of(fields.data))
     types = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
     if kind in VIDEOS or fields.encoding not in types:
         raise SourceError(f"depth is read from 16UC1, mono16 and 32FC1, got {getattr(fields, 'encoding', kind)!r}")
@@ -380,6 +328,15 @@ def depth_of(kind: str, fields: Any) -> NDArray[Any]:
     stored = np.dtype(order + types[fields.encoding])
     rows = np.ascontiguousarray(raw_rows(fields, stored.itemsize, fields.height))
     return rows.view(stored).astype(stored.newbyteorder("="))
+
+
+def _bytes_of(data: Any) -> bytes:
+    """Of a message, whose own definition may have anything in their place. Raises SourceError."""
+    if isinstance(data, np.ndarray) and data.dtype == np.uint8:
+        return data.tobytes()
+    if not isinstance(data, bytes | bytearray | memoryview):
+        raise SourceError(f"its data are no bytes, but {type(data).__name__}")
+    return bytes(data)
 
 
 def _decoded_depth(format_: str, coded: bytes) -> NDArray[Any]:

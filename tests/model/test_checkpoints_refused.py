@@ -169,6 +169,13 @@ def test_what_is_no_checkpoint_is_named_with_a_remedy(tmp_path: Path, content: b
     assert said in refused(path)
 
 
+def test_a_pickle_of_more_than_any_checkpoint_needs_is_not_read(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "a.ckpt", "w") as archive:
+        archive.writestr("a/data.pkl", b"\x80\x02" + b"]" * 2**24)
+        archive.writestr("a/version", "3")
+    assert "its pickle has" in refused(tmp_path / "a.ckpt")
+
+
 def test_zips_of_another_kind_are_refused(tmp_path: Path) -> None:
     for inner, said in (("a/b.txt", "without data.pkl"), ("a/constants.pkl", "TorchScript")):
         with zipfile.ZipFile(tmp_path / "a.ckpt", "w") as archive:

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from gcd_model import Intrinsics, OptionError, PoseError, RenderOptions, ShapeError, load_synthesizer
-from gcd_model.live.config import LIVE_TINY, SKY_M
+from gcd_model.live.config import LIVE_TINY, SKY_M, LiveConfig
 from gcd_model.live.seen_world import SeenWorld
 from gcd_model.live.sweep import Reference
 from gcd_model.live.synthesizer import LiveSynthesizer
@@ -203,3 +203,21 @@ def test_what_cannot_be_is_refused(networks: LiveNetworks) -> None:
         view.step(frame, [2 * HERE], lens=LENS)
     with pytest.raises(OptionError):
         LiveView(networks, steps=0)
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [
+        {"height": 8192, "width": 8192},
+        {"steps": 1000},
+        {"sigma_max": 1e300},
+        {"depth": {"nearest_m": 1e-300}},
+        {"depth": {"farthest_m": 1e30}},
+    ],
+    ids=str,
+)
+def test_numbers_that_no_camera_and_no_sampler_has_are_refused(
+    stated: dict[str, object],
+) -> None:
+    with pytest.raises((OptionError, msgspec.ValidationError)):
+        msgspec.convert(stated, LiveConfig)

@@ -257,6 +257,14 @@ def test_nothing_is_written_over_that_is_no_export_or_into_nowhere(
     assert [path.name for path in tmp_path.rglob("*")] == ["mine"]
 
 
+def test_a_manifest_of_another_program_is_not_written_over(tmp_path: Path) -> None:
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / MANIFEST).write_text('{"name": "a web page"}')
+    with pytest.raises(OptionError):
+        export_onnx(tiny_weights(), tmp_path / "site", overwrite=True)
+    assert (tmp_path / "site" / MANIFEST).exists()
+
+
 def test_a_size_the_network_cannot_take_is_refused(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="must be multiples of 8 for tiny, got 36x64"):
         export_onnx(tiny_weights(), tmp_path / "export", height=36)

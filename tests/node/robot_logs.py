@@ -20,8 +20,8 @@ from rosbags.rosbag2 import Writer as Bag2Writer
 from rosbags.typesys import Stores, get_typestore
 
 from gcd_node.frame import Frame, Image
-from gcd_node.sources.log_reader import ros1_types
 from gcd_node.sources.logs import LogSource
+from gcd_node.sources.ros_bags import ros1_types
 
 START_NS = 1_750_000_000_123_456_789
 PERIOD_NS = 100_000_000
@@ -158,13 +158,17 @@ def write_bag(
     messages: Sequence[Sent],
     storage: StoragePlugin = StoragePlugin.SQLITE3,
     compression: CompressionMode = CompressionMode.NONE,
+    *,
+    folded: bool = False,
 ) -> Path:
-    """A ROS 1 bag if `path` ends in .bag, else the folder of a ROS 2 bag, a message every PERIOD_NS."""
+    """A ROS 1 bag if `path` ends in .bag, by bz2 if folded, else a folder of ROS 2; a message every PERIOD_NS."""
     is_ros1 = path.suffix == ".bag"
     store, ros2 = ros1_types() if is_ros1 else get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS2_HUMBLE)
     writer = Bag1Writer(path) if is_ros1 else Bag2Writer(path, version=9, storage_plugin=storage)
     if isinstance(writer, Bag2Writer):
         writer.set_compression(compression, CompressionFormat.ZSTD)
+    elif folded:
+        writer.set_compression(Bag1Writer.CompressionFormat.BZ2)
     with writer:
         connections: dict[str, Any] = {}
         for i, (topic, kind, fields) in enumerate(messages):

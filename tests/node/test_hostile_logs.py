@@ -1,26 +1,31 @@
 """Logs and runs made to keep their reader busy for ever, or to fill its memory: each ends in one line, in time."""
 
+import bz2
 import json
+import shutil
 import struct
 import subprocess
 import sys
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
+from types import SimpleNamespace
 
 import lz4.frame
 import pytest
 import zstandard
 from media import ramp
-from robot_logs import write_log
+from robot_logs import COMPRESSED, at, compressed, write_bag, write_log
+from rosbags.rosbag2 import CompressionMode
 from runs import copied, made_run
 
 from gcd_node.cli.main import run_app
 from gcd_node.errors import DamagedRunError, SourceError
 from gcd_node.replay.compare import compare
 from gcd_node.replay.run import MANIFEST, open_run
-from gcd_node.sources import logs
+from gcd_node.sources import logs, ros_bags
 from gcd_node.sources.logs import LogSource
+from gcd_node.sources.ros_bags import unfolded
 
 MOST_BYTES = 2**31  # of a process that meets such a log
 BIG = 200 * 2**20
@@ -72,7 +77,7 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
 
 READER = """
 import json, pathlib, sys, time
-from gcd_node.sources import logs
+from gcd_node.sources import logs, ros_bags
 logs._SEARCH_S = 0.4
 for path in sys.argv[1:]:
     begun = time.monotonic()
@@ -158,3 +163,28 @@ def test_a_play_list_in_the_place_of_a_video_is_not_followed(tmp_path: Path) -> 
     (run / "main.mkv").write_text("#EXTM3U\n#EXTINF:10,\nhttp://127.0.0.1:1/video.ts\n")
     with pytest.raises(DamagedRunError):
         compare(golden, open_run(run))
+
+
+@pytest.mark.parametrize("kind", ["zstd", "lz4", "bz2"])
+def test_what_is_packed_unfolds_to_so_much_and_no_more(kind: str) -> None:
+    fold = {"zstd": zstandard.compress, "lz4": lz4.frame.compress, "bz2": bz2.compress}[kind]
+    assert unfolded(fold(bytes(1000)), kind, 1000) == bytes(1000)
+    with pytest.raises(SourceError):
+        unfolded(fold(bytes(1001)), kind, 1000)
+    if kind == "zstd":  # a second frame behind the first
+        with pytest.raises(SourceError):
+            unfolded(fold(bytes(600)) + fold(bytes(600)), kind, 1000)
+
+
+@pytest.mark.parametrize("name", ["log.bag", "message", "file"])
+def test_a_bag_that_unfolds_to_more_than_it_may_is_refused(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent = [("/front/image", COMPRESSED, compressed(image, at(i))) for i, image in enumerate(ramp(3))]
+    mode = {"message": CompressionMode.MESSAGE, "file": CompressionMode.FILE}.get(name, CompressionMode.NONE)
+    path = write_bag(tmp_path / name, sent, compression=mode, folded=True)
+    assert len(list(LogSource(path).frames())) == 3
+    monkeypatch.setattr(ros_bags, "MAX_BYTES", 500)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
+    with pytest.raises(SourceError):
+        list(LogSource(path).frames())

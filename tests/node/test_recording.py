@@ -33,8 +33,8 @@ from gcd_client.images import depth_m, images
 from gcd_client.protocol import to_json
 from gcd_node.config import parse_config
 from gcd_node.ros_messages import note_messages, view_messages
-from gcd_node.sources.log_reader import ros2_types
 from gcd_node.sources.logs import pose_of
+from gcd_node.sources.ros_bags import ros2_types
 
 pytestmark = pytest.mark.timeout(120)
 

@@ -180,8 +180,12 @@ def test_bags_of_ros_1_and_ros_2_are_read_as_mcap_is(tmp_path: Path) -> None:
     sent = [("/front/camera_info", INFO, camera_info(WIDTH, HEIGHT))]
     sent += [("/front/image", COMPRESSED, compressed(image, at(i))) for i, image in enumerate(ramp(COUNT))]
     folder = write_bag(tmp_path / "bag", sent)
-    packed = write_bag(tmp_path / "packed", sent, StoragePlugin.MCAP, CompressionMode.MESSAGE)
-    for path in (write_bag(tmp_path / "log.bag", sent), folder, folder / "bag.db3", packed):
+    packed = [
+        write_bag(tmp_path / f"{storage.name}_{mode.name}", sent, storage, mode)
+        for storage in StoragePlugin
+        for mode in (CompressionMode.MESSAGE, CompressionMode.FILE)
+    ]
+    for path in (write_bag(tmp_path / "log.bag", sent), folder, folder / "bag.db3", *packed):
         source = LogSource(path)
         frames = list(source.frames())
         assert stamps(frames) == [at(i) for i in range(COUNT)]
