@@ -15,7 +15,7 @@ from gcd_model.networks import random_networks
 from gcd_model.weights.card import Card
 from gcd_model.weights.load import load_weights, save_weights
 
-CARD = Card(name="small", config=TINY, family="kubric90", move_time=13, uncertainty_scale=1.75)
+CARD = Card(name="small", config=TINY, family="kubric90", move_time=2, uncertainty_scale=1.75)
 
 
 @pytest.fixture(scope="module")
