@@ -1,6 +1,5 @@
 """The demo: the packaged drive through the model, over ZeroMQ into a second process, and pictures of what arrived."""
 
-import os
 import subprocess
 import sys
 import tempfile
@@ -55,7 +54,7 @@ def demo_config(folder: Path) -> NodeConfig:
     """The demo's launch file, with sockets in a folder of its own so that it never meets a running node."""
     return NodeConfig(
         source=FileSource(path="package:drive.mp4", pace="realtime", hfov_deg=85.0, pose=_MOUNT),
-        model=ModelSection(weights=WEIGHTS, threads=min(4, len(os.sched_getaffinity(0)))),
+        model=ModelSection(weights=WEIGHTS),
         view={VIEW_ID: ViewConfig(kind="fixed")},
         publish=PublishConfig(data=f"ipc://{folder}/data", status=f"ipc://{folder}/status"),
         control=ControlConfig(endpoint=None),

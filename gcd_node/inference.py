@@ -1,26 +1,34 @@
-"""The model thread: takes windows, renders every view of each, hands the messages over. Owns the device."""
+"""One window: what is seen of it, its views drawn and sent, what goes wrong on the way, and what it cost."""
 
 import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
 
-from gcd_model import Cancelled, DeviceMemoryError, NonFiniteError, PoseError, RenderOptions, View
+from gcd_model import (
+    Cancelled,
+    DeviceMemoryError,
+    FrameSynthesizer,
+    NonFiniteError,
+    PoseError,
+    RenderOptions,
+    SeenFrame,
+    SourceFeatures,
+    Trajectory,
+    View,
+)
 from gcd_node.encoded_frames import EncodedFrames, EncodeTerms, window_seed
 from gcd_node.errors import DepthError
-from gcd_node.health import IDLE, Level
+from gcd_node.health import Level
 from gcd_node.messages import Rendered, messages, newest_ns, utc_offset_ns, world_flags
 from gcd_node.model import (
-    FULL,
     FailureCounter,
-    IdleTimer,
     ModelSlot,
     OomLevel,
-    interruptible,
     model_errors,
     oom_levels,
     render_grey,
@@ -28,7 +36,7 @@ from gcd_node.model import (
 from gcd_node.status import Announcer, Condition
 from gcd_node.stream_context import StreamContext, drawing_options, sampler_in_use
 from gcd_node.views import EndOfStream, LiveConfig, Settings, VirtualView, VirtualViews
-from gcd_node.window import FrameWindow, PartialWindow, WindowSlot
+from gcd_node.window import FrameWindow, PartialWindow
 
 _LOG = logging.getLogger(__name__)
 _KEPT = 1000  # a node runs for weeks
@@ -59,17 +67,26 @@ class WindowReport:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class _Job:
-    """One window and everything that was decided for it when it was taken."""
+class Job:
+    """One window and everything that was decided for it when it was taken. paths: of its views. started_ns: when that
+    was, on the monotonic clock."""
 
     window: FrameWindow
     settings: Settings
     context: StreamContext
     views: list[VirtualView]
+    paths: list[Trajectory]
+    started_ns: int
 
 
-class ModelWorker:
-    """Renders windows until there are no more, it is cancelled, or the model has failed."""
+_Failure = NonFiniteError | DeviceMemoryError
+Seen = SourceFeatures | Sequence[SeenFrame] | _Failure
+"""What is known of a window before a view of it is drawn, frame by frame if the model works so; or what that failed
+with."""
+
+
+class Renderer:
+    """Renders windows with a model, in two halves that two threads may share: `take`, then `render`."""
 
     def __init__(
         self,
@@ -77,133 +94,84 @@ class ModelWorker:
         announcer: Announcer,
         model: ModelSlot,
         context_at: Callable[[int], StreamContext],
+        beat: Callable[[], None],
+        cancel: threading.Event,
         on_window: Callable[[WindowReport], None] | None = None,
     ) -> None:
-        """context_at: what is known of the source in an epoch; -1 for now.
+        """context_at: what is known of the source in an epoch; -1 for now. beat: called at every step. cancel: set to
+        abandon.
 
         Raises:
             OptionError, PoseError: see VirtualView.
         """
         self.counts = WorkCounts()
-        self.warm = threading.Event()  # the first window may come
         self._model, self._context_at, self._on_window = model, context_at, on_window
-        self._live, self._sink, self._health = live, announcer.sink, announcer.health
-        config = live.config
-        self._realtime = config.source.pace == "realtime"
+        self._live, self._health, self._beat, self._cancel = live, announcer.health, beat, cancel
         self._out = EndOfStream(live, announcer.sink, lambda: context_at(-1))
         self._views = VirtualViews(model.traits)
         self._views.sync(live.settings(), context_at(-1).mount)
-        self._idle = IdleTimer(config.life.idle_s if self._realtime else 0.0)
         self._failures = FailureCounter(announcer)
-        self._cancel = threading.Event()
-        self._beat_s: float | None = None
-        self._encoded = EncodedFrames(self._beat, self._count_bad_depth, self._tell_odometry)
+        self._encoded = EncodedFrames(beat, self._count_bad_depth, self._tell_odometry)
+        self._seeing = threading.Lock()
+        """Held by whoever encodes, or makes the model forget what it saw or load anew."""
         hold_s = _HOLD_S if model.streams else 0.0
         self._bad_depth, self._bad_odometry, self._lost_motion = (
             Condition(code, announcer, hold_s=hold_s) for code in _INPUT_CODES
         )
-        self._may_encode_ahead = True
         self._epoch = -1
         self._latest: tuple[StreamContext, StreamContext] | None = None
 
     @property
-    def silent_s(self) -> float:
-        """How long the model has been at one step; 0 while it waits for windows."""
-        beat_s = self._beat_s
-        return 0.0 if beat_s is None else time.monotonic() - beat_s
-
-    def cancel(self) -> None:
-        """Abandon the window in work at the next layer of a network; from any thread."""
-        self._cancel.set()
-
-    def work(self, newest: WindowSlot) -> None:
-        """Take windows and publish their views; while there is none, encode what has arrived of the next.
-
-        Raises:
-            ModelFailedError: three windows in a row could not be used, or there is no memory however little is asked.
-            whatever the source failed with, once its last window is done.
-        """
-        try:
-            with interruptible(self._cancel):
-                self._work(newest)
-        except Cancelled:
-            _LOG.info("the window in work was abandoned")
-        finally:
-            self._beat_s = None
-            self.warm.set()
-
-    def announce_end(self, *, delay_ms: int | None) -> None:
-        """Send the end of every view. After `work`. delay_ms: see MessageSink."""
-        self._out.announce_all(self.counts.last_window_id, delay_ms=delay_ms)
-
-    def _work(self, newest: WindowSlot) -> None:
-        if self._realtime:
-            self._warm_up()
-        self._ready()
-        self.warm.set()
-        while (window := newest.take(lambda: self._encode_ahead(newest.filling))) is not None:
-            self._may_encode_ahead = True
-            self._out.announce_removed(self.counts.last_window_id)
-            if not self._is_idle():
-                self._beat()
-                self._health.stage("window", (time.monotonic_ns() - window.arrival_ns) / 1e9)
-                try:
-                    self._render_or_count(self._job(window))
-                except DepthError:  # it is known already: see _count_bad_depth
-                    self._health.count("model")
-            self._ready()
-        self._out.announce_removed(self.counts.last_window_id)
-
-    def _beat(self) -> None:
-        self._beat_s = time.monotonic()
-        self._health.model("degraded" if self._level is not FULL else "busy")
-
-    def _ready(self) -> None:
-        self._beat_s = None
-        self._health.model("degraded" if self._level is not FULL else "ready")
-
-    @property
-    def _level(self) -> OomLevel:
+    def level(self) -> OomLevel:
+        """How much is asked of the device."""
         return self._failures.level
 
-    def _is_idle(self) -> bool:
-        """Whether no subscriber would see this window."""
-        is_idle = self._idle.is_idle(self._sink.stats.watchers)
-        if is_idle:
-            self._health.raise_reason(IDLE, Level.OK)
-        else:
-            self._health.clear_reason(IDLE)
-        return is_idle
-
-    def _warm_up(self) -> None:
-        """Render a grey clip in one step, so that the first window does not pay for what happens only once."""
-        self._health.model("warming")
-        self._beat_s = time.monotonic()
+    def warm_up(self) -> None:
+        """Render a grey clip in one step. Raises NonFiniteError, DeviceMemoryError."""
         settings, mount = self._live.settings(), self._context_at(-1).mount
         paths = [view.planned() for view in self._views.sync(settings, mount)]
-        try:
-            with model_errors():
-                render_grey(self._model.synthesizer, paths, mount, self._options(settings, 0, steps=1))
-        except (NonFiniteError, DeviceMemoryError) as error:
-            _LOG.warning("the warm-up came to nothing: %s", error)  # windows are dealt with one by one
+        render_grey(self._model.synthesizer, paths, mount, self._options(settings, 0, steps=1))
 
-    def _encode_ahead(self, filling: PartialWindow | None) -> bool:
-        """Encode one frame of the window that fills; False if there is nothing to do."""
-        if filling is None or not self._may_encode_ahead or self._idle.is_idle(self._sink.stats.watchers):
-            return False
-        try:
-            with model_errors():
+    def encode_ahead(self, filling: PartialWindow) -> bool:
+        """Encode one frame of the window that fills; False if there is nothing to do. Raises DeviceMemoryError."""
+        with self._seeing, model_errors():
+            try:
                 terms = _terms(self._context(self._live.settings(), filling.epoch))
                 return self._encoded.ahead(self._model.synthesizer, filling, terms)
-        except DeviceMemoryError as error:
-            _LOG.warning("nothing is encoded before the next window is there: %s", error)
-            self._encoded.forget()
-            self._may_encode_ahead = False
-            return False
-        finally:
-            self._ready()
+            except DeviceMemoryError:
+                self._encoded.forget()
+                raise
 
-    # One window.
+    def take(self, window: FrameWindow) -> tuple[Job, Seen] | None:
+        """The first half of a window: what of it is needed for every view. None if its depth is not to be trusted."""
+        with self._seeing:
+            job = self._job(window)
+            try:
+                return job, self._seen(job)
+            except DepthError:  # it is known already: see _count_bad_depth
+                self._health.count("model")
+                return None
+
+    def render(self, job: Job, seen: Seen) -> None:
+        """The second half: its views, drawn and sent; one retry, with another seed or with less asked.
+
+        A window that fails again is counted and not published.
+        Raises:
+            ModelFailedError: three windows in a row could not be used, or there is no memory however little is asked.
+            Cancelled.
+        """
+        try:
+            self._render_or_count(job, seen)
+        except DepthError:
+            self._health.count("model")
+
+    def announce_removed(self) -> None:
+        """Send the end of views that were taken out."""
+        self._out.announce_removed(self.counts.last_window_id)
+
+    def announce_end(self, *, delay_ms: int | None) -> None:
+        """Send the end of every view. delay_ms: see MessageSink."""
+        self._out.announce_all(self.counts.last_window_id, delay_ms=delay_ms)
 
     def _context(self, settings: Settings, epoch: int) -> StreamContext:
         """With what is in force now; the same object while nothing changes, as its digest is costly."""
@@ -215,30 +183,66 @@ class ModelWorker:
         self._latest = base, replace(base, config=config, traits=traits)
         return self._latest[1]
 
-    def _job(self, window: FrameWindow) -> _Job:
+    def _job(self, window: FrameWindow) -> Job:
         """A command that comes from here on is for the next window."""
         settings = self._live.settings()
         context = self._context(settings, window.epoch)
         views = self._views.sync(settings, context.mount)
-        return _Job(window=window, settings=settings, context=context, views=views[:1] if self._level.single else views)
+        views = views[:1] if self.level.single else views
+        paths = [view.trajectory(window.stamps_ns[-1], window.epoch) for view in views]
+        return Job(
+            window=window,
+            settings=settings,
+            context=context,
+            views=views,
+            paths=paths,
+            started_ns=time.monotonic_ns(),
+        )
 
-    def _render_or_count(self, job: _Job) -> None:
-        """One retry, with another seed or with less asked; a window that fails again is counted and not published."""
-        failure: NonFiniteError | DeviceMemoryError | None = None
+    def _seen(self, job: Job) -> Seen:
+        """The first half of a window, or what it failed with; without its traceback, which would keep the model and all
+        its work in memory. Raises DepthError."""
+        try:
+            with model_errors():
+                return self._see(job)
+        except (NonFiniteError, DeviceMemoryError) as error:
+            return error.with_traceback(None)
+
+    def _see(self, job: Job) -> Seen:
+        synthesizer, window, context = self._model.synthesizer, job.window, job.context
+        if window.epoch != self._epoch:
+            self._model.forget_frames()
+            self._epoch = window.epoch
+        started_s = time.monotonic()
+        features = self._encoded.features(synthesizer, window, _terms(context))
+        guessed = self._encoded.guessed
+        if guessed and context.config.model.on_bad_depth == "stop":
+            raise DepthError(f"the depth of {guessed} frames of this window cannot be used; it is not rendered")
+        if not guessed:
+            self._bad_depth.update(None)
+        seen = synthesizer.see(features) if isinstance(synthesizer, FrameSynthesizer) else features
+        self._health.stage("encode", time.monotonic() - started_s)
+        return seen
+
+    def _render_or_count(self, job: Job, seen: Seen) -> None:
+        failure: _Failure | None = None
         window_id = job.window.window_id
         seeds = [window_seed(job.context.digest, window_id, attempt) for attempt in (0, 1)]
         for seed in seeds:
-            failure = self._attempt(job, seed)
+            if failure is not None:
+                with self._seeing:
+                    job, seen = self._anew(job, failure)
+            failure = seen if isinstance(seen, _Failure) else self._attempt(job, seed, seen)
             if failure is None:
                 self._failures.success()
                 return
-            self._encoded.forget()
-            self._model.forget_frames()
+            with self._seeing:
+                self._encoded.forget()
+                self._model.forget_frames()
             if isinstance(failure, NonFiniteError):
                 _LOG.warning("window %d: %s", window_id, failure)
             else:
                 self._give_up_more(job, failure)
-                job = self._job(job.window)
         self._health.count("model")
         if isinstance(failure, NonFiniteError):
             self.counts.nan_windows += 1
@@ -252,15 +256,23 @@ class ModelWorker:
                 }
             )
 
-    def _attempt(self, job: _Job, seed: int) -> NonFiniteError | DeviceMemoryError | None:
-        """What it failed with; without its traceback, which would keep the model and all its work in memory."""
+    def _anew(self, job: Job, failure: _Failure) -> tuple[Job, Seen]:
+        """The job with what may still be asked of the device, and its first half again."""
+        if isinstance(failure, DeviceMemoryError):
+            most = 1 if self.level.single else len(job.views)
+            context = self._context(job.settings, job.window.epoch)
+            job = replace(job, context=context, views=job.views[:most], paths=job.paths[:most])
+        return job, self._seen(job)
+
+    def _attempt(self, job: Job, seed: int, seen: SourceFeatures | Sequence[SeenFrame]) -> _Failure | None:
+        """What it failed with; without its traceback, as in `_seen`."""
         try:
-            self._publish(job, seed)
+            self._publish(job, seed, seen)
         except (NonFiniteError, DeviceMemoryError) as error:
             return error.with_traceback(None)
         return None
 
-    def _give_up_more(self, job: _Job, error: DeviceMemoryError) -> None:
+    def _give_up_more(self, job: Job, error: DeviceMemoryError) -> None:
         levels = oom_levels(
             views=len(job.views),
             samples=job.context.config.model.samples,
@@ -269,16 +281,16 @@ class ModelWorker:
             can_part=not self._model.streams,
         )
         self._failures.out_of_memory(job.window.window_id, error, levels)
-        if self._level.half and self._model.can_halve:
+        if self.level.half and self._model.can_halve:
             self._beat_s = None  # loading takes as long as it takes
             self._health.model("loading")
             self._model.halve()
 
-    def _publish(self, job: _Job, seed: int) -> None:
-        started_ns, level = time.monotonic_ns(), self._level
+    def _publish(self, job: Job, seed: int, seen: SourceFeatures | Sequence[SeenFrame]) -> None:
+        level = self.level
         steps = max(1, self._steps_in_full(job) // level.steps_divisor)
         with model_errors():
-            views = self._draw(job, seed, steps if level.steps_divisor > 1 else job.context.config.model.steps)
+            views = self._draw(job, seed, seen, steps if level.steps_divisor > 1 else job.context.config.model.steps)
         if self._cancel.is_set():  # a model that ignores cancel: nothing may follow the end
             raise Cancelled("the node is stopping")
         ended_ns, offset_ns = time.monotonic_ns(), utc_offset_ns()
@@ -289,7 +301,7 @@ class ModelWorker:
                 view=view,
                 view_id=virtual.view_id,
                 view_rev=virtual.rev,
-                started_ns=started_ns,
+                started_ns=job.started_ns,
                 ended_ns=ended_ns,
                 steps=steps,
                 seed=seed,
@@ -299,36 +311,26 @@ class ModelWorker:
             age_s = (time.monotonic_ns() - newest_ns(job.context, job.window)) / 1e9
             self._health.published(virtual.view_id, age_s)
         self._health.stage("publish", (time.monotonic_ns() - ended_ns) / 1e9)
-        self._count(job, (ended_ns - started_ns) / 1e9)
+        self._count(job, (ended_ns - job.started_ns) / 1e9)
 
-    def _draw(self, job: _Job, seed: int, steps: int | None) -> list[View]:
-        synthesizer, window, context = self._model.synthesizer, job.window, job.context
-        if window.epoch != self._epoch:
-            self._model.forget_frames()
-            self._epoch = window.epoch
-        started_s = time.monotonic()
-        features = self._encoded.features(synthesizer, window, _terms(context))
-        guessed = self._encoded.guessed
-        if guessed and context.config.model.on_bad_depth == "stop":
-            raise DepthError(f"the depth of {guessed} frames of this window cannot be used; it is not rendered")
-        if not guessed:
-            self._bad_depth.update(None)
-        encoded_s = time.monotonic()
-        self._health.stage("encode", encoded_s - started_s)
-        self._beat()
-        paths = [view.trajectory(window.stamps_ns[-1], window.epoch) for view in job.views]
+    def _draw(self, job: Job, seed: int, seen: SourceFeatures | Sequence[SeenFrame], steps: int | None) -> list[View]:
+        synthesizer, started_s = self._model.synthesizer, time.monotonic()
         options = self._options(job.settings, seed, steps=steps)
-        if self._level.one_by_one:
-            views = [synthesizer.render(features, [path], options)[0] for path in paths]
+        self._beat()
+        if not isinstance(seen, SourceFeatures):
+            assert isinstance(synthesizer, FrameSynthesizer), "only such a model has seen frames"
+            views = synthesizer.paint(seen, job.paths, options)
+        elif self.level.one_by_one:
+            views = [synthesizer.render(seen, [path], options)[0] for path in job.paths]
         else:
-            views = synthesizer.render(features, paths, options)
-        self._health.stage("render", time.monotonic() - encoded_s)
+            views = synthesizer.render(seen, job.paths, options)
+        self._health.stage("render", time.monotonic() - started_s)
         self._beat()
         return views
 
     def _options(self, settings: Settings, seed: int, *, steps: int | None) -> RenderOptions:
         model = settings.config.model
-        samples = 1 if self._level.single else model.samples
+        samples = 1 if self.level.single else model.samples
         return replace(
             drawing_options(model),
             steps=steps,
@@ -342,7 +344,7 @@ class ModelWorker:
     def _step_done(self, _done: int, _steps: int) -> None:
         self._beat()
 
-    def _steps_in_full(self, job: _Job) -> int:
+    def _steps_in_full(self, job: Job) -> int:
         return sampler_in_use(job.context.config.model, job.context.traits).steps
 
     # What windows show, and cost.
@@ -365,7 +367,7 @@ class ModelWorker:
         else:
             self._health.clear_reason("world")
 
-    def _count(self, job: _Job, seconds: float) -> None:
+    def _count(self, job: Job, seconds: float) -> None:
         age_ms = (time.monotonic_ns() - newest_ns(job.context, job.window)) / 1e6
         self.counts.windows += 1
         self.counts.last_window_id = job.window.window_id

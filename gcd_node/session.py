@@ -39,8 +39,9 @@ def open_publisher(
 
 
 def model_threads(section: ModelSection) -> int:
-    """CPU threads for the model: as stated, else one less than this process may use, for the rest of the robot."""
-    return section.threads or max(1, len(os.sched_getaffinity(0)) - 1)
+    """CPU threads of a network: as stated, else half of what this process may use. The live model has two networks at
+    work side by side, and the robot has work of its own."""
+    return section.threads or max(1, len(os.sched_getaffinity(0)) // 2)
 
 
 def load_model(section: ModelSection) -> ViewSynthesizer:

@@ -18,6 +18,7 @@ from gcd_model.engines.torch import Engine, TorchEngine
 from gcd_model.errors import DeviceMemoryError, NonFiniteError, OptionError, ShapeError
 from gcd_model.geometry import Trajectory
 from gcd_model.layers import prepare
+from gcd_model.live.view import SeenFrame
 from gcd_model.networks import Networks
 from gcd_model.traits import Traits
 from gcd_model.vae import to_pixels
@@ -65,6 +66,23 @@ class FrameSynthesizer(ViewSynthesizer, Protocol):
 
     def reset(self) -> None:
         """Forget all frames: the next one is the first."""
+        ...
+
+    def see(self, features: SourceFeatures) -> Sequence[SeenFrame]:
+        """Take in what was encoded of a clip: all of `render` that no view is needed for.
+
+        Raises: ShapeError: the features are another model's. DeviceMemoryError.
+        """
+        ...
+
+    def paint(
+        self, seen: Sequence[SeenFrame], trajectories: Sequence[Trajectory], options: RenderOptions | None = None
+    ) -> list[View]:
+        """Views of what was seen; clips in the order in which they were. So `render` is `see`, then `paint`, and one
+        thread may see the next clip while another paints this one.
+
+        Raises: as `render`.
+        """
         ...
 
 

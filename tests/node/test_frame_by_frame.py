@@ -1,12 +1,18 @@
-"""Models that work frame by frame: a view of every frame, and nothing remembered across a break of the source."""
+"""Models that work frame by frame: a view of every frame, nothing remembered across a break of the source, and two
+threads beside a live one."""
 
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
+import pytest
 from fakes import Box, FakeSource, FakeSynthesizer, fake_config, made_node, traits
 from msgspec.structs import replace as struct_replace
 
-from gcd_model import NonFiniteError, RenderOptions
+from gcd_model import NonFiniteError, RenderOptions, SourceFeatures, Trajectory, View
+from gcd_node.config import NodeConfig
+from gcd_node.errors import ModelFailedError
 from gcd_node.frame import Frame
 
 
@@ -22,6 +28,12 @@ class Streaming(FakeSynthesizer):
 
     def reset(self) -> None:
         self.resets.append(len(self.asked))
+
+    def see(self, features: SourceFeatures) -> Any:
+        return (features,)
+
+    def paint(self, seen: Any, trajectories: Sequence[Trajectory], options: RenderOptions | None = None) -> list[View]:
+        return self.render(seen[0], trajectories, options)
 
 
 class Stepping(FakeSource):
@@ -51,3 +63,67 @@ def test_a_frame_that_is_rendered_again_is_the_first_one_then() -> None:
     made_node(fake_config(), model, FakeSource(8), box).run()
     assert [message.header.src.seq for message in box.of("win")] == [(seq,) for seq in range(8)]
     assert model.resets == [0, 5]
+
+
+class SideBySide(Streaming):
+    """Paints frame 3 only while frame 4 is being seen, which is waited for; by which threads, of every call."""
+
+    def __init__(self, act: Callable[[RenderOptions], None] | None = None) -> None:
+        super().__init__(act)
+        self.seeing, self.painting = set[str](), set[str]()
+        self._fourth, self.met = threading.Event(), False
+
+    def see(self, features: SourceFeatures) -> Any:
+        self.seeing.add(threading.current_thread().name)
+        if len(self.clips) == 5:
+            self._fourth.set()
+        return super().see(features)
+
+    def paint(self, seen: Any, trajectories: Sequence[Trajectory], options: RenderOptions | None = None) -> list[View]:
+        self.painting.add(threading.current_thread().name)
+        if len(self.asked) == 4:
+            self.met = self._fourth.wait(10)
+        return super().paint(seen, trajectories, options)
+
+
+def live_config() -> NodeConfig:
+    config = fake_config()
+    return struct_replace(config, source=struct_replace(config.source, pace="realtime"))
+
+
+def slowly(count: int) -> FakeSource:
+    source = FakeSource(count)
+    source.period_s = 0.05
+    return source
+
+
+def test_beside_a_live_source_a_frame_is_seen_while_the_one_before_is_painted() -> None:
+    model, box = SideBySide(), Box()
+    made_node(live_config(), model, slowly(12), box).run()
+    assert model.met
+    assert (model.seeing, model.painting) == ({"model"}, {"painter"})
+    seqs = [message.header.src.seq[0] for message in box.of("win")]
+    assert seqs == sorted(set(seqs))
+    assert seqs[-1] == 11
+    assert not any(thread.name == "painter" for thread in threading.enumerate())
+
+
+def test_what_fails_in_the_painter_is_done_again_or_ends_the_node() -> None:
+    failing = iter([True])
+
+    def once(_: RenderOptions) -> None:
+        if len(model.asked) > 5 and next(failing, False):
+            raise NonFiniteError("for once")
+
+    model, box = Streaming(once), Box()
+    made_node(live_config(), model, slowly(12), box).run()
+    assert box.of("win")[-1].header.src.seq == (11,)
+    assert len(model.resets) == 2
+
+    def broken(_: RenderOptions) -> None:
+        if len(model.asked) > 5:
+            raise ValueError("broken")
+
+    model = Streaming(broken)
+    with pytest.raises(ModelFailedError, match="broken"):
+        made_node(live_config(), model, slowly(1000), Box()).run()

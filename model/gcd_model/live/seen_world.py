@@ -20,7 +20,8 @@ class SeenWorld:
             SurfelMemory(capacity, oldest_frames=oldest_frames or float("inf"), device=device) if capacity else None
         )
         self._fresh, self._static = Surfels.empty(device), Surfels.empty(device)
-        self._now = 0.0
+        self.now = 0.0
+        """Stamp of the newest frame's points."""
 
     def reset(self) -> None:
         """Forget everything: another scene, or a camera that jumped."""
@@ -44,15 +45,19 @@ class SeenWorld:
             picture: [3, H, W] in [-1, 1]. metres: [H, W], 0 for a hole. labels: uint8 [H, W]. static: bool [H, W], what
                 may be remembered. world_from_source: [4, 4].
         """
-        self._now += 1.0
+        self.now += 1.0
         if self._memory is not None:
             self._memory.add(self._static)
             self._memory.forget(metres, lens, world_from_source, metres > 0)
-        self._fresh = unproject(metres, picture, labels, lens, world_from_source, self._now)
+        self._fresh = unproject(metres, picture, labels, lens, world_from_source, self.now)
         if self._memory is not None:
             self._static = self._fresh.rows(static.flatten()[(metres > 0).flatten()])
 
+    @property
+    def points(self) -> Surfels:
+        """All of it: this frame's and the remembered ones."""
+        return self._fresh if self._memory is None else self._fresh.joined(self._memory.surfels)
+
     def splat(self, world_from_target: Tensor, lens: Intrinsics) -> Splat:
         """All of it as a target camera sees it, in one depth test."""
-        every = self._fresh if self._memory is None else self._fresh.joined(self._memory.surfels)
-        return splat(every, world_from_target, lens, self._classes, self._now)
+        return splat(self.points, world_from_target, lens, self._classes, self.now)

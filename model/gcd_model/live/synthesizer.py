@@ -1,8 +1,8 @@
 """The live model behind the door of all models: clips of T frames in, views of T frames out."""
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -18,9 +18,11 @@ from gcd_model.live.view import (
     PAINTED,
     SEEN_NOW,
     Floor,
-    LiveFrame,
     LiveNetworks,
     LiveView,
+    Painter,
+    SeenFrame,
+    ViewFrame,
 )
 from gcd_model.synthesizer import out_of_memory_is_our_error, whole_levels
 from gcd_model.traits import Traits
@@ -32,16 +34,17 @@ _SEED_STEP, _SEEDS = 0x9E3779B97F4A7C15, 1 << 63  # neighbouring seeds of sample
 
 
 class LiveSynthesizer:
-    """A ViewSynthesizer: `encode` keeps what is stated of the frames, `render` takes one `LiveView.step` for each.
+    """A ViewSynthesizer: `encode` keeps what is stated of the frames, `render` sees and paints one after the other.
 
     Where a view stands is seen from the source camera of the same frame, which may move: `source_from_target[t]`. One
     that stands still is the case of all other models.
     """
 
     def __init__(self, networks: LiveNetworks, traits: Traits, *, carries: bool = False) -> None:
-        """carries: every call of `render` goes on where the one before ended, instead of knowing nothing."""
+        """carries: every call goes on where the one before ended, instead of knowing nothing."""
         self._networks, self._traits, self._carries = networks.requires_grad_(False), traits, carries
-        self._carried: list[LiveView] = []
+        self._view = LiveView(networks)
+        self._painters: list[Painter] = []
         self._drawn_with: tuple[int, int] | None = None
 
     @property
@@ -60,7 +63,7 @@ class LiveSynthesizer:
 
     def reset(self) -> None:
         """See FrameSynthesizer."""
-        self._carried = []
+        self._view.reset()
 
     @out_of_memory_is_our_error
     def encode(
@@ -97,49 +100,88 @@ class LiveSynthesizer:
     def render(
         self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
     ) -> list[View]:
-        """See ViewSynthesizer. Nothing is known of frames before the first, unless it is `streaming`; `cancel` is asked
-        between two frames.
+        """See ViewSynthesizer: `see`, then `paint`. Nothing is known of frames before the first, unless `streaming`.
 
-        Several samples differ where several steps draw; one step paints the mean, the same every time. Of the options,
-        solver, guidance, motion number and initial noise are for diffusion models and mean nothing here.
+        Of the options, solver, guidance, motion number and initial noise mean something to diffusion models only.
         """
         options = RenderOptions() if options is None else options
-        window = self._window(features, trajectories)
-        steps = options.steps or self._traits.config.sampling.steps
+        self._require(features.frames, trajectories)
+        return self._painted(self._seen(features), trajectories, options)
+
+    @out_of_memory_is_our_error
+    def see(self, features: SourceFeatures) -> tuple[SeenFrame, ...]:
+        """See FrameSynthesizer."""
+        return tuple(self._seen(features))
+
+    @out_of_memory_is_our_error
+    def paint(
+        self, seen: Sequence[SeenFrame], trajectories: Sequence[Trajectory], options: RenderOptions | None = None
+    ) -> list[View]:
+        """See FrameSynthesizer.
+
+        Several samples differ where several steps draw; one step paints the mean, the same every time.
+        """
+        self._require(len(seen), trajectories)
+        return self._painted(seen, trajectories, RenderOptions() if options is None else options)
+
+    def _require(self, length: int, trajectories: Sequence[Trajectory]) -> None:
+        frames = self._traits.config.frames
+        if not trajectories:
+            raise ShapeError("at least one trajectory is wanted, got none")
+        for each in (length, *(path.frames for path in trajectories)):
+            if each != frames:
+                raise ShapeError(f"{self._traits.name} works on {frames} frames, got {each}")
+
+    def _seen(self, features: SourceFeatures) -> Iterator[SeenFrame]:
+        """Frame by frame, each when it is asked for: what was seen is large."""
+        video, geometry = features.video, features.geometry
+        if video is None or geometry is None:
+            raise ShapeError(
+                f"{self._traits.name} needs points of the source, which these features lack; encode it here"
+            )
+        if not self._carries:
+            self._view.reset()
+        floor, odometry = _floor(features.mount), geometry.odometry
+        for t, frame in enumerate(video):
+            depth = geometry.metres[t] if bool(geometry.stated[t]) else None
+            pose = None if odometry is None else odometry[t]
+            yield self._view.see(frame, lens=geometry.lens, depth=depth, odometry=pose, floor=floor)
+
+    def _painted(
+        self, seen: Iterable[SeenFrame], trajectories: Sequence[Trajectory], options: RenderOptions
+    ) -> list[View]:
+        """`cancel` is asked between two frames."""
+        steps, frames = options.steps or self._traits.config.sampling.steps, self._traits.config.frames
         draws = options.samples if steps > 1 else 1
-        step_done = _Counter(options, draws * features.frames)
-        drawn = [window.drawn(live, step_done) for live in self._live_views(steps, _seeds(options.seed, draws))]
-        drawn += drawn[:1] * (options.samples - draws)
-        views = [self._view(drawn, v, path, options) for v, path in enumerate(trajectories)]
-        if not all(_is_finite(frame) for draw in drawn for frame in draw):
+        if not self._carries or self._drawn_with != (steps, draws):
+            self._painters = [Painter(self._networks, steps=steps, seed=seed) for seed in _seeds(options.seed, draws)]
+            self._drawn_with = (steps, draws)
+        made: list[list[tuple[ViewFrame, ...]]] = []  # by frame, then by draw
+        scores: list[float] = []
+        lost: list[str] = []
+        for t, frame in enumerate(seen):
+            if options.cancel is not None and options.cancel.is_set():
+                raise Cancelled(f"stopped before frame {t} of {frames}, as was asked")
+            poses = [path.source_from_target[t] for path in trajectories]
+            made.append([painter.paint(frame, poses) for painter in self._painters])
+            scores.append(frame.geometry.ood)
+            lost += [] if frame.lost is None else [frame.lost]
+            if options.progress is not None:
+                options.progress(t + 1, frames)
+        views = [self._joined(made, v, path, options) for v, path in enumerate(trajectories)]
+        views = [replace(view, ood=sum(scores) / frames, lost=tuple(lost)) for view in views]
+        if not all(map(_is_finite, views)):
             raise NonFiniteError(
                 f"{self._traits.name} produced NaN or Inf; look at the weights with `gcd-node weights inspect`"
             )
         return views
 
-    def _live_views(self, steps: int, seeds: list[int]) -> list[LiveView]:
-        """One for each draw: new ones, or those of the frame before."""
-        if not self._carries or not self._carried or self._drawn_with != (steps, len(seeds)):
-            self._carried = [LiveView(self._networks, steps=steps, seed=seed) for seed in seeds]
-            self._drawn_with = (steps, len(seeds))
-        return self._carried
-
-    def _window(self, features: SourceFeatures, trajectories: Sequence[Trajectory]) -> "_Window":
-        frames, video, geometry = self._traits.config.frames, features.video, features.geometry
-        if video is None or geometry is None:
-            raise ShapeError(
-                f"{self._traits.name} needs points of the source, which these features lack; encode it here"
-            )
-        if not trajectories:
-            raise ShapeError("at least one trajectory is wanted, got none")
-        for length in (features.frames, *(path.frames for path in trajectories)):
-            if length != frames:
-                raise ShapeError(f"{self._traits.name} works on {frames} frames, got {length}")
-        return _Window(video, geometry, _floor(features.mount), tuple(trajectories))
-
-    def _view(self, drawn: list[list[LiveFrame]], number: int, path: Trajectory, options: RenderOptions) -> View:
+    def _joined(
+        self, made: list[list[tuple[ViewFrame, ...]]], number: int, path: Trajectory, options: RenderOptions
+    ) -> View:
         """One view of all draws; what is no draw, such as depth, is the first one's."""
-        draws = [[frame.views[number] for frame in frames] for frames in drawn]
+        draws = [[views[number] for views in frame] for frame in zip(*made, strict=True)]
+        draws += draws[:1] * (options.samples - len(draws))
         pixels = torch.stack([torch.stack([(each.picture + 1) / 2 for each in frames]) for frames in draws])
         first = draws[0]
         return View(
@@ -152,50 +194,7 @@ class LiveSynthesizer:
             visibility=torch.stack([each.visibility for each in first]).cpu(),
             inverse_depth=torch.stack([each.inverse_depth for each in first]).float().cpu(),
             log_variance=torch.stack([each.log_variance for each in first]).float().cpu(),
-            ood=sum(frame.geometry.ood for frame in drawn[0]) / len(drawn[0]),
-            lost=tuple(frame.lost for frame in drawn[0] if frame.lost is not None),
         )
-
-
-@dataclass(frozen=True, slots=True)
-class _Window:
-    """What one call of `render` was asked for."""
-
-    video: Tensor
-    geometry: SourceGeometry
-    floor: Floor | None
-    trajectories: tuple[Trajectory, ...]
-
-    def drawn(self, live: LiveView, step_done: Callable[[], None]) -> list[LiveFrame]:
-        """All frames of all views. step_done: called before each frame, may raise Cancelled."""
-        frames: list[LiveFrame] = []
-        geometry, odometry = self.geometry, self.geometry.odometry
-        for t, frame in enumerate(self.video):
-            step_done()
-            made = live.step(
-                frame,
-                [path.source_from_target[t] for path in self.trajectories],
-                lens=geometry.lens,
-                odometry=None if odometry is None else odometry[t],
-                floor=self.floor,
-                depth=geometry.metres[t] if bool(geometry.stated[t]) else None,
-            )
-            frames.append(made)
-        return frames
-
-
-class _Counter:
-    """Asks for a cancel and tells the progress, frame by frame."""
-
-    def __init__(self, options: RenderOptions, frames: int) -> None:
-        self._options, self._frames, self._done = options, frames, 0
-
-    def __call__(self) -> None:
-        if self._options.cancel is not None and self._options.cancel.is_set():
-            raise Cancelled(f"stopped before frame {self._done} of {self._frames}, as was asked")
-        self._done += 1
-        if self._options.progress is not None:
-            self._options.progress(self._done, self._frames)
 
 
 def lens_of(clip: Clip) -> Intrinsics:
@@ -240,9 +239,9 @@ def _seeds(seed: int, draws: int) -> list[int]:
     return [(seed + s * _SEED_STEP) % _SEEDS for s in range(draws)]
 
 
-def _is_finite(frame: LiveFrame) -> bool:
-    pictures = [each for view in frame.views for each in (view.picture, view.inverse_depth, view.log_variance)]
-    return math.isfinite(frame.geometry.ood) and all(bool(each.isfinite().all()) for each in pictures)
+def _is_finite(view: View) -> bool:
+    pictures = (view.samples, view.inverse_depth, view.log_variance)
+    return math.isfinite(view.ood or 0.0) and all(bool(each.isfinite().all()) for each in pictures if each is not None)
 
 
 def save_live(

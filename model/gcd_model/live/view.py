@@ -84,6 +84,24 @@ class ViewFrame:
     log_variance: Tensor
 
 
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class SeenFrame:
+    """What is known once a source frame was taken in; views are painted from it and change nothing of it.
+
+    points: this frame's and the remembered ones, in the world. now: stamp of this frame's. lens, floor: of the source.
+    begins: nothing of an earlier frame holds. world_from_source, lost: see `LiveFrame`.
+    """
+
+    geometry: FrameGeometry
+    points: Surfels
+    now: float
+    lens: Intrinsics
+    floor: Floor | None
+    world_from_source: Tensor
+    begins: bool
+    lost: str | None
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class LiveFrame:
     """What became of a source frame. world_from_source: [4, 4], the world begins as a frame's camera.
@@ -100,15 +118,14 @@ class LiveFrame:
 class LiveView:
     """Views of one camera's video, one frame at a time; a window is its frames one by one.
 
-    Not thread-safe. The state is what was seen and what was painted; `reset` drops both, and so does another lens.
+    The state is what was seen and what was painted; `reset` drops both, and so does another lens. `see` has the first,
+    a `Painter` the second: one thread may see the next frame while another paints this one.
     """
 
     def __init__(self, networks: LiveNetworks, *, steps: int | None = None, seed: int = 0) -> None:
-        """steps: of the paint sampler, None as the weights say; one paints the mean, several draw with `seed`."""
-        self._networks, self._config, self._seed = networks.eval(), networks.config, seed
-        self._steps = networks.config.steps if steps is None else steps
-        if self._steps < 1:
-            raise OptionError(f"the paint sampler takes at least one step, got {steps}")
+        """steps, seed: see `Painter`."""
+        self._networks, self._config = networks.eval(), networks.config
+        self._painter = Painter(networks, steps=steps, seed=seed)
         self._device = next(networks.parameters()).device
         config = networks.config
         self._world = SeenWorld(
@@ -118,16 +135,15 @@ class LiveView:
             device=self._device,
         )
         self._ego, self._references = EgoMotion(), References()
-        self._painted: list[Surfels] = []
         self._lens: Intrinsics | None = None
-        self._movable = movable_classes(config).to(self._device)
+        self._begins = True
 
     def reset(self) -> None:
         """Forget all that was seen and painted."""
         self._world.reset()
         self._ego.reset()
         self._references.reset()
-        self._painted = []
+        self._begins = True
 
     @torch.inference_mode()
     def look(
@@ -156,7 +172,6 @@ class LiveView:
         spread = reading.spread[0] if depth is None else None
         return FrameGeometry(metres=metres, labels=labels, static=static, ood=ood, spread=spread)
 
-    @torch.inference_mode()
     def step(
         self,
         frame: Tensor,
@@ -169,19 +184,33 @@ class LiveView:
         geometry: FrameGeometry | None = None,
         target_lens: Intrinsics | None = None,
     ) -> LiveFrame:
-        """One frame of every view.
+        """One frame of every view: `see`, then `Painter.paint`."""
+        seen = self.see(frame, lens=lens, depth=depth, odometry=odometry, floor=floor, geometry=geometry)
+        views = self._painter.paint(seen, poses, target_lens)
+        return LiveFrame(views=views, geometry=seen.geometry, world_from_source=seen.world_from_source, lost=seen.lost)
+
+    @torch.inference_mode()
+    def see(
+        self,
+        frame: Tensor,
+        *,
+        lens: Intrinsics,
+        depth: Tensor | None = None,
+        odometry: Tensor | None = None,
+        floor: Floor | None = None,
+        geometry: FrameGeometry | None = None,
+    ) -> SeenFrame:
+        """Take in one frame: its depth, its motion, and what is still known of those before.
 
         Args:
             frame: float32 [3, H, W], RGB in [-1, 1]; H and W multiples of 32.
-            poses: source_from_target [4, 4] of each view, metres.
             lens: of the source; 40 to 120 degrees across were trained.
             depth: [H, W] metres, 0 or not finite where unknown, instead of the depth network's.
             odometry: world_from_source [4, 4] of any world that stays the same from frame to frame; None: from the
                 pictures.
             floor: where the declared mount has the ground. geometry: what the frame shows, if that is known.
-            target_lens: of the views; None: the source's.
         Raises:
-            ShapeError: frame, depth and lens differ in size, or the size is no multiple of 32. PoseError.
+            ShapeError: frame, depth and lens differ in size, or the size is no multiple of 32.
         """
         picture = self._checked(frame, lens)
         if lens != self._lens:  # another camera, or another size of its pictures
@@ -191,19 +220,23 @@ class LiveView:
         if motion.lost:
             self._world.reset()
             self._references.reset()
-            self._painted = []
         pose = motion.world_from_camera
         if geometry is None:
             geometry = self.look(frame, lens, depth=depth, floor=floor, reference=self._references.chosen(pose))
         self._ego.settle(geometry.metres, geometry.static, geometry.spread)
         self._references.add(picture, pose, geometry.metres)
         self._world.look(picture, geometry.metres, geometry.labels, geometry.static, lens, pose)
-        out_lens = lens if target_lens is None else target_lens
-        self._painted = self._painted[: len(poses)]
-        targets = [pose @ require_rigid(each, "a target pose") for each in poses]
-        seen = [self._seen(i, target, out_lens, pose, floor) for i, target in enumerate(targets)]
-        views = tuple(self._view(i, each, targets[i], out_lens) for i, each in enumerate(seen))
-        return LiveFrame(views=views, geometry=geometry, world_from_source=pose, lost=motion.reason)
+        begins, self._begins = self._begins or motion.lost, False
+        return SeenFrame(
+            geometry=geometry,
+            points=self._world.points,
+            now=self._world.now,
+            lens=lens,
+            floor=floor,
+            world_from_source=pose,
+            begins=begins,
+            lost=motion.reason,
+        )
 
     def _checked(self, frame: Tensor, lens: Intrinsics) -> Tensor:
         if frame.shape != (3, lens.height, lens.width) or lens.height % SIZE_FACTOR or lens.width % SIZE_FACTOR:
@@ -213,17 +246,50 @@ class LiveView:
             )
         return frame.to(self._device, torch.float32)
 
-    def _seen(self, index: int, target: Tensor, lens: Intrinsics, source: Tensor, floor: Floor | None) -> Seen:
+
+class Painter:
+    """Paints views of seen frames, one frame after the other; the state is what was painted."""
+
+    def __init__(self, networks: LiveNetworks, *, steps: int | None = None, seed: int = 0) -> None:
+        """steps: of the paint sampler, None as the weights say; one paints the mean, several draw with `seed`."""
+        self._networks, self._config, self._seed = networks.eval(), networks.config, seed
+        self._steps = networks.config.steps if steps is None else steps
+        if self._steps < 1:
+            raise OptionError(f"the paint sampler takes at least one step, got {steps}")
+        self._device = next(networks.parameters()).device
+        self._movable = movable_classes(networks.config).to(self._device)
+        self._painted: list[Surfels] = []
+
+    @torch.inference_mode()
+    def paint(
+        self, frame: SeenFrame, poses: Sequence[Tensor], target_lens: Intrinsics | None = None
+    ) -> tuple[ViewFrame, ...]:
+        """One frame of every view.
+
+        Args:
+            poses: source_from_target [4, 4] of each view, metres. target_lens: of the views; None: the source's.
+        Raises:
+            PoseError.
+        """
+        lens = frame.lens if target_lens is None else target_lens
+        self._painted = [] if frame.begins else self._painted[: len(poses)]
+        targets = [frame.world_from_source @ require_rigid(each, "a target pose") for each in poses]
+        seen = [self._seen(i, target, lens, frame) for i, target in enumerate(targets)]
+        return tuple(self._view(i, each, targets[i], lens) for i, each in enumerate(seen))
+
+    def _seen(self, index: int, target: Tensor, lens: Intrinsics, frame: SeenFrame) -> Seen:
         """What is known of a view: its splat, what was painted a frame ago, its rays and its floor."""
+        source, classes = frame.world_from_source, len(self._config.classes)
         carried: Splat | None = None
         if index < len(self._painted) and len(self._painted[index]):
-            carried = splat(self._painted[index], target, lens, len(self._config.classes), 0.0)
+            carried = splat(self._painted[index], target, lens, classes, 0.0)
         ground = torch.zeros(lens.height, lens.width)
-        if floor is not None:
-            ground = _floor_of(floor, invert_rigid(target) @ source, lens)
+        if frame.floor is not None:
+            ground = _floor_of(frame.floor, invert_rigid(target) @ source, lens)
         rays = pixel_rays(lens, self._device)
         camera = camera_features((invert_rigid(source) @ target)[None])[0]
-        return seen_of(self._world.splat(target, lens), carried, rays, ground.to(self._device), camera.to(self._device))
+        shown = splat(frame.points, target, lens, classes, frame.now)
+        return seen_of(shown, carried, rays, ground.to(self._device), camera.to(self._device))
 
     def _view(self, index: int, seen: Seen, target: Tensor, lens: Intrinsics) -> ViewFrame:
         """Paint, read off, and remember what was painted."""

@@ -1,0 +1,189 @@
+"""The model's threads: they take windows, and have every view of each rendered and sent. They own the device.
+
+A model that works frame by frame has a second thread beside a live source: the first sees frame t + 1, its depth and
+motion, while the second paints and sends the views of frame t.
+"""
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from functools import partial
+
+from gcd_model import Cancelled, DeviceMemoryError, NonFiniteError
+from gcd_node.health import IDLE, Level
+from gcd_node.inference import Job, Renderer, Seen, WindowReport, WorkCounts
+from gcd_node.model import FULL, IdleTimer, ModelSlot, interruptible, model_errors
+from gcd_node.status import Announcer
+from gcd_node.stream_context import StreamContext
+from gcd_node.views import LiveConfig
+from gcd_node.window import PartialWindow, WindowSlot
+
+_LOG = logging.getLogger(__name__)
+
+
+class ModelWorker:
+    """Renders windows until there are no more, it is cancelled, or the model has failed."""
+
+    def __init__(
+        self,
+        live: LiveConfig,
+        announcer: Announcer,
+        model: ModelSlot,
+        context_at: Callable[[int], StreamContext],
+        on_window: Callable[[WindowReport], None] | None = None,
+    ) -> None:
+        """context_at: what is known of the source in an epoch; -1 for now.
+
+        Raises:
+            OptionError, PoseError: see VirtualView.
+        """
+        self.warm = threading.Event()  # the first window may come
+        self._model, self._context_at = model, context_at
+        self._sink, self._health = announcer.sink, announcer.health
+        self._realtime = live.config.source.pace == "realtime"
+        self._idle = IdleTimer(live.config.life.idle_s if self._realtime else 0.0)
+        self._cancel = threading.Event()
+        self._beats_s: dict[int, float] = {}  # by thread, while it works
+        self._renderer = Renderer(live, announcer, model, context_at, self._beat, self._cancel, on_window)
+        self._may_encode_ahead = True
+
+    @property
+    def counts(self) -> WorkCounts:
+        """What was done so far."""
+        return self._renderer.counts
+
+    @property
+    def silent_s(self) -> float:
+        """How long the model has been at one step; 0 while it waits for windows."""
+        return max((time.monotonic() - beat_s for beat_s in list(self._beats_s.values())), default=0.0)
+
+    def cancel(self) -> None:
+        """Abandon the window in work at the next layer of a network; from any thread."""
+        self._cancel.set()
+
+    def work(self, newest: WindowSlot) -> None:
+        """Take windows and publish their views; while there is none, encode what has arrived of the next.
+
+        Raises:
+            ModelFailedError: three windows in a row could not be used, or there is no memory however little is asked.
+            whatever the source failed with, once its last window is done.
+        """
+        try:
+            with interruptible(self._cancel):
+                self._work(newest)
+        except Cancelled:
+            _LOG.info("the window in work was abandoned")
+        finally:
+            self._beats_s.clear()
+            self.warm.set()
+
+    def announce_end(self, *, delay_ms: int | None) -> None:
+        """Send the end of every view. After `work`. delay_ms: see MessageSink."""
+        self._renderer.announce_end(delay_ms=delay_ms)
+
+    def _work(self, newest: WindowSlot) -> None:
+        if self._realtime:
+            self._warm_up()
+        self._ready()
+        self.warm.set()
+        with self._second_half(newest) as finish:
+            while (window := newest.take(lambda: self._encode_ahead(newest.filling))) is not None:
+                self._may_encode_ahead = True
+                taken: tuple[Job, Seen] | None = None
+                if not self._is_idle():
+                    self._beat()
+                    self._health.stage("window", (time.monotonic_ns() - window.arrival_ns) / 1e9)
+                    taken = self._renderer.take(window)
+                self._ready()
+                finish(partial(self._finish, taken))
+        self._renderer.announce_removed()
+
+    def _finish(self, taken: tuple[Job, Seen] | None) -> None:
+        """The views of a window. taken: None if it is not to be rendered."""
+        self._renderer.announce_removed()
+        if taken is not None:
+            self._beat()
+            self._renderer.render(*taken)
+        self._ready()
+
+    @contextmanager
+    def _second_half(self, newest: WindowSlot) -> Generator[Callable[[Callable[[], None]], None]]:
+        """How to have the second half of a window done: at once, or in a thread that ends with the block.
+
+        Then the call returns when the work is begun, which is when that before it is done: the window taken next is the
+        newest. An error there closes `newest`, and is raised at the end of the block.
+        """
+        if not (self._realtime and self._model.streams):
+            yield lambda work: work()
+            return
+        waiting: queue.Queue[Callable[[], None] | None] = queue.Queue()
+        failures: list[Exception] = []
+
+        def paint() -> None:
+            while (work := waiting.get()) is not None:
+                waiting.task_done()
+                try:
+                    if not failures:
+                        with interruptible(self._cancel):
+                            work()
+                except Exception as error:  # the end of a thread: the block raises it
+                    failures.append(error)
+                    newest.close()
+
+        def hand_over(work: Callable[[], None]) -> None:
+            waiting.put(work)
+            waiting.join()
+
+        painter = threading.Thread(target=paint, name="painter", daemon=True)
+        painter.start()
+        try:
+            yield hand_over
+        finally:
+            waiting.put(None)
+            painter.join()
+            if failures:
+                raise failures[0]
+
+    def _beat(self) -> None:
+        self._beats_s[threading.get_ident()] = time.monotonic()
+        self._health.model("busy" if self._renderer.level is FULL else "degraded")
+
+    def _ready(self) -> None:
+        self._beats_s.pop(threading.get_ident(), None)
+        if not self._beats_s:
+            self._health.model("ready" if self._renderer.level is FULL else "degraded")
+
+    def _is_idle(self) -> bool:
+        """Whether no subscriber would see this window."""
+        is_idle = self._idle.is_idle(self._sink.stats.watchers)
+        if is_idle:
+            self._health.raise_reason(IDLE, Level.OK)
+        else:
+            self._health.clear_reason(IDLE)
+        return is_idle
+
+    def _warm_up(self) -> None:
+        """Render a grey clip in one step, so that the first window does not pay for what happens only once."""
+        self._beat()
+        self._health.model("warming")
+        try:
+            with model_errors():
+                self._renderer.warm_up()
+        except (NonFiniteError, DeviceMemoryError) as error:
+            _LOG.warning("the warm-up came to nothing: %s", error)  # windows are dealt with one by one
+
+    def _encode_ahead(self, filling: PartialWindow | None) -> bool:
+        """Encode one frame of the window that fills; False if there is nothing to do."""
+        if filling is None or not self._may_encode_ahead or self._idle.is_idle(self._sink.stats.watchers):
+            return False
+        try:
+            return self._renderer.encode_ahead(filling)
+        except DeviceMemoryError as error:
+            _LOG.warning("nothing is encoded before the next window is there: %s", error)
+            self._may_encode_ahead = False
+            return False
+        finally:
+            self._ready()
