@@ -6,6 +6,8 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TypeVar
 
 import torch
 
@@ -14,6 +16,7 @@ from gcd_model import (
     DeviceMemoryError,
     FrameSynthesizer,
     NonFiniteError,
+    PlacedFrame,
     PoseError,
     RenderOptions,
     SeenFrame,
@@ -37,6 +40,8 @@ from gcd_node.status import Announcer, Condition
 from gcd_node.stream_context import StreamContext, drawing_options, sampler_in_use
 from gcd_node.views import EndOfStream, LiveConfig, Settings, VirtualView, VirtualViews
 from gcd_node.window import FrameWindow, PartialWindow
+
+Made = TypeVar("Made")
 
 _LOG = logging.getLogger(__name__)
 _KEPT = 1000  # a node runs for weeks
@@ -81,12 +86,14 @@ class Job:
 
 _Failure = NonFiniteError | DeviceMemoryError
 Seen = SourceFeatures | Sequence[SeenFrame] | _Failure
-"""What is known of a window before a view of it is drawn, frame by frame if the model works so; or what that failed
-with."""
+"""What is known of a window, frame by frame if the model works so; or what that failed with."""
+_Known = SourceFeatures | Sequence[PlacedFrame]
+Placed = _Known | _Failure
+"""The same, and of its views."""
 
 
 class Renderer:
-    """Renders windows with a model, in two halves that two threads may share: `take`, then `render`."""
+    """Renders windows with a model in three steps: `take`, `place`, `render`. Each may have a thread of its own."""
 
     def __init__(
         self,
@@ -112,8 +119,8 @@ class Renderer:
         self._views.sync(live.settings(), context_at(-1).mount)
         self._failures = FailureCounter(announcer)
         self._encoded = EncodedFrames(beat, self._count_bad_depth, self._tell_odometry)
-        self._seeing = threading.Lock()
-        """Held by whoever encodes, or makes the model forget what it saw or load anew."""
+        self._seeing, self._placing = threading.Lock(), threading.Lock()
+        """Held by whoever encodes or makes the model forget, and by whoever places. One at a time, never both."""
         hold_s = _HOLD_S if model.streams else 0.0
         self._bad_depth, self._bad_odometry, self._lost_motion = (
             Condition(code, announcer, hold_s=hold_s) for code in _INPUT_CODES
@@ -143,7 +150,7 @@ class Renderer:
                 raise
 
     def take(self, window: FrameWindow) -> tuple[Job, Seen] | None:
-        """The first half of a window: what of it is needed for every view. None if its depth is not to be trusted."""
+        """What of a window is needed for every view. None if its depth is not to be trusted."""
         with self._seeing:
             job = self._job(window)
             try:
@@ -152,18 +159,26 @@ class Renderer:
                 self._health.count("model")
                 return None
 
-    def render(self, job: Job, seen: Seen) -> None:
-        """The second half: its views, drawn and sent; one retry, with another seed or with less asked.
+    def place(self, job: Job, seen: Seen) -> Placed:
+        """What is known of each view before anything is painted: the model's memory goes on by a window."""
+        if isinstance(seen, SourceFeatures | _Failure):
+            return seen
+        with self._placing, model_errors():
+            return _tried(lambda: self._frames.place(seen, job.paths))
 
-        A window that fails again is counted and not published.
-        Raises:
-            ModelFailedError: three windows in a row could not be used, or there is no memory however little is asked.
-            Cancelled.
-        """
+    def render(self, job: Job, placed: Placed) -> None:
+        """Its views, drawn and sent; one retry, with another seed or with less asked; else counted, and not published.
+        Raises ModelFailedError: the third in a row, or there is no memory; Cancelled."""
         try:
-            self._render_or_count(job, seen)
+            self._render_or_count(job, placed)
         except DepthError:
             self._health.count("model")
+
+    @property
+    def _frames(self) -> FrameSynthesizer:
+        synthesizer = self._model.synthesizer
+        assert isinstance(synthesizer, FrameSynthesizer), "only such a model sees frames"
+        return synthesizer
 
     def announce_removed(self) -> None:
         """Send the end of views that were taken out."""
@@ -200,15 +215,11 @@ class Renderer:
         )
 
     def _seen(self, job: Job) -> Seen:
-        """The first half of a window, or what it failed with; without its traceback, which would keep the model and all
-        its work in memory. Raises DepthError."""
-        try:
-            with model_errors():
-                return self._see(job)
-        except (NonFiniteError, DeviceMemoryError) as error:
-            return error.with_traceback(None)
+        """Or what it failed with. Raises DepthError."""
+        with model_errors():
+            return _tried(lambda: self._see(job))
 
-    def _see(self, job: Job) -> Seen:
+    def _see(self, job: Job) -> SourceFeatures | Sequence[SeenFrame]:
         synthesizer, window, context = self._model.synthesizer, job.window, job.context
         if window.epoch != self._epoch:
             self._model.forget_frames()
@@ -224,15 +235,14 @@ class Renderer:
         self._health.stage("encode", time.monotonic() - started_s)
         return seen
 
-    def _render_or_count(self, job: Job, seen: Seen) -> None:
+    def _render_or_count(self, job: Job, placed: Placed) -> None:
         failure: _Failure | None = None
         window_id = job.window.window_id
         seeds = [window_seed(job.context.digest, window_id, attempt) for attempt in (0, 1)]
         for seed in seeds:
             if failure is not None:
-                with self._seeing:
-                    job, seen = self._anew(job, failure)
-            failure = seen if isinstance(seen, _Failure) else self._attempt(job, seed, seen)
+                job, placed = self._anew(job, failure)
+            failure = _tried(partial(self._publish, job, seed, placed))
             if failure is None:
                 self._failures.success()
                 return
@@ -256,27 +266,21 @@ class Renderer:
                 }
             )
 
-    def _anew(self, job: Job, failure: _Failure) -> tuple[Job, Seen]:
-        """The job with what may still be asked of the device, and its first half again."""
-        if isinstance(failure, DeviceMemoryError):
-            most = 1 if self.level.single else len(job.views)
-            context = self._context(job.settings, job.window.epoch)
-            job = replace(job, context=context, views=job.views[:most], paths=job.paths[:most])
-        return job, self._seen(job)
-
-    def _attempt(self, job: Job, seed: int, seen: SourceFeatures | Sequence[SeenFrame]) -> _Failure | None:
-        """What it failed with; without its traceback, as in `_seen`."""
-        try:
-            self._publish(job, seed, seen)
-        except (NonFiniteError, DeviceMemoryError) as error:
-            return error.with_traceback(None)
-        return None
+    def _anew(self, job: Job, failure: _Failure) -> tuple[Job, Placed]:
+        """The job with what may still be asked of the device, and its first steps again."""
+        with self._seeing:
+            if isinstance(failure, DeviceMemoryError):
+                most = 1 if self.level.single else len(job.views)
+                context = self._context(job.settings, job.window.epoch)
+                job = replace(job, context=context, views=job.views[:most], paths=job.paths[:most])
+            seen = self._seen(job)
+        return job, self.place(job, seen)
 
     def _give_up_more(self, job: Job, error: DeviceMemoryError) -> None:
         levels = oom_levels(
             views=len(job.views),
             samples=job.context.config.model.samples,
-            steps=self._steps_in_full(job),
+            steps=sampler_in_use(job.context.config.model, job.context.traits).steps,
             can_halve=self._model.can_halve,
             can_part=not self._model.streams,
         )
@@ -286,11 +290,13 @@ class Renderer:
             self._health.model("loading")
             self._model.halve()
 
-    def _publish(self, job: Job, seed: int, seen: SourceFeatures | Sequence[SeenFrame]) -> None:
+    def _publish(self, job: Job, seed: int, placed: Placed) -> None:
+        if isinstance(placed, _Failure):
+            raise placed
         level = self.level
-        steps = max(1, self._steps_in_full(job) // level.steps_divisor)
+        steps = max(1, sampler_in_use(job.context.config.model, job.context.traits).steps // level.steps_divisor)
         with model_errors():
-            views = self._draw(job, seed, seen, steps if level.steps_divisor > 1 else job.context.config.model.steps)
+            views = self._draw(job, seed, placed, steps if level.steps_divisor > 1 else job.context.config.model.steps)
         if self._cancel.is_set():  # a model that ignores cancel: nothing may follow the end
             raise Cancelled("the node is stopping")
         ended_ns, offset_ns = time.monotonic_ns(), utc_offset_ns()
@@ -313,17 +319,16 @@ class Renderer:
         self._health.stage("publish", (time.monotonic_ns() - ended_ns) / 1e9)
         self._count(job, (ended_ns - job.started_ns) / 1e9)
 
-    def _draw(self, job: Job, seed: int, seen: SourceFeatures | Sequence[SeenFrame], steps: int | None) -> list[View]:
-        synthesizer, started_s = self._model.synthesizer, time.monotonic()
+    def _draw(self, job: Job, seed: int, placed: _Known, steps: int | None) -> list[View]:
+        started_s = time.monotonic()
         options = self._options(job.settings, seed, steps=steps)
         self._beat()
-        if not isinstance(seen, SourceFeatures):
-            assert isinstance(synthesizer, FrameSynthesizer), "only such a model has seen frames"
-            views = synthesizer.paint(seen, job.paths, options)
+        if not isinstance(placed, SourceFeatures):
+            views = self._frames.paint(placed, job.paths, options)
         elif self.level.one_by_one:
-            views = [synthesizer.render(seen, [path], options)[0] for path in job.paths]
+            views = [self._model.synthesizer.render(placed, [path], options)[0] for path in job.paths]
         else:
-            views = synthesizer.render(seen, job.paths, options)
+            views = self._model.synthesizer.render(placed, job.paths, options)
         self._health.stage("render", time.monotonic() - started_s)
         self._beat()
         return views
@@ -343,9 +348,6 @@ class Renderer:
 
     def _step_done(self, _done: int, _steps: int) -> None:
         self._beat()
-
-    def _steps_in_full(self, job: Job) -> int:
-        return sampler_in_use(job.context.config.model, job.context.traits).steps
 
     # What windows show, and cost.
 
@@ -377,6 +379,14 @@ class Renderer:
             self._health.measure("gpu_mem_mb", torch.cuda.memory_allocated() / 1e6)
         if self._on_window is not None:
             self._on_window(WindowReport(window=job.window, render_s=seconds, age_ms=age_ms))
+
+
+def _tried(step: Callable[[], Made]) -> Made | _Failure:
+    """What a step came to, or failed with: without its traceback, which keeps the model's work in memory."""
+    try:
+        return step()
+    except (NonFiniteError, DeviceMemoryError) as error:
+        return error.with_traceback(None)
 
 
 def _terms(context: StreamContext) -> EncodeTerms:

@@ -1,7 +1,7 @@
 """The model's threads: they take windows, and have every view of each rendered and sent. They own the device.
 
-A model that works frame by frame has a second thread beside a live source: the first sees frame t + 1, its depth and
-motion, while the second paints and sends the views of frame t.
+A model that works frame by frame has three of them beside a live source, at work on consecutive frames: one sees depth
+and motion, one places what was seen in the views, one paints the views and sends them.
 """
 
 import logging
@@ -10,16 +10,18 @@ import threading
 import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from functools import partial
+from typing import TypeVar
 
 from gcd_model import Cancelled, DeviceMemoryError, NonFiniteError
 from gcd_node.health import IDLE, Level
-from gcd_node.inference import Job, Renderer, Seen, WindowReport, WorkCounts
+from gcd_node.inference import Job, Placed, Renderer, Seen, WindowReport, WorkCounts
 from gcd_node.model import FULL, IdleTimer, ModelSlot, interruptible, model_errors
 from gcd_node.status import Announcer
 from gcd_node.stream_context import StreamContext
 from gcd_node.views import LiveConfig
 from gcd_node.window import PartialWindow, WindowSlot
+
+Given = TypeVar("Given")
 
 _LOG = logging.getLogger(__name__)
 
@@ -89,63 +91,87 @@ class ModelWorker:
             self._warm_up()
         self._ready()
         self.warm.set()
-        with self._second_half(newest) as finish:
+        with self._steps(newest) as go_on:
             while (window := newest.take(lambda: self._encode_ahead(newest.filling))) is not None:
                 self._may_encode_ahead = True
-                taken: tuple[Job, Seen] | None = None
+                taken = None
                 if not self._is_idle():
                     self._beat()
                     self._health.stage("window", (time.monotonic_ns() - window.arrival_ns) / 1e9)
                     taken = self._renderer.take(window)
                 self._ready()
-                finish(partial(self._finish, taken))
+                go_on(taken)
         self._renderer.announce_removed()
-
-    def _finish(self, taken: tuple[Job, Seen] | None) -> None:
-        """The views of a window. taken: None if it is not to be rendered."""
-        self._renderer.announce_removed()
-        if taken is not None:
-            self._beat()
-            self._renderer.render(*taken)
-        self._ready()
 
     @contextmanager
-    def _second_half(self, newest: WindowSlot) -> Generator[Callable[[Callable[[], None]], None]]:
-        """How to have the second half of a window done: at once, or in a thread that ends with the block.
-
-        Then the call returns when the work is begun, which is when that before it is done: the window taken next is the
-        newest. An error there closes `newest`, and is raised at the end of the block.
-        """
+    def _steps(self, newest: WindowSlot) -> Generator[Callable[[tuple[Job, Seen] | None], None]]:
+        """What is to be done with a window that was taken, here or in threads that end with the block."""
         if not (self._realtime and self._model.streams):
-            yield lambda work: work()
+            yield lambda taken: self._render(self._place(taken))
             return
-        waiting: queue.Queue[Callable[[], None] | None] = queue.Queue()
+
+        def place_and_paint(taken: tuple[Job, Seen] | None) -> None:
+            paint(self._place(taken))
+
+        with (
+            self._thread("painter", newest, self._render) as paint,
+            self._thread("placer", newest, place_and_paint) as place,
+        ):
+            yield place
+
+    @contextmanager
+    def _thread(
+        self, name: str, newest: WindowSlot, step: Callable[[Given], None]
+    ) -> Generator[Callable[[Given], None]]:
+        """A step in a thread of its own. What is handed over is begun once the step before is done, and the call waits
+        until it is begun: so the window taken next is the newest.
+
+        An error closes `newest`, and is raised at the end of the block.
+        """
+        waiting: queue.Queue[tuple[Given] | None] = queue.Queue()
         failures: list[Exception] = []
 
-        def paint() -> None:
-            while (work := waiting.get()) is not None:
+        def work() -> None:
+            while (given := waiting.get()) is not None:
                 waiting.task_done()
                 try:
                     if not failures:
                         with interruptible(self._cancel):
-                            work()
+                            step(*given)
                 except Exception as error:  # the end of a thread: the block raises it
                     failures.append(error)
                     newest.close()
+                finally:
+                    self._ready()
 
-        def hand_over(work: Callable[[], None]) -> None:
-            waiting.put(work)
+        def hand_over(given: Given) -> None:
+            waiting.put((given,))
             waiting.join()
 
-        painter = threading.Thread(target=paint, name="painter", daemon=True)
-        painter.start()
+        thread = threading.Thread(target=work, name=name, daemon=True)
+        thread.start()
         try:
             yield hand_over
         finally:
             waiting.put(None)
-            painter.join()
+            thread.join()
             if failures:
                 raise failures[0]
+
+    def _place(self, taken: tuple[Job, Seen] | None) -> tuple[Job, Placed] | None:
+        if taken is None:
+            return None
+        self._beat()
+        job, seen = taken
+        return job, self._renderer.place(job, seen)
+
+    def _render(self, placed: tuple[Job, Placed] | None) -> None:
+        """The views of a window. placed: None if it is not to be rendered."""
+        self._renderer.announce_removed()
+        if placed is not None:
+            self._beat()
+            self._renderer.render(*placed)
+        self._ready()
 
     def _beat(self) -> None:
         self._beats_s[threading.get_ident()] = time.monotonic()

@@ -39,8 +39,9 @@ from gcd_model.geometry import (
     pose_trajectory,
 )
 from gcd_model.live.ego_motion import require_motion
+from gcd_model.live.eyes import SeenFrame
+from gcd_model.live.seen_world import PlacedFrame
 from gcd_model.live.synthesizer import visibility_of
-from gcd_model.live.view import SeenFrame
 from gcd_model.loading import EngineName, default_precision, export_weights, load_synthesizer, weights_path
 from gcd_model.small_files import decode_toml, explain_settings_error, printable, read_json, read_small
 from gcd_model.synthesizer import FrameSynthesizer, Synthesizer, ViewSynthesizer, synthesize
@@ -71,6 +72,7 @@ __all__ = [
     "NonFiniteError",
     "OptionError",
     "Orbit",
+    "PlacedFrame",
     "PoseError",
     "Quality",
     "RenderOptions",

@@ -13,7 +13,7 @@ from gcd_model.config import ModelConfig
 from gcd_model.errors import CheckpointError
 from gcd_model.image_encoder import ImageEncoder
 from gcd_model.live.config import LiveConfig
-from gcd_model.live.view import LiveNetworks
+from gcd_model.live.networks import LiveNetworks
 from gcd_model.unet import VideoUNet
 from gcd_model.vae import Encoder, TemporalDecoder
 from gcd_model.weights.card import NO_DIFFUSION, Card, Layout

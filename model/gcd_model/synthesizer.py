@@ -18,7 +18,8 @@ from gcd_model.engines.torch import Engine, TorchEngine
 from gcd_model.errors import DeviceMemoryError, NonFiniteError, OptionError, ShapeError
 from gcd_model.geometry import Trajectory
 from gcd_model.layers import prepare
-from gcd_model.live.view import SeenFrame
+from gcd_model.live.eyes import SeenFrame
+from gcd_model.live.seen_world import PlacedFrame
 from gcd_model.networks import Networks
 from gcd_model.traits import Traits
 from gcd_model.vae import to_pixels
@@ -69,20 +70,21 @@ class FrameSynthesizer(ViewSynthesizer, Protocol):
         ...
 
     def see(self, features: SourceFeatures) -> Sequence[SeenFrame]:
-        """Take in what was encoded of a clip: all of `render` that no view is needed for.
+        """What was encoded of a clip is looked at: the first third of `render`.
 
+        The thirds keep their own state, so three threads may be at work on consecutive clips, each in their order.
         Raises: ShapeError: the features are another model's. DeviceMemoryError.
         """
         ...
 
-    def paint(
-        self, seen: Sequence[SeenFrame], trajectories: Sequence[Trajectory], options: RenderOptions | None = None
-    ) -> list[View]:
-        """Views of what was seen; clips in the order in which they were. So `render` is `see`, then `paint`, and one
-        thread may see the next clip while another paints this one.
+    def place(self, seen: Sequence[SeenFrame], trajectories: Sequence[Trajectory]) -> Sequence[PlacedFrame]:
+        """What is known of every view before anything is painted. Raises: ShapeError, DeviceMemoryError."""
+        ...
 
-        Raises: as `render`.
-        """
+    def paint(
+        self, placed: Sequence[PlacedFrame], trajectories: Sequence[Trajectory], options: RenderOptions | None = None
+    ) -> list[View]:
+        """The views. trajectories: as placed. Raises: as `render`."""
         ...
 
 

@@ -9,10 +9,12 @@ from torch.testing import assert_close
 
 from gcd_model import Intrinsics, OptionError, PoseError, RenderOptions, ShapeError, load_synthesizer
 from gcd_model.live.config import LIVE_TINY, SKY_M, LiveConfig
+from gcd_model.live.eyes import Eyes
+from gcd_model.live.networks import LiveNetworks
 from gcd_model.live.seen_world import SeenWorld
 from gcd_model.live.sweep import Reference
 from gcd_model.live.synthesizer import LiveSynthesizer
-from gcd_model.live.view import LiveFrame, LiveNetworks, LiveView
+from gcd_model.live.view import LiveFrame, LiveView
 from gcd_model.networks import random_networks
 
 HERE = torch.eye(4, dtype=torch.float64)
@@ -98,7 +100,7 @@ def test_looking_ahead_changes_no_state(networks: LiveNetworks) -> None:
     looks, plain = LiveView(networks), LiveView(networks)
     clip = room()
     for t in range(3):
-        looks.look(clip.video[13 - t], LENS)
+        looks.eyes.look(clip.video[13 - t], LENS)
         assert_same(*(steps(each, range(t, t + 1))[0] for each in (looks, plain)))
 
 
@@ -107,9 +109,9 @@ def test_depth_looks_at_an_earlier_frame_where_there_is_one(networks: LiveNetwor
     assert clip.odometry is not None
     view = LiveView(networks)
     made = [view.step(clip.video[t], [HERE], lens=LENS, odometry=clip.odometry[t]).geometry for t in range(3)]
-    alone = LiveView(networks).look(clip.video[2], LENS)
+    alone = Eyes(networks).look(clip.video[2], LENS)
     move = torch.linalg.inv(clip.odometry[0]) @ clip.odometry[2]
-    compared = view.look(
+    compared = view.eyes.look(
         clip.video[2], LENS, reference=Reference(picture=clip.video[0], reference_from_camera=move.double())
     )
     assert not torch.equal(made[2].metres, alone.metres)
@@ -144,7 +146,7 @@ def test_what_points_do_not_cover_is_never_marked_seen(networks: LiveNetworks) -
     for t in range(3):
         target = aside(0.3)
         (made,) = view.step(clip.video[t], [target], lens=LENS, depth=depth, odometry=HERE).views
-        seen = view.look(clip.video[t], LENS, depth=depth)
+        seen = view.eyes.look(clip.video[t], LENS, depth=depth)
         world.look(clip.video[t], seen.metres, seen.labels, seen.static, LENS, HERE)
         covered = world.splat(target, LENS).coverage >= 0.5
         assert bool((made.visibility[covered] == 2).all())
@@ -171,7 +173,7 @@ def test_holes_are_filled_by_nobody_but_the_sky(sky: float, metres: float) -> No
     bias = networks.depth.head.out.bias
     assert bias is not None
     bias.data[LIVE_TINY.depth.bins - 1] = sky
-    seen = LiveView(networks).look(room().video[0], LENS, depth=torch.full((HEIGHT, WIDTH), torch.nan))
+    seen = Eyes(networks).look(room().video[0], LENS, depth=torch.full((HEIGHT, WIDTH), torch.nan))
     assert bool((seen.metres == metres).all())
 
 
@@ -194,11 +196,11 @@ def test_a_jump_drops_the_memory_says_so_and_goes_on(networks: LiveNetworks) -> 
 def test_what_cannot_be_is_refused(networks: LiveNetworks) -> None:
     view, frame = LiveView(networks), room().video[0]
     with pytest.raises(ShapeError):
-        view.look(frame, Intrinsics.from_hfov(70.0, 96, 64))
+        view.eyes.look(frame, Intrinsics.from_hfov(70.0, 96, 64))
     with pytest.raises(ShapeError):
-        view.look(frame, LENS, depth=torch.ones(HEIGHT, WIDTH + 32))
+        view.eyes.look(frame, LENS, depth=torch.ones(HEIGHT, WIDTH + 32))
     with pytest.raises(ShapeError):
-        view.look(frame[:, :, :40], Intrinsics.from_hfov(70.0, 40, HEIGHT))
+        view.eyes.look(frame[:, :, :40], Intrinsics.from_hfov(70.0, 40, HEIGHT))
     with pytest.raises(PoseError):
         view.step(frame, [2 * HERE], lens=LENS)
     with pytest.raises(OptionError):

@@ -1,8 +1,8 @@
-"""Models that work frame by frame: a view of every frame, nothing remembered across a break of the source, and two
+"""Models that work frame by frame: a view of every frame, nothing remembered across a break of the source, and three
 threads beside a live one."""
 
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -32,8 +32,13 @@ class Streaming(FakeSynthesizer):
     def see(self, features: SourceFeatures) -> Any:
         return (features,)
 
-    def paint(self, seen: Any, trajectories: Sequence[Trajectory], options: RenderOptions | None = None) -> list[View]:
-        return self.render(seen[0], trajectories, options)
+    def place(self, seen: Any, trajectories: Sequence[Trajectory]) -> Any:
+        return seen
+
+    def paint(
+        self, placed: Any, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
+    ) -> list[View]:
+        return self.render(placed[0], trajectories, options)
 
 
 class Stepping(FakeSource):
@@ -66,24 +71,33 @@ def test_a_frame_that_is_rendered_again_is_the_first_one_then() -> None:
 
 
 class SideBySide(Streaming):
-    """Paints frame 3 only while frame 4 is being seen, which is waited for; by which threads, of every call."""
+    """Paints frame 3 only while frame 5 is being seen, and frame 4 placed, which is waited for. Notes the threads."""
 
-    def __init__(self, act: Callable[[RenderOptions], None] | None = None) -> None:
-        super().__init__(act)
-        self.seeing, self.painting = set[str](), set[str]()
-        self._fourth, self.met = threading.Event(), False
+    def __init__(self) -> None:
+        super().__init__()
+        self.threads = {name: set[str]() for name in ("see", "place", "paint")}
+        self._fifth, self.met = threading.Event(), False
+
+    def _note(self, step: str) -> None:
+        self.threads[step].add(threading.current_thread().name)
 
     def see(self, features: SourceFeatures) -> Any:
-        self.seeing.add(threading.current_thread().name)
-        if len(self.clips) == 5:
-            self._fourth.set()
+        self._note("see")
+        if len(self.clips) == 6:
+            self._fifth.set()
         return super().see(features)
 
-    def paint(self, seen: Any, trajectories: Sequence[Trajectory], options: RenderOptions | None = None) -> list[View]:
-        self.painting.add(threading.current_thread().name)
+    def place(self, seen: Any, trajectories: Sequence[Trajectory]) -> Any:
+        self._note("place")
+        return super().place(seen, trajectories)
+
+    def paint(
+        self, placed: Any, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
+    ) -> list[View]:
+        self._note("paint")
         if len(self.asked) == 4:
-            self.met = self._fourth.wait(10)
-        return super().paint(seen, trajectories, options)
+            self.met = self._fifth.wait(10)
+        return super().paint(placed, trajectories, options)
 
 
 def live_config() -> NodeConfig:
@@ -97,15 +111,15 @@ def slowly(count: int) -> FakeSource:
     return source
 
 
-def test_beside_a_live_source_a_frame_is_seen_while_the_one_before_is_painted() -> None:
+def test_beside_a_live_source_three_frames_are_in_work_at_once() -> None:
     model, box = SideBySide(), Box()
     made_node(live_config(), model, slowly(12), box).run()
     assert model.met
-    assert (model.seeing, model.painting) == ({"model"}, {"painter"})
+    assert model.threads == {"see": {"model"}, "place": {"placer"}, "paint": {"painter"}}
     seqs = [message.header.src.seq[0] for message in box.of("win")]
     assert seqs == sorted(set(seqs))
     assert seqs[-1] == 11
-    assert not any(thread.name == "painter" for thread in threading.enumerate())
+    assert not {"painter", "placer"} & {thread.name for thread in threading.enumerate()}
 
 
 def test_what_fails_in_the_painter_is_done_again_or_ends_the_node() -> None:

@@ -216,24 +216,18 @@ def _smoothed(metres: Tensor, confidence: Tensor) -> Tensor:
     """Averages of inverse depth, which is linear on planes, along rows and then columns; edges stay: [N, H, W]."""
     inverse = 1 / metres
     for _ in range(_SMOOTH_ROUNDS):
-        for axis in (2, 1):
-            stacked = torch.stack([inverse, inverse.log(), confidence], dim=1)  # [N, 3, H, W]
+        for axis, sides in ((2, (_SMOOTH_PX, _SMOOTH_PX, 0, 0)), (1, (0, 0, _SMOOTH_PX, _SMOOTH_PX))):
+            log, size = inverse.log(), inverse.shape[axis]
+            wide = F.pad(torch.stack([inverse, log, confidence], dim=1), sides, mode="replicate")
             total, weights = inverse * confidence, confidence
             for step in range(1, _SMOOTH_PX + 1):
                 for shift in (step, -step):
-                    beside = _shifted(stacked, shift, axis + 1)
-                    near = ((beside[:, 1] - stacked[:, 1]) / _SMOOTH_SPREAD).square()
+                    beside = wide.narrow(axis + 1, _SMOOTH_PX + shift, size)
+                    near = ((beside[:, 1] - log) / _SMOOTH_SPREAD).square()
                     weight = beside[:, 2] * torch.exp(-near / 2)
                     total, weights = total + weight * beside[:, 0], weights + weight
             inverse = total / weights
     return 1 / inverse
-
-
-def _shifted(x: Tensor, shift: int, axis: int) -> Tensor:
-    """Each pixel's neighbour so far along an axis; the edge is its own neighbour."""
-    size = x.shape[axis]
-    index = (torch.arange(size, device=x.device) + shift).clamp(0, size - 1)
-    return x.index_select(axis, index)
 
 
 def _entropy(logits: Tensor) -> Tensor:

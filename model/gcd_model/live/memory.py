@@ -93,11 +93,12 @@ class SurfelMemory:
 
 def _newest(stamp: Tensor, count: int) -> Tensor:
     """Numbers of the newest, in their order; of the oldest frame that still has room an even share is kept."""
-    oldest = stamp.sort(descending=True).values[count - 1]
-    newer, at = torch.nonzero(stamp > oldest)[:, 0], torch.nonzero(stamp == oldest)[:, 0]
-    room = count - len(newer)
+    oldest = stamp.kthvalue(len(stamp) - count + 1).values
+    newer, at = stamp > oldest, torch.nonzero(stamp == oldest)[:, 0]
+    room = count - int(newer.sum())
     even = torch.arange(room, device=stamp.device) * len(at) // max(room, 1)
-    return torch.cat([newer, at[even]]).sort().values
+    newer[at[even]] = True
+    return torch.nonzero(newer)[:, 0]
 
 
 def _refuted(

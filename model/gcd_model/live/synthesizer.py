@@ -12,18 +12,11 @@ from gcd_model.clip import Augmentation, Clip, RenderOptions, View
 from gcd_model.conditioning import SourceFeatures, SourceGeometry
 from gcd_model.errors import Cancelled, NonFiniteError, ShapeError
 from gcd_model.geometry import CameraMount, Intrinsics, Trajectory
+from gcd_model.live.eyes import Eyes, Floor, SeenFrame
+from gcd_model.live.networks import COVERED, PAINTED, SEEN_NOW, LiveNetworks
+from gcd_model.live.painter import Painter, ViewFrame
+from gcd_model.live.seen_world import PlacedFrame, seen_world
 from gcd_model.live.splat import splat, unproject
-from gcd_model.live.view import (
-    COVERED,
-    PAINTED,
-    SEEN_NOW,
-    Floor,
-    LiveNetworks,
-    LiveView,
-    Painter,
-    SeenFrame,
-    ViewFrame,
-)
 from gcd_model.synthesizer import out_of_memory_is_our_error, whole_levels
 from gcd_model.traits import Traits
 from gcd_model.weights.card import Card, Entry
@@ -34,7 +27,7 @@ _SEED_STEP, _SEEDS = 0x9E3779B97F4A7C15, 1 << 63  # neighbouring seeds of sample
 
 
 class LiveSynthesizer:
-    """A ViewSynthesizer: `encode` keeps what is stated of the frames, `render` sees and paints one after the other.
+    """A ViewSynthesizer: `encode` keeps what is stated of the frames, `render` sees, places and paints one by one.
 
     Where a view stands is seen from the source camera of the same frame, which may move: `source_from_target[t]`. One
     that stands still is the case of all other models.
@@ -43,7 +36,7 @@ class LiveSynthesizer:
     def __init__(self, networks: LiveNetworks, traits: Traits, *, carries: bool = False) -> None:
         """carries: every call goes on where the one before ended, instead of knowing nothing."""
         self._networks, self._traits, self._carries = networks.requires_grad_(False), traits, carries
-        self._view = LiveView(networks)
+        self._eyes, self._world = Eyes(networks), seen_world(networks.config, next(networks.parameters()).device)
         self._painters: list[Painter] = []
         self._drawn_with: tuple[int, int] | None = None
 
@@ -63,7 +56,7 @@ class LiveSynthesizer:
 
     def reset(self) -> None:
         """See FrameSynthesizer."""
-        self._view.reset()
+        self._eyes.reset()
 
     @out_of_memory_is_our_error
     def encode(
@@ -100,13 +93,12 @@ class LiveSynthesizer:
     def render(
         self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
     ) -> list[View]:
-        """See ViewSynthesizer: `see`, then `paint`. Nothing is known of frames before the first, unless `streaming`.
+        """See ViewSynthesizer: `see`, `place`, `paint`. No frame before the first is known, unless `streaming`.
 
         Of the options, solver, guidance, motion number and initial noise mean something to diffusion models only.
         """
-        options = RenderOptions() if options is None else options
         self._require(features.frames, trajectories)
-        return self._painted(self._seen(features), trajectories, options)
+        return self._painted(self._placed(self._seen(features), trajectories), trajectories, options)
 
     @out_of_memory_is_our_error
     def see(self, features: SourceFeatures) -> tuple[SeenFrame, ...]:
@@ -114,15 +106,20 @@ class LiveSynthesizer:
         return tuple(self._seen(features))
 
     @out_of_memory_is_our_error
+    def place(self, seen: Sequence[SeenFrame], trajectories: Sequence[Trajectory]) -> tuple[PlacedFrame, ...]:
+        """See FrameSynthesizer."""
+        self._require(len(seen), trajectories)
+        return tuple(self._placed(seen, trajectories))
+
+    @out_of_memory_is_our_error
     def paint(
-        self, seen: Sequence[SeenFrame], trajectories: Sequence[Trajectory], options: RenderOptions | None = None
+        self, placed: Sequence[PlacedFrame], trajectories: Sequence[Trajectory], options: RenderOptions | None = None
     ) -> list[View]:
         """See FrameSynthesizer.
 
         Several samples differ where several steps draw; one step paints the mean, the same every time.
         """
-        self._require(len(seen), trajectories)
-        return self._painted(seen, trajectories, RenderOptions() if options is None else options)
+        return self._painted(placed, trajectories, options)
 
     def _require(self, length: int, trajectories: Sequence[Trajectory]) -> None:
         frames = self._traits.config.frames
@@ -140,17 +137,22 @@ class LiveSynthesizer:
                 f"{self._traits.name} needs points of the source, which these features lack; encode it here"
             )
         if not self._carries:
-            self._view.reset()
+            self._eyes.reset()
         floor, odometry = _floor(features.mount), geometry.odometry
         for t, frame in enumerate(video):
             depth = geometry.metres[t] if bool(geometry.stated[t]) else None
             pose = None if odometry is None else odometry[t]
-            yield self._view.see(frame, lens=geometry.lens, depth=depth, odometry=pose, floor=floor)
+            yield self._eyes.see(frame, lens=geometry.lens, depth=depth, odometry=pose, floor=floor)
+
+    def _placed(self, seen: Iterable[SeenFrame], trajectories: Sequence[Trajectory]) -> Iterator[PlacedFrame]:
+        for t, frame in enumerate(seen):
+            yield self._world.place(frame, [path.source_from_target[t] for path in trajectories])
 
     def _painted(
-        self, seen: Iterable[SeenFrame], trajectories: Sequence[Trajectory], options: RenderOptions
+        self, placed: Iterable[PlacedFrame], trajectories: Sequence[Trajectory], options: RenderOptions | None
     ) -> list[View]:
         """`cancel` is asked between two frames."""
+        options = RenderOptions() if options is None else options
         steps, frames = options.steps or self._traits.config.sampling.steps, self._traits.config.frames
         draws = options.samples if steps > 1 else 1
         if not self._carries or self._drawn_with != (steps, draws):
@@ -159,13 +161,12 @@ class LiveSynthesizer:
         made: list[list[tuple[ViewFrame, ...]]] = []  # by frame, then by draw
         scores: list[float] = []
         lost: list[str] = []
-        for t, frame in enumerate(seen):
+        for t, frame in enumerate(placed):
             if options.cancel is not None and options.cancel.is_set():
                 raise Cancelled(f"stopped before frame {t} of {frames}, as was asked")
-            poses = [path.source_from_target[t] for path in trajectories]
-            made.append([painter.paint(frame, poses) for painter in self._painters])
-            scores.append(frame.geometry.ood)
-            lost += [] if frame.lost is None else [frame.lost]
+            made.append([painter.paint(frame) for painter in self._painters])
+            scores.append(frame.seen.geometry.ood)
+            lost += [] if frame.seen.lost is None else [frame.seen.lost]
             if options.progress is not None:
                 options.progress(t + 1, frames)
         views = [self._joined(made, v, path, options) for v, path in enumerate(trajectories)]

@@ -22,10 +22,12 @@ from gcd_model.geometry import Intrinsics, invert_rigid
 from gcd_model.layers import zeroed
 from gcd_model.live.config import SKY_M, LiveConfig
 from gcd_model.live.depth_net import pixel_rays
+from gcd_model.live.eyes import Eyes, Floor, FrameGeometry
+from gcd_model.live.networks import COVERED, LiveNetworks
 from gcd_model.live.paint_net import filled, seen_of
 from gcd_model.live.splat import splat, unproject
 from gcd_model.live.synthesizer import LiveSynthesizer
-from gcd_model.live.view import COVERED, Floor, FrameGeometry, LiveNetworks, LiveView
+from gcd_model.live.view import LiveView
 from gcd_model.loading import load_synthesizer
 from gcd_model.small_files import decode_json
 from gcd_train.errors import DataError
@@ -269,7 +271,8 @@ class LiveModel:
 
     def views(self, clip: LiveClip) -> MethodViews:
         """See Method."""
-        view = _Misjudging(self.networks, self.depth_scale, self.steps)
+        view = LiveView(self.networks, steps=self.steps)
+        view.eyes = _Misjudging(self.networks, self.depth_scale)
         source, lens = pictures_of(clip, "source"), _lens(clip, "target")
         poses = _poses(clip, "source")
         source_from_target = invert_rigid(poses) @ _poses(clip, "target")
@@ -301,11 +304,11 @@ class LiveModel:
         return Floor(up=up, height_m=source.heights_m[t] + self.floor_higher_m)
 
 
-class _Misjudging(LiveView):
-    """A live view whose depth is off by a factor."""
+class _Misjudging(Eyes):
+    """Eyes whose depth is off by a factor."""
 
-    def __init__(self, networks: LiveNetworks, scale: float, steps: int | None) -> None:
-        super().__init__(networks, steps=steps)
+    def __init__(self, networks: LiveNetworks, scale: float) -> None:
+        super().__init__(networks)
         self._scale = scale
 
     def look(self, *args: Any, **kwargs: Any) -> FrameGeometry:

@@ -12,8 +12,8 @@ import numpy as np
 from torch import Tensor
 
 from gcd_model.geometry import Intrinsics
+from gcd_model.live.eyes import Eyes
 from gcd_model.live.synthesizer import LiveSynthesizer
-from gcd_model.live.view import LiveView
 from gcd_train.live.batches import to_video
 from gcd_train.live.clips import clip_paths, evenly, read_clip
 from gcd_train.live.measure_methods import live_model
@@ -25,8 +25,8 @@ _ASSUMED_HFOV_DEG = 70.0
 
 def score(synthesizer: LiveSynthesizer, video: Tensor, lens: Intrinsics) -> float:
     """Mean `FrameGeometry.ood` of a window [T, 3, H, W] in [-1, 1], motion by its pictures, no mount declared."""
-    view = LiveView(synthesizer.networks)
-    return float(np.mean([view.step(frame, [], lens=lens).geometry.ood for frame in video]))
+    eyes = Eyes(synthesizer.networks)
+    return float(np.mean([eyes.see(frame, lens=lens).geometry.ood for frame in video]))
 
 
 def auc(known: Sequence[float], other: Sequence[float]) -> float:

@@ -15,8 +15,8 @@ import msgspec
 import torch
 
 from gcd_model.live.depth_net import DepthNet
+from gcd_model.live.networks import LiveNetworks
 from gcd_model.live.synthesizer import LiveSynthesizer, save_live
-from gcd_model.live.view import LiveNetworks
 from gcd_model.loading import load_synthesizer
 from gcd_train.engine.engine import Engine
 from gcd_train.engine.processes import ALONE, Processes

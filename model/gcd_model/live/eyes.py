@@ -1,0 +1,172 @@
+"""What a source frame shows: depth, classes, what moves, and where the camera is.
+
+frame + an earlier one -> depth network, ego-motion -> SeenFrame
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gcd_model.errors import ShapeError
+from gcd_model.geometry import Intrinsics
+from gcd_model.live.config import SIZE_FACTOR, SKY_M
+from gcd_model.live.depth_net import depth_inputs, pixel_rays, plane_depth, read_depth
+from gcd_model.live.ego_motion import EgoMotion
+from gcd_model.live.networks import LiveNetworks
+from gcd_model.live.sweep import Reference, References, sweep_costs
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Floor:
+    """The plane on which the source camera's carrier stands: its normal in camera axes, float32 [3], towards the
+    camera, and the camera's height over it in metres.
+    """
+
+    up: Tensor
+    height_m: float
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class FrameGeometry:
+    """What a source frame shows: metres [H, W] (0: hole, SKY_M: sky), labels uint8 [H, W], static bool [H, W].
+
+    ood: how unlike its training it looks to the depth network, 0 to 1; see `Familiarity`. spread: [H, W], see
+    `DepthReading`; None for depth from elsewhere.
+    """
+
+    metres: Tensor
+    labels: Tensor
+    static: Tensor
+    ood: float
+    spread: Tensor | None = None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class SeenFrame:
+    """A source frame, once it was looked at.
+
+    picture: [3, H, W] in [-1, 1]. lens, floor: of the source. world_from_source: [4, 4], the world begins as a frame's
+    camera. begins: nothing of an earlier frame holds. lost: why, if the motion is unknown; None also where it begins
+    as it should.
+    """
+
+    picture: Tensor
+    geometry: FrameGeometry
+    lens: Intrinsics
+    floor: Floor | None
+    world_from_source: Tensor
+    begins: bool
+    lost: str | None
+
+
+class Eyes:
+    """Look at one camera's frames, one after the other: depth, classes and motion. The state is earlier frames."""
+
+    def __init__(self, networks: LiveNetworks) -> None:
+        self._networks, self._config = networks.eval(), networks.config
+        self._device = next(networks.parameters()).device
+        self._ego, self._references = EgoMotion(), References()
+        self._lens: Intrinsics | None = None
+        self._begins = True
+
+    def reset(self) -> None:
+        """Forget all frames: the next one begins."""
+        self._ego.reset()
+        self._references.reset()
+        self._begins = True
+
+    @torch.inference_mode()
+    def look(
+        self,
+        frame: Tensor,
+        lens: Intrinsics,
+        *,
+        depth: Tensor | None = None,
+        floor: Floor | None = None,
+        reference: Reference | None = None,
+    ) -> FrameGeometry:
+        """Depth, classes and motion of one frame; leaves the state alone.
+
+        Args: see `step`. reference: an earlier frame, see `sweep_costs`.
+        """
+        picture = self._checked(frame, lens)
+        ground = torch.zeros(lens.height, lens.width) if floor is None else plane_depth(lens, floor.up, floor.height_m)
+        rays = pixel_rays(lens, self._device)
+        inputs = depth_inputs(picture[None], rays[None], ground[None].to(self._device))
+        output = self._networks.depth(inputs, sweep_costs(picture, lens, reference, self._config.depth)[None])
+        reading = read_depth(output, self._config.depth)
+        labels = likeliest(output.classes[0])
+        metres = reading.metres[0] if depth is None else _taken(depth, reading.metres[0], lens)
+        static = output.moves[0] < 0
+        ood = float(self._networks.familiarity.score(output.summary, reading.entropy)[0])
+        spread = reading.spread[0] if depth is None else None
+        return FrameGeometry(metres=metres, labels=labels, static=static, ood=ood, spread=spread)
+
+    @torch.inference_mode()
+    def see(
+        self,
+        frame: Tensor,
+        *,
+        lens: Intrinsics,
+        depth: Tensor | None = None,
+        odometry: Tensor | None = None,
+        floor: Floor | None = None,
+        geometry: FrameGeometry | None = None,
+    ) -> SeenFrame:
+        """Take in one frame: its depth, its classes, and how the camera moved.
+
+        Args:
+            frame: float32 [3, H, W], RGB in [-1, 1]; H and W multiples of 32.
+            lens: of the source; 40 to 120 degrees across were trained.
+            depth: [H, W] metres, 0 or not finite where unknown, instead of the depth network's.
+            odometry: world_from_source [4, 4] of any world that stays the same from frame to frame; None: from the
+                pictures.
+            floor: where the declared mount has the ground. geometry: what the frame shows, if that is known.
+        Raises:
+            ShapeError: frame, depth and lens differ in size, or the size is no multiple of 32.
+        """
+        picture = self._checked(frame, lens)
+        if lens != self._lens:  # another camera, or another size of its pictures
+            self.reset()
+            self._lens = lens
+        motion = self._ego.follow(picture, lens, odometry)
+        if motion.lost:
+            self._references.reset()
+        pose = motion.world_from_camera
+        if geometry is None:
+            geometry = self.look(frame, lens, depth=depth, floor=floor, reference=self._references.chosen(pose))
+        self._ego.settle(geometry.metres, geometry.static, geometry.spread)
+        self._references.add(picture, pose, geometry.metres)
+        begins, self._begins = self._begins or motion.lost, False
+        return SeenFrame(
+            picture=picture,
+            geometry=geometry,
+            lens=lens,
+            floor=floor,
+            world_from_source=pose,
+            begins=begins,
+            lost=motion.reason,
+        )
+
+    def _checked(self, frame: Tensor, lens: Intrinsics) -> Tensor:
+        if frame.shape != (3, lens.height, lens.width) or lens.height % SIZE_FACTOR or lens.width % SIZE_FACTOR:
+            raise ShapeError(
+                f"a frame must be [3, H, W] of its lens's size ({lens.height} x {lens.width}), in multiples of "
+                f"{SIZE_FACTOR}, got {list(frame.shape)}"
+            )
+        return frame.to(self._device, torch.float32)
+
+
+def likeliest(chances: Tensor) -> Tensor:
+    """Of K choices [K, H, W]: uint8 [H, W]. (`max` is four times as fast as `argmax` here.)"""
+    return chances.max(dim=0).indices.to(torch.uint8)
+
+
+def _taken(depth: Tensor, learned: Tensor, lens: Intrinsics) -> Tensor:
+    """Depth from elsewhere: bad numbers are holes, a hole in what the network calls sky is sky. Raises ShapeError."""
+    if depth.shape != (lens.height, lens.width):
+        raise ShapeError(f"depth must be [{lens.height}, {lens.width}] as its frame, got {list(depth.shape)}")
+    metres = torch.where(depth.isfinite() & (depth > 0), depth, 0.0).float()
+    metres = metres.to(learned.device)
+    return torch.where((metres == 0) & (learned >= SKY_M), SKY_M, metres)
