@@ -14,8 +14,8 @@ from gcd_node.config import LifeConfig, ModelSection
 from gcd_node.session import load_model, model_threads
 
 
-def test_the_model_leaves_the_rest_of_the_robot_a_core(monkeypatch: pytest.MonkeyPatch) -> None:
-    for cores, threads in ((1, 1), (2, 1), (8, 7)):
+def test_a_network_takes_half_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    for cores, threads in ((1, 1), (2, 1), (8, 4)):
         ours = set(range(cores))
 
         def affinity(_: int, ours: set[int] = ours) -> set[int]:
