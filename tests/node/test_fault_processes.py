@@ -119,7 +119,7 @@ def test_f23_sigterm_ends_every_view_and_the_process_with_0(tmp_path: Path) -> N
 @pytest.fixture(scope="module")
 def hung(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, "subprocess.Popen[str]"]]:
     """Nodes that hang, begun all at once: each takes its time to start and to end."""
-    begun = {each: _hung(each, tmp_path_factory.mktemp(each)) for each in ("load", "warm", "render", "render twice")}
+    begun = {each: _hung(each, tmp_path_factory.mktemp(each)) for each in ("load", "render", "render twice")}
     yield begun
     for node in begun.values():
         node.kill()
@@ -132,7 +132,7 @@ def _hung(phase: str, folder: Path) -> "subprocess.Popen[str]":
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment())
 
 
-@pytest.mark.parametrize("phase", ["load", "warm", "render"])
+@pytest.mark.parametrize("phase", ["load", "render"])
 def test_f23_a_model_that_hears_nothing_does_not_hold_up_the_end(
     hung: dict[str, "subprocess.Popen[str]"], phase: str
 ) -> None:
