@@ -9,17 +9,11 @@ from small_models import draw, randomise, relative_error
 from torch import Tensor, nn
 from torch.testing import assert_close
 
-from gcd_model.layers import (
-    Derived,
-    Downsample,
-    TokenAttention,
-    Upsample,
-    prepare,
-)
+from gcd_model.layers import Derived, Downsample, TokenAttention, Upsample, prepare
 from gcd_model.temporal import FramePositions, TemporalShare, VideoResBlock
 
 
-@pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 4), (3, 5), (4, 6), (7, 2)])
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (3, 5), (4, 6)])
 @pytest.mark.parametrize("prepared", [False, True])
 def test_up_sampling_by_phases_equals_nearest_neighbour_then_convolution(
     height: int, width: int, prepared: bool

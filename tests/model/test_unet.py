@@ -120,7 +120,7 @@ def test_gradients_through_derived_values_equal_the_published_ones() -> None:
     assert all(theirs[name].abs().max() < 1e-9 for name in dormant)  # the published network does not use them either
 
 
-@pytest.mark.parametrize("frame", range(CLIPS * FRAMES))
+@pytest.mark.parametrize("frame", [0, 2, FRAMES])
 def test_a_token_counts_for_its_own_frame_and_the_first_of_a_clip_for_all_its_frames_together(frame: int) -> None:
     unet = small_unet()
     rows = CLIPS * FRAMES
@@ -162,9 +162,6 @@ def test_norms_have_the_published_epsilons() -> None:
             assert module.eps == (1e-6 if name.endswith("attention.norm") else 1e-5), name
         if isinstance(module, nn.LayerNorm):
             assert module.eps == 1e-5, name
-
-
-# --- diffusers ---------------------------------------------------------------------------------------------------
 
 
 def small_diffusers_unet() -> UNetSpatioTemporalConditionModel:
