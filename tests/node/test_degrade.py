@@ -9,14 +9,7 @@ import pytest
 from fakes import Box, FakeSource, FakeSynthesizer, traits
 from rig import Rig
 
-from gcd_model import (
-    DeviceMemoryError,
-    RenderOptions,
-    SourceFeatures,
-    Trajectory,
-    View,
-    ViewSynthesizer,
-)
+from gcd_model import DeviceMemoryError, RenderOptions, SourceFeatures, Trajectory, View, ViewSynthesizer
 from gcd_node.config import ModelSection
 from gcd_node.errors import ModelFailedError
 from gcd_node.health import Health

@@ -16,14 +16,7 @@ from cameras import until
 from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, made_node, traits
 from media import frames_at
 
-from gcd_model import (
-    Augmentation,
-    CameraMount,
-    Clip,
-    RenderOptions,
-    SourceFeatures,
-    load_synthesizer,
-)
+from gcd_model import Augmentation, CameraMount, Clip, RenderOptions, SourceFeatures, load_synthesizer
 from gcd_node.config import NodeConfig, parse_config
 from gcd_node.encoded_frames import EncodedFrames, EncodeTerms
 from gcd_node.frame import Frame

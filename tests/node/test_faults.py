@@ -19,14 +19,7 @@ from rig import Rig, service_manager
 
 from gcd_client.control import Code
 from gcd_client.subscriber import ViewSubscriber
-from gcd_model import (
-    DeviceMemoryError,
-    NonFiniteError,
-    RenderOptions,
-    SourceFeatures,
-    Trajectory,
-    View,
-)
+from gcd_model import DeviceMemoryError, NonFiniteError, RenderOptions, SourceFeatures, Trajectory, View
 from gcd_node.errors import ConfigError, SourceLostError
 from gcd_node.frame import Frame
 from gcd_node.service import ServiceManager
@@ -242,12 +235,7 @@ def test_f12_pictures_that_are_no_numbers_are_never_published(tmp_path: Path) ->
 
 @pytest.mark.parametrize(
     ("levels", "flags"),
-    [
-        ((255, 255), {"exposure", "static"}),
-        ((120, 120), {"static"}),
-        ((0, 4), {"exposure"}),
-        ((120, 124), set()),
-    ],
+    [((255, 255), {"exposure", "static"}), ((120, 120), {"static"}), ((0, 4), {"exposure"}), ((120, 124), set())],
     ids=["saturated", "frozen", "dark", "good"],
 )
 def test_f13_an_input_without_a_picture_is_published_and_flagged(levels: tuple[int, int], flags: set[str]) -> None:

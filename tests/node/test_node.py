@@ -23,13 +23,7 @@ from gcd_model import (
     ViewRangeError,
 )
 from gcd_node.config import NodeConfig, PublishConfig, parse_config
-from gcd_node.errors import (
-    EndpointError,
-    ModelFailedError,
-    NodeError,
-    PublisherError,
-    SourceError,
-)
+from gcd_node.errors import EndpointError, ModelFailedError, NodeError, PublisherError, SourceError
 from gcd_node.node import Node
 from gcd_node.pipeline import ending
 from gcd_node.publisher import Publisher

@@ -1,7 +1,6 @@
 """Frames become windows: the grid, its holes, restarts and the end of a stream."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -57,13 +56,6 @@ def test_a_camera_that_was_silent_is_no_clock_that_was_set() -> None:
     for frame in frames_at([4000.0, 9000.0]):
         builder.push(frame, frames[-1].stamp_ns + 10**8)  # these do not
     assert builder.reasons["CLOCK_STEP"] == 2
-
-
-def test_a_picture_like_the_one_before_is_told() -> None:
-    first, second, third = even(3, 10.0)
-    builder = WindowBuilder(frames=1, fps=10.0, source_fps=10.0)
-    again = replace(second, image=first.image)
-    assert [window.static for window in run(builder, [first, again, third])] == [False, True, False]
 
 
 @pytest.mark.parametrize("fps", [5.0, 24.0, 30000 / 1001])
@@ -148,15 +140,6 @@ def test_only_frames_of_a_window_are_fitted_and_each_once() -> None:
     assert fitted == [0, 3, 6, 9, 12, 15, 18, 21]
 
 
-def test_a_missing_frame_rejects_its_window_and_nothing_else() -> None:
-    frames = even(42, 10.0)
-    del frames[18:21]
-    builder = WindowBuilder(frames=14, fps=10.0, source_fps=10.0)
-    windows = run(builder, frames)
-    assert [window.seqs for window in windows] == [tuple(range(14)), tuple(range(21, 35))]
-    assert builder.reasons == {"WIN_GAP": 1}
-
-
 def test_the_skew_that_is_allowed_decides_what_a_hole_is() -> None:
     frames = frames_at([0, 100, 230, 300])
     assert len(run(WindowBuilder(frames=4, fps=10.0, max_skew=0.5), frames)) == 1
@@ -180,28 +163,6 @@ def test_a_step_of_the_clock_begins_a_new_epoch(step_ms: float) -> None:
     windows = run(builder, frames_at([*early, *(early + step_ms)]), at_once=True)
     assert [(window.epoch, window.seqs) for window in windows] == [(0, (0, 1, 2, 3)), (1, (6, 7, 8, 9))]
     assert builder.reasons == {"CLOCK_STEP": 1}
-
-
-def test_another_picture_size_begins_a_new_epoch() -> None:
-    small, large = frames_at(range(0, 600, 100)), frames_at(range(600, 1200, 100), width=8)
-    builder = WindowBuilder(frames=4, fps=10.0)
-    windows = run(builder, [*small, *large])
-    assert [(window.epoch, window.images.shape[2]) for window in windows] == [(0, 4), (1, 8)]
-    assert builder.reasons == {"SRC_FORMAT": 1}
-
-
-def test_after_a_restart_a_builder_goes_on_at_another_rate() -> None:
-    builder = WindowBuilder(frames=4, fps=24.0, source_fps=24.0)
-    before = run(builder, even(6, 24.0))
-    builder.restart("SRC_LOST")
-    builder.run_at(12.0, 12.5)
-    after = run(builder, even(9, 12.5, first_ms=9000.0))
-    assert [(window.epoch, window.fps, window.window_id) for window in before + after] == [
-        (0, 24.0, 0),
-        (1, 12.0, 1),
-        (1, 12.0, 2),
-    ]
-    assert seqs(after) == list(range(8))
 
 
 def test_the_end_completes_a_window_that_only_waits_for_a_nearer_frame() -> None:
