@@ -235,8 +235,14 @@ def test_f12_pictures_that_are_no_numbers_are_never_published(tmp_path: Path) ->
 
 @pytest.mark.parametrize(
     ("levels", "flags"),
-    [((255, 255), {"exposure", "static"}), ((120, 120), {"static"}), ((0, 4), {"exposure"}), ((120, 124), set())],
-    ids=["saturated", "frozen", "dark", "good"],
+    [
+        ((0, 0), {"exposure", "static"}),
+        ((255, 255), {"exposure", "static"}),
+        ((120, 120), {"static"}),
+        ((0, 4), {"exposure"}),
+        ((120, 124), set()),
+    ],
+    ids=["black", "saturated", "frozen", "dark", "good"],
 )
 def test_f13_an_input_without_a_picture_is_published_and_flagged(levels: tuple[int, int], flags: set[str]) -> None:
     class Covered(FakeSource):
