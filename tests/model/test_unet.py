@@ -1,6 +1,7 @@
 """The U-Net against its plain twin and against diffusers, and what it costs at full size."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import msgspec
 import pytest
@@ -81,14 +82,14 @@ def batch(control: CameraControl = "spherical", clips: int = CLIPS) -> Batch:
     )
 
 
-def small_unet(control: CameraControl = "spherical") -> VideoUNet:
+def small_unet(control: CameraControl = "spherical", **changes: Any) -> VideoUNet:
     width = 0 if control == "none" else UNET.camera_width
-    unet = VideoUNet(msgspec.structs.replace(UNET, camera_width=width), FRAMES)
+    unet = VideoUNet(msgspec.structs.replace(UNET, camera_width=width, **changes), FRAMES)
     randomise(unet)
     return unet
 
 
-@pytest.mark.parametrize("control", ["spherical", "relative_pose", "none"])
+@pytest.mark.parametrize("control", ["spherical", "none"])
 def test_the_u_net_equals_the_published_one_in_training_and_prepared(control: CameraControl) -> None:
     unet, given = small_unet(control).train(), batch(control)
     with torch.no_grad():
@@ -100,7 +101,7 @@ def test_the_u_net_equals_the_published_one_in_training_and_prepared(control: Ca
 
 def test_gradients_through_derived_values_equal_the_published_ones() -> None:
     """In double precision, so that rounding does not hide a wrong term; all parameters, also those derived from."""
-    unet = small_unet().double().train()
+    unet = small_unet(multipliers=(1, 2), attention=(True, False), blocks_per_level=1).double().train()
     given, weights = (
         batch(clips=1),
         {name: w.double().clone().requires_grad_() for name, w in released_unet(unet).items()},

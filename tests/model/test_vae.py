@@ -65,16 +65,6 @@ def test_the_temporal_decoder_equals_diffusers(ours: _Vae, theirs: AutoencoderKL
     assert relative_error(result, expected) < 1e-5
 
 
-def test_frames_are_encoded_each_alone_and_decoded_together(ours: _Vae) -> None:
-    frames, latents = draw(FRAMES, 3, 32, 32), draw(FRAMES, 4, 4, 4)
-    with torch.inference_mode():
-        alone = torch.cat([ours.encoder(frame).mean for frame in frames.split(1)])
-        assert relative_error(alone, ours.encoder(frames).mean) < 1e-5
-        together = ours.decoder(latents, FRAMES)
-        apart = torch.cat([ours.decoder(latent, 1) for latent in latents.split(1)])
-    assert relative_error(apart, together) > 1e-3
-
-
 def test_a_fresh_decoder_has_temporal_branches_that_add_nothing_and_even_shares() -> None:
     decoder = TemporalDecoder(VAE)
     blocks = [module for module in decoder.modules() if isinstance(module, VideoResBlock)]
