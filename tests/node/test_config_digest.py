@@ -57,7 +57,7 @@ def test_a_default_that_is_written_out_changes_nothing(made: Traits, written_out
         (STEERED, "model.steps=3"),
         (STEERED, "model.guidance=[1.0, 3.0]"),
         (STEERED, "model.solver=dpmpp_2m"),
-        (STEERED, "model.cond_aug=0.5"),
+        (STEERED, "model.cond_aug=0.0"),
         (STEERED, "model.move_time=0"),
         (STEERED, "model.seed=1"),
         (STEERED, "window.stride=4"),
