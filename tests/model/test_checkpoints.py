@@ -147,6 +147,11 @@ def test_all_that_does_not_fit_is_said_at_once(tmp_path: Path) -> None:
     assert all(word in message for word in ("1 of", "missing", "misshapen", "1 unexpected names"))
 
 
+def test_a_missing_weight_that_tells_the_architecture_is_named(tmp_path: Path) -> None:
+    name = f"{UNET}.out.2.weight"
+    assert name in refused(changed(tmp_path, lambda state: drop(state, [name])))
+
+
 def test_leftovers_are_recognised_and_counted(tmp_path: Path) -> None:
     report = inspect_weights(write_gcd(tmp_path))
     assert {leftover.kind: leftover.tensors for leftover in report.leftovers} == {

@@ -12,8 +12,9 @@ from small_models import TINY, TINY_DRIVING, random_clip, relative_error, tiny_d
 from tape import TapeRecorder
 
 from gcd_model.clip import Clip, RenderOptions, View
+from gcd_model.config import ModelConfig
 from gcd_model.diffusion import Schedule
-from gcd_model.engines.cuda import CudaEngine, CudaOptions, twin
+from gcd_model.engines.cuda import CudaEngine, CudaOptions, cache_folder, keep_compiled, regions, twin
 from gcd_model.engines.graphs import CudaGraphs, Recent, Recorder, Replay, Unrecorded
 from gcd_model.errors import Cancelled, DeviceMemoryError, OptionError
 from gcd_model.geometry import SphericalDelta, Trajectory
@@ -179,6 +180,28 @@ def test_a_twin_has_the_same_weights_in_memory_and_its_own_modules(plain: Synthe
     assert all(mine.data_ptr() == other.data_ptr() for mine, other in pairs)
     assert not {id(module) for module in first.modules()} & {id(module) for module in second.modules()}
     assert not any(module._compiled_call_impl for module in first.modules())
+
+
+@pytest.mark.parametrize("config", [TINY, TINY_DRIVING])
+def test_every_convolution_of_the_unet_but_its_ends_lies_in_a_compiled_region(config: ModelConfig) -> None:
+    networks = (tiny_synthesizer if config is TINY else tiny_driving)(config).networks
+    inside = {id(part) for region in regions(networks.unet) for part in region.modules()}
+    outside = [
+        name
+        for name, part in networks.unet.named_modules()
+        if isinstance(part, torch.nn.Conv2d | torch.nn.Conv3d) and id(part) not in inside
+    ]
+    assert outside == ["stem", "conv_out"]
+
+
+def test_compiled_code_is_kept_in_the_folder_that_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GCD_CACHE_DIR", str(tmp_path))
+    for name in ("TORCHINDUCTOR_CACHE_DIR", "TRITON_CACHE_DIR"):
+        monkeypatch.setenv(name, "")
+        monkeypatch.delenv(name)
+    assert cache_folder() == tmp_path / "compiled" / torch.__version__
+    keep_compiled(cache_folder())
+    assert cache_folder().is_dir()
 
 
 def test_whole_levels_are_the_nearest_to_the_same_pictures(plain: Synthesizer) -> None:

@@ -70,6 +70,12 @@ def test_views_samples_and_branches_are_runs_of_one_graph() -> None:
     assert found.runs.count("decoder") == 4
 
 
+def test_another_size_than_the_exports_is_refused() -> None:
+    ours, _ = engined(tiny_synthesizer())
+    with pytest.raises(OptionError):
+        ours.encode(random_clip(structs.replace(TINY, height=64)))
+
+
 def one_graph(tmp_path: Path, operator: str = "Add") -> dict[str, Path]:
     """A file with one operator of two inputs [2]."""
     onnx = pytest.importorskip("onnx", reason="needs the extra `onnx`")

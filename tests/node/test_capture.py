@@ -2,13 +2,15 @@
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import pytest
 from cameras import until
 from fakes import FakeSource, Steady
+from media import frames_at
 
 from gcd_node.errors import ReaderError
+from gcd_node.frame import Frame
 from gcd_node.window import WindowBuilder, WindowSlot, read
 
 GUARD_S = 5.0
@@ -104,6 +106,19 @@ def test_what_is_shown_while_there_is_work_under_way_is_not_lost() -> None:
 
     assert slot.take(work) == 7
     assert calls == [0, 1]
+
+
+class Hurried(FakeSource):
+    """Its last frame comes early: it could be taken for its place only by who knows that none is nearer."""
+
+    def frames(self) -> Iterator[Frame]:
+        yield from frames_at([0, 100, 200, 270])
+
+
+def test_the_last_window_is_not_forgotten_at_the_end() -> None:
+    slot = WindowSlot()
+    read(Hurried(4), WindowBuilder(frames=4, fps=10.0), slot)
+    assert slot.take() is not None
 
 
 def test_a_fault_in_the_source_is_not_swallowed() -> None:

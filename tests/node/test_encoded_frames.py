@@ -179,6 +179,21 @@ def test_views_are_the_same_to_the_last_bit_whatever_the_timing(stride: int, pac
     assert max(found) == max(wanted)
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_it_makes_no_difference_in_what_order_frames_are_encoded(seed: int) -> None:
+    chance, model, encoded = random.Random(seed), Encoder(), kept()
+    builder, windows = WindowBuilder(frames=T, fps=10.0, stride=chance.randint(1, T)), 0
+    for frame in ten_fps(50):
+        for window in builder.push(frame, frame.stamp_ns):
+            windows += 1
+            wanted = kept().features(Encoder(), window, TERMS)
+            assert same(encoded.features(model, window, TERMS), wanted)
+        while chance.random() < 0.6 and encoded.ahead(model, builder.filling, TERMS):
+            assert len(encoded) <= T
+    assert windows >= 3
+    assert sorted(set(model.encoded)) == sorted(model.encoded)  # each once
+
+
 # When frames are encoded.
 
 

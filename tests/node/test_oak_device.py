@@ -61,6 +61,12 @@ def test_no_device_is_said_within_three_seconds() -> None:
     assert time.monotonic() - begin < 6  # 1.1 s on a machine that is not busy
 
 
+def test_an_address_where_nobody_answers_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DEPTHAI_SEARCH_TIMEOUT", "300")
+    with pytest.raises(SourceAbsentError):
+        open_oak(OakSource(device="127.0.0.1", open_timeout_s=PATIENT_S))
+
+
 def test_a_real_camera_is_wired_by_depthais_own_names(monkeypatch: pytest.MonkeyPatch) -> None:
     opened = create_autospec(dai.Device, instance=True)
     camera = create_autospec(dai.node.Camera, instance=True)

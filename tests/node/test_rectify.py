@@ -193,6 +193,14 @@ def test_twice_the_size_is_near_full_resolution_and_far_better_than_straight() -
     assert psnr(straight, full) < ours - 6.0
 
 
+def test_pictures_of_another_size_of_the_same_shape_are_taken() -> None:
+    rectifier = rectifier_of(BARREL, width=192, height=128, hfov_deg=53.13)
+    small = photograph(BARREL.resized(640, 360))
+    large = np.asarray(cv2.resize(small, (1280, 720), interpolation=cv2.INTER_CUBIC), np.uint8)
+    large, small = rectifier.image(large), rectifier.image(small)
+    assert psnr(small, large) > 30.0
+
+
 CALIBRATION = """
 image_width: 1280
 image_height: 720

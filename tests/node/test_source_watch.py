@@ -204,6 +204,31 @@ def test_closing_ends_a_silent_watch_and_one_that_looks_for_its_camera() -> None
         assert camera.closed.is_set()
 
 
+def test_closing_does_not_wait_for_a_camera_that_is_being_opened() -> None:
+    camera, late = Camera(), Camera()
+    asked, answer = threading.Event(), threading.Event()
+    asked_for: list[SourceInfo] = []
+
+    def open_slowly(before: SourceInfo) -> Camera:
+        asked_for.append(before)
+        asked.set()
+        answer.wait(60)
+        return late
+
+    watch = SourceWatch(camera, open_slowly, Log(), V4l2Source(), quick)
+    left = threading.Thread(target=lambda: list(watch.frames()), daemon=True)
+    left.start()
+    camera.feed(None)
+    assert asked.wait(20)
+    watch.close()
+    left.join(20)
+    assert not left.is_alive()
+    assert not late.closed.is_set()
+    answer.set()
+    until(late.closed.is_set)  # nobody wants it any more
+    assert asked_for == [camera.info]
+
+
 def test_waiting_doubles_up_to_its_limit_and_never_passes_it(monkeypatch: pytest.MonkeyPatch) -> None:
     for part in (0.8, 1.0, 1.2):
         monkeypatch.setattr("random.uniform", lambda *_, part=part: part)
