@@ -47,6 +47,9 @@ LENS = LensModel(
 )  # fmt: skip
 
 
+# --- files -------------------------------------------------------------------------------------------------------
+
+
 def read(folder: Path, content: bytes) -> LensModel:
     (folder / "camera.yaml").write_bytes(content)
     return load_lens(folder / "camera.yaml")
