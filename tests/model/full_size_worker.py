@@ -44,9 +44,7 @@ def _diffusers_unet() -> nn.Module:
 
     Imported here, so that our own process does not hold diffusers in memory.
     """
-    from diffusers.models.unets.unet_spatio_temporal_condition import (
-        UNetSpatioTemporalConditionModel,
-    )
+    from diffusers.models.unets.unet_spatio_temporal_condition import UNetSpatioTemporalConditionModel
 
     with torch.device("meta"):
         unet = UNetSpatioTemporalConditionModel(num_frames=FRAMES)

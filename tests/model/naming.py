@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from gcd_model.config import ImageEncoderConfig, UNetConfig, VAEConfig
 from gcd_model.unet import VideoUNet
-from gcd_model.weights.names import GCD_UNET, Form, Levels, diffusers_source, gcd_source
+from gcd_model.weights.names import GCD_UNET, Levels, Source, diffusers_source, gcd_source
 
 
 def levels_of(
@@ -48,17 +48,17 @@ def diffusers_state(module: nn.Module, own: str, folder: str, levels: Levels) ->
     for name, value in module.state_dict().items():
         source = diffusers_source(f"{own}.{name}", levels)
         assert source is not None, f"diffusers has no {own}.{name}"
-        for published, part in zip(source.names, _taken_apart(value, source.form), strict=True):
-            state[published.removeprefix(folder)] = part
+        state |= {published.removeprefix(folder): part for published, part in taken_apart(value, source).items()}
     return state
 
 
-def _taken_apart(value: Tensor, form: Form) -> tuple[Tensor, ...]:
-    if form == "stacked":
-        return tuple(value.chunk(3))
-    if form == "transposed":
-        return (value.T,)
-    return (value.flatten(1) if form == "pixelwise" else value,)
+def taken_apart(tensor: Tensor, source: Source) -> dict[str, Tensor]:
+    """The published tensors that make one of ours: the inverse of `assembled`."""
+    if source.form == "stacked":
+        return dict(zip(source.names, (part.clone() for part in tensor.chunk(3)), strict=True))
+    if source.form == "transposed":
+        return {source.names[0]: tensor.T.contiguous()}
+    return {source.names[0]: tensor[:, :, 0, 0].contiguous() if source.form == "pixelwise" else tensor.clone()}
 
 
 def from_diffusers_unet(weights: Mapping[str, Tensor], unet: VideoUNet) -> dict[str, Tensor]:

@@ -55,14 +55,7 @@ class _Pass:
 
 
 def plain_unet(
-    weights: Weights,
-    x: Tensor,
-    *,
-    noise_label: Tensor,
-    vector: Tensor,
-    tokens: Tensor,
-    frames: int,
-    head_width: int,
+    weights: Weights, x: Tensor, *, noise_label: Tensor, vector: Tensor, tokens: Tensor, frames: int, head_width: int
 ) -> Tensor:
     """One evaluation of the network F, frames flattened into the batch with time fastest.
 

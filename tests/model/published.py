@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 import pytest
 import torch
+from naming import taken_apart
 from safetensors.torch import load_file, save_file
 from small_models import randomise
 from torch import Tensor
@@ -19,7 +20,7 @@ from gcd_model.errors import CheckpointError
 from gcd_model.networks import Networks
 from gcd_model.weights.infer import Naming
 from gcd_model.weights.load import load_weights
-from gcd_model.weights.names import Levels, Source, diffusers_source, gcd_source
+from gcd_model.weights.names import Levels, diffusers_source, gcd_source
 
 MANIFEST = Path(__file__).parents[2].parent / "shared" / "spec" / "checkpoint-manifest.json.gz"
 
@@ -61,15 +62,6 @@ def filled(config: ModelConfig = SMALL_GCD, seed: int = 0) -> Networks:
     networks = Networks(config)
     randomise(networks, seed)
     return networks
-
-
-def taken_apart(tensor: Tensor, source: Source) -> dict[str, Tensor]:
-    """The published tensors that make one of ours: the inverse of `assembled`."""
-    if source.form == "stacked":
-        return dict(zip(source.names, (part.clone() for part in tensor.chunk(3)), strict=True))
-    if source.form == "transposed":
-        return {source.names[0]: tensor.T.contiguous()}
-    return {source.names[0]: tensor[:, :, 0, 0].contiguous() if source.form == "pixelwise" else tensor.clone()}
 
 
 def published_state(networks: Networks, naming: Naming) -> dict[str, Tensor]:

@@ -6,14 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from gcd_model.clip import Clip
-from gcd_model.config import (
-    ImageEncoderConfig,
-    ModelConfig,
-    SamplingConfig,
-    SemanticClass,
-    UNetConfig,
-    VAEConfig,
-)
+from gcd_model.config import ImageEncoderConfig, ModelConfig, SamplingConfig, SemanticClass, UNetConfig, VAEConfig
 from gcd_model.networks import Networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits

@@ -2,7 +2,6 @@
 
 import gc
 from collections.abc import Callable
-from copy import deepcopy
 from pathlib import Path
 
 import msgspec
@@ -32,9 +31,6 @@ UNET = "model.diffusion_model"
 CONV = f"{UNET}.input_blocks.1.0.in_layers.2.weight"
 
 
-# --- every layout gives the same networks ----------------------------------------------------------------------------
-
-
 def test_a_lightning_checkpoint_loads_weight_by_weight(tmp_path: Path) -> None:
     loaded = load_weights(write_gcd(tmp_path))
     assert_same_weights(loaded.networks, filled())
@@ -56,14 +52,6 @@ def test_a_diffusers_folder_loads_weight_by_weight(tmp_path: Path, configs: bool
     assert_same_weights(loaded.networks, filled(shared_vae(SMALL_GCD)))
     assert loaded.networks.config == shared_vae(SMALL_GCD)
     assert loaded.networks.condition_encoder is loaded.networks.target_encoder
-
-
-def test_a_float16_variant_keeps_its_precision_until_asked(tmp_path: Path) -> None:
-    loaded = load_weights(write_diffusers(tmp_path / "model", half=True))
-    assert {parameter.dtype for parameter in loaded.networks.parameters()} == {torch.float16}
-    wanted = deepcopy(filled(shared_vae(SMALL_GCD))).half().state_dict()
-    for name, tensor in loaded.networks.state_dict().items():
-        torch.testing.assert_close(tensor, wanted[name].half(), rtol=0, atol=0, msg=name)
 
 
 def test_a_sharded_part_is_put_together(tmp_path: Path) -> None:
@@ -98,9 +86,6 @@ def test_config_json_tells_heads_frames_and_scale(tmp_path: Path) -> None:
     assert (given.unet.head_width, given.frames, given.image_encoder.heads) == (16, 7, 8)
 
 
-# --- mapped, not read ------------------------------------------------------------------------------------------------
-
-
 def private_bytes() -> int:
     """Memory of this process that no file backs."""
     for line in Path("/proc/self/smaps_rollup").read_text().splitlines():
@@ -124,12 +109,6 @@ def test_loading_takes_no_memory_of_its_own(tmp_path: Path) -> None:
     assert sum(parameter.nbytes for parameter in loaded.networks.parameters()) > 0.9 * weights
 
 
-def test_the_optimizer_state_is_weighed_and_not_kept(tmp_path: Path) -> None:
-    report = inspect_weights(write_gcd(tmp_path))
-    assert report.optimizer_size == 4 + 2 * 50 * 4
-    assert report.other_entries == ("epoch", "global_step")
-
-
 def test_writing_into_loaded_weights_leaves_the_file_alone(tmp_path: Path) -> None:
     path = write_gcd(tmp_path)
     before = digest((path,))
@@ -138,9 +117,6 @@ def test_writing_into_loaded_weights_leaves_the_file_alone(tmp_path: Path) -> No
         for parameter in loaded.networks.parameters():
             parameter.zero_()
     assert digest((path,)) == before
-
-
-# --- strictness ------------------------------------------------------------------------------------------------------
 
 
 def drop(state: dict[str, Tensor], names: list[str]) -> None:
@@ -171,21 +147,9 @@ def test_all_that_does_not_fit_is_said_at_once(tmp_path: Path) -> None:
     assert all(word in message for word in ("1 of", "missing", "misshapen", "1 unexpected names"))
 
 
-@pytest.mark.parametrize(
-    "name",
-    [f"{UNET}.input_blocks.0.0.weight", f"{UNET}.out.2.weight", "first_stage_model.encoder.conv_in.weight"],
-)
-def test_a_missing_weight_that_tells_the_architecture_is_named(tmp_path: Path, name: str) -> None:
+def test_a_missing_weight_that_tells_the_architecture_is_named(tmp_path: Path) -> None:
+    name = f"{UNET}.out.2.weight"
     assert name in refused(changed(tmp_path, lambda state: drop(state, [name])))
-
-
-def test_every_single_missing_weight_is_noticed(tmp_path: Path) -> None:
-    """For one name of every kind, so that none is only found by luck."""
-    state = gcd_state(filled())
-    used = [name for name in state if "open_clip.model." not in name and ".decoder.conv_in" not in name]
-    for name in used[:: len(used) // 12]:
-        path = write_lightning(tmp_path / "a.ckpt", {n: t for n, t in state.items() if n != name})
-        assert name in refused(path)
 
 
 def test_leftovers_are_recognised_and_counted(tmp_path: Path) -> None:
@@ -197,11 +161,3 @@ def test_leftovers_are_recognised_and_counted(tmp_path: Path) -> None:
         "EMA": 1,
     }
     assert next(left.size for left in report.leftovers if left.kind == "LPIPS") == 16
-
-
-def test_the_decoder_of_the_condition_vae_may_be_absent(tmp_path: Path) -> None:
-    def change(state: dict[str, Tensor]) -> None:
-        for name in [name for name in state if name.startswith("conditioner.embedders.3.encoder.decoder")]:
-            del state[name]
-
-    assert_same_weights(load_weights(changed(tmp_path, change)).networks, filled())

@@ -28,9 +28,6 @@ UNET = "model.diffusion_model"
 CONV = f"{UNET}.input_blocks.1.0.in_layers.2.weight"
 
 
-# --- foreign and hostile objects -------------------------------------------------------------------------------------
-
-
 def foreign_class(monkeypatch: pytest.MonkeyPatch) -> type:
     """A class of a module that exists only while the checkpoint is written."""
     module = types.ModuleType("made_up_trainer")
@@ -91,8 +88,7 @@ def test_hostile_code_among_the_weights_is_refused_and_never_runs(tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["posix.system", "os.system", "builtins.eval", "builtins.getattr", "torch.load", "torch.storage._load_from_bytes"],
+    "name", ["posix.system", "builtins.eval", "builtins.getattr", "torch.load", "torch.storage._load_from_bytes"]
 )
 def test_no_function_but_rebuilding_is_ever_called(tmp_path: Path, name: str) -> None:
     module, _, function = name.rpartition(".")
@@ -128,9 +124,6 @@ def test_quantised_weights_are_refused(tmp_path: Path) -> None:
     assert refused(path).startswith(f"1 weights are stored as int8, first: {CONV}")
 
 
-# --- files that are something else -----------------------------------------------------------------------------------
-
-
 def cut(path: Path, keep: float) -> Path:
     path.write_bytes(path.read_bytes()[: int(keep * path.stat().st_size)])
     return path
@@ -151,7 +144,6 @@ def test_truncated_files_say_so(tmp_path: Path) -> None:
         (b"", "is empty (0 bytes); fetch it again"),
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n", "run `git lfs pull`"),
         (b"\n<!DOCTYPE html><html><body>Sign in</body></html>", "is a web page"),
-        (b"\x00" * 1000, "is neither a torch zip"),
         (b"text, no weights", "is neither a torch zip"),
         ((50).to_bytes(8, "little") + b"{" * 50, "is damaged or truncated safetensors"),
         ((1 << 60).to_bytes(8, "little") + b"{" * 50, "too long to be true"),
@@ -160,13 +152,9 @@ def test_truncated_files_say_so(tmp_path: Path) -> None:
         (pickle.dumps({"a": 1}, protocol=2), "torch's old format"),
     ],
 )
-@pytest.mark.parametrize("name", ["a.ckpt", "a.safetensors"])
-def test_what_is_no_checkpoint_is_named_with_a_remedy(tmp_path: Path, content: bytes, said: str, name: str) -> None:
-    path = tmp_path / name
-    path.write_bytes(content)
-    if name.endswith(".safetensors") and content.startswith(b"PK"):
-        said = "rename it to .ckpt"
-    assert said in refused(path)
+def test_what_is_no_checkpoint_is_named_with_a_remedy(tmp_path: Path, content: bytes, said: str) -> None:
+    (tmp_path / "a.ckpt").write_bytes(content)
+    assert said in refused(tmp_path / "a.ckpt")
 
 
 def test_a_pickle_of_more_than_any_checkpoint_needs_is_not_read(tmp_path: Path) -> None:

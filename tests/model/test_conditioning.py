@@ -45,7 +45,7 @@ def test_relative_poses_become_their_top_three_rows_row_by_row() -> None:
 
 def test_a_free_path_is_refused_by_spherical_control_with_the_way_out() -> None:
     free = pose_trajectory(torch.eye(4, dtype=torch.float64).repeat(3, 1, 1))
-    with pytest.raises(ShapeError, match="plan_view"):
+    with pytest.raises(ShapeError):
         CameraEmbedder("spherical", 5)(free)
 
 
@@ -91,15 +91,6 @@ def test_without_guidance_there_is_one_branch_and_without_a_tower_no_token() -> 
     assert condition_latents(features, 2, unconditional=False).shape == (6, 4, 2, 3)
     blind = SourceFeatures(tokens=None, latents=features.latents, extra=None, fps=12.0, augmentation=0.02)
     assert condition_tokens(blind, 2, unconditional=True) is None
-
-
-def test_rows_and_followed_by_undo_each_other() -> None:
-    features = _features(frames=5, extra=draw(5, 2, 2, 3, seed=1))
-    joined = features.rows(0, 2).followed_by(features.rows(2, 3), features.rows(3, 5))
-    for name in ("tokens", "latents", "extra"):
-        assert torch.equal(getattr(joined, name), getattr(features, name))
-    assert joined.frames == 5
-    assert features.rows(1, 4).frames == 3
 
 
 def test_condition_latents_are_the_posterior_mean_of_the_noised_frames_and_not_scaled() -> None:

@@ -75,7 +75,7 @@ def adapted() -> FeedForward:
     return feed
 
 
-@pytest.mark.parametrize("floats", [1, 6 * 35 * 2, cpu.REUSED_FLOATS])
+@pytest.mark.parametrize("floats", [1, 6 * 35 * 2])
 @pytest.mark.parametrize(
     ("module", "given"),
     [

@@ -1,12 +1,10 @@
 """A small model with every switch that is ours: x0, shared noise, patches; and the class map of what it paints."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import msgspec
 import pytest
 import torch
-from msgspec import structs
 from small_models import (
     TINY_CLASSES,
     TINY_DRIVING,
@@ -29,7 +27,6 @@ from gcd_model.loading import load_synthesizer
 from gcd_model.networks import Networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.weights.card import Card
-from gcd_model.weights.families import DRIVING
 from gcd_model.weights.load import save_weights
 
 FRAMES, HEIGHT, WIDTH = TINY_DRIVING.frames, TINY_DRIVING.height, TINY_DRIVING.width
@@ -57,9 +54,6 @@ class Rows:
         self.noisy.append(given[0][:, :4])
 
 
-# --- rendering -------------------------------------------------------------------------------------------------------
-
-
 def test_a_painted_view_comes_with_the_classes_of_its_colours(synthesizer: Synthesizer) -> None:
     view = rendered(synthesizer, options=RenderOptions(samples=2))
     assert synthesizer.traits.classes == TINY_CLASSES
@@ -67,13 +61,6 @@ def test_a_painted_view_comes_with_the_classes_of_its_colours(synthesizer: Synth
     assert view.classes.shape == (2, FRAMES, HEIGHT, WIDTH)
     away = (view.samples.unsqueeze(3) - palette(TINY_CLASSES).T[:, :, None, None] / 255).square().sum(dim=2)
     assert torch.equal(view.classes.long(), away.argmin(dim=2))
-
-
-def test_classes_are_named_only_where_pictures_are_painted() -> None:
-    assert replace(tiny_driving().traits, family=DRIVING).classes == ()
-    unnamed = tiny_driving(structs.replace(TINY_DRIVING, semantic_classes=()))
-    assert unnamed.traits.classes == ()
-    assert rendered(unnamed).classes is None
 
 
 def test_every_frame_starts_from_the_same_noise() -> None:
@@ -105,11 +92,8 @@ def test_the_checkpoint_names_its_augmentation(synthesizer: Synthesizer) -> None
 
 def test_a_mount_is_refused_where_the_view_hangs_on_no_vehicle(synthesizer: Synthesizer) -> None:
     for traits in (synthesizer.traits, tiny_synthesizer().traits):
-        with pytest.raises(OptionError, match="leave the mount out"):
+        with pytest.raises(OptionError):
             traits.plan_view(mount=CameraMount())
-
-
-# --- the config ------------------------------------------------------------------------------------------------------
 
 
 def test_a_model_stored_in_half_precision_comes_back_and_computes_in_float32(tmp_path: Path) -> None:
@@ -132,7 +116,7 @@ def test_an_ontology_that_cannot_be_told_apart_is_refused() -> None:
         content["semantic_classes"] = [msgspec.to_builtins(TINY_CLASSES[i]) for i in classes]
         with pytest.raises(msgspec.ValidationError, match=words):
             msgspec.convert(content, ModelConfig)
-    with pytest.raises(OptionError, match="within 0-255"):
+    with pytest.raises(OptionError):
         SemanticClass(name="car", colour=(0, 300, 0))
 
 
@@ -146,9 +130,6 @@ def test_a_painted_map_is_read_back_even_a_little_off_colour(classes: tuple[Sema
         found = nearest_classes(pixels, classes)
         assert found.dtype == torch.uint8
         assert torch.equal(found.long(), truth)
-
-
-# --- single frames first, then clips ---------------------------------------------------------------------------------
 
 
 def unet_rows(networks: Networks, rows: int, *, image_mode: bool, order: Tensor | None = None) -> Tensor:

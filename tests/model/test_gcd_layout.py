@@ -20,13 +20,15 @@ from small_models import TINY_DRIVING, draw
 from torch import Tensor
 
 from gcd_model.config import SMALL, SVD_14, ModelConfig
-from gcd_model.errors import OptionError
+from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.networks import Networks, empty_networks
 from gcd_model.weights.adapter import CAMERA
 from gcd_model.weights.card import Card
 from gcd_model.weights.infer import LEFTOVERS
 from gcd_model.weights.load import convert_weights, inspect_weights, load_weights
 from gcd_model.weights.save import gcd_state, write_published
+
+NARROW_HEADS = msgspec.structs.replace(SMALL_GCD, unet=msgspec.structs.replace(SMALL_GCD.unet, head_width=32))
 
 
 def card(config: ModelConfig, family: str = "kubric90") -> Card:
@@ -114,21 +116,11 @@ def test_one_encoder_for_all_frames_becomes_two_that_compute_the_same(tmp_path: 
             torch.testing.assert_close(encoder(frames).log_variance, wanted.log_variance, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("config", "wanted"), [(TINY_DRIVING, "the paper's networks only"), (SMALL, "cannot say this architecture: ")]
-)
-def test_networks_the_released_code_could_not_build_are_refused(
-    tmp_path: Path, config: ModelConfig, wanted: str
-) -> None:
-    with pytest.raises(OptionError, match=wanted):
+@pytest.mark.parametrize("config", [TINY_DRIVING, SMALL, NARROW_HEADS], ids=["driving", "small", "narrow heads"])
+def test_networks_the_released_code_could_not_build_are_refused(tmp_path: Path, config: ModelConfig) -> None:
+    with pytest.raises(OptionError):
         written(tmp_path / "mine.ckpt", Networks(config))
     assert list(tmp_path.iterdir()) == []
-
-
-def test_heads_that_names_and_shapes_do_not_tell_are_refused() -> None:
-    narrow = msgspec.structs.replace(SMALL_GCD, unet=msgspec.structs.replace(SMALL_GCD.unet, head_width=32))
-    with pytest.raises(OptionError, match="its unet would be read as"):
-        gcd_state(empty_networks(narrow).state_dict(), narrow, {})
 
 
 def test_a_note_that_lies_about_the_networks_is_refused(tmp_path: Path) -> None:
@@ -140,7 +132,7 @@ def test_a_note_that_lies_about_the_networks_is_refused(tmp_path: Path) -> None:
         "gcd.move_time": "2",
     }
     torch.save(root, path)
-    with pytest.raises(Exception, match="weights are missing"):
+    with pytest.raises(CheckpointError):
         load_weights(path)
 
 

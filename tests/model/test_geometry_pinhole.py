@@ -1,4 +1,5 @@
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -35,71 +36,47 @@ def test_a_field_of_view_survives_the_round_trip(hfov_deg: float) -> None:
     assert (camera.cx, camera.cy) == (192.0, 128.0)
 
 
+def with_entry(row: int, column: int, value: float) -> Tensor:
+    matrix = CAMERA.matrix
+    matrix[row, column] = value
+    return matrix
+
+
+@pytest.mark.parametrize(
+    ("make", "error"),
+    [
+        (lambda: CAMERA.cropped(-1, 0, 10, 10), ShapeError),
+        (lambda: CAMERA.cropped(0, 471, 10, 10), ShapeError),
+        (lambda: CAMERA.cropped(0, 0, 0, 10), ShapeError),
+        (lambda: CAMERA.resized(10, 0), ShapeError),
+        (lambda: Intrinsics(fx=0.0, fy=1.0, cx=1.0, cy=1.0, width=2, height=2), OptionError),
+        (lambda: Intrinsics(fx=1.0, fy=math.inf, cx=1.0, cy=1.0, width=2, height=2), OptionError),
+        (lambda: Intrinsics.from_hfov(180.0, 384, 256), OptionError),
+        (lambda: Intrinsics.from_hfov(math.nan, 384, 256), OptionError),
+        (lambda: Intrinsics.from_hfov(50.0, 0, 256), ShapeError),
+        (lambda: Intrinsics.from_matrix(with_entry(0, 1, 3.0), 640, 480), OptionError),
+        (lambda: Intrinsics.from_matrix(with_entry(2, 2, 2.0), 640, 480), OptionError),
+        (lambda: Intrinsics.from_matrix(torch.eye(4), 640, 480), ShapeError),
+        (lambda: center_crop_box(640, 480, -1.5), OptionError),
+        (lambda: center_crop_box(640, 480, math.nan), OptionError),
+    ],
+)
+def test_what_no_pinhole_camera_is_is_refused(make: Callable[[], object], error: type[Exception]) -> None:
+    with pytest.raises(error):
+        make()
+
+
 def test_a_matrix_survives_the_round_trip_in_single_precision_too() -> None:
     assert Intrinsics.from_matrix(CAMERA.matrix, 640, 480) == CAMERA
     assert Intrinsics.from_matrix(CAMERA.matrix.float(), 640, 480) == CAMERA
     assert CAMERA.matrix.dtype == torch.float64
 
 
-def test_a_focal_length_of_one_picture_width_is_the_field_of_view_of_kubric() -> None:
-    camera = Intrinsics(fx=384.0, fy=384.0, cx=192.0, cy=128.0, width=384, height=256)
-    assert camera.hfov_deg == pytest.approx(53.13, abs=0.005)
-    assert camera.hfov_deg == pytest.approx(math.degrees(2 * math.atan(0.5)))
-    assert Intrinsics.from_hfov(camera.hfov_deg, 384, 256).fy / 256 == pytest.approx(1.5)
-
-
-@pytest.mark.parametrize(
-    ("box", "message"),
-    [
-        ((-1, 0, 10, 10), "stay inside the 640 x 480"),
-        ((0, -1, 10, 10), "stay inside"),
-        ((600, 0, 41, 10), "stay inside"),
-        ((0, 471, 10, 10), "stay inside"),
-        ((0, 0, 0, 10), "at least 1 x 1"),
-    ],
-)
-def test_a_crop_must_stay_inside(box: tuple[int, int, int, int], message: str) -> None:
-    with pytest.raises(ShapeError, match=message):
-        CAMERA.cropped(*box)
-
-
-@pytest.mark.parametrize(("fx", "fy"), [(0.0, 1.0), (1.0, -1.0), (math.nan, 1.0), (1.0, math.inf)])
-def test_focal_lengths_must_be_positive_and_finite(fx: float, fy: float) -> None:
-    with pytest.raises(OptionError, match=r"positive|finite"):
-        Intrinsics(fx=fx, fy=fy, cx=1.0, cy=1.0, width=2, height=2)
-
-
-@pytest.mark.parametrize("hfov_deg", [0.0, -10.0, 180.0, math.nan])
-def test_a_field_of_view_must_be_an_angle_a_plane_can_show(hfov_deg: float) -> None:
-    with pytest.raises(OptionError, match="between 0 and 180"):
-        Intrinsics.from_hfov(hfov_deg, 384, 256)
-
-
-def test_a_picture_has_at_least_one_pixel() -> None:
-    with pytest.raises(ShapeError, match="at least 1 x 1, got 0 x 256"):
-        Intrinsics.from_hfov(50.0, 0, 256)
-    with pytest.raises(ShapeError, match="at least 1 x 1"):
-        CAMERA.resized(10, 0)
-
-
-@pytest.mark.parametrize(("row", "column", "value"), [(0, 1, 3.0), (1, 0, 3.0), (2, 0, 0.1), (2, 2, 2.0)])
-def test_a_matrix_of_another_kind_of_camera_is_refused(row: int, column: int, value: float) -> None:
-    matrix = CAMERA.matrix
-    matrix[row, column] = value
-    with pytest.raises(OptionError, match="undistort"):
-        Intrinsics.from_matrix(matrix, 640, 480)
-
-
-def test_a_matrix_must_be_3_by_3() -> None:
-    with pytest.raises(ShapeError, match=r"\[3, 3\], got \[4, 4\]"):
-        Intrinsics.from_matrix(torch.eye(4), 640, 480)
-
-
 # The crop to the trained shape
 
 
 @pytest.mark.parametrize("aspect", [0.75, 1.0, 1.5, 16 / 9])
-@pytest.mark.parametrize(("width", "height"), [(640, 480), (576, 384), (1920, 1080), (333, 777), (37, 11)])
+@pytest.mark.parametrize(("width", "height"), [(640, 480), (333, 777), (37, 11)])
 def test_the_crop_is_the_largest_centred_part_of_that_shape(width: int, height: int, aspect: float) -> None:
     left, top, kept_width, kept_height = center_crop_box(width, height, aspect, tolerance=0.0)
     assert kept_width == width or kept_height == height
@@ -120,9 +97,3 @@ def test_the_crop_is_the_largest_centred_part_of_that_shape(width: int, height: 
 )
 def test_recorded_crops_to_three_by_two(width: int, height: int, box: tuple[int, int, int, int]) -> None:
     assert center_crop_box(width, height, 1.5) == box
-
-
-@pytest.mark.parametrize("aspect", [0.0, -1.5, float("nan"), float("inf")])
-def test_an_impossible_aspect_is_refused(aspect: float) -> None:
-    with pytest.raises(OptionError, match="positive number"):
-        center_crop_box(640, 480, aspect)

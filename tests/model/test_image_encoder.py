@@ -44,13 +44,3 @@ def test_pixels_are_squeezed_by_kornias_antialiased_bicubic_before_the_range_cha
     mean = torch.tensor([0.48145466, 0.4578275, 0.40821073]).reshape(3, 1, 1)
     deviation = torch.tensor([0.26862954, 0.26130258, 0.27577711]).reshape(3, 1, 1)
     assert_close(clip_pixels(frames, 224), ((squeezed + 1) / 2 - mean) / deviation)
-
-
-def test_the_whole_picture_is_kept_when_it_is_not_square() -> None:
-    frames = torch.full((1, 3, 64, 256), -1.0)
-    frames[..., :32], frames[..., -32:] = 1.0, 1.0  # a centre crop would lose both bright edges
-    pixels = clip_pixels(frames, 56)
-    assert pixels.shape == (1, 3, 56, 56)
-    assert pixels[0, 0, 28, 2] > 1.0
-    assert pixels[0, 0, 28, -3] > 1.0
-    assert pixels[0, 0, 28, 28] < 0.0

@@ -5,7 +5,6 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from gcd_model.errors import OptionError, ShapeError
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.memory import SurfelMemory
 from gcd_model.live.splat import Surfels, unproject
@@ -102,16 +101,3 @@ def test_painted_stays_painted_until_it_is_seen() -> None:
     assert bool(memory.surfels.painted.all())
     memory.update(flat(5.0), LENS, HERE, surfels(flat(5.0), stamp=1.0))
     assert not bool(memory.surfels.painted.any())
-
-
-def test_a_reset_memory_is_empty() -> None:
-    memory = memory_of(surfels(flat(5.0), stamp=0.0))
-    memory.reset()
-    assert len(memory.surfels) == 0
-
-
-def test_a_memory_needs_room_and_depth_of_the_lens_size() -> None:
-    with pytest.raises(OptionError):
-        SurfelMemory(0)
-    with pytest.raises(ShapeError):
-        SurfelMemory(5).forget(torch.ones(4, 4), LENS, HERE)

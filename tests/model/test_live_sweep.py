@@ -7,7 +7,7 @@ from torch.testing import assert_close
 
 from gcd_model.live.config import DepthConfig
 from gcd_model.live.depth_net import DepthNet, depth_inputs, pixel_rays, read_depth
-from gcd_model.live.sweep import LONGEST, Reference, References, sweep_channels, sweep_costs
+from gcd_model.live.sweep import LONGEST, Reference, References, sweep_costs
 
 CONFIG = DepthConfig(bins=32, nearest_m=1.0, farthest_m=10.0)
 HERE = torch.eye(4, dtype=torch.float64)
@@ -52,13 +52,6 @@ def test_a_network_that_trusts_the_sweep_reads_its_depth_off_it() -> None:
     assert ((metres / 3.0 - 1).abs() < 0.1).float().mean() > 0.8
     whole = output.logits.flatten(2).gather(2, some[:, None].expand(-1, 32, -1))
     assert_close(sampled.logits[..., 0], whole)
-
-
-def test_without_a_reference_there_is_nothing_and_it_says_so() -> None:
-    made = sweep_costs(room().video[3], LENS, None, CONFIG)
-    assert made.shape == (sweep_channels(CONFIG), LENS.height // 2, LENS.width // 2)
-    assert not made.any()
-    assert bool((sweep_costs(room().video[3], LENS, reference(2), CONFIG)[-1] == 1).all())
 
 
 def test_what_the_earlier_frame_did_not_see_costs_the_same_at_any_depth() -> None:

@@ -48,20 +48,6 @@ def assert_same(a: LiveFrame, b: LiveFrame, tolerance: float = 0.0) -> None:
             assert_close(getattr(mine, name), getattr(other, name), rtol=tolerance, atol=tolerance)
 
 
-def test_a_window_is_its_frames_one_by_one(networks: LiveNetworks) -> None:
-    synthesizer = LiveSynthesizer(networks, load_synthesizer("random:live", device="cpu").traits)
-    window = synthesizer.render(synthesizer.encode(room()), [path(0.5)], RenderOptions(seed=2))[0]
-    assert window.visibility is not None
-    assert window.inverse_depth is not None
-    assert window.classes is not None
-    for t, frame in enumerate(steps(LiveView(networks, seed=2), range(FRAMES))):
-        (view,) = frame.views
-        assert_close(window.samples[0, t], (view.picture + 1) / 2, rtol=0, atol=1e-5)
-        assert_close(window.inverse_depth[t], view.inverse_depth, rtol=0, atol=1e-5)
-        assert torch.equal(window.visibility[t], view.visibility)
-        assert torch.equal(window.classes[0, t], view.classes)
-
-
 def test_a_window_is_its_frames_when_they_stream(networks: LiveNetworks) -> None:
     whole = LiveSynthesizer(networks, load_synthesizer("random:live", device="cpu").traits)
     features = whole.encode(room())
@@ -177,22 +163,6 @@ def test_holes_are_filled_by_nobody_but_the_sky(sky: float, metres: float) -> No
     assert bool((seen.metres == metres).all())
 
 
-def test_a_jump_drops_the_memory_says_so_and_goes_on(networks: LiveNetworks) -> None:
-    view, clip = LiveView(networks), room()
-    assert clip.odometry is not None
-    assert clip.depth is not None
-    steps(view, range(5))
-    jump = clip.odometry[5].clone()
-    jump[:3, 3] += 500.0
-    lost = view.step(clip.video[5], [aside(1.5)], lens=LENS, depth=clip.depth[5], odometry=jump)
-    assert lost.lost is not None
-    assert not bool((lost.views[0].visibility == 1).any())
-    after = jump.clone()
-    after[0, 3] += 0.1
-    goes_on = view.step(clip.video[6], [aside(1.5)], lens=LENS, depth=clip.depth[6], odometry=after)
-    assert goes_on.lost is None
-
-
 def test_what_cannot_be_is_refused(networks: LiveNetworks) -> None:
     view, frame = LiveView(networks), room().video[0]
     with pytest.raises(ShapeError):
@@ -218,8 +188,6 @@ def test_what_cannot_be_is_refused(networks: LiveNetworks) -> None:
     ],
     ids=str,
 )
-def test_numbers_that_no_camera_and_no_sampler_has_are_refused(
-    stated: dict[str, object],
-) -> None:
+def test_numbers_that_no_camera_and_no_sampler_has_are_refused(stated: dict[str, object]) -> None:
     with pytest.raises((OptionError, msgspec.ValidationError)):
         msgspec.convert(stated, LiveConfig)

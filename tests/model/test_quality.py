@@ -4,27 +4,41 @@ from dataclasses import replace
 from functools import lru_cache
 
 import pytest
-from mixture import apart, followed
 from msgspec import structs
+from small_models import draw
 from torch import Tensor
 
 from gcd_model import RenderOptions, Sampler, Schedule, sampler_of
 from gcd_model.clip import QUALITIES, Quality, SolverName
 from gcd_model.config import PLAIN_SMALL, SVD_14, SamplingConfig
-from gcd_model.diffusion import FAST, FASTEST
+from gcd_model.diffusion import FAST, FASTEST, edm_sigmas, sample, solver_steps
 
 PUBLISHED = SamplingConfig()
 
 
+CENTRES, NOISE, SPREAD = draw(24, 32, seed=2).double(), draw(64, 32, seed=3).double(), 0.3
+
+
+def denoised(x: Tensor, sigma: float) -> Tensor:
+    """Exactly, of data that are a mixture of Gaussians at CENTRES: the mean of what x [N, D] could be without noise."""
+    variance = SPREAD**2 + sigma**2
+    nearness = -((x[:, None] - CENTRES) ** 2).sum(dim=2) / (2 * variance)
+    mean = nearness.softmax(dim=1) @ CENTRES
+    return mean + SPREAD**2 / variance * (x - mean)
+
+
 @lru_cache
 def flow(solver: SolverName, steps: int) -> Tensor:
-    """Of the mixture's noise."""
-    return followed(solver, steps)
+    """Where the noise ends up: [64, 32]."""
+    sigmas = edm_sigmas(PUBLISHED, steps)
+    start = NOISE * (sigmas[0].item() ** 2 + 1) ** 0.5
+    return sample(lambda x, i: denoised(x, sigmas[i].item()), start, solver_steps(solver, sigmas))
 
 
 def error(solver: SolverName, steps: int) -> float:
-    """How far the samples end from where many steps bring them, mean."""
-    return apart(flow(solver, steps), flow("dpmpp_2m", 1200)).mean().item()
+    """How far the samples end from where many steps bring them, relative, mean."""
+    limit = flow("dpmpp_2m", 1200)
+    return ((flow(solver, steps) - limit).norm(dim=1) / limit.norm(dim=1)).mean().item()
 
 
 def in_quality(quality: Quality, sampling: SamplingConfig = PUBLISHED) -> Sampler:
@@ -43,7 +57,7 @@ def test_a_checkpoint_of_few_steps_is_sampled_its_own_way_in_every_quality(quali
     assert in_quality(quality, sampling) == own
 
 
-@pytest.mark.parametrize("steps", range(1, 60))
+@pytest.mark.parametrize("steps", [1, 2, 5, 25, 59])
 def test_no_quality_takes_more_of_the_network_than_a_better_one(steps: int) -> None:
     config = structs.replace(SVD_14, sampling=SamplingConfig(steps=steps))
     cost = [Schedule.of(config, RenderOptions(quality=quality)).evaluations for quality in QUALITIES]

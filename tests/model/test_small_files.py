@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from gcd_model.errors import FileError
-from gcd_model.small_files import MOST_DEPTH, decode_json, decode_toml, printable, read_json, read_small
+from gcd_model.small_files import MOST_DEPTH, decode_json, decode_toml, printable, read_small
 
 
 class Facts(msgspec.Struct, forbid_unknown_fields=True):
@@ -83,11 +83,6 @@ def test_what_a_reader_passes_over_is_held_to_the_limits_too() -> None:
 def test_digits_in_names_and_fractions_are_no_long_integers() -> None:
     digest = "0123456789" * 6
     assert decode_json(f'{{"name": "{digest}", "share": 0.{digest}}}', Facts).name == digest
-
-
-def test_a_json_file_is_read_as_its_type(tmp_path: Path) -> None:
-    (tmp_path / "a").write_text('{"name": "x", "count": 3}')
-    assert read_json(tmp_path / "a", Facts) == Facts(name="x", count=3)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """The U-Net against its plain twin and against diffusers, and what it costs at full size."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import msgspec
 import pytest
@@ -81,14 +82,14 @@ def batch(control: CameraControl = "spherical", clips: int = CLIPS) -> Batch:
     )
 
 
-def small_unet(control: CameraControl = "spherical") -> VideoUNet:
+def small_unet(control: CameraControl = "spherical", **changes: Any) -> VideoUNet:
     width = 0 if control == "none" else UNET.camera_width
-    unet = VideoUNet(msgspec.structs.replace(UNET, camera_width=width), FRAMES)
+    unet = VideoUNet(msgspec.structs.replace(UNET, camera_width=width, **changes), FRAMES)
     randomise(unet)
     return unet
 
 
-@pytest.mark.parametrize("control", ["spherical", "relative_pose", "none"])
+@pytest.mark.parametrize("control", ["spherical", "none"])
 def test_the_u_net_equals_the_published_one_in_training_and_prepared(control: CameraControl) -> None:
     unet, given = small_unet(control).train(), batch(control)
     with torch.no_grad():
@@ -100,7 +101,7 @@ def test_the_u_net_equals_the_published_one_in_training_and_prepared(control: Ca
 
 def test_gradients_through_derived_values_equal_the_published_ones() -> None:
     """In double precision, so that rounding does not hide a wrong term; all parameters, also those derived from."""
-    unet = small_unet().double().train()
+    unet = small_unet(multipliers=(1, 2), attention=(True, False), blocks_per_level=1).double().train()
     given, weights = (
         batch(clips=1),
         {name: w.double().clone().requires_grad_() for name, w in released_unet(unet).items()},
@@ -120,7 +121,7 @@ def test_gradients_through_derived_values_equal_the_published_ones() -> None:
     assert all(theirs[name].abs().max() < 1e-9 for name in dormant)  # the published network does not use them either
 
 
-@pytest.mark.parametrize("frame", range(CLIPS * FRAMES))
+@pytest.mark.parametrize("frame", [0, 2, FRAMES])
 def test_a_token_counts_for_its_own_frame_and_the_first_of_a_clip_for_all_its_frames_together(frame: int) -> None:
     unet = small_unet()
     rows = CLIPS * FRAMES
@@ -162,9 +163,6 @@ def test_norms_have_the_published_epsilons() -> None:
             assert module.eps == (1e-6 if name.endswith("attention.norm") else 1e-5), name
         if isinstance(module, nn.LayerNorm):
             assert module.eps == 1e-5, name
-
-
-# --- diffusers ---------------------------------------------------------------------------------------------------
 
 
 def small_diffusers_unet() -> UNetSpatioTemporalConditionModel:

@@ -80,15 +80,6 @@ def test_parameter_counts_at_full_size_are_the_published_ones(full_size: Network
     assert _count(full_size.decoder) == 63_579_183
 
 
-def test_the_parameters_that_see_more_than_one_frame_are_as_many_as_published(full_size: Networks) -> None:
-    parts = (".temporal.", ".positions.", ".share.")
-    temporal = [p.numel() for name, p in full_size.unet.named_parameters() if any(part in name for part in parts)]
-    assert sum(temporal) == 656_076_838
-
-
-# --- what is computed once ---------------------------------------------------------------------------------------
-
-
 class _Counter:
     """How often each module of a kind ran."""
 
@@ -136,9 +127,7 @@ def test_the_source_is_encoded_once_for_all_views_samples_and_both_guidance_bran
     assert counter.calls == {"tower": 0, "encoder": 0}
 
 
-def test_what_the_weights_determine_is_not_derived_again_in_a_prepared_network(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_the_weights_determine_is_not_derived_again_in_a_prepared_network(monkeypatch: pytest.MonkeyPatch) -> None:
     synthesizer = tiny_synthesizer()
     derived = [module for module in synthesizer.networks.modules() if isinstance(module, Derived)]
     assert {type(module) for module in derived} == {Upsample, FramePositions, TemporalShare}

@@ -2,7 +2,8 @@
 
 import threading
 import time
-from collections.abc import Callable
+
+from cameras import until
 
 from gcd_client.control import Code
 from gcd_node.auth import Role
@@ -65,7 +66,7 @@ class Events:
 
     def wait(self, code: str) -> dict[str, object]:
         """The fields of the first event with this code."""
-        wait_for(lambda: code in self.codes())
+        until(lambda: code in self.codes())
         return next(fields for each, fields in self.seen if each == code)
 
     def within(self, code: str, seconds: float) -> bool:
@@ -76,10 +77,3 @@ class Events:
                 return False
             time.sleep(0.005)
         return True
-
-
-def wait_for(condition: Callable[[], bool], seconds: float = 20.0) -> None:
-    until = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < until, "it never happened"
-        time.sleep(0.005)

@@ -1,5 +1,6 @@
 """A model, a source and an outbox that do what a test tells them."""
 
+import functools
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -56,6 +57,7 @@ def painting_traits() -> Traits:
     return replace(traits("driving-semantic"), config=config)
 
 
+@functools.cache
 def live_traits() -> Traits:
     """Of the live model, in windows: it uses its camera's mount and takes any pose."""
     made = load_synthesizer("random:live", device="cpu").traits

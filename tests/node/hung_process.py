@@ -1,6 +1,6 @@
-"""A node in its own process that hangs and hears no cancel: while its model loads, warms up, or renders.
+"""A node in its own process that hangs and hears no cancel: while its model loads or renders.
 
-hung_process.py FOLDER load|warm|render
+hung_process.py FOLDER load|render
 Prints `hangs` once it does.
 """
 
@@ -30,8 +30,7 @@ def load(_: ModelSection) -> ViewSynthesizer:
 
 
 def main() -> None:
-    pace = "realtime" if sys.argv[2] == "warm" else "lockstep"  # nothing is warmed up in lockstep
-    config = rig_config(Path(sys.argv[1]), f'kind = "synthetic"\npace = "{pace}"', "[view.main]", "")
+    config = rig_config(Path(sys.argv[1]), 'kind = "synthetic"\npace = "lockstep"', "[view.main]", "")
     parts = Parts(open_source=lambda _: FakeSource(100_000), load_model=load)
     with open_publisher(config) as publisher:
         node = Node(config, parts, publisher, once=False)

@@ -1,5 +1,7 @@
-"""Small recordings for tests, written with OpenCV; pictures are RGB."""
+"""Small recordings for tests, written with OpenCV; pictures are RGB. And what processes of tests need."""
 
+import os
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -10,6 +12,11 @@ from gcd_node.frame import Frame, Image
 
 WIDTH, HEIGHT = 64, 48
 CODECS = {"mp4": "mp4v", "avi": "MJPG", "mkv": "FFV1", "webm": "VP80"}
+
+
+def environment() -> dict[str, str]:
+    """Of a process that finds what this one finds."""
+    return os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
 
 
 def flat(red: int, green: int, blue: int, width: int = WIDTH, height: int = HEIGHT) -> Image:

@@ -30,7 +30,8 @@ from gcd_node.session import open_publisher
 from gcd_node.sources import SourceConfig
 
 CAMERA = 'kind = "v4l2"'
-_SILENCE_MS = 300
+_LOOK_MS, _SILENT_LOOKS = 50, 6
+"""How long a reader waits for more, and how often in vain once the node is done: once, after a last word."""
 
 
 @dataclass(frozen=True)
@@ -165,13 +166,20 @@ class Rig:
 
     def _hear(self) -> None:
         with StatusSubscriber(f"ipc://{self.folder}/status") as notes:
-            while (note := notes.receive(_SILENCE_MS)) is not None or not self._done.is_set():
+            silent, over = 0, False
+            while silent < (1 if over else _SILENT_LOOKS):
+                done, note = self._done.is_set(), notes.receive(_LOOK_MS)
+                silent = silent + 1 if done and note is None else 0
                 if note is not None:
                     self.notes.append((time.monotonic(), note.topic, note.fields))
+                    over = note.fields.get("state") == "finalized"
 
     def _see(self) -> None:
         with ViewSubscriber(f"ipc://{self.folder}/data", None, "win", conflate=False) as views:
-            while (view := views.receive(_SILENCE_MS)) is not None or not self._done.is_set():
+            silent = 0
+            while silent < (1 if self.ended else _SILENT_LOOKS):
+                done, view = self._done.is_set(), views.receive(_LOOK_MS)
+                silent = silent + 1 if done and view is None else 0
                 if view is not None:
                     self.views.append(seen(view, keep=self._keep))
                 elif views.ended:

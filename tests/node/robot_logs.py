@@ -126,19 +126,13 @@ class RosLog:
 
 @contextmanager
 def ros_log(
-    path: Path,
-    *,
-    compression: CompressionType = CompressionType.ZSTD,
-    chunk_size: int = 1 << 16,
-    finish: bool = True,
-    checked: bool = True,
+    path: Path, *, compression: CompressionType = CompressionType.ZSTD, chunk_size: int = 1 << 16, checked: bool = True
 ) -> Generator[RosLog]:
     """checked: with checksums of the chunks."""
     with path.open("wb") as file:
         writer = RosWriter(file, chunk_size=chunk_size, compression=compression, enable_crcs=checked)
         yield RosLog(writer)
-        if finish:
-            writer.finish()
+        writer.finish()
 
 
 def write_log(path: Path, images: Sequence[Image], *, topic: str = TOPIC, **options: Any) -> Path:

@@ -70,10 +70,6 @@ class RtspServer:
     def url(self) -> str:
         return f"rtsp://127.0.0.1:{self._port}/live"
 
-    @property
-    def picture_count(self) -> int:
-        return len(self._pictures)
-
     def start(self) -> None:
         """Come (back) to life, on the port of the first time."""
         self._listener = socket.create_server(("127.0.0.1", self._port))

@@ -103,9 +103,6 @@ def test_aliases_that_multiply_and_deep_nesting_end_in_an_error(tmp_path: Path) 
             read(tmp_path, text)
 
 
-# --- messages ----------------------------------------------------------------------------------------------------
-
-
 def test_a_camera_nobody_calibrated_has_no_lens() -> None:
     assert lens_of(**INFO | {"k": (0.0,) * 9}) is None
 
@@ -138,9 +135,7 @@ def test_names_of_distortion_become_ours(model: str, d: tuple[float, ...], wante
 
 
 def test_a_fish_eye_picture_that_depthai_has_undistorted_is_not_undistorted_again() -> None:
-    """DepthAI leaves the model's name, and no coefficients."""
-    matrix = [[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]]
-    lens = depthai_lens(matrix, [], "Fisheye", (640, 480))
+    lens = depthai_lens([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]], [], "Fisheye", (640, 480))
     assert (lens.distortion, lens.coefficients) == ("none", ())
 
 
@@ -157,9 +152,6 @@ def test_a_part_of_the_picture_and_joined_pixels_move_the_axis() -> None:
     assert lens is not None
     assert (lens.width, lens.height, lens.fx, lens.fy) == (200, 150, 433.5 / 2, 432.75 / 2)
     assert (lens.cx, lens.cy) == ((322.25 - 100 + 0.5) / 2 - 0.5, (241.5 - 40 + 0.5) / 2 - 0.5)
-
-
-# --- sizes -------------------------------------------------------------------------------------------------------
 
 
 def test_resizing_moves_every_point_with_the_picture() -> None:

@@ -13,8 +13,7 @@ from rig import Rig, Seen
 
 from gcd_client.control import Code
 from gcd_node.errors import SourceAbsentError, SourceLostError
-from gcd_node.frame import SourceInfo
-from gcd_node.sources import OakSource, SourceConfig, V4l2Source
+from gcd_node.sources import OakSource, SourceConfig
 
 CALIBRATION = """
 image_width: 384
@@ -66,19 +65,6 @@ def view_of(rig: Rig, camera: Steady, epoch: int, size: tuple[int, int] | None =
 
 
 # Another size.
-
-
-def test_a_calibration_follows_the_picture_to_another_size_of_its_shape(tmp_path: Path) -> None:
-    camera = Steady(size=WHOLE)
-    with Rig(tmp_path, Bench(camera), config=calibrated(tmp_path)) as rig:
-        rig.await_state("active")
-        before, after = view_of(rig, camera, 0).header, view_of(rig, camera, 1, HALF).header
-        rig.await_event("SRC_FORMAT")
-    assert (before.src.resize, after.src.resize) == ("remap2x_area", "remap2x_area")
-    assert before.intrinsics is not None
-    assert before.intrinsics[0] == pytest.approx(WIDTH, rel=1e-3)  # 53.13 degrees, as the model was trained
-    assert after.intrinsics == pytest.approx(before.intrinsics)
-    assert "hfov" not in (*before.quality.ood, *after.quality.ood)
 
 
 def test_a_calibration_of_another_shape_is_left_out_and_the_field_of_view_is_flagged_until_it_is_back(
@@ -176,27 +162,6 @@ def test_a_camera_that_returns_too_slow_for_the_stated_rate_is_refused_and_the_n
     assert len({view.header.src.epoch for view in rig.of()}) == 2  # none of what was refused
 
 
-def test_a_source_that_is_searched_for_counts_as_lost_and_never_as_closed(tmp_path: Path) -> None:
-    camera, bench = Steady(), Bench()
-    bench.plug(camera)
-    with Rig(tmp_path, bench) as rig:
-        rig.await_state("active")
-        view_of(rig, camera, 0)
-        lose(rig, camera)
-        tries = bench.tries
-        until(lambda: bench.tries >= tries + 2)
-        assert rig.ask("state").result["source"] == "lost"
-        second = bench.plug(Steady())
-        until(lambda: second in bench.opened)
-        assert rig.ask("state").result["source"] == "lost"  # until a frame comes
-        view_of(rig, second, 1)
-        seen = [status["source"]["state"] for status in rig.statuses()]
-    first = seen.index("streaming")
-    assert list(dict.fromkeys(seen[:first])) == ["closed", "connecting"]
-    assert set(seen[first:]) <= {"streaming", "stalled", "lost"}
-    assert "lost" in seen
-
-
 def test_a_node_can_be_stopped_and_started_while_its_camera_takes_for_ever_to_open(tmp_path: Path) -> None:
     first, late, answer = Steady(), Steady(), threading.Event()
     asked: list[Steady] = []
@@ -245,11 +210,3 @@ def test_an_oak_is_opened_again_by_its_own_id_unless_its_place_was_stated(stated
         until(lambda: len(cameras) == 2)
         view_of(rig, cameras[1], 1)
     assert wanted == [stated, stated or "18443010A1B2"]
-
-
-def test_only_an_oak_has_an_id_to_be_asked_for() -> None:
-    from gcd_node.lifecycle import same_camera
-
-    config = V4l2Source()
-    before = SourceInfo(kind="v4l2", id="video0", width=96, height=64, fps_nominal=24.0, clock="realtime")
-    assert same_camera(config, before) is config

@@ -6,38 +6,14 @@ from collections.abc import Callable, Iterator
 
 import pytest
 from cameras import until
+from fakes import FakeSource, Steady
 from media import frames_at
 
 from gcd_node.errors import ReaderError
-from gcd_node.frame import Frame, SourceInfo
-from gcd_node.window import FrameWindow, WindowBuilder, WindowSlot, read
+from gcd_node.frame import Frame
+from gcd_node.window import WindowBuilder, WindowSlot, read
 
 GUARD_S = 5.0
-
-
-class ScriptedSource:
-    """Gives the frames it was given, then fails or waits as told."""
-
-    def __init__(self, frames: list[Frame], *, failure: Exception | None = None, stays: bool = False) -> None:
-        self._frames, self._failure, self._stays = frames, failure, stays
-        self._closed = threading.Event()
-        self.given = 0
-
-    @property
-    def info(self) -> SourceInfo:
-        return SourceInfo(kind="synthetic", id="script", width=4, height=2, fps_nominal=10.0, clock="replay")
-
-    def frames(self) -> Iterator[Frame]:
-        for frame in self._frames:
-            self.given += 1
-            yield frame
-        if self._stays:
-            self._closed.wait(GUARD_S)
-        if self._failure is not None:
-            raise self._failure
-
-    def close(self) -> None:
-        self._closed.set()
 
 
 def started(target: Callable[[], object]) -> threading.Thread:
@@ -51,22 +27,8 @@ def joined(thread: threading.Thread) -> None:
     assert not thread.is_alive(), "a thread hangs"
 
 
-def taken(slot: WindowSlot) -> list[FrameWindow]:
-    windows: list[FrameWindow] = []
-    while (window := slot.take()) is not None:
-        windows.append(window)
-    return windows
-
-
-def ten_fps(count: int) -> list[Frame]:
-    return frames_at(i * 100.0 for i in range(count))
-
-
 def builder() -> WindowBuilder:
     return WindowBuilder(frames=4, fps=10.0, source_fps=10.0)
-
-
-# --- the slot ----------------------------------------------------------------------------------------------------
 
 
 def test_the_newest_item_wins_and_the_rest_is_counted() -> None:
@@ -146,18 +108,24 @@ def test_what_is_shown_while_there_is_work_under_way_is_not_lost() -> None:
     assert calls == [0, 1]
 
 
-# --- the reader --------------------------------------------------------------------------------------------------
+class Hurried(FakeSource):
+    """Its last frame comes early: it could be taken for its place only by who knows that none is nearer."""
+
+    def frames(self) -> Iterator[Frame]:
+        yield from frames_at([0, 100, 200, 270])
 
 
 def test_the_last_window_is_not_forgotten_at_the_end() -> None:
     slot = WindowSlot()
-    read(ScriptedSource(frames_at([0, 100, 200, 270])), WindowBuilder(frames=4, fps=10.0), slot)
-    assert len(taken(slot)) == 1
+    read(Hurried(4), WindowBuilder(frames=4, fps=10.0), slot)
+    assert slot.take() is not None
 
 
 def test_a_fault_in_the_source_is_not_swallowed() -> None:
     slot = WindowSlot()
-    read(ScriptedSource([], failure=ZeroDivisionError("bug")), builder(), slot)
+    source = FakeSource(0)
+    source.fails = ZeroDivisionError("bug")
+    read(source, builder(), slot)
     with pytest.raises(ReaderError) as caught:
         slot.take()
     assert isinstance(caught.value.__cause__, ZeroDivisionError)
@@ -165,7 +133,7 @@ def test_a_fault_in_the_source_is_not_swallowed() -> None:
 
 def test_closing_slot_and_source_stops_the_reader_without_an_error() -> None:
     slot = WindowSlot()
-    source = ScriptedSource(ten_fps(2), stays=True)
+    source = Steady()
     reader = started(lambda: read(source, builder(), slot))
     time.sleep(0.05)
     slot.close()

@@ -10,24 +10,21 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, fake_config, made_node, traits
+from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, fake_config, live_traits, made_node, traits
 from msgspec.structs import replace as struct_replace
 
 from gcd_client.protocol import to_json
-from gcd_model import RenderOptions, SourceFeatures, Traits, Trajectory, View, load_synthesizer
+from gcd_model import RenderOptions, SourceFeatures, Traits, Trajectory, View
 from gcd_node.cli.main import run_app
-from gcd_node.errors import ConfigError, DepthError, SourceError, TooShortError, UsageError
+from gcd_node.errors import ConfigError, DepthError, SourceError, TooShortError
 from gcd_node.frame import Frame, Image
 from gcd_node.image_io import write_video
 from gcd_node.offline import ClipRequest, OfflineClip, read_clip
 
-LIVE = load_synthesizer("random:live", device="cpu").traits
+LIVE = live_traits()
 FRAMES = 14
 FX, BASELINE_M, DISPARITY = 300.0, 0.09, 10
 PAIR_SIZE = (384, 256)
-
-
-# --- recorded depth --------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -84,9 +81,6 @@ def test_depth_that_does_not_belong_to_the_pictures_is_refused(
         read(video, depth=tmp_path / "d.npy")
 
 
-# --- stereo pairs ----------------------------------------------------------------------------------------------------
-
-
 def camera(step_cm: float, onward: int) -> dict[str, Any]:
     return {
         "width": PAIR_SIZE[0],
@@ -126,23 +120,6 @@ def test_a_stereo_pair_gives_its_rectified_left_picture_with_lens_and_depth(pair
     known = depth[depth > 0]
     assert len(known) > 0.6 * depth.numel()
     assert float(known.median()) == pytest.approx(FX * BASELINE_M / DISPARITY, rel=0.06)
-
-
-def test_a_pair_that_is_none_is_refused_in_one_line(pair: Path, tmp_path: Path) -> None:
-    left, right, calibration = (pair / name for name in ("left.mkv", "right.mkv", "calib.json"))
-    with pytest.raises(DepthError):
-        read(right, depth=left, calibration=calibration)
-    with pytest.raises(ConfigError):
-        read(left, depth=right, calibration=tmp_path / "missing.json")
-    write_video(tmp_path / "short.mkv", [np.zeros((256, 384, 3), np.uint8)] * 5, 10.0)
-    with pytest.raises(TooShortError):
-        read(left, depth=tmp_path / "short.mkv", calibration=calibration)
-    for half in ({"calibration": calibration}, {"rectified": True}, {"depth": right, "rectified": True}):
-        with pytest.raises(UsageError):
-            ClipRequest(**half)
-
-
-# --- the command -----------------------------------------------------------------------------------------------------
 
 
 def synthesize(source: Path, weights: str, out: Path, *options: object) -> int:
@@ -208,9 +185,6 @@ def test_depth_that_cannot_be_used_is_refused_in_one_line(
     placed = [still_clip.parent / each if each.endswith(("npy", "onnx")) else each for each in options]
     assert synthesize(still_clip, weights, still_clip.parent / "out", *placed) == code
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
-
-
-# --- a node ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -303,21 +277,13 @@ def test_other_models_are_given_neither() -> None:
 
 @pytest.mark.parametrize(
     ("made", "path", "kind"),
-    [
-        (traits(), "junk.onnx", "metric"),
-        (LIVE, "junk.onnx", "metric"),
-        (LIVE, "missing.onnx", "metric"),
-        (LIVE, "junk.onnx", "inverse"),
-    ],
+    [(traits(), "junk.onnx", "metric"), (LIVE, "missing.onnx", "metric"), (LIVE, "junk.onnx", "inverse")],
 )
 def test_a_node_refuses_depth_that_it_cannot_use(tmp_path: Path, made: Traits, path: str, kind: str) -> None:
     pytest.importorskip("onnxruntime", reason="needs the extra `onnx`")
     (tmp_path / "junk.onnx").write_bytes(b"junk")
     with pytest.raises(ConfigError):
         run(FakeSynthesizer(made), f'depth_model = "{tmp_path / path}"\ndepth_kind = "{kind}"')
-
-
-# --- a source unlike the training ------------------------------------------------------------------------------------
 
 
 class Telling(FakeSynthesizer):

@@ -16,14 +16,7 @@ from cameras import until
 from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, made_node, traits
 from media import frames_at
 
-from gcd_model import (
-    Augmentation,
-    CameraMount,
-    Clip,
-    RenderOptions,
-    SourceFeatures,
-    load_synthesizer,
-)
+from gcd_model import Augmentation, CameraMount, Clip, RenderOptions, SourceFeatures, load_synthesizer
 from gcd_node.config import NodeConfig, parse_config
 from gcd_node.encoded_frames import EncodedFrames, EncodeTerms
 from gcd_node.frame import Frame
@@ -186,7 +179,7 @@ def test_views_are_the_same_to_the_last_bit_whatever_the_timing(stride: int, pac
     assert max(found) == max(wanted)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_it_makes_no_difference_in_what_order_frames_are_encoded(seed: int) -> None:
     chance, model, encoded = random.Random(seed), Encoder(), kept()
     builder, windows = WindowBuilder(frames=T, fps=10.0, stride=chance.randint(1, T)), 0

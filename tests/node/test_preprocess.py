@@ -13,14 +13,6 @@ def noise(width: int, height: int) -> np.ndarray:
     return np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
 
 
-@pytest.mark.parametrize(("width", "height"), [(640, 480), (1920, 1080), (576, 384), (300, 900), (385, 257)])
-@pytest.mark.parametrize("resize", ["released", "area"])
-def test_every_picture_comes_out_at_the_wanted_size(width: int, height: int, resize: str) -> None:
-    fit = Fit(width=192, height=128, resize=resize)
-    out = fit.image(noise(width, height))
-    assert (out.shape, out.dtype) == ((128, 192, 3), np.uint8)
-
-
 def test_the_released_fit_is_a_centre_crop_and_a_bilinear_resize() -> None:
     image = noise(640, 480)
     left, top, wide, high = center_crop_box(640, 480, 384 / 256)

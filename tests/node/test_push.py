@@ -1,20 +1,19 @@
 """Frames that somebody else pushes: who may, what is refused, what travels with a picture, and how it comes back."""
 
 import logging
-import os
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 import zmq
 from cameras import until
-from media import flat, write_video
+from media import environment, flat, write_video
 
 from gcd_client import AuthError, ClientKeys, FramePusher
 from gcd_client.frames import encode_frame
@@ -124,22 +123,15 @@ def test_what_is_no_frame_is_refused_and_counted_and_the_next_is_taken(
 
 
 def test_a_second_pusher_is_refused_until_the_first_has_gone(endpoint: str) -> None:
-    with opened_by(endpoint) as (source, leave), pushing(endpoint, red):
-        until(lambda: source.corrupt > 3)
-        leave()
-        with pytest.raises(SourceLostError):
-            until(lambda: taken(source).seq < 0)
+    with ExitStack() as first:
+        first.enter_context(pushing(endpoint, red))
+        with opened(endpoint) as source, pushing(endpoint, red):
+            until(lambda: source.corrupt > 3)
+            first.close()
+            with pytest.raises(SourceLostError):
+                until(lambda: taken(source).seq < 0)
     with pushing(endpoint, red), opened(endpoint) as source:  # as the node opens it again
         taken(source)
-
-
-@contextmanager
-def opened_by(endpoint: str) -> Iterator[tuple[LiveCamera, Callable[[], None]]]:
-    """A source, and how to end the one who pushes."""
-    first = pushing(endpoint, red)
-    first.__enter__()
-    with opened(endpoint) as source:
-        yield source, lambda: first.__exit__(None, None, None)
 
 
 def test_nobody_waits_for_a_node_that_is_not_there(endpoint: str) -> None:
@@ -182,9 +174,8 @@ def test_the_example_for_opencv_pushes_a_file(endpoint: str, tmp_path: Path) -> 
     video = write_video(tmp_path / "clip.mkv", [RED] * 200, fps=25.0)
     script = Path(__file__).parents[2] / "launch" / "clients" / "push_opencv.py"
     command = [sys.executable, script, video, "--endpoint", endpoint]
-    path = {"PYTHONPATH": os.pathsep.join(sys.path)}
     with (
-        subprocess.Popen(command, stdout=subprocess.PIPE, env=os.environ | path) as process,
+        subprocess.Popen(command, stdout=subprocess.PIPE, env=environment()) as process,
         opened(endpoint) as source,
     ):
         frames = [taken(source) for _ in range(5)]

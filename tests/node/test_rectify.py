@@ -106,9 +106,6 @@ def psnr(a: NDArray[Any], b: NDArray[Any]) -> float:
     return 10 * math.log10(255**2 / float(np.mean((a.astype(float) - b) ** 2)))
 
 
-# --- laws --------------------------------------------------------------------------------------------------------
-
-
 @ALL_LENSES
 def test_pixels_lie_where_the_formulas_of_the_lens_say(lens: LensModel) -> None:
     rays = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 2))
@@ -165,9 +162,6 @@ def test_a_calibration_that_sees_nothing_is_refused() -> None:
         widest_camera(lens, 384, 256, 53.0)
 
 
-# --- quality -----------------------------------------------------------------------------------------------------
-
-
 def detailed_texture(width: int, height: int) -> Image:
     """Noise at every scale down to single pixels, as grass and gravel have it."""
     rng = np.random.default_rng(3)
@@ -199,9 +193,6 @@ def test_twice_the_size_is_near_full_resolution_and_far_better_than_straight() -
     assert psnr(straight, full) < ours - 6.0
 
 
-# --- sizes -------------------------------------------------------------------------------------------------------
-
-
 def test_pictures_of_another_size_of_the_same_shape_are_taken() -> None:
     rectifier = rectifier_of(BARREL, width=192, height=128, hfov_deg=53.13)
     small = photograph(BARREL.resized(640, 360))
@@ -209,8 +200,6 @@ def test_pictures_of_another_size_of_the_same_shape_are_taken() -> None:
     large, small = rectifier.image(large), rectifier.image(small)
     assert psnr(small, large) > 30.0
 
-
-# --- in a run ----------------------------------------------------------------------------------------------------
 
 CALIBRATION = """
 image_width: 1280

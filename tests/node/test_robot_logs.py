@@ -49,15 +49,8 @@ COLOUR = (250, 10, 120)
 every_compression = pytest.mark.parametrize("compression", list(CompressionType), ids=lambda each: each.name)
 
 
-def noisy(count: int) -> list[Image]:
-    return list(np.random.default_rng(0).integers(0, 255, (count, HEIGHT, WIDTH, 3), np.uint8))
-
-
 def near(image: Image, colour: tuple[int, int, int] = COLOUR, tolerance: int = 8) -> bool:
     return bool(np.abs(image.astype(int) - colour).max() <= tolerance)
-
-
-# --- what was recorded -------------------------------------------------------------------------------------------
 
 
 @every_compression
@@ -122,7 +115,7 @@ def test_red_stays_red_in_every_raw_layout(tmp_path: Path) -> None:
 
 
 def test_padding_at_the_end_of_rows_is_left_out_and_grey_becomes_rgb(tmp_path: Path) -> None:
-    image = noisy(1)[0]
+    image = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
     padded = np.zeros((HEIGHT, WIDTH * 3 + 20), np.uint8)
     padded[:, : WIDTH * 3] = image.reshape(HEIGHT, -1)
     pictures = [raw(padded.tobytes(), WIDTH, HEIGHT, "rgb8", WIDTH * 3 + 20, at(i)) for i in range(2)]
@@ -173,9 +166,6 @@ def test_video_in_a_log_is_read_frame_by_frame(tmp_path: Path) -> None:
         assert abs(frame.image.mean() - image.mean()) < 3
 
 
-# --- bags --------------------------------------------------------------------------------------------------------
-
-
 def test_bags_of_ros_1_and_ros_2_are_read_as_mcap_is(tmp_path: Path) -> None:
     sent = [("/front/camera_info", INFO, camera_info(WIDTH, HEIGHT))]
     sent += [("/front/image", COMPRESSED, compressed(image, at(i))) for i, image in enumerate(ramp(COUNT))]
@@ -203,9 +193,6 @@ def test_the_split_files_of_a_bag_are_played_by_their_numbers(tmp_path: Path) ->
     write_log(tmp_path / "other.mcap", ramp(2))
     with pytest.raises(SourceError):
         LogSource(tmp_path)
-
-
-# --- depth and odometry ------------------------------------------------------------------------------------------
 
 
 def companions(path: Path, more: list[tuple[str, str, Fields, float]]) -> list[Frame]:
@@ -272,9 +259,6 @@ def test_frames_carry_the_camera_s_pose_by_odometry_and_static_transforms(tmp_pa
     assert poses[3] is None
 
 
-# --- playing -----------------------------------------------------------------------------------------------------
-
-
 def test_realtime_takes_as_long_as_the_recording_but_skips_long_holes(tmp_path: Path) -> None:
     periods = [0, 1, 36_001, 36_002, 0, 1]
     of_pictures(tmp_path / "log.mcap", [compressed(flat(9, 9, 9), at(i)) for i in periods])
@@ -282,9 +266,6 @@ def test_realtime_takes_as_long_as_the_recording_but_skips_long_holes(tmp_path: 
     frames = list(LogSource(tmp_path / "log.mcap", pace="realtime").frames())
     assert stamps(frames) == [at(i) for i in periods]
     assert 0.29 <= time.monotonic() - begin < 60
-
-
-# --- which topic -------------------------------------------------------------------------------------------------
 
 
 def test_of_several_topics_one_must_be_named(tmp_path: Path) -> None:
@@ -310,9 +291,6 @@ def test_pictures_that_begin_late_are_found_and_one_is_too_few(tmp_path: Path) -
                 log.say(TOPIC, COMPRESSED, compressed(flat(*COLOUR), at(i)))
         with nullcontext() if error is None else pytest.raises(error):
             assert LogSource(tmp_path / "log.mcap").topic == TOPIC
-
-
-# --- calibration -------------------------------------------------------------------------------------------------
 
 
 PINHOLE = (WIDTH, 60.0, 61.0, "plumb_bob")

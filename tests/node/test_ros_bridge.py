@@ -43,9 +43,6 @@ with pytest.MonkeyPatch.context() as patch:
     from gcd_views import bridge, messages
 
 
-# --- messages ----------------------------------------------------------------------------------------------------
-
-
 def with_header(message: ViewMessage, **changes: Any) -> ViewMessage:
     return replace(message, header=replace(message.header, **changes))
 
@@ -151,9 +148,6 @@ def test_states_and_transitions_are_those_of_ros_and_of_the_node() -> None:
     assert messages.to_verb(transition(id=99, label="")) is None
 
 
-# --- the node over real sockets ----------------------------------------------------------------------------------
-
-
 def meta(*views: str) -> StatusMessage:
     return StatusMessage(topic="meta", header=origin(), fields={"views": list(views)})
 
@@ -231,14 +225,6 @@ def test_a_view_becomes_topics_of_one_stamp_and_frame_under_the_name_of_the_node
     assert [(each["id"], each["name"], tuple(each["colour"])) for each in json.loads(latched.data)] == [
         (each.id, each.name, each.colour) for each in CLASSES
     ]
-
-
-def test_a_jpeg_is_decoded_only_for_somebody_and_raw_pictures_are_never_encoded(bench: Bench) -> None:
-    bench.until(lambda: bench.out("~/top/image"), window())
-    assert bench.out("~/top/image/compressed") == []
-    bench.node.unread.add("~/top/image")
-    bench.until(lambda: bench.out("~/top/image/compressed"), jpeg_window())
-    assert {each.height for each in bench.out("~/top/image")} == {window().header.shape[1]}  # none of the JPEG's size
 
 
 @pytest.mark.parametrize(
@@ -344,9 +330,6 @@ def test_a_wrong_parameter_ends_the_program_with_a_line(monkeypatch: pytest.Monk
     monkeypatch.setattr(RosNode, "parameters", {"data": "udp://somewhere"})
     with pytest.raises(SystemExit, match="udp"):
         bridge.main()
-
-
-# --- the package -------------------------------------------------------------------------------------------------
 
 
 def imported(path: Path) -> set[str]:

@@ -1,18 +1,22 @@
-"""Visibility, depth and a stated spread, from the view that holds them to a reader: what is published, and when."""
-
-import threading
-from functools import partial
-from pathlib import Path
+"""Class maps, visibility, depth and a stated spread, from the view that holds them: what is published, and when."""
 
 import numpy as np
 import pytest
 import torch
-from fakes import Box, FakeSource, FakeSynthesizer, fake_config, fake_maps, made_node, painting_traits, traits
+from fakes import (
+    Box,
+    FakeSource,
+    FakeSynthesizer,
+    fake_classes,
+    fake_config,
+    fake_maps,
+    made_node,
+    painting_traits,
+    traits,
+)
 
 from gcd_client.images import depth_m, images, inverse_depth
-from gcd_client.subscriber import ReceivedView, ViewSubscriber
-from gcd_node.config import PublishConfig
-from gcd_node.publisher import Publisher
+from gcd_node.messages import ontology
 
 pytestmark = pytest.mark.timeout(30)
 HELD = ("visibility", "inverse_depth")
@@ -27,15 +31,30 @@ def published(*holds: str, frames: int = 28, **options: int | str) -> Box:
 
 
 def test_every_window_of_a_view_that_holds_them_comes_with_its_own() -> None:
-    box = published(*HELD)
+    box, made = published(*HELD), painting_traits()
     order = [message.topic.rpartition("/")[2] for message in box.views[:4]]
     assert order == ["win", "cls", "vis", "depth"]
-    for kind in ("vis", "depth"):
+    same = ("window_id", "t_capture_ns", "source_from_view", "view_rev", "intrinsics", "frame_role", "age_ms", "model")
+    for kind, proto in (("cls", "gcd/1.0"), ("vis", "gcd/1.1"), ("depth", "gcd/1.1")):
         for message, window in zip(box.of(kind), box.of("win"), strict=True):
-            same = ("window_id", "t_capture_ns", "source_from_view", "view_rev", "intrinsics", "frame_role", "age_ms")
             assert all(getattr(message.header, name) == getattr(window.header, name) for name in same)
-            assert (message.header.proto, window.header.proto) == ("gcd/1.1", "gcd/1.0")
+            assert (message.header.proto, window.header.proto) == (proto, "gcd/1.0")
     assert np.array_equal(images(box.of("vis")[1])[..., 0], fake_maps()["visibility"].numpy())
+    drawn, told = fake_classes(made, 1), box.of("cls")[0].header.classes
+    assert drawn is not None
+    assert told is not None
+    assert np.array_equal(images(box.of("cls")[0])[..., 0], drawn[0].numpy())
+    assert told == ontology(made)
+    meta = next(fields for topic, fields in box.notes if topic == "meta")
+    assert meta["classes"] == [{"id": each.id, "name": each.name, "colour": each.colour} for each in told]
+
+
+@pytest.mark.parametrize("family", ["kubric90", "driving", "svd"])
+def test_a_model_without_a_class_head_publishes_no_class_map(family: str) -> None:
+    box = Box()
+    made_node(fake_config(), FakeSynthesizer(traits(family)), FakeSource(28, fps=10.0), box).run()
+    assert "view/main/cls" not in {message.topic for message in (*box.views, *box.ends)}
+    assert next(fields for topic, fields in box.notes if topic == "meta")["classes"] == []
 
 
 def test_depth_loses_less_than_a_thousandth_from_0_3_to_200_m_and_none_stays_none() -> None:
@@ -90,29 +109,3 @@ def test_one_sample_of_a_model_that_states_its_spread_has_a_deviation() -> None:
     assert np.allclose(levels, 25.5, atol=0.1)  # a tenth, in grey levels
     assert published(frames=14).of("std") == []
     assert len(published("log_variance", frames=28).ends) == len(published(frames=28).ends) + 1
-
-
-def test_a_reader_of_both_kinds_gets_exactly_what_was_published_in_order(tmp_path: Path) -> None:
-    opened = partial(
-        Publisher,
-        PublishConfig(data=f"ipc://{tmp_path}/d", status=f"ipc://{tmp_path}/s", min_subscribers=2, end_delay_ms=0),
-        lockstep=True,
-    )
-    received: list[ReceivedView] = []
-
-    def read() -> None:
-        with ViewSubscriber(f"ipc://{tmp_path}/d", "main", ("vis", "depth"), conflate=False) as views:
-            received.extend(views)
-
-    with opened() as publisher:
-        reader = threading.Thread(target=read, daemon=True)
-        reader.start()
-        model = FakeSynthesizer(traits("driving"), holds=HELD)
-        made_node(fake_config(), model, FakeSource(28, fps=10.0), publisher).run()
-        reader.join(10)
-    topics = ["view/main/vis", "view/main/depth"]
-    assert [(view.message.topic, view.header.window_id) for view in received] == [
-        (topic, window_id) for window_id in (0, 1) for topic in topics
-    ]
-    assert np.array_equal(received[2].images[..., 0], fake_maps()["visibility"].numpy())
-    assert np.allclose(received[3].inverse_depth, fake_maps()["inverse_depth"].numpy(), rtol=5e-4)

@@ -6,9 +6,9 @@ Each kind is a row of KINDS: how to open one that shows flat red, how to silence
 import importlib.util
 import threading
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import count, islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
@@ -55,12 +55,8 @@ def nothing() -> None:
     """A recording needs no silencing: opened slowly, it waits by itself."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Opened:
-    """A source; `hush` makes a live one silent."""
-
-    source: FrameSource
-    hush: Callable[[], None] = nothing
+Opened = tuple[FrameSource, Callable[[], None]]
+"""A source, and what makes a live one silent."""
 
 
 def is_red(image: Image) -> None:
@@ -79,20 +75,19 @@ class Kind:
 
     open: with "slow" a recording plays in real time, a frame every 2 s; else it plays in lockstep. A live one gives
         25 FPS, whichever.
-    missing: settings for one that is not there, and the error that says so. needs: packages, and why else to skip.
+    missing: settings for one that is not there, and the error that says so.
     """
 
     open: Callable[[Path, bool], AbstractContextManager[Opened]]
     missing: Callable[[Path], SourceConfig]
     error: type[SourceError] = SourceError
     check: Callable[[Image], None] = is_red
-    needs: tuple[str, ...] = field(default=())
 
 
 @contextmanager
 def closing(source: FrameSource, hush: Callable[[], None] = nothing) -> Generator[Opened]:
     try:
-        yield Opened(source=source, hush=hush)
+        yield source, hush
     finally:
         source.close()
 
@@ -210,26 +205,15 @@ KINDS: dict[SourceKind, Kind] = {
     "file": Kind(open=open_file, missing=lambda folder: FileSource(path=str(folder / "none.mp4"))),
     "folder": Kind(open=open_folder, missing=lambda folder: FolderSource(path=str(folder / "none"), fps=5.0)),
     "synthetic": Kind(open=open_synthetic, missing=lambda folder: SyntheticSource(fps=5000.0), check=is_striped),
-    "mcap": Kind(
-        open=open_mcap,
-        missing=lambda folder: McapSource(path=str(folder / "none.mcap")),
-        needs=("mcap", "mcap_ros2", "mcap_protobuf", "foxglove_schemas_protobuf"),
-    ),
+    "mcap": Kind(open=open_mcap, missing=lambda folder: McapSource(path=str(folder / "none.mcap"))),
     "v4l2": Kind(
-        open=open_v4l2_camera,
-        missing=lambda folder: V4l2Source(device=str(folder / "video7")),
-        error=SourceAbsentError,
+        open=open_v4l2_camera, missing=lambda folder: V4l2Source(device=str(folder / "video7")), error=SourceAbsentError
     ),
     "rtsp": Kind(
-        open=open_rtsp,
-        missing=lambda folder: RtspSource(url="rtsp://127.0.0.1:1/live"),
-        error=SourceAbsentError,
+        open=open_rtsp, missing=lambda folder: RtspSource(url="rtsp://127.0.0.1:1/live"), error=SourceAbsentError
     ),
     "oak": Kind(
-        open=open_oak,
-        missing=lambda folder: OakSource(device="14442C10NOSUCHDEVICE"),
-        error=SourceAbsentError,
-        needs=("depthai",),
+        open=open_oak, missing=lambda folder: OakSource(device="14442C10NOSUCHDEVICE"), error=SourceAbsentError
     ),
     "push": Kind(
         open=open_push,
@@ -239,47 +223,33 @@ KINDS: dict[SourceKind, Kind] = {
 }
 LIVE: list[SourceKind] = [kind for kind in KINDS if kind in LIVE_KINDS]
 RECORDED: list[SourceKind] = [kind for kind in KINDS if kind not in LIVE_KINDS]
-every_kind = pytest.mark.parametrize("kind", list(KINDS))
-live_kinds = pytest.mark.parametrize("kind", LIVE)
-recorded_kinds = pytest.mark.parametrize("kind", RECORDED)
+LACKING = {} if importlib.util.find_spec("depthai") else {"oak": pytest.mark.skip(reason="needs the extra `oak`")}
 
 
-@pytest.fixture(autouse=True)
-def _installed(request: pytest.FixtureRequest) -> None:
-    callspec = getattr(request.node, "callspec", None)
-    if callspec is None:
-        return
-    for package in KINDS[callspec.params["kind"]].needs:
-        if importlib.util.find_spec(package) is None:
-            pytest.skip(f"a source of kind {callspec.params['kind']} needs the package {package}")
+def each_of(kinds: Iterable[SourceKind]) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize("kind", [pytest.param(kind, marks=LACKING.get(kind, ())) for kind in kinds])
 
 
-@contextmanager
-def opened(kind: SourceKind, folder: Path, *, slow: bool = False) -> Generator[Opened]:
-    with KINDS[kind].open(folder, slow) as made:
-        yield made
+every_kind, live_kinds, recorded_kinds = each_of(KINDS), each_of(LIVE), each_of(RECORDED)
 
 
 def test_every_kind_of_a_launch_file_is_in_this_suite() -> None:
     assert set(KINDS) == set(get_args(SourceKind))
 
 
-# --- frames ------------------------------------------------------------------------------------------------------
-
-
 @every_kind
 def test_a_source_says_what_it_is_and_gives_such_frames(kind: SourceKind, tmp_path: Path) -> None:
-    with opened(kind, tmp_path) as it:
-        info = it.source.info
+    with KINDS[kind].open(tmp_path, False) as (source, _):
+        info = source.info
         assert (info.kind, info.live, info.clock) == (kind, kind in LIVE, "realtime" if kind in LIVE else "replay")
         assert info.fps_nominal == pytest.approx(25.0, rel=0.02)
         assert info.id
         assert "/" not in info.id
         assert info.stamp_uncertainty_us > 0
-        frames = list(islice(it.source.frames(), COUNT))
+        frames = list(islice(source.frames(), COUNT))
         assert len(frames) == COUNT
         assert all(b.stamp_ns > a.stamp_ns and b.seq > a.seq for a, b in pairwise(frames))
-        assert (it.source.corrupt, it.source.info) == (0, info)
+        assert (source.corrupt, source.info) == (0, info)
         for frame in frames:
             assert (frame.image.dtype, frame.image.shape) == (np.uint8, (HEIGHT, WIDTH, 3))
             assert frame.size == (info.width, info.height)
@@ -289,11 +259,11 @@ def test_a_source_says_what_it_is_and_gives_such_frames(kind: SourceKind, tmp_pa
 
 @live_kinds
 def test_a_slow_caller_of_a_camera_gets_the_newest_by_this_host_s_clock(kind: SourceKind, tmp_path: Path) -> None:
-    with opened(kind, tmp_path) as it:
-        first = next(iter(it.source.frames()))
+    with KINDS[kind].open(tmp_path, False) as (source, _):
+        first = next(iter(source.frames()))
         time.sleep(0.6)
         asked_ns = time.monotonic_ns()
-        second = next(iter(it.source.frames()))  # a second look goes on
+        second = next(iter(source.frames()))  # a second look goes on
         assert second.seq >= first.seq + 5
         assert asked_ns - 400_000_000 < second.stamp_ns <= time.monotonic_ns()
 
@@ -302,31 +272,28 @@ def test_a_slow_caller_of_a_camera_gets_the_newest_by_this_host_s_clock(kind: So
 def test_a_recording_begins_again_with_every_look_and_a_slow_caller_misses_nothing(
     kind: SourceKind, tmp_path: Path
 ) -> None:
-    with opened(kind, tmp_path) as it:
+    with KINDS[kind].open(tmp_path, False) as (source, _):
         first: list[Frame] = []
-        for frame in it.source.frames():
+        for frame in source.frames():
             first.append(frame)
             time.sleep(0.01)
         assert [frame.seq for frame in first] == list(range(COUNT))
-        second = list(it.source.frames())
+        second = list(source.frames())
         assert [(frame.stamp_ns, frame.seq) for frame in first] == [(frame.stamp_ns, frame.seq) for frame in second]
         assert all(np.array_equal(a.image, b.image) for a, b in zip(first, second, strict=True))
 
 
-# --- the end -----------------------------------------------------------------------------------------------------
-
-
 @every_kind
 def test_closing_from_another_thread_ends_a_blocked_look_within_a_second(kind: SourceKind, tmp_path: Path) -> None:
-    with opened(kind, tmp_path, slow=True) as it:
+    with KINDS[kind].open(tmp_path, True) as (source, hush):
         seen: list[Frame] = []
         errors: list[Exception] = []
-        reader = threading.Thread(target=lambda: look(it.source, seen, errors), daemon=True)
+        reader = threading.Thread(target=lambda: look(source, seen, errors), daemon=True)
         reader.start()
         until(lambda: bool(seen), GUARD_S)
-        it.hush()
+        hush()
         time.sleep(0.2)  # what was on its way arrives
-        closer = threading.Thread(target=it.source.close, daemon=True)
+        closer = threading.Thread(target=source.close, daemon=True)
         closer.start()
         reader.join(1.0)
         assert not reader.is_alive()
@@ -339,13 +306,13 @@ def test_closing_from_another_thread_ends_a_blocked_look_within_a_second(kind: S
 def test_a_closed_source_stays_closed_for_a_look_that_was_given_up_and_a_new_one(
     kind: SourceKind, tmp_path: Path
 ) -> None:
-    with opened(kind, tmp_path) as it:
-        frames = it.source.frames()
+    with KINDS[kind].open(tmp_path, False) as (source, _):
+        frames = source.frames()
         next(frames)
-        it.source.close()
-        it.source.close()
+        source.close()
+        source.close()
         assert list(frames) == []
-        assert list(it.source.frames()) == []
+        assert list(source.frames()) == []
 
 
 @every_kind

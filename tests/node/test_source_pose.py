@@ -9,9 +9,8 @@ from fakes import Box, FakeSource, FakeSynthesizer, live_traits, made_node, trai
 from gcd_model import CameraMount, Traits
 from gcd_node.config import NodeConfig, load_config, parse_config
 from gcd_node.errors import ConfigError
-from gcd_node.preprocess import require_usable, stated_mount, stated_sphere
+from gcd_node.preprocess import require_usable, stated_mount
 from gcd_node.sources import SourcePose
-from gcd_node.stream_context import config_digest
 
 
 def config(pose: str | None = None, *, source: str = "", more: str = "") -> NodeConfig:
@@ -65,7 +64,8 @@ def test_meta_tells_a_stated_mount() -> None:
     assert meta["mount"]["height_m"] == 2.0
     assert meta["mount"]["assumed"] is False
     _, box = run(config(), traits("driving"))
-    assert next(fields for topic, fields in box.notes if topic == "meta")["mount"] is None
+    meta = next(fields for topic, fields in box.notes if topic == "meta")
+    assert (meta["mount"], meta["src_pose"]) == (None, None)
 
 
 @pytest.mark.parametrize(
@@ -91,14 +91,6 @@ def test_an_impossible_pose_is_refused(pose: str) -> None:
         config(pose)
 
 
-def test_a_sphere_is_filled_with_what_is_assumed() -> None:
-    assert stated_sphere(None) is None
-    half = stated_sphere(SourcePose(radius=14.0))
-    assert half is not None
-    assert (half.elevation_deg, half.radius_m) == (5.0, 14.0)
-    assert stated_sphere(SourcePose(height_m=2.0)) is None
-
-
 def test_an_orbit_is_planned_from_where_the_camera_is_said_to_stand() -> None:
     model, box = run(config("elevation_deg = 25.0\nradius = 13.0"), traits(), FakeSource(14, fps=12.0))
     source = model.asked[0][0][0].source
@@ -108,14 +100,3 @@ def test_an_orbit_is_planned_from_where_the_camera_is_said_to_stand() -> None:
     told = {"el_deg": 25.0, "r": 13.0, "assumed": False}
     meta = next(fields for topic, fields in box.notes if topic == "meta")
     assert (meta["mount"], meta["src_pose"]) == (None, told)
-
-
-def test_meta_tells_an_assumed_source_and_none_where_the_view_is_fixed() -> None:
-    for made, told in ((traits(), {"el_deg": 5.0, "r": 15.0, "assumed": True}), (traits("driving"), None)):
-        _, box = run(config(), made, FakeSource(14, fps=made.fps))
-        assert next(fields for topic, fields in box.notes if topic == "meta")["src_pose"] == told
-
-
-def test_the_mount_is_part_of_what_the_digest_names() -> None:
-    lower, higher = (config_digest(config(f"height_m = {height}"), live_traits()) for height in (2.0, 2.1))
-    assert lower != higher

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from cameras import FPS, Bench, Camera, until
 from fake_camera import FakeVideoCapture
-from fakes import FakeSource
 from media import flat
 
 from gcd_node.errors import SourceError, SourceLostError
@@ -21,16 +20,21 @@ from gcd_node.sources.opencv import open_v4l2
 from gcd_node.window import Reason
 
 
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A camera is lost sooner than two seconds after its last frame."""
+    monkeypatch.setattr("gcd_node.sources.live._LOST_S", 0.3)
+
+
 def quick(_: object) -> Iterator[float]:
     return repeat(0.02)
 
 
 @dataclass
 class Log:
-    """A listener that writes down what it is told, with times."""
+    """A listener that writes down what it is told."""
 
     states: list[SourceState] = field(default_factory=list)
-    times_s: list[float] = field(default_factory=list)
     details: list[str] = field(default_factory=list)
     told: list[str] = field(default_factory=list)
     heard: list[Frame] = field(default_factory=list)
@@ -39,7 +43,6 @@ class Log:
 
     def source_state(self, state: SourceState, detail: str) -> None:
         self.states.append(state)
-        self.times_s.append(time.monotonic())
         self.details.append(detail)
         self.told.append(state)
 
@@ -80,13 +83,6 @@ class Reader:
         return self
 
 
-def test_a_recording_passes_as_if_nobody_watched() -> None:
-    reader = Reader(FakeSource(30)).finish()
-    assert [frame.seq for frame in reader.frames] == list(range(30))
-    assert reader.log.told == ["connecting", "opened", "streaming", "ended"]
-    assert reader.log.heard == reader.frames
-
-
 def test_a_silent_camera_stalls_and_goes_on() -> None:
     camera = Camera()
     reader = Reader(camera, stall_ms=100.0)
@@ -98,26 +94,6 @@ def test_a_silent_camera_stalls_and_goes_on() -> None:
     reader.finish()
     assert reader.log.states == ["connecting", "streaming", "stalled", "streaming"]
     assert "SRC_LOST" not in reader.log.told
-
-
-def test_a_camera_that_stays_silent_is_let_go_and_the_next_one_taken() -> None:
-    camera, bench = Camera(), Bench()
-    reader = Reader(camera, bench, stall_ms=100.0)
-    camera.shoot()
-    until(lambda: "lost" in reader.log.states)
-    stalled, lost = (reader.log.times_s[reader.log.states.index(state)] for state in ("stalled", "lost"))
-    first_s = reader.log.times_s[reader.log.states.index("streaming")]
-    assert stalled - first_s >= 0.1
-    assert lost - first_s >= 1.8
-    until(camera.closed.is_set)
-    second = bench.plug(Camera())
-    until(lambda: second in bench.opened)
-    second.shoot()
-    until(lambda: len(reader.frames) == 2)
-    reader.watch.close()
-    reader.finish()
-    assert reader.log.states == ["connecting", "streaming", "stalled", "lost", "streaming"]
-    assert reader.log.told[-4:] == ["lost", "SRC_LOST", "opened", "streaming"]
 
 
 @pytest.mark.parametrize("ending", [SourceLostError("USB said goodbye"), SourceError("torn"), None])
@@ -135,6 +111,7 @@ def test_a_camera_that_says_it_is_gone_is_believed_at_once(ending: Exception | N
     assert reader.log.details[reader.log.states.index("lost")] == str(ending or "the stream ended")
 
 
+@pytest.mark.usefixtures("impatient")
 def test_a_device_that_never_answers_again_is_left_behind() -> None:
     deaf, second = FakeVideoCapture(flat(9, 9, 9)), Camera()
     first = open_v4l2(V4l2Source(device="/dev/null"), deaf.open)
@@ -164,6 +141,7 @@ def test_after_so_many_failed_attempts_in_a_row_it_is_given_up() -> None:
     assert bench.tries == 3
 
 
+@pytest.mark.usefixtures("impatient")
 def test_a_camera_that_opens_and_gives_nothing_counts_as_a_failed_attempt() -> None:
     camera, bench = Camera(), Bench(Camera(), Camera(), Camera())
     reader = Reader(camera, bench, max_reconnects=2, open_timeout_s=0.05, stall_ms=10.0)
@@ -171,19 +149,6 @@ def test_a_camera_that_opens_and_gives_nothing_counts_as_a_failed_attempt() -> N
     reader.finish()
     assert isinstance(reader.failure, SourceLostError)
     assert len(bench.opened) == 2
-
-
-def test_another_picture_size_is_told_before_its_first_frame() -> None:
-    camera = Camera()
-    reader = Reader(camera)
-    camera.shoot()
-    camera.shoot(np.zeros((32, 48, 3), np.uint8))
-    camera.shoot(np.zeros((32, 48, 3), np.uint8))
-    until(lambda: len(reader.frames) == 3)
-    reader.watch.close()
-    reader.finish()
-    assert [(info.width, info.height) for info in reader.log.infos] == [(96, 64), (48, 32)]
-    assert reader.log.told == ["connecting", "opened", "streaming", "SRC_FORMAT", "opened"]
 
 
 def test_frames_of_a_size_nobody_wants_are_told_of_and_not_given() -> None:
@@ -223,30 +188,6 @@ def test_a_slow_reader_gets_the_newest_frames_and_the_rest_is_counted() -> None:
     assert list(frames) == []
     assert seqs[1:] == list(range(fake.grabbed - 3, fake.grabbed + 1))
     assert watch.skipped + len(seqs) == fake.grabbed + 1
-
-
-def test_pictures_that_wait_before_anybody_reads_are_not_skipped() -> None:
-    fake = FakeVideoCapture(flat(9, 9, 9), fps=200.0)
-    camera = open_v4l2(V4l2Source(device="/dev/null"), fake.open)
-    until(lambda: fake.grabbed > 20)
-    frames = camera.frames()
-    assert next(frames).seq > 10
-    assert camera.skipped <= fake.grabbed - 16  # what came while it was read
-    fake.awake.clear()
-    camera.close()
-    fake.awake.set()
-
-
-def test_damaged_frames_are_counted_over_all_openings() -> None:
-    camera, second = Camera(), Camera()
-    camera.corrupt, second.corrupt = 3, 4
-    reader = Reader(camera, Bench(second))
-    assert reader.watch.corrupt == 3
-    camera.feed(None)
-    until(lambda: len(reader.log.infos) == 2)
-    assert reader.watch.corrupt == 7
-    reader.watch.close()
-    reader.finish()
 
 
 def test_closing_ends_a_silent_watch_and_one_that_looks_for_its_camera() -> None:

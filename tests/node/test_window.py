@@ -1,7 +1,6 @@
 """Frames become windows: the grid, its holes, restarts and the end of a stream."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -33,9 +32,6 @@ def seqs(windows: Sequence[FrameWindow]) -> list[int]:
     return [seq for window in windows for seq in window.seqs]
 
 
-# --- windows of one frame ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("spread", [0.0, 0.3, 0.45])
 def test_every_frame_is_a_window_of_one_at_once(spread: float) -> None:
     builder = WindowBuilder(frames=1, fps=10.0, source_fps=10.0)
@@ -62,17 +58,7 @@ def test_a_camera_that_was_silent_is_no_clock_that_was_set() -> None:
     assert builder.reasons["CLOCK_STEP"] == 2
 
 
-def test_a_picture_like_the_one_before_is_told() -> None:
-    first, second, third = even(3, 10.0)
-    builder = WindowBuilder(frames=1, fps=10.0, source_fps=10.0)
-    again = replace(second, image=first.image)
-    assert [window.static for window in run(builder, [first, again, third])] == [False, True, False]
-
-
-# --- laws --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("fps", [5.0, 6.0, 8.0, 10.0, 12.0, 24.0, 30000 / 1001])
+@pytest.mark.parametrize("fps", [5.0, 24.0, 30000 / 1001])
 def test_at_the_trained_rate_every_frame_is_used_once(fps: float) -> None:
     windows = run(WindowBuilder(frames=14, fps=fps, source_fps=fps), even(42, fps))
     assert seqs(windows) == list(range(42))
@@ -87,8 +73,8 @@ def test_nearly_the_trained_rate_uses_every_frame_once_however_long_the_stream(s
     assert builder.reasons == {}
 
 
-@pytest.mark.parametrize("source_fps", [24.0, 25.0, 30000 / 1001, 30.0, 50.0, 60.0])
-@pytest.mark.parametrize("fps", [6.0, 12.0, 24.0])
+@pytest.mark.parametrize("source_fps", [24.0, 25.0, 30000 / 1001, 60.0])
+@pytest.mark.parametrize("fps", [6.0, 24.0])
 def test_each_place_in_time_gets_the_nearest_frame(source_fps: float, fps: float) -> None:
     frames = even(400, source_fps, first_ms=123.0)
     stamps = np.array([frame.stamp_ns for frame in frames])
@@ -99,8 +85,8 @@ def test_each_place_in_time_gets_the_nearest_frame(source_fps: float, fps: float
         assert abs(stamps[seq] - wanted_ns) <= np.abs(stamps - wanted_ns).min() + 1e6
 
 
-@pytest.mark.parametrize("source_fps", [7.0, 24.0, 25.0, 29.97, 60.0])
-@pytest.mark.parametrize("stride", [1, 5, 14, 20])
+@pytest.mark.parametrize("source_fps", [7.0, 24.0, 29.97])
+@pytest.mark.parametrize("stride", [1, 14, 20])
 def test_no_frame_is_repeated_and_time_never_runs_back(source_fps: float, stride: int) -> None:
     fps, _ = choose_fps(source_fps, (6.0, 24.0))
     builder = WindowBuilder(frames=14, fps=fps, stride=stride, source_fps=source_fps)
@@ -132,16 +118,6 @@ def test_what_a_window_holds_so_far_is_how_the_whole_one_will_begin(stride: int)
         seen.append(builder.filling)
 
 
-def test_after_a_restart_a_window_holds_nothing() -> None:
-    builder = WindowBuilder(frames=4, fps=10.0)
-    run(builder, even(3, 10.0), flush=False)
-    builder.restart("SRC_LOST")
-    assert (builder.filling.seqs, builder.filling.epoch) == ((), 1)
-
-
-# --- a window ----------------------------------------------------------------------------------------------------
-
-
 def test_a_window_carries_pictures_stamps_and_arrival() -> None:
     frames = even(8, 10.0, first_ms=50.0)
     window = run(WindowBuilder(frames=4, fps=10.0), frames)[1]
@@ -162,18 +138,6 @@ def test_only_frames_of_a_window_are_fitted_and_each_once() -> None:
     windows = run(WindowBuilder(frames=4, fps=10.0, fit=fit), even(24, 30.0), flush=False)
     assert windows[0].images.shape == (4, 3, 5, 3)
     assert fitted == [0, 3, 6, 9, 12, 15, 18, 21]
-
-
-# --- holes, steps, the end ---------------------------------------------------------------------------------------
-
-
-def test_a_missing_frame_rejects_its_window_and_nothing_else() -> None:
-    frames = even(42, 10.0)
-    del frames[18:21]
-    builder = WindowBuilder(frames=14, fps=10.0, source_fps=10.0)
-    windows = run(builder, frames)
-    assert [window.seqs for window in windows] == [tuple(range(14)), tuple(range(21, 35))]
-    assert builder.reasons == {"WIN_GAP": 1}
 
 
 def test_the_skew_that_is_allowed_decides_what_a_hole_is() -> None:
@@ -201,37 +165,12 @@ def test_a_step_of_the_clock_begins_a_new_epoch(step_ms: float) -> None:
     assert builder.reasons == {"CLOCK_STEP": 1}
 
 
-def test_another_picture_size_begins_a_new_epoch() -> None:
-    small, large = frames_at(range(0, 600, 100)), frames_at(range(600, 1200, 100), width=8)
-    builder = WindowBuilder(frames=4, fps=10.0)
-    windows = run(builder, [*small, *large])
-    assert [(window.epoch, window.images.shape[2]) for window in windows] == [(0, 4), (1, 8)]
-    assert builder.reasons == {"SRC_FORMAT": 1}
-
-
-def test_after_a_restart_a_builder_goes_on_at_another_rate() -> None:
-    builder = WindowBuilder(frames=4, fps=24.0, source_fps=24.0)
-    before = run(builder, even(6, 24.0))
-    builder.restart("SRC_LOST")
-    builder.run_at(12.0, 12.5)
-    after = run(builder, even(9, 12.5, first_ms=9000.0))
-    assert [(window.epoch, window.fps, window.window_id) for window in before + after] == [
-        (0, 24.0, 0),
-        (1, 12.0, 1),
-        (1, 12.0, 2),
-    ]
-    assert seqs(after) == list(range(8))
-
-
 def test_the_end_completes_a_window_that_only_waits_for_a_nearer_frame() -> None:
     frames = frames_at([0, 100, 200, 280])
     builder = WindowBuilder(frames=4, fps=10.0)
     assert run(builder, frames, flush=False) == []
     assert [window.seqs for window in builder.flush()] == [(0, 1, 2, 3)]
     assert builder.flush() == []
-
-
-# --- rates and refusals ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
