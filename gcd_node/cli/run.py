@@ -1,9 +1,11 @@
 """`gcd-node run`, `check` and `demo`: a launch file, and the demo's own. What brings torch is imported when called."""
 
 import gc
+import logging
 import os
 import statistics
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
@@ -20,7 +22,9 @@ from gcd_node.service import ServiceManager, background_logging
 
 if TYPE_CHECKING:
     from gcd_model import Traits
+    from gcd_node.health import Health
     from gcd_node.inference import WindowReport
+    from gcd_node.node import Node
     from gcd_node.pipeline import Summary
 
 ConfigPath: TypeAlias = Annotated[Path, Argument(metavar="CONFIG", help="A launch file, such as launch/demo.toml.")]
@@ -36,7 +40,9 @@ Show: TypeAlias = Annotated[
     bool, Option("--open", help="Run in a loop, and open the page on which to watch and steer it; ends with Ctrl-C.")
 ]
 
+_LOG = logging.getLogger(__name__)
 _SWITCH_S = 0.001
+_LOOK_S, _QUIET_S = 1.0, 60.0
 _STYLES = {"ok": "green", "warning": "yellow", "failed": "red"}
 
 
@@ -51,15 +57,18 @@ def run(config: ConfigPath, changes: Changes = None, print_config: PrintConfig =
     apply_scheduling(settings.life)
     console = Console(stderr=True, markup=False)
     status = console.status(Text(f"loading {settings.model.weights}"))
+    nodes: list[Node] = []
+    show, warn = _window_printer(console), world_warning(lambda: nodes[0].health)
     session = open_session(
         settings,
         once=once,
         on_configured=lambda traits: _show_configured(console, status, traits),
-        on_window=_window_printer(console),
+        on_window=lambda report: (show(report), warn()),
         service=ServiceManager(os.environ),
         viewer=True,
     )
     with background_logging(as_json=settings.health.log == "json"), status, session as (node, publisher):
+        nodes.append(node)
         console.print(f"views on {publisher.endpoint}, status on {publisher.status_endpoint}", soft_wrap=True)
         summary = run_until_signal(node, publisher)
     console.print(_summary_table(summary, f"{publisher.stats.sent} messages sent"))
@@ -143,15 +152,29 @@ def _window_printer(console: Console) -> Callable[["WindowReport"], None]:
     return show
 
 
+def world_warning(health: Callable[[], "Health"]) -> Callable[[], None]:
+    """Logs, once a minute at most, that the model does not know what its camera shows. To be called for each window."""
+    due_s = 0.0
+
+    def warn() -> None:
+        nonlocal due_s
+        if (now_s := time.monotonic()) < due_s:
+            return
+        is_foreign = "world" in health().snapshot().findings
+        due_s = now_s + (_QUIET_S if is_foreign else _LOOK_S)
+        if is_foreign:
+            _LOG.warning("world: this is another one than the model learned from: depth and classes are guesses")
+
+    return warn
+
+
 def _summary_table(summary: "Summary", delivered: str) -> Table:
-    """What a run came to. Real-time factor: video time per window over inference time; 1 and above keeps up."""
+    """What a run came to."""
     counts = summary.counts
     rows = {"frames read": str(summary.frames), "windows rendered": str(counts.windows), "delivered": delivered}
     if counts.windows:
-        median_s = statistics.median(counts.render_s)
         rows |= {
-            "ms per window (median)": f"{median_s * 1000:.0f}",
-            "real-time factor": f"{summary.window_s / median_s:.2f}",
+            "ms per window (median)": f"{statistics.median(counts.render_s) * 1000:.0f}",
             "age at publish, ms (median)": f"{statistics.median(counts.age_ms):.0f}",
         }
     rejected = ", ".join(f"{count} {reason}" for reason, count in summary.rejected.items()) or "0"

@@ -211,7 +211,8 @@ class ViewTable:
         self._bytes[topic] = self._bytes.get(topic, 0) + len(view.message.payload)
 
     def rows(self, now_s: float, *, ended: bool = False) -> list[tuple[str, ...]]:
-        """By topic: window, shape, age in ms, messages a second, messages missed, MB received, and the state."""
+        """By topic: window, shape, age in ms, messages a second, messages missed, MB received, and the state, with what
+        lies outside the model's training."""
         rows: list[tuple[str, ...]] = []
         for topic, newest in sorted(self._newest.items()):
             header, arrivals = newest.header, self._arrivals[topic]
@@ -222,6 +223,7 @@ class ViewTable:
             numbers = (f"{newest.age_ms + since_ms:.0f}", f"{rate_hz:.2f}", str(self._missed[topic]))
             shape, megabytes = "x".join(map(str, header.shape)), f"{self._bytes[topic] / 1e6:.1f}"
             state = "ended" if ended else "expired" if expired else "live"
+            state = ", ".join((state, *header.quality.ood))
             rows.append((topic, str(header.window_id), shape, *numbers, megabytes, state))
         return rows
 
@@ -234,9 +236,11 @@ class ViewTable:
         table.padding = (0, 1, 0, 0)
         for name in ("topic", "window", "shape", "age ms", "rate Hz", "missed", "MB", "state"):
             left = name in ("topic", "state")
-            table.add_column(name, justify="left" if left else "right", no_wrap=name != "topic", overflow="fold")
+            table.add_column(
+                name, justify="left" if left else "right", no_wrap=name not in ("topic", "state"), overflow="fold"
+            )
         for row in rows:
-            table.add_row(*row[:-1], Text(row[-1], style=_VIEW_STYLES[row[-1]]))
+            table.add_row(*row[:-1], Text(row[-1], style=_VIEW_STYLES.get(row[-1], "yellow")))
         return table
 
 

@@ -307,19 +307,18 @@ def report_text(comparison: RunComparison, tolerance: Tolerance) -> str:
 
 
 def tables(comparison: RunComparison, tolerance: Tolerance) -> list[Table]:
-    """What the runs were made from, if that differs, and every view of every window; of many, those that differ."""
+    """What the runs were made from, and the views of windows, as far as they differ."""
     facts = Table("differs", "A", "B", title="What the runs were made from", title_style="dim")
     for fact in comparison.facts:
         facts.add_row(fact.name, fact.a, fact.b)
-    rows = sorted((*comparison.views, *comparison.missing), key=lambda each: (each.window_id, each.view_id))
-    rows = rows if len(rows) <= _ROWS else list(comparison.failures(Tolerance()))
+    rows = comparison.failures(Tolerance())
     views = Table("window", "view", "difference", title="Views of windows", title_style="dim")
     failures = comparison.failures(tolerance)
     for each in rows[:_ROWS]:
         views.add_row(str(each.window_id), each.view_id, str(each), style="red" if each in failures else None)
     if len(rows) > _ROWS:
         views.caption = f"and {len(rows) - _ROWS} more that differ; --json has them all"
-    return [facts, views] if comparison.facts else [views]
+    return [table for table in (facts, views) if table.row_count]
 
 
 def to_plain(comparison: RunComparison, tolerance: Tolerance) -> dict[str, Any]:

@@ -89,9 +89,9 @@ def test_a_table_has_the_figures_of_each_topic_and_fits_into_80_columns() -> Non
     table.add(received(window(123_456, view_id="a_view_name_of16")), now_s=12.0)
     long, top = table.rows(now_s=12.25)
     assert long[:2] == ("view/a_view_name_of16/win", "123456")
-    assert top == ("view/top/win", "4", "2x4x6x3", "290", "2.00", "2", "0.0", "live")
-    assert [row[-1] for row in table.rows(now_s=72.2)] == ["expired", "expired"]
-    assert table.rows(now_s=12.25, ended=True)[0][-1] == "ended"
+    assert top == ("view/top/win", "4", "2x4x6x3", "290", "2.00", "2", "0.0", "live, fps")
+    assert [row[-1] for row in table.rows(now_s=72.2)] == ["expired, fps", "expired, fps"]
+    assert table.rows(now_s=12.25, ended=True)[0][-1] == "ended, fps"
     text = text_of(table.render(99.0), width=80)
     assert "…" not in text
     assert max(map(len, text.splitlines())) <= 80
