@@ -2,7 +2,7 @@
 
 import math
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -52,21 +52,40 @@ def write_png(path: Path, image: Image) -> None:
     _require_written(path, cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)))
 
 
-def video_writer(path: Path, width: int, height: int, fps: float) -> cv2.VideoWriter:
-    """An open video: .mp4 is small and lossy, .mkv is lossless (FFV1). It takes BGR. Raises OutputError."""
-    make_folder(path.parent)
-    code = cv2.VideoWriter.fourcc(*("FFV1" if path.suffix == ".mkv" else "mp4v"))
-    writer = cv2.VideoWriter(str(path), code, max(fps, 1.0), (width, height))
-    _require_written(path, writer.isOpened())
-    return writer
+class VideoWriter:
+    """A video: .mp4 is small and lossy, .mkv without loss (FFV1). It begins with the first frame, and has its end after
+    `close`. A full disk does not show: OpenCV does not tell."""
+
+    def __init__(self, path: Path, fps: float) -> None:
+        self._path, self._fps = path, max(fps, 1.0)
+        self._video: cv2.VideoWriter | None = None
+        self._size = (0, 0)
+
+    def add(self, frames: Iterable[NDArray[np.uint8]]) -> None:
+        """Append pictures, [H, W, 3] RGB or [H, W] grey. Raises OutputError: it cannot be written, or the size is
+        another than before."""
+        for frame in frames:
+            size = (frame.shape[1], frame.shape[0])
+            if self._video is None:
+                make_folder(self._path.parent)
+                code = cv2.VideoWriter.fourcc(*("FFV1" if self._path.suffix == ".mkv" else "mp4v"))
+                self._video, self._size = cv2.VideoWriter(str(self._path), code, self._fps, size), size
+                _require_written(self._path, self._video.isOpened())
+            if size != self._size:
+                raise OutputError(f"{self._path} holds pictures of {self._size}, now {size}; write to a new folder")
+            self._video.write(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR if frame.ndim == 2 else cv2.COLOR_RGB2BGR))
+
+    def close(self) -> None:
+        """Finish the file."""
+        if self._video is not None:
+            self._video.release()
 
 
-def write_video(path: Path, frames: Sequence[Image], fps: float) -> None:
-    """Write a whole video, see video_writer(). Raises OutputError."""
-    writer = video_writer(path, frames[0].shape[1], frames[0].shape[0], fps)
-    for frame in frames:
-        writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
-    writer.release()
+def write_video(path: Path, frames: Iterable[Image], fps: float) -> None:
+    """Write a whole video, see VideoWriter. Raises OutputError."""
+    writer = VideoWriter(path, fps)
+    writer.add(frames)
+    writer.close()
 
 
 def write_animation(path: Path, frames: Sequence[Image], fps: float, width: int) -> None:

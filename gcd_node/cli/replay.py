@@ -13,7 +13,7 @@ from typer import Argument, Option
 from gcd_node.cli.run import Changes, ConfigPath
 from gcd_node.config import load_config
 from gcd_node.inference import WindowReport
-from gcd_node.replay.compare import REPORT, Tolerance, compare, divergence, tables, to_plain, verdict, write_report
+from gcd_node.replay.compare import REPORT, Tolerance, compare, report_text, to_plain, write_report
 from gcd_node.replay.lockstep import replay
 from gcd_node.replay.run import RunFolder, open_run
 
@@ -71,11 +71,8 @@ def diff(
     if as_json:
         typer.echo(msgspec.json.encode(to_plain(comparison, tolerance)).decode())
     else:
-        console = Console(markup=False)
-        console.print(*tables(comparison, tolerance), sep="\n")
-        for line in (verdict(comparison, tolerance), divergence(comparison), *(f"wrote {path}" for path in written)):
-            if line is not None:
-                console.print(line, soft_wrap=True, highlight=False)
+        for line in (report_text(comparison, tolerance), *(f"wrote {path}" for path in written)):
+            typer.echo(line)
     if comparison.failures(tolerance):
         raise typer.Exit(1)
 

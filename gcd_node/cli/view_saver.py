@@ -2,15 +2,13 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from gcd_client.protocol import ViewHeader, kind_of
 from gcd_client.subscriber import ReceivedView
 from gcd_model import hatched
-from gcd_node.errors import OutputError
 from gcd_node.frame import Image
-from gcd_node.image_io import legend, video_writer, write_npy, write_png
+from gcd_node.image_io import VideoWriter, legend, write_npy, write_png
 
 _LEGEND_WIDTH = 384
 
@@ -31,7 +29,7 @@ class ViewSaver:
     def __init__(self, folder: Path, *, hatch: bool = False) -> None:
         self._folder, self._hatch = folder, hatch
         self._held: dict[str, tuple[ReceivedView, Image]] = {}  # windows that wait for their visibility, which is next
-        self._videos: dict[Path, tuple[cv2.VideoWriter, tuple[int, ...]]] = {}
+        self._videos: dict[Path, VideoWriter] = {}
         self._legends: set[Path] = set()
         self.files = 0
 
@@ -50,8 +48,8 @@ class ViewSaver:
         """Finish the videos; until then they may lack their end."""
         for view_id in tuple(self._held):
             self._write_held(view_id, None)
-        for video, _ in self._videos.values():
-            video.release()
+        for video in self._videos.values():
+            video.close()
         self._videos.clear()
 
     def __enter__(self) -> "ViewSaver":
@@ -85,19 +83,11 @@ class ViewSaver:
             write_png(folder / "legend.png", legend(header.classes, _LEGEND_WIDTH))
             self._legends.add(folder)
             self.files += 1
-        video = self._video(folder.with_suffix(".mkv"), header)
-        for frame in frames:
-            video.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
-
-    def _video(self, path: Path, header: ViewHeader) -> cv2.VideoWriter:
-        size = header.shape[1:3]
+        path = folder.with_suffix(".mkv")
         if path not in self._videos:
-            self._videos[path] = (video_writer(path, size[1], size[0], header.src.fps_cond), size)
+            self._videos[path] = VideoWriter(path, header.src.fps_cond)
             self.files += 1
-        video, first = self._videos[path]
-        if first != size:
-            raise OutputError(f"view {header.view_id} was {first} (height, width), now {size}; save to a new folder")
-        return video
+        self._videos[path].add(frames)
 
 
 def _moment(header: ViewHeader) -> tuple[object, ...]:

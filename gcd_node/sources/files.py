@@ -139,7 +139,7 @@ class VideoFile(Recording):
         super().__init__(str(path), fps=fps, pace=pace, loop=loop)
         _check_file(path)
         self._path, self._stated_fps = path.resolve(), fps
-        with _opened(self._path) as capture:
+        with open_video(self._path) as capture:
             first, codec = capture.read()[1], codec_name(capture.get(cv2.CAP_PROP_FOURCC))
             stated = capture.get(cv2.CAP_PROP_FPS)
         if first is None:  # pyright: ignore[reportUnnecessaryComparison] - the stub hides it
@@ -161,7 +161,7 @@ class VideoFile(Recording):
 
     def _one_pass(self) -> Iterator[Frame]:
         stamp_ns, seq, fps = None, -1, self.info.fps_nominal
-        with _opened(self._path) as capture:
+        with open_video(self._path) as capture:
             while not self._stopped.is_set() and (read := capture.read())[0]:
                 seq += 1
                 if self._stated_fps is None:
@@ -202,7 +202,7 @@ def _check_file(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Generator[cv2.VideoCapture]:
+def open_video(path: Path) -> Generator[cv2.VideoCapture]:
     """FFmpeg on one file, quiet on stderr. Raises SourceError."""
     with quiet_opencv():
         capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
