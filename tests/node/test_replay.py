@@ -147,12 +147,6 @@ def test_windows_that_were_rejected_are_counted_and_those_with_nan_named(tmp_pat
     assert str(window_seed(nan.cfg_digest, 1, 1)) in trouble.detail
 
 
-def test_every_view_has_its_own_pixels(tmp_path: Path) -> None:
-    two = made_run(tmp_path / "run", changes=["view.second.azimuth_deg=5.0"])
-    assert two.manifest.views == ("main", "second")
-    assert sorted(path.name for path in two.path.iterdir()) == ["main.mkv", MANIFEST, "second.mkv"]
-
-
 # How a run comes to be.
 
 
@@ -292,10 +286,3 @@ def test_a_manifest_that_is_none_is_damage_and_says_where(
     (tmp_path / MANIFEST).write_bytes(text.replace(old, new, 1))
     with pytest.raises(DamagedRunError, match=reason):
         open_run(tmp_path)
-
-
-def test_a_folder_without_a_manifest_is_another_error_than_none(tmp_path: Path) -> None:
-    with pytest.raises(DamagedRunError):
-        open_run(tmp_path)
-    with pytest.raises(SourceError):
-        open_run(tmp_path / "nowhere")

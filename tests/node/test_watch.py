@@ -127,14 +127,6 @@ def test_a_watch_for_hatching_takes_windows_with_their_visibility(tmp_path: Path
     assert np.array_equal(read_video(tmp_path / "out" / "top.mkv"), hatched(image, SEEN))
 
 
-def test_views_that_never_come_are_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_app(["view", f"ipc://{tmp_path}/nobody", "--timeout", "0.3"]) == 69
-    said = capsys.readouterr()
-    assert "is the node running?" in said.out
-    assert said.out.endswith("\n")  # an error that follows begins its own line
-    assert said.err.startswith(f"error: no view from ipc://{tmp_path}/nobody within 0.3 s")
-
-
 def test_maps_are_saved_in_colour_and_as_numbers_apart_from_windows(tmp_path: Path) -> None:
     drawn = [numbers(i, height=16, width=16) for i in range(2)]
     with ViewSaver(tmp_path) as saver:
@@ -257,13 +249,6 @@ def test_a_working_node_is_shown_with_its_figures_in_80_columns() -> None:
     ):
         assert expected in shown, expected
     assert "E11" not in shown  # only the latest
-
-
-def test_a_node_that_is_silent_or_not_ready_is_shown_as_that() -> None:
-    headline = text_of(board_of(note("status", working())).render(20.0)).splitlines()[0]
-    assert headline.split() == ["STALE", "robot_7", "silent", "for", "10", "s", "before:", "active"]
-    text = text_of(board_of(note("status", Health().report())).render(10.0))
-    assert "not ready: NOT_ACTIVE, SRC_NOT_STREAMING" in text
 
 
 HOSTILE: tuple[dict[str, Any], ...] = (
