@@ -21,10 +21,10 @@ import numpy as np
 import psutil
 from msgspec.structs import replace
 from rich.console import Console
-from rich.table import Table
 from typer import Argument, Option
 
 from gcd_client.subscriber import ViewSubscriber
+from gcd_node.cli.main import table
 from gcd_node.cli.run import Changes
 from gcd_node.config import ControlConfig, NodeConfig, ViewerConfig, load_config, parse_config, to_toml
 from gcd_node.errors import NodeError, OutputError, UsageError
@@ -111,10 +111,9 @@ def bench(
         for rate in () if stream else rates or _RATES_HZ:
             status.update(f"{rate:g} Hz")
             by_rate[rate] = _run(settings, "realtime", rate, seconds, idle)
-    table = Table("", first, *(f"{rate:g} Hz" for rate in by_rate))
-    for label, (name, decimals) in _ROWS.items():
-        table.add_row(label, *(f"{run[name]:.{decimals}f}" for run in (figures, *by_rate.values())))
-    Console().print(table)
+    runs = (figures, *by_rate.values())
+    rows = ((label, *(f"{run[name]:.{decimals}f}" for run in runs)) for label, (name, decimals) in _ROWS.items())
+    Console().print(table(rows, ("", f">{first}", *(f">{rate:g} Hz" for rate in by_rate))))
     if json_file is not None:
         named = {f"{rate:.1f}fps": run for rate, run in by_rate.items()}
         text = msgspec.json.encode({**figures, **named, "metadata": _metadata(settings, idle)})

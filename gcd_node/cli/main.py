@@ -1,4 +1,4 @@
-"""`gcd-node`: finds the command, and what becomes of errors."""
+"""`gcd-node`: finds the command, and what becomes of errors; the tables that commands print."""
 
 import contextlib
 import logging
@@ -7,11 +7,12 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Sequence
 from importlib import import_module, metadata
 from typing import Annotated, cast
 
 import typer
+from rich.table import Table
 
 from gcd_client.protocol import ClientError
 from gcd_node.errors import NodeError, SourceError
@@ -103,6 +104,16 @@ def new_app(loaded: Collection[str]) -> typer.Typer:
             text = re.sub(r"(\[[a-z])", r"\\\1", command.__doc__ or "")  # [model] is no markup
             app.command(name, help=text)(command)
     return app
+
+
+def table(rows: Iterable[Sequence[object]], columns: Sequence[str] = (), title: str | None = None) -> Table:
+    """A table to print. columns: headings, ">" before those of numbers; none of a list of facts."""
+    made = Table(title=title, show_header=bool(columns))
+    for name in columns:
+        made.add_column(name.removeprefix(">"), justify="right" if name.startswith(">") else "left")
+    for row in rows:
+        made.add_row(*map(str, row))
+    return made
 
 
 def _print_version(wanted: bool) -> None:

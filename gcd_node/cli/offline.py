@@ -9,14 +9,12 @@ from typing import Annotated, Literal
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 from typer import Argument, Option
 
 from gcd_model import (
     Augmentation,
     EngineName,
     ExportPrecision,
-    Manifest,
     Quality,
     RenderOptions,
     SolverName,
@@ -27,6 +25,7 @@ from gcd_model import (
     load_synthesizer,
     visibility_of,
 )
+from gcd_node.cli.main import table
 from gcd_node.cli.weights import FamilyOption, HeadWidth, ImageHeads
 from gcd_node.errors import SourceError, UsageError
 from gcd_node.image_io import write_npz
@@ -312,15 +311,15 @@ def export(
             progress=advance,
         )
     console = Console(markup=False)
-    console.print(_table(manifest))
+    rows = (
+        (
+            name,
+            graph.precision,
+            ", ".join(f"{each.name} {'x'.join(map(str, each.shape))}" for each in graph.inputs),
+            f"{sum(file.size for file in graph.files) / 1e6:,.1f}",
+        )
+        for name, graph in manifest.graphs.items()
+    )
+    title = f"{manifest.card['gcd.name']}, {manifest.precision}, digest {manifest.sha256_12}"
+    console.print(table(rows, ("graph", "precision", "takes", ">MB"), title))
     console.print(f"wrote {onnx}", soft_wrap=True)
-
-
-def _table(manifest: Manifest) -> Table:
-    table = Table(title=f"{manifest.card['gcd.name']}, {manifest.precision}, digest {manifest.sha256_12}")
-    for column in ("graph", "precision", "takes", "MB"):
-        table.add_column(column, justify="right" if column == "MB" else "left")
-    for name, graph in manifest.graphs.items():
-        takes = ", ".join(f"{each.name} {'x'.join(map(str, each.shape))}" for each in graph.inputs)
-        table.add_row(name, graph.precision, takes, f"{sum(file.size for file in graph.files) / 1e6:,.1f}")
-    return table

@@ -6,16 +6,16 @@ from typing import Annotated
 import msgspec
 import typer
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 from typer import Argument, Option
 
-from gcd_node.cli.run import Changes, ConfigPath
+from gcd_node.cli.main import table
+from gcd_node.cli.run import Changes, ConfigPath, in_words
 from gcd_node.config import load_config
 from gcd_node.inference import WindowReport
 from gcd_node.replay.compare import REPORT, Tolerance, compare, report_text, to_plain, write_report
 from gcd_node.replay.lockstep import replay
-from gcd_node.replay.run import RunFolder, open_run
+from gcd_node.replay.run import open_run
 
 RunOut = Annotated[Path, Option("--out", metavar="RUN", help="Folder for the run; new, or empty.")]
 RunA = Annotated[Path, Argument(metavar="RUN_A", help="A run of `gcd-node replay`, such as the golden one.")]
@@ -47,7 +47,18 @@ def replay_launch(config: ConfigPath, out: RunOut, changes: Changes = None) -> N
             status.update(f"window {report.window.window_id}: {report.render_s * 1000:.0f} ms")
 
         run = replay(settings, out, tell)
-    Console(markup=False).print(_run_table(run))
+    totals, made_from = run.manifest.totals, run.manifest.made_from
+    machine = ", ".join(made_from[f"machine {name}"] for name in ("device", "processor", "threads"))
+    rows = (
+        ("weights", f"{made_from['weights name']} {made_from['weights sha256_12']}"),
+        ("frames read", totals.frames),
+        ("windows rendered", totals.windows),
+        ("windows rejected", in_words(totals.rejected)),
+        ("windows with NaN", totals.nan_windows),
+        ("views", ", ".join(run.manifest.views)),
+        ("on", f"{machine} threads"),
+    )
+    Console(markup=False).print(table(rows))
     Console(markup=False).print(f"wrote {run.path}", soft_wrap=True, highlight=False)
 
 
@@ -75,21 +86,3 @@ def diff(
             typer.echo(line)
     if comparison.failures(tolerance):
         raise typer.Exit(1)
-
-
-def _run_table(run: RunFolder) -> Table:
-    manifest = run.manifest
-    totals, made_from = manifest.totals, manifest.made_from
-    rejected = ", ".join(f"{count} {reason}" for reason, count in totals.rejected.items()) or "0"
-    table = Table(show_header=False)
-    for row in (
-        ("weights", f"{made_from['weights name']} {made_from['weights sha256_12']}"),
-        ("frames read", str(totals.frames)),
-        ("windows rendered", str(totals.windows)),
-        ("windows rejected", rejected),
-        ("windows with NaN", str(totals.nan_windows)),
-        ("views", ", ".join(manifest.views)),
-        ("on", ", ".join(made_from[f"machine {name}"] for name in ("device", "processor", "threads")) + " threads"),
-    ):
-        table.add_row(*row)
-    return table

@@ -6,7 +6,7 @@ import os
 import statistics
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
@@ -17,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 from typer import Argument, Option
 
+from gcd_node.cli.main import table
 from gcd_node.config import LifeConfig, load_config, to_toml
 from gcd_node.service import ServiceManager, background_logging
 
@@ -59,11 +60,16 @@ def run(config: ConfigPath, changes: Changes = None, print_config: PrintConfig =
     status = console.status(Text(f"loading {settings.model.weights}"))
     nodes: list[Node] = []
     show, warn = _window_printer(console), world_warning(lambda: nodes[0].health)
+
+    def on_window(report: "WindowReport") -> None:
+        show(report)
+        warn()
+
     session = open_session(
         settings,
         once=once,
         on_configured=lambda traits: _show_configured(console, status, traits),
-        on_window=lambda report: (show(report), warn()),
+        on_window=on_window,
         service=ServiceManager(os.environ),
         viewer=True,
     )
@@ -100,10 +106,11 @@ def check(config: ConfigPath, changes: Changes = None, print_config: PrintConfig
 
     with Console(stderr=True, markup=False).status("looking"):
         findings = list(check_launch(settings))
-    table = Table(show_header=False)
-    for each in findings:
-        table.add_row(each.topic, each.verdict, printable(each.detail, 4000), style=_STYLES[each.verdict])
-    Console(markup=False).print(table)
+    rows = ((each.topic, each.verdict, printable(each.detail, 4000)) for each in findings)
+    shown = table(rows)
+    for row, each in zip(shown.rows, findings, strict=True):
+        row.style = _STYLES[each.verdict]
+    Console(markup=False).print(shown)
     for each in findings:
         if each.error is not None:
             raise each.error
@@ -171,15 +178,20 @@ def world_warning(health: Callable[[], "Health"]) -> Callable[[], None]:
 def _summary_table(summary: "Summary", delivered: str) -> Table:
     """What a run came to."""
     counts = summary.counts
-    rows = {"frames read": str(summary.frames), "windows rendered": str(counts.windows), "delivered": delivered}
+    rows: dict[str, object] = {
+        "frames read": summary.frames,
+        "windows rendered": counts.windows,
+        "delivered": delivered,
+    }
     if counts.windows:
         rows |= {
             "ms per window (median)": f"{statistics.median(counts.render_s) * 1000:.0f}",
             "age at publish, ms (median)": f"{statistics.median(counts.age_ms):.0f}",
         }
-    rejected = ", ".join(f"{count} {reason}" for reason, count in summary.rejected.items()) or "0"
-    rows |= {"windows dropped": str(summary.dropped), "windows rejected": rejected}
-    table = Table(show_header=False)
-    for row in (*rows.items(), ("windows with NaN", str(counts.nan_windows))):
-        table.add_row(*row)
-    return table
+    rows |= {"windows dropped": summary.dropped, "windows rejected": in_words(summary.rejected)}
+    return table((rows | {"windows with NaN": counts.nan_windows}).items())
+
+
+def in_words(rejected: Mapping[str, int]) -> str:
+    """What spoilt windows, and how many."""
+    return ", ".join(f"{count} {reason}" for reason, count in rejected.items()) or "0"
