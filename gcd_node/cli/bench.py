@@ -23,7 +23,7 @@ from msgspec.structs import replace
 from rich.console import Console
 from typer import Argument, Option
 
-from gcd_client.subscriber import ViewSubscriber
+from gcd_client.subscriber import ReceivedView, ViewSubscriber
 from gcd_node.cli.main import table
 from gcd_node.cli.run import Changes
 from gcd_node.config import ControlConfig, NodeConfig, ViewerConfig, load_config, parse_config, to_toml
@@ -275,12 +275,13 @@ class _Node:
             reader.join()
 
     def _read(self, endpoint: str, view: str) -> None:
+        def note(found: ReceivedView) -> None:
+            now_ns, seqs = time.monotonic_ns(), found.header.src.seq
+            self.arrivals[view].append(Arrival(at_ns=now_ns, age_ms=found.age_ms, seqs=seqs))
+
         try:
             with ViewSubscriber(endpoint, view, conflate=False) as views:
-                while not self._closed.is_set():
-                    if (found := views.receive(1000 * _POLL_S)) is not None:
-                        now_ns, seqs = time.monotonic_ns(), found.header.src.seq
-                        self.arrivals[view].append(Arrival(at_ns=now_ns, age_ms=found.age_ms, seqs=seqs))
+                views.run(note, self._closed)
         except Exception as error:  # the end of a thread: require_alive() raises it
             self._error = error
 

@@ -281,15 +281,6 @@ def test_a_recording_stops_before_the_room_is_gone_that_it_must_leave(tmp_path: 
         assert box.of("win")
 
 
-def test_a_folder_that_cannot_be_made_is_blamed_on_the_setting(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    _, box = recorded(recorder_config(tmp_path / "file" / "recordings"), FakeSource(14))
-    done = ended(box)
-    assert (done["reason"], done["file"], done["finished"]) == ("DISK_ERROR", None, False)
-    assert "check folder in [record]" in str(done["message"])
-    assert box.of("win")
-
-
 # --- slow disks --------------------------------------------------------------------------------------------------
 
 
