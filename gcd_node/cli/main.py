@@ -24,11 +24,11 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "view": ("watch:view", "Watch the views of a node: a live table, and with --save pictures on disk."),
     "viewer": ("watch:viewer", "Serve the page for a running node; ends with Ctrl-C."),
     "replay": (
-        "replay:replay_launch",
+        "run:replay_launch",
         "Replay a launch file's recording in lockstep, as fast as the model goes, into a run that can be compared.",
     ),
     "diff": (
-        "replay:diff",
+        "run:diff",
         "Compare two runs window by window: identical, or how far apart, where first, and what they were made from.",
     ),
     "status": ("watch:status", "Watch how a node does: states, rates, ages, drops, stage times and events."),

@@ -1,4 +1,5 @@
-"""`gcd-node run`, `check` and `demo`: a launch file, and the demo's own. What brings torch is imported when called."""
+"""What is done with a launch file: `gcd-node run`, `check`, `replay` and the `diff` of two runs; and `demo`, which has
+one of its own. What brings torch is imported when called."""
 
 import gc
 import logging
@@ -10,6 +11,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
+import msgspec
 import typer
 from rich.console import Console
 from rich.status import Status
@@ -40,6 +42,21 @@ DemoOut: TypeAlias = Annotated[Path, Option(help="Folder for the pictures.")]
 Show: TypeAlias = Annotated[
     bool, Option("--open", help="Run in a loop, and open the page on which to watch and steer it; ends with Ctrl-C.")
 ]
+
+RunOut: TypeAlias = Annotated[Path, Option("--out", metavar="RUN", help="Folder for the run; new, or empty.")]
+RunA: TypeAlias = Annotated[Path, Argument(metavar="RUN_A", help="A run of `gcd-node replay`, such as the golden one.")]
+RunB: TypeAlias = Annotated[Path, Argument(metavar="RUN_B", help="The run to compare with it.")]
+MinPsnr: TypeAlias = Annotated[
+    float | None,
+    Option(metavar="DB", help="What each frame of each view must reach; else all pixels must be identical."),
+]
+MaxClassShare: TypeAlias = Annotated[
+    float, Option(metavar="SHARE", help="Of a view's class pixels in a window, how many may differ, 0 to 1.")
+]
+DiffOut: TypeAlias = Annotated[
+    Path | None, Option("--out", metavar="DIR", help="Folder for diff.json and pictures of the worst windows.")
+]
+AsJson: TypeAlias = Annotated[bool, Option("--json", help="Print the whole comparison as one line of JSON.")]
 
 _LOG = logging.getLogger(__name__)
 _SWITCH_S = 0.001
@@ -139,6 +156,66 @@ def demo(out: DemoOut = Path("gcd-demo"), show: Show = False) -> None:
         made_by = "These weights are random: the plumbing is real, what is generated is noise."
     console.print(f"Shown, from left to right: {'; '.join(HEADINGS)}. {made_by}", soft_wrap=True)
     console.print(f"wrote {' and '.join(map(str, report.files))}", soft_wrap=True)
+
+
+def replay_launch(config: ConfigPath, out: RunOut, changes: Changes = None) -> None:
+    """Replay a launch file's recording in lockstep, as fast as the model goes, into a run that can be compared.
+
+    RUN gets manifest.json (what it was made from, and a SHA-256 of every view of every window) and the pixels without
+    loss. It appears when it is complete. Opens no socket; the same machine gives the same hashes every time.
+    """
+    from gcd_node.replay.lockstep import replay
+
+    settings = load_config(config, changes or ())
+    console = Console(stderr=True, markup=False)
+    with console.status(Text(f"loading {settings.model.weights}")) as status:
+
+        def tell(report: "WindowReport") -> None:
+            status.update(f"window {report.window.window_id}: {report.render_s * 1000:.0f} ms")
+
+        run = replay(settings, out, tell)
+    totals, made_from = run.manifest.totals, run.manifest.made_from
+    machine = ", ".join(made_from[f"machine {name}"] for name in ("device", "processor", "threads"))
+    rows = (
+        ("weights", f"{made_from['weights name']} {made_from['weights sha256_12']}"),
+        ("frames read", totals.frames),
+        ("windows rendered", totals.windows),
+        ("windows rejected", in_words(totals.rejected)),
+        ("windows with NaN", totals.nan_windows),
+        ("views", ", ".join(run.manifest.views)),
+        ("on", f"{machine} threads"),
+    )
+    Console(markup=False).print(table(rows))
+    Console(markup=False).print(f"wrote {run.path}", soft_wrap=True, highlight=False)
+
+
+def diff(
+    run_a: RunA,
+    run_b: RunB,
+    min_psnr: MinPsnr = None,
+    max_class_share: MaxClassShare = 0.0,
+    out: DiffOut = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compare two runs window by window: identical, or how far apart, where first, and what they were made from.
+
+    Ends with 0 if they are identical or near enough, with 1 if not, with 65 or 66 if one is damaged or missing.
+    """
+    from gcd_node.replay.compare import REPORT, Tolerance, compare, report_text, to_plain, write_report
+    from gcd_node.replay.run import open_run
+
+    tolerance = Tolerance(min_psnr_db=min_psnr, max_class_share=max_class_share)
+    runs = open_run(run_a), open_run(run_b)
+    with Console(stderr=True, markup=False).status("comparing"):
+        comparison = compare(*runs)
+        written = () if out is None else (out / REPORT, *write_report(out, comparison, tolerance))
+    if as_json:
+        typer.echo(msgspec.json.encode(to_plain(comparison, tolerance)).decode())
+    else:
+        for line in (report_text(comparison, tolerance), *(f"wrote {path}" for path in written)):
+            typer.echo(line)
+    if comparison.failures(tolerance):
+        raise typer.Exit(1)
 
 
 def _show_configured(console: Console, status: Status, traits: "Traits") -> None:

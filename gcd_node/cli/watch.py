@@ -96,7 +96,7 @@ def view(
     with ExitStack() as stack:
         saver = None
         if save is not None:
-            from gcd_node.cli.view_saver import ViewSaver  # takes seconds, in which a subscriber would lose views
+            from gcd_node.image_io import ViewSaver  # takes seconds, in which a subscriber would lose views
 
             saver = stack.enter_context(ViewSaver(save, hatch=hatch))
         views = stack.enter_context(ViewSubscriber(endpoint, name, kinds, conflate=False, keys=keys))

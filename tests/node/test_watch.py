@@ -22,11 +22,11 @@ from gcd_client.subscriber import ReceivedView
 from gcd_model import hatched
 from gcd_node.auth import Client, ServerSecurity, new_key_pair, write_key_pair
 from gcd_node.cli.main import run_app
-from gcd_node.cli.view_saver import ViewSaver
 from gcd_node.cli.watch import StatusBoard, ViewTable
 from gcd_node.config import PublishConfig
 from gcd_node.errors import OutputError
 from gcd_node.health import Health, Level
+from gcd_node.image_io import ViewSaver
 from gcd_node.publisher import Publisher
 
 pytestmark = pytest.mark.timeout(60)
