@@ -36,15 +36,7 @@ _CPU_INTERVAL_S = 1.0  # psutil's figure of a shorter interval is noise
 _FEWEST_VIEWS = 3  # jitter is a difference of differences
 _MEBIBYTE = 2**20
 
-LaunchFile: TypeAlias = Annotated[
-    Path | None, Argument(metavar="[CONFIG]", help="A launch file; the packaged drive where left out.")
-]
-Rates: TypeAlias = Annotated[
-    list[float] | None, Option("--rate", min=0.1, help="Input rate for latency, Hz; 5, 10 and 15. Again for more.")
-]
-Seconds: TypeAlias = Annotated[float, Option(min=1.0, help="How long each run is watched after its first view.")]
 Stream: TypeAlias = Annotated[bool, Option("--stream", help="One run alone, at the source's own rate.")]
-JsonFile: TypeAlias = Annotated[Path | None, Option("--json", help="Also a file, in the names of Isaac ROS Benchmark.")]
 
 Pace: TypeAlias = Literal["realtime", "lockstep"]
 
@@ -79,12 +71,18 @@ class Arrival:
 
 
 def bench(
-    config: LaunchFile = None,
-    rates: Rates = None,
-    seconds: Seconds = 20.0,
+    config: Annotated[
+        Path | None, Argument(metavar="[CONFIG]", help="A launch file; the packaged drive where left out.")
+    ] = None,
+    rates: Annotated[
+        list[float] | None, Option("--rate", min=0.1, help="Input rate for latency, Hz; 5, 10 and 15. Again for more.")
+    ] = None,
+    seconds: Annotated[float, Option(min=1.0, help="How long each run is watched after its first view.")] = 20.0,
     stream: Stream = False,
     changes: Changes = None,
-    json_file: JsonFile = None,
+    json_file: Annotated[
+        Path | None, Option("--json", help="Also a file, in the names of Isaac ROS Benchmark.")
+    ] = None,
 ) -> None:
     """Measure a node in a process of its own: latency, throughput, missed frames, cost.
 

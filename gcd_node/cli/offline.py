@@ -40,7 +40,6 @@ _sampling = partial(Option, rich_help_panel="Sampling")
 _model = partial(Option, rich_help_panel="The model")
 _mount = partial(Option, rich_help_panel="The camera's mount; what is left out is as the model was trained")
 _depth = partial(Option, rich_help_panel="Depth from elsewhere, for the live model; for others it tells what was seen")
-_narrow = partial(Option, rich_help_panel="Narrower numbers")
 
 Input = Annotated[
     Path,
@@ -266,30 +265,29 @@ def _progress(first: str) -> Generator[Callable[[str, int, int], None]]:
 
 # Export.
 
-OnnxFolder = Annotated[
-    Path, Option("--onnx", metavar="DIR", help="Folder to write; it appears whole or not at all.", show_default=False)
-]
-Checkpoint = Annotated[
-    str, Option(help="A checkpoint, a diffusers folder, package:NAME, or random:FAMILY (noise).", show_default=False)
-]
-Half = Annotated[bool, _narrow("--fp16", help="Half precision, for GPUs; the decoder stays float32.")]
-GraphHeight = Annotated[int | None, Option(help="Instead of the trained height; the graphs take no other.")]
-GraphWidth = Annotated[int | None, Option(help="Instead of the trained width; the graphs take no other.")]
-Adapter = Annotated[Path | None, Option("--adapter", help="Low-rank adapter trained on these weights.")]
-Overwrite = Annotated[bool, Option("--overwrite", help="Replace the export that is there.")]
-
 
 def export(
-    onnx: OnnxFolder,
-    weights: Checkpoint,
-    fp16: Half = False,
-    height: GraphHeight = None,
-    width: GraphWidth = None,
+    onnx: Annotated[
+        Path,
+        Option("--onnx", metavar="DIR", help="Folder to write; it appears whole or not at all.", show_default=False),
+    ],
+    weights: Annotated[
+        str,
+        Option(help="A checkpoint, a diffusers folder, package:NAME, or random:FAMILY (noise).", show_default=False),
+    ],
+    fp16: Annotated[
+        bool,
+        Option(
+            "--fp16", rich_help_panel="Narrower numbers", help="Half precision, for GPUs; the decoder stays float32."
+        ),
+    ] = False,
+    height: Annotated[int | None, Option(help="Instead of the trained height; the graphs take no other.")] = None,
+    width: Annotated[int | None, Option(help="Instead of the trained width; the graphs take no other.")] = None,
     family: FamilyOption = None,
     head_width: HeadWidth = None,
     image_heads: ImageHeads = None,
-    adapter: Adapter = None,
-    overwrite: Overwrite = False,
+    adapter: Annotated[Path | None, Option("--adapter", help="Low-rank adapter trained on these weights.")] = None,
+    overwrite: Annotated[bool, Option("--overwrite", help="Replace the export that is there.")] = False,
 ) -> None:
     """Write every network of a checkpoint as an ONNX graph of one size, with a manifest.
 

@@ -35,28 +35,7 @@ Changes: TypeAlias = Annotated[
     list[str] | None, Option("--set", metavar="KEY=VALUE", help="Change a setting, as model.steps=4. Again for more.")
 ]
 PrintConfig: TypeAlias = Annotated[bool, Option("--print-config", help="Print the whole configuration, and end.")]
-Once: TypeAlias = Annotated[
-    bool | None, Option("--once/--stay", help="End with the source or the first failure; else wait for commands.")
-]
-DemoOut: TypeAlias = Annotated[Path, Option(help="Folder for the pictures.")]
-Show: TypeAlias = Annotated[
-    bool, Option("--open", help="Run in a loop, and open the page on which to watch and steer it; ends with Ctrl-C.")
-]
 
-RunOut: TypeAlias = Annotated[Path, Option("--out", metavar="RUN", help="Folder for the run; new, or empty.")]
-RunA: TypeAlias = Annotated[Path, Argument(metavar="RUN_A", help="A run of `gcd-node replay`, such as the golden one.")]
-RunB: TypeAlias = Annotated[Path, Argument(metavar="RUN_B", help="The run to compare with it.")]
-MinPsnr: TypeAlias = Annotated[
-    float | None,
-    Option(metavar="DB", help="What each frame of each view must reach; else all pixels must be identical."),
-]
-MaxClassShare: TypeAlias = Annotated[
-    float, Option(metavar="SHARE", help="Of a view's class pixels in a window, how many may differ, 0 to 1.")
-]
-DiffOut: TypeAlias = Annotated[
-    Path | None, Option("--out", metavar="DIR", help="Folder for diff.json and pictures of the worst windows.")
-]
-AsJson: TypeAlias = Annotated[bool, Option("--json", help="Print the whole comparison as one line of JSON.")]
 
 _LOG = logging.getLogger(__name__)
 _SWITCH_S = 0.001
@@ -64,7 +43,14 @@ _LOOK_S, _QUIET_S = 1.0, 60.0
 _STYLES = {"ok": "green", "warning": "yellow", "failed": "red"}
 
 
-def run(config: ConfigPath, changes: Changes = None, print_config: PrintConfig = False, once: Once = None) -> None:
+def run(
+    config: ConfigPath,
+    changes: Changes = None,
+    print_config: PrintConfig = False,
+    once: Annotated[
+        bool | None, Option("--once/--stay", help="End with the source or the first failure; else wait for commands.")
+    ] = None,
+) -> None:
     """Run the node on a launch file, until its recording ends or it is told to."""
     settings = load_config(config, changes or ())
     if print_config:
@@ -133,7 +119,13 @@ def check(config: ConfigPath, changes: Changes = None, print_config: PrintConfig
             raise each.error
 
 
-def demo(out: DemoOut = Path("gcd-demo"), show: Show = False) -> None:
+def demo(
+    out: Annotated[Path, Option(help="Folder for the pictures.")] = Path("gcd-demo"),
+    show: Annotated[
+        bool,
+        Option("--open", help="Run in a loop, and open the page on which to watch and steer it; ends with Ctrl-C."),
+    ] = False,
+) -> None:
     """Replay the packaged drive through the model and over ZeroMQ into a second process.
 
     Writes side_by_side.mp4, .webp and .png; needs neither camera nor GPU. With --open the drive runs in a loop
@@ -158,7 +150,11 @@ def demo(out: DemoOut = Path("gcd-demo"), show: Show = False) -> None:
     console.print(f"wrote {' and '.join(map(str, report.files))}", soft_wrap=True)
 
 
-def replay_launch(config: ConfigPath, out: RunOut, changes: Changes = None) -> None:
+def replay_launch(
+    config: ConfigPath,
+    out: Annotated[Path, Option("--out", metavar="RUN", help="Folder for the run; new, or empty.")],
+    changes: Changes = None,
+) -> None:
     """Replay a launch file's recording in lockstep, as fast as the model goes, into a run that can be compared.
 
     RUN gets manifest.json (what it was made from, and a SHA-256 of every view of every window) and the pixels without
@@ -190,12 +186,19 @@ def replay_launch(config: ConfigPath, out: RunOut, changes: Changes = None) -> N
 
 
 def diff(
-    run_a: RunA,
-    run_b: RunB,
-    min_psnr: MinPsnr = None,
-    max_class_share: MaxClassShare = 0.0,
-    out: DiffOut = None,
-    as_json: AsJson = False,
+    run_a: Annotated[Path, Argument(metavar="RUN_A", help="A run of `gcd-node replay`, such as the golden one.")],
+    run_b: Annotated[Path, Argument(metavar="RUN_B", help="The run to compare with it.")],
+    min_psnr: Annotated[
+        float | None,
+        Option(metavar="DB", help="What each frame of each view must reach; else all pixels must be identical."),
+    ] = None,
+    max_class_share: Annotated[
+        float, Option(metavar="SHARE", help="Of a view's class pixels in a window, how many may differ, 0 to 1.")
+    ] = 0.0,
+    out: Annotated[
+        Path | None, Option("--out", metavar="DIR", help="Folder for diff.json and pictures of the worst windows.")
+    ] = None,
+    as_json: Annotated[bool, Option("--json", help="Print the whole comparison as one line of JSON.")] = False,
 ) -> None:
     """Compare two runs window by window: identical, or how far apart, where first, and what they were made from.
 
