@@ -158,13 +158,6 @@ def test_a_window_that_only_one_run_has_fails_and_shifts_none_of_the_others(gold
     assert set(holed.facts) == facts
 
 
-def test_a_view_that_one_run_lacks_is_missing_in_every_window(golden: RunFolder, tmp_path: Path) -> None:
-    comparison = compare(golden, made_run(tmp_path / "run", changes=["view.second.azimuth_deg=5.0"]))
-    missing = [(each.window_id, each.view_id) for each in comparison.views if each.only_in]
-    assert missing == [(i, "second") for i in range(WINDOWS)]
-    assert "config view.second.azimuth_deg" in comparison.facts
-
-
 @pytest.mark.parametrize(
     ("field", "value"),
     [("stamps", tuple((9, i) for i in range(FRAMES))), ("seqs", tuple(range(1, FRAMES + 1))), ("epoch", 4), ("ood", 0)],

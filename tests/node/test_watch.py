@@ -113,12 +113,6 @@ def test_saved_pictures_and_video_are_the_published_pixels(tmp_path: Path, capsy
     assert np.array_equal(picture(out / "top" / "000001_01.png"), sent[1][1])
 
 
-def test_a_watch_of_all_kinds_ends_when_all_have(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    messages = (window(0, view_id="side"), window(0), class_map(0), end(), class_map(1), end(kind="cls"))
-    assert watch(tmp_path, ["--view", "top", "--kind", "all"], *messages) == 0
-    assert "3 messages, 0 files, 0 damaged; the stream ended" in capsys.readouterr().out
-
-
 def test_a_watch_for_hatching_takes_windows_with_their_visibility(tmp_path: Path) -> None:
     image = pixels(0, height=16, width=16)
     messages = (window(0, images=image), class_map(0), visibility(0, seen=SEEN), end(), end(kind="vis"))
@@ -326,17 +320,6 @@ def test_a_stream_of_json_has_every_note_on_its_line(endpoint: str) -> None:
     assert set(lines) == {"status", "meta", "event"}
     assert lines["event"]["code"] == "SRC_LOST"
     assert lines["meta"]["node_id"] == "gcd"
-
-
-def test_a_table_in_a_pipe_is_printed_for_every_status(endpoint: str, silence: Callable[[], None]) -> None:
-    command = [sys.executable, "-m", "gcd_node", "status", endpoint, "--timeout", "0.3"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as reader:
-        assert reader.stdout is not None
-        headlines = 0
-        while headlines < 2:
-            headlines += "robot" in (line := reader.stdout.readline()) or " gcd " in line
-        silence()
-        reader.terminate()
 
 
 @pytest.mark.parametrize(("known", "code"), [(True, 0), (False, 77)])
