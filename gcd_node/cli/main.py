@@ -9,13 +9,15 @@ import sys
 import threading
 from collections.abc import Collection, Iterable, Sequence
 from importlib import import_module, metadata
-from typing import Annotated, cast
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
-from rich.table import Table
 
 from gcd_client.protocol import ClientError
 from gcd_node.errors import NodeError, SourceError
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("run:demo", "Replay the packaged drive through the model and over ZeroMQ into a second process."),
@@ -106,8 +108,10 @@ def new_app(loaded: Collection[str]) -> typer.Typer:
     return app
 
 
-def table(rows: Iterable[Sequence[object]], columns: Sequence[str] = (), title: str | None = None) -> Table:
+def table(rows: Iterable[Sequence[object]], columns: Sequence[str] = (), title: str | None = None) -> "Table":
     """A table to print. columns: headings, ">" before those of numbers; none of a list of facts."""
+    from rich.table import Table  # many commands print none
+
     made = Table(title=title, show_header=bool(columns))
     for name in columns:
         made.add_column(name.removeprefix(">"), justify="right" if name.startswith(">") else "left")
