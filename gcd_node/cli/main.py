@@ -7,7 +7,7 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Sequence
 from importlib import import_module, metadata
 from typing import TYPE_CHECKING, Annotated, cast
 
@@ -118,6 +118,20 @@ def table(rows: Iterable[Sequence[object]], columns: Sequence[str] = (), title: 
     for row in rows:
         made.add_row(*map(str, row))
     return made
+
+
+@contextlib.contextmanager
+def progress_bar(first: str) -> Generator[Callable[[str, int, int], None]]:
+    """A bar on a terminal. Gives what moves it: what is being done, how much of it is done, and how much there is."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}")
+    console = Console(stderr=True, markup=False)
+    hidden = not console.is_terminal
+    with Progress(*columns, TimeElapsedColumn(), console=console, transient=True, disable=hidden) as bar:
+        task = bar.add_task(first, total=None)
+        yield lambda what, done, total: bar.update(task, description=what, completed=done, total=total)
 
 
 def _print_version(wanted: bool) -> None:

@@ -1,14 +1,12 @@
 """`gcd-node synthesize` and `export`: one clip seen from another camera, and a checkpoint as ONNX graphs."""
 
-from collections.abc import Callable, Generator, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from typer import Argument, Option
 
 from gcd_model import (
@@ -25,7 +23,7 @@ from gcd_model import (
     load_synthesizer,
     visibility_of,
 )
-from gcd_node.cli.main import table
+from gcd_node.cli.main import progress_bar, table
 from gcd_node.cli.weights import FamilyOption, HeadWidth, ImageHeads
 from gcd_node.errors import SourceError, UsageError
 from gcd_node.image_io import write_npz
@@ -210,7 +208,7 @@ def _run(
     require_usable(pose, traits)
     source = read_clip(input_path, clip, traits, pose)
     trajectory = path(traits, mount=source.clip.mount)
-    with _progress("encoding") as advance:
+    with progress_bar("encoding") as advance:
         features = model.encode(source.clip, augmentation)
         progress = partial(advance, "denoising")
         view = model.render(features, [trajectory], replace(options, progress=progress))[0]
@@ -251,18 +249,6 @@ def _assumed(
         yield f"The pictures are taken to be {source.hfov_deg:.4g} degrees wide; say it with --hfov-deg."
 
 
-@contextmanager
-def _progress(first: str) -> Generator[Callable[[str, int, int], None]]:
-    """A bar on a terminal. Gives what moves it: what is being done, how much of it is done, and how much there is."""
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
-    console = Console(stderr=True, markup=False)
-    with Progress(
-        *columns, TimeElapsedColumn(), console=console, transient=True, disable=not console.is_terminal
-    ) as bar:
-        task = bar.add_task(first, total=None)
-        yield lambda what, done, total: bar.update(task, description=what, completed=done, total=total)
-
-
 # Export.
 
 
@@ -294,7 +280,7 @@ def export(
     `gcd-node synthesize --weights DIR` and `[model] weights` take the folder. Needs the extra `onnx`.
     """
     precision: ExportPrecision = "float16" if fp16 else "float32"
-    with _progress("loading") as advance:
+    with progress_bar("loading") as advance:
         manifest = export_weights(
             weights,
             onnx,

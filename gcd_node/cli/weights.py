@@ -1,16 +1,16 @@
 """`gcd-node weights`: look into checkpoints, convert them."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 from typer import Argument, Option, Typer
 
 from gcd_model import ModelConfig, WeightsReport, convert_weights, inspect_weights, weights_path
-from gcd_node.cli.main import table
+from gcd_node.cli.main import progress_bar, table
 
 weights = Typer(no_args_is_help=True, help="Look into checkpoints, convert them.")
 
@@ -68,13 +68,7 @@ def convert(
 
     OUT appears whole or not at all.
     """
-    errors = Console(stderr=True, markup=False)
-    with Progress(console=errors, transient=True, disable=not errors.is_terminal) as progress:
-        task = progress.add_task("converting", total=None)
-
-        def advance(done: int, total: int) -> None:
-            progress.update(task, completed=done, total=total)
-
+    with progress_bar("converting") as advance:
         report = convert_weights(
             weights_path(str(file)),
             out,
@@ -84,7 +78,7 @@ def convert(
             head_width=head_width,
             image_heads=image_heads,
             overwrite=overwrite,
-            progress=advance,
+            progress=partial(advance, "converting"),
         )
     console = Console(markup=False)
     _show(console, report)
