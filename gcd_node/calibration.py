@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal, TypeAlias
 
 import msgspec
@@ -108,41 +109,33 @@ class LensModel:
         )
 
 
-def lens_of(
-    *,
-    width: int,
-    height: int,
-    model: str,
-    d: Sequence[float],
-    k: Sequence[float],
-    p: Sequence[float] = (),
-    binning: tuple[int, int] = (1, 1),
-    roi: tuple[int, int, int, int] = (0, 0, 0, 0),
-    rectified: bool = False,
-) -> LensModel | None:
-    """The lens that a ROS CameraInfo or a Foxglove CameraCalibration states; None if the camera was never calibrated.
+def lens_of_message(message: Any, *, rectified: bool = False) -> LensModel | None:
+    """The lens that a CameraInfo of ROS 1 or 2, or a Foxglove CameraCalibration states; None if the camera was never
+    calibrated.
 
     Args:
-        width, height: of the full picture. model: the name of the distortion, whose coefficients are d.
-        k: [9] of the raw picture, all zero if nobody calibrated it; p: [12] of the rectified one, or ().
-        binning: pixels joined across and down, 0 and 1 are none. roi: left, top, width, height of the part of the full
-            picture that is sent; all 0 is the whole.
+        message: what is binned or cut off may be missing in it.
         rectified: the pictures are undistorted already: p holds, and there is no distortion left.
     Raises:
         ConfigError: an unknown kind of distortion, or numbers that no camera has.
     Source: the ROS message sensor_msgs/CameraInfo.
     """
-    matrix, columns = (p, 4) if rectified else (k, 3)
+
+    def numbers(name: str) -> tuple[float, ...]:
+        return tuple(map(float, getattr(message, name if hasattr(message, name) else name.upper())))
+
+    matrix, columns = (numbers("p"), 4) if rectified else (numbers("k"), 3)
     if not any(matrix):
         return None
     if len(matrix) != 3 * columns:
         raise ConfigError(f"a camera matrix must have {3 * columns} numbers, got {len(matrix)}")
-    kind, coefficients = ("none", ()) if rectified else _distortion(model, tuple(d))
-    left, top, part_wide, part_high = roi
-    across, along = (max(each, 1) for each in binning)
+    kind, coefficients = ("none", ()) if rectified else _distortion(message.distortion_model, numbers("d"))
+    across, along = (max(getattr(message, name, 1), 1) for name in ("binning_x", "binning_y"))
+    part = getattr(message, "roi", None)
+    left, top, width, height = (0, 0, 0, 0) if part is None else (part.x_offset, part.y_offset, part.width, part.height)
     whole = LensModel(
-        width=part_wide or width,
-        height=part_high or height,
+        width=width or message.width,
+        height=height or message.height,
         fx=matrix[0],
         cx=matrix[2] - left,
         fy=matrix[columns + 1],
@@ -151,26 +144,6 @@ def lens_of(
         coefficients=coefficients,
     )
     return whole if (across, along) == (1, 1) else whole.resized(whole.width // across, whole.height // along)
-
-
-def lens_of_message(message: Any, *, rectified: bool = False) -> LensModel | None:
-    """lens_of() for the fields of a CameraInfo, of ROS 1 or 2, or a CameraCalibration. Raises ConfigError."""
-
-    def numbers(name: str) -> tuple[float, ...]:
-        return tuple(map(float, getattr(message, name if hasattr(message, name) else name.upper())))
-
-    roi = getattr(message, "roi", None)
-    return lens_of(
-        width=message.width,
-        height=message.height,
-        model=message.distortion_model,
-        d=numbers("d"),
-        k=numbers("k"),
-        p=numbers("p"),
-        binning=(getattr(message, "binning_x", 1), getattr(message, "binning_y", 1)),
-        roi=(0, 0, 0, 0) if roi is None else (roi.x_offset, roi.y_offset, roi.width, roi.height),
-        rectified=rectified,
-    )
 
 
 def _distortion(model: str, d: tuple[float, ...]) -> tuple[Distortion, tuple[float, ...]]:
@@ -212,13 +185,14 @@ def load_lens(path: Path) -> LensModel:
             read_small(path, _LARGEST_FILE)
         )  # the loader in C would end the process on deep nesting
         stated = msgspec.convert(content, _File, strict=False)  # YAML takes 1e-05 for a word
-        lens = lens_of(
+        info = SimpleNamespace(
             width=stated.image_width,
             height=stated.image_height,
-            model=stated.distortion_model or stated.camera_model or "plumb_bob",
+            distortion_model=stated.distortion_model or stated.camera_model or "plumb_bob",
             d=stated.distortion_coefficients.data,
             k=stated.camera_matrix.data,
         )
+        lens = lens_of_message(info)
     except (FileError, ConfigError) as error:
         raise ConfigError(f"{path}: {error}; give a ROS camera_info YAML file") from error
     except (msgspec.ValidationError, yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError) as error:

@@ -96,7 +96,11 @@ def run_demo(out: Path, on_window: Callable[[WindowReport], None]) -> DemoReport
         with session as (node, publisher), _receiver(publisher, received) as receiver:
             summary = run_until_signal(node, publisher)
             publisher.close()
-            _await_end(receiver)
+            try:
+                receiver.wait(_RECEIVER_TIMEOUT_S)  # it ends by itself after the stream, with everything saved
+            except subprocess.TimeoutExpired as error:
+                hint = "try `gcd-node view` by hand to see why"
+                raise NodeError(f"the receiving process outlives the stream by {error.timeout:g} s; {hint}") from error
         views, maps = (_pictures(received / VIEW_ID / kind) for kind in (".", "cls"))
         seen = {int(path.stem): list(np.load(path)) for path in (received / VIEW_ID / "vis").glob("*.npy")}
     windows = moments(inputs, views, seen, maps)
@@ -125,17 +129,6 @@ def _receiver(publisher: Publisher, folder: Path) -> Generator[subprocess.Popen[
     finally:
         process.terminate()
         process.wait()
-
-
-def _await_end(receiver: subprocess.Popen[bytes]) -> None:
-    """Until it has saved everything. Raises NodeError if it does not end by itself after the stream has."""
-    try:
-        receiver.wait(_RECEIVER_TIMEOUT_S)
-    except subprocess.TimeoutExpired as error:
-        raise NodeError(
-            f"the receiving process did not end within {_RECEIVER_TIMEOUT_S:g} s of the end of the stream; "
-            "try `gcd-node view` by hand to see why"
-        ) from error
 
 
 def _pictures(folder: Path) -> dict[int, list[Image]]:

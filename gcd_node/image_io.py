@@ -1,8 +1,9 @@
-"""Pictures, videos and arrays to files and back, and pictures side by side. Images are u8 RGB [H, W, 3]."""
+"""Pictures, videos, arrays and received views to files, arrays back, and pictures side by side. Images are u8 RGB
+[H, W, 3]."""
 
 import math
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -10,11 +11,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_client.protocol import ClassRecord
+from gcd_client.protocol import ClassRecord, ViewHeader, kind_of
+from gcd_client.subscriber import ReceivedView
+from gcd_model import hatched
 from gcd_node.errors import OutputError, SourceError
 from gcd_node.frame import Image
 
 _ANIMATION_QUALITY = 60  # WebP's scale of 100
+_LEGEND_WIDTH = 384  # pixels, of saved class maps
 _MOST_BYTES = 2**30  # of all arrays in a file, unfolded
 _COLUMN_WIDTH = 320  # pixels; smaller pictures are enlarged by a whole factor to at least this
 _FONT, _SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.45
@@ -52,21 +56,40 @@ def write_png(path: Path, image: Image) -> None:
     _require_written(path, cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)))
 
 
-def video_writer(path: Path, width: int, height: int, fps: float) -> cv2.VideoWriter:
-    """An open video: .mp4 is small and lossy, .mkv is lossless (FFV1). It takes BGR. Raises OutputError."""
-    make_folder(path.parent)
-    code = cv2.VideoWriter.fourcc(*("FFV1" if path.suffix == ".mkv" else "mp4v"))
-    writer = cv2.VideoWriter(str(path), code, max(fps, 1.0), (width, height))
-    _require_written(path, writer.isOpened())
-    return writer
+class VideoWriter:
+    """A video: .mp4 is small and lossy, .mkv without loss (FFV1). It begins with the first frame, and has its end after
+    `close`. A full disk does not show: OpenCV does not tell."""
+
+    def __init__(self, path: Path, fps: float) -> None:
+        self._path, self._fps = path, max(fps, 1.0)
+        self._video: cv2.VideoWriter | None = None
+        self._size = (0, 0)
+
+    def add(self, frames: Iterable[NDArray[np.uint8]]) -> None:
+        """Append pictures, [H, W, 3] RGB or [H, W] grey. Raises OutputError: it cannot be written, or the size is
+        another than before."""
+        for frame in frames:
+            size = (frame.shape[1], frame.shape[0])
+            if self._video is None:
+                make_folder(self._path.parent)
+                code = cv2.VideoWriter.fourcc(*("FFV1" if self._path.suffix == ".mkv" else "mp4v"))
+                self._video, self._size = cv2.VideoWriter(str(self._path), code, self._fps, size), size
+                _require_written(self._path, self._video.isOpened())
+            if size != self._size:
+                raise OutputError(f"{self._path} holds pictures of {self._size}, now {size}; write to a new folder")
+            self._video.write(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR if frame.ndim == 2 else cv2.COLOR_RGB2BGR))
+
+    def close(self) -> None:
+        """Finish the file."""
+        if self._video is not None:
+            self._video.release()
 
 
-def write_video(path: Path, frames: Sequence[Image], fps: float) -> None:
-    """Write a whole video, see video_writer(). Raises OutputError."""
-    writer = video_writer(path, frames[0].shape[1], frames[0].shape[0], fps)
-    for frame in frames:
-        writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
-    writer.release()
+def write_video(path: Path, frames: Iterable[Image], fps: float) -> None:
+    """Write a whole video, see VideoWriter. Raises OutputError."""
+    writer = VideoWriter(path, fps)
+    writer.add(frames)
+    writer.close()
 
 
 def write_animation(path: Path, frames: Sequence[Image], fps: float, width: int) -> None:
@@ -143,6 +166,90 @@ def _write_whole(path: Path, save: Callable[[BinaryIO], None]) -> None:
         part.replace(path)
     except OSError as error:
         raise OutputError(f"cannot write {path}: {error.strerror}; name another file or folder") from error
+
+
+# Views of a running node.
+
+
+class ViewSaver:
+    """Writes each window's frames as `<view>/<window>_<frame>.png`, and all of a view as lossless `<view>.mkv`.
+
+    Other kinds go to a folder of their own: `<view>/<kind>/<window>_<frame>.png`, `<view>/<kind>.mkv`. Single frames,
+    of which a window may give many, are numbered as the source did. Class maps and visibility are shown in colour, with
+    a `legend.png`; their numbers are in `<window>.npy`, u8 [T, H, W]; of depth float32 [T, H, W], 1/m.
+
+    hatch: draw lines over the painted pixels of windows. A window whose visibility did not come is hatched all over.
+
+    Raises:
+        OutputError: a file cannot be written, or a view changes its size.
+    """
+
+    def __init__(self, folder: Path, *, hatch: bool = False) -> None:
+        self._folder, self._hatch = folder, hatch
+        self._held: dict[str, tuple[ReceivedView, Image]] = {}  # windows that wait for their visibility, which is next
+        self._videos: dict[Path, VideoWriter] = {}
+        self._legends: set[Path] = set()
+        self.files = 0
+
+    def add(self, view: ReceivedView) -> None:
+        """Write one message's frames; of a window to be hatched, once its visibility is here."""
+        view_id, kind, frames = view.header.view_id, kind_of(view.message.topic), view.colours
+        if self._hatch and kind == "win":
+            self._write_held(view_id, None)
+            self._held[view_id] = view, frames
+            return
+        if kind == "vis":
+            self._write_held(view_id, view)
+        self._write(view, frames)
+
+    def close(self) -> None:
+        """Finish the videos; until then they may lack their end."""
+        for view_id in tuple(self._held):
+            self._write_held(view_id, None)
+        for video in self._videos.values():
+            video.close()
+        self._videos.clear()
+
+    def __enter__(self) -> "ViewSaver":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _write_held(self, view_id: str, visibility: ReceivedView | None) -> None:
+        if view_id not in self._held:
+            return
+        held, frames = self._held.pop(view_id)
+        seen = np.zeros(frames.shape[:3], np.uint8)
+        if visibility is not None and _moment(visibility.header) == _moment(held.header):
+            seen = visibility.images[..., 0]
+        self._write(held, hatched(frames, seen))
+
+    def _write(self, view: ReceivedView, frames: Image) -> None:
+        header, kind = view.header, kind_of(view.message.topic)
+        folder = self._folder / header.view_id / ("" if kind == "win" else kind)
+        for index, frame in enumerate(frames):
+            number = f"{header.src.seq[0]:06d}" if kind == "frm" else f"{index:02d}"  # many of these share a window
+            write_png(folder / f"{header.window_id:06d}_{number}.png", frame)
+        self.files += len(frames)
+        if kind == "depth" or header.classes is not None:
+            write_npy(
+                folder / f"{header.window_id:06d}.npy", view.inverse_depth if kind == "depth" else view.images[..., 0]
+            )
+            self.files += 1
+        if header.classes is not None and folder not in self._legends:
+            write_png(folder / "legend.png", legend(header.classes, _LEGEND_WIDTH))
+            self._legends.add(folder)
+            self.files += 1
+        path = folder.with_suffix(".mkv")
+        if path not in self._videos:
+            self._videos[path] = VideoWriter(path, header.src.fps_cond)
+            self.files += 1
+        self._videos[path].add(frames)
+
+
+def _moment(header: ViewHeader) -> tuple[object, ...]:
+    return header.boot_id, header.view_rev, header.window_id, header.shape[:3]
 
 
 # Side by side.

@@ -81,7 +81,7 @@ def _import_what_commands_import() -> None:
     from gcd_node.cli.main import COMMANDS, new_app
 
     new_app(COMMANDS)
-    for name in ("check", "cli.view_saver", "demo", "viewer.server"):
+    for name in ("check", "image_io", "demo", "viewer.server"):
         import_module(f"gcd_node.{name}")
     for name in ("distillation.recipe", "evaluation.run", "gallery", "reports.pages", "show.open_scene", "trainer"):
         import_module(f"gcd_train.{name}")

@@ -16,7 +16,7 @@ import msgspec
 import zmq
 from msgspec import Meta
 
-from gcd_client.endpoints import ClientKeys, Connection, Steps, fingerprint, resolve_endpoint
+from gcd_client.endpoints import Client, ClientKeys, Connection, Steps, fingerprint, resolve_endpoint
 from gcd_client.protocol import LARGEST_INTEGER, PROTO, ClientError, MessageError, check_version
 
 MAX_REQUEST = 64 * 1024  # bytes; ZeroMQ drops a peer that sends more
@@ -101,7 +101,7 @@ def decode_reply(part: bytes) -> Reply:
     return reply
 
 
-class ControlClient:
+class ControlClient(Client):
     """Sends one request at a time and waits for its reply.
 
     endpoint: "ipc" for the node on this machine, or ipc://PATH, tcp://HOST:PORT. keys: for a node that asks for them.
@@ -131,25 +131,13 @@ class ControlClient:
         """request() for asyncio."""
         return await self._connection.run_async(self._steps(verb, args, dry_run, if_view_rev, request_id))
 
-    def call(self, verb: str, args: Args = None, *, dry_run: bool = False, if_view_rev: Rev = None) -> Result:
+    def call(self, verb: str, args: Args = None) -> Result:
         """Send a request and give its result, {}: none. Raises ControlError with the code of a refusal, too."""
-        return _result(verb, self.request(verb, args, dry_run=dry_run, if_view_rev=if_view_rev))
+        return _result(verb, self.request(verb, args))
 
-    async def call_async(
-        self, verb: str, args: Args = None, *, dry_run: bool = False, if_view_rev: Rev = None
-    ) -> Result:
+    async def call_async(self, verb: str, args: Args = None) -> Result:
         """call() for asyncio."""
-        return _result(verb, await self.request_async(verb, args, dry_run=dry_run, if_view_rev=if_view_rev))
-
-    def close(self) -> None:
-        """Close the socket; a second call does nothing."""
-        self._connection.close()
-
-    def __enter__(self) -> "ControlClient":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        return _result(verb, await self.request_async(verb, args))
 
     def _steps(self, verb: str, args: Args, dry_run: bool, if_view_rev: Rev, request_id: str) -> Steps[Reply]:
         raw, new_id = msgspec.Raw(msgspec.json.encode(dict(args or {}))), request_id or uuid.uuid4().hex

@@ -16,6 +16,7 @@ from gcd_client.protocol import ClientError
 
 Channel: TypeAlias = Literal["data", "status", "control", "frames"]
 Result = TypeVar("Result")
+Own = TypeVar("Own", bound="Client")
 Steps: TypeAlias = Generator[int | None, list[tuple[Any, int]], Result]
 """Yields how long to poll, milliseconds or None, is sent what was ready, and returns its result."""
 
@@ -183,6 +184,22 @@ class Connection:
         for each in (self.socket, self._monitor):
             poller.register(each, zmq.POLLIN)
         return poller
+
+
+class Client:
+    """What owns a connection. Use it as a context manager."""
+
+    _connection: Connection
+
+    def close(self) -> None:
+        """Close the socket; a second call does nothing."""
+        self._connection.close()
+
+    def __enter__(self: Own) -> Own:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 def _read_key(path: Path) -> str:

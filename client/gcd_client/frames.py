@@ -17,7 +17,7 @@ import zmq
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from gcd_client.endpoints import ClientKeys, Connection, resolve_endpoint
+from gcd_client.endpoints import Client, ClientKeys, Connection, resolve_endpoint
 from gcd_client.images import decode_jpegs, jpeg_size
 from gcd_client.protocol import (
     HAS_PAYLOAD,
@@ -72,7 +72,7 @@ class PushedFrame:
     odometry: NDArray[np.float64] | None = None
 
 
-class FramePusher:
+class FramePusher(Client):
     """Sends frames to one node and never waits for it. For one thread.
 
     endpoint: "ipc" for the node on this machine, or ipc://PATH, tcp://HOST:PORT. keys: for a node that asks for them.
@@ -113,16 +113,6 @@ class FramePusher:
             self.skipped += 1
             return False
         return True
-
-    def close(self) -> None:
-        """Close the socket; a second call does nothing."""
-        self._connection.close()
-
-    def __enter__(self) -> "FramePusher":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def encode_frame(

@@ -16,7 +16,7 @@ import msgspec
 import zmq
 
 from gcd_client import protocol
-from gcd_client.endpoints import ClientKeys, Connection, SetupError, Steps, resolve_endpoint
+from gcd_client.endpoints import Client, ClientKeys, Connection, SetupError, Steps, resolve_endpoint
 from gcd_client.protocol import EndMessage, Message, StatusMessage, StatusTopic, ViewHeader, ViewKind, ViewMessage
 
 if TYPE_CHECKING:  # numpy takes longer to import than all the rest
@@ -69,7 +69,7 @@ class ReceivedView(msgspec.Struct, frozen=True, kw_only=True):
         return colours(self.message)
 
 
-class Subscriber(Generic[Item]):
+class Subscriber(Client, Generic[Item]):
     """What both subscribers share. damaged: messages left out because they are not valid; last_error: why the last was.
 
     Whatever receives raises AuthError if the node refuses the connection; then make a new subscriber.
@@ -107,10 +107,6 @@ class Subscriber(Generic[Item]):
             elif self.ended:
                 return
 
-    def close(self) -> None:
-        """Close the socket; a second call does nothing."""
-        self._connection.close()
-
     def __iter__(self) -> Iterator[Item]:
         while (item := self.receive()) is not None:
             yield item
@@ -118,9 +114,6 @@ class Subscriber(Generic[Item]):
     async def __aiter__(self) -> AsyncIterator[Item]:
         while (item := await self.receive_async()) is not None:
             yield item
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _steps(self, timeout_ms: float | None) -> Steps[Item | None]:
         deadline_s = None if timeout_ms is None else time.monotonic() + timeout_ms / 1000
@@ -196,9 +189,6 @@ class ViewSubscriber(Subscriber[ReceivedView]):
         """Whether every view seen has ended; false again once a new message comes."""
         return bool(self._streams) and all(stream.ended for stream in self._streams.values())
 
-    def __enter__(self) -> "ViewSubscriber":
-        return self
-
     def _accept(self, message: Message) -> ReceivedView | None:
         if isinstance(message, StatusMessage) or not message.topic.endswith(self._suffixes):
             return None
@@ -251,9 +241,6 @@ class StatusSubscriber(Subscriber[StatusMessage]):
         keyed = {protocol.topic_key(topic) for topic in topics}
         super().__init__(resolve_endpoint(endpoint, "status"), keyed, conflate=False, max_payload=0, keys=keys)
         self._seen: dict[str, tuple[str, int]] = {}
-
-    def __enter__(self) -> "StatusSubscriber":
-        return self
 
     def _accept(self, message: Message) -> StatusMessage | None:
         number = (message.header.boot_id, message.sequence)

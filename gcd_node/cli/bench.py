@@ -21,10 +21,10 @@ import numpy as np
 import psutil
 from msgspec.structs import replace
 from rich.console import Console
-from rich.table import Table
 from typer import Argument, Option
 
-from gcd_client.subscriber import ViewSubscriber
+from gcd_client.subscriber import ReceivedView, ViewSubscriber
+from gcd_node.cli.main import table
 from gcd_node.cli.run import Changes
 from gcd_node.config import ControlConfig, NodeConfig, ViewerConfig, load_config, parse_config, to_toml
 from gcd_node.errors import NodeError, OutputError, UsageError
@@ -36,15 +36,7 @@ _CPU_INTERVAL_S = 1.0  # psutil's figure of a shorter interval is noise
 _FEWEST_VIEWS = 3  # jitter is a difference of differences
 _MEBIBYTE = 2**20
 
-LaunchFile: TypeAlias = Annotated[
-    Path | None, Argument(metavar="[CONFIG]", help="A launch file; the packaged drive where left out.")
-]
-Rates: TypeAlias = Annotated[
-    list[float] | None, Option("--rate", min=0.1, help="Input rate for latency, Hz; 5, 10 and 15. Again for more.")
-]
-Seconds: TypeAlias = Annotated[float, Option(min=1.0, help="How long each run is watched after its first view.")]
 Stream: TypeAlias = Annotated[bool, Option("--stream", help="One run alone, at the source's own rate.")]
-JsonFile: TypeAlias = Annotated[Path | None, Option("--json", help="Also a file, in the names of Isaac ROS Benchmark.")]
 
 Pace: TypeAlias = Literal["realtime", "lockstep"]
 
@@ -79,12 +71,18 @@ class Arrival:
 
 
 def bench(
-    config: LaunchFile = None,
-    rates: Rates = None,
-    seconds: Seconds = 20.0,
+    config: Annotated[
+        Path | None, Argument(metavar="[CONFIG]", help="A launch file; the packaged drive where left out.")
+    ] = None,
+    rates: Annotated[
+        list[float] | None, Option("--rate", min=0.1, help="Input rate for latency, Hz; 5, 10 and 15. Again for more.")
+    ] = None,
+    seconds: Annotated[float, Option(min=1.0, help="How long each run is watched after its first view.")] = 20.0,
     stream: Stream = False,
     changes: Changes = None,
-    json_file: JsonFile = None,
+    json_file: Annotated[
+        Path | None, Option("--json", help="Also a file, in the names of Isaac ROS Benchmark.")
+    ] = None,
 ) -> None:
     """Measure a node in a process of its own: latency, throughput, missed frames, cost.
 
@@ -111,10 +109,9 @@ def bench(
         for rate in () if stream else rates or _RATES_HZ:
             status.update(f"{rate:g} Hz")
             by_rate[rate] = _run(settings, "realtime", rate, seconds, idle)
-    table = Table("", first, *(f"{rate:g} Hz" for rate in by_rate))
-    for label, (name, decimals) in _ROWS.items():
-        table.add_row(label, *(f"{run[name]:.{decimals}f}" for run in (figures, *by_rate.values())))
-    Console().print(table)
+    runs = (figures, *by_rate.values())
+    rows = ((label, *(f"{run[name]:.{decimals}f}" for run in runs)) for label, (name, decimals) in _ROWS.items())
+    Console().print(table(rows, ("", f">{first}", *(f">{rate:g} Hz" for rate in by_rate))))
     if json_file is not None:
         named = {f"{rate:.1f}fps": run for rate, run in by_rate.items()}
         text = msgspec.json.encode({**figures, **named, "metadata": _metadata(settings, idle)})
@@ -276,12 +273,13 @@ class _Node:
             reader.join()
 
     def _read(self, endpoint: str, view: str) -> None:
+        def note(found: ReceivedView) -> None:
+            now_ns, seqs = time.monotonic_ns(), found.header.src.seq
+            self.arrivals[view].append(Arrival(at_ns=now_ns, age_ms=found.age_ms, seqs=seqs))
+
         try:
             with ViewSubscriber(endpoint, view, conflate=False) as views:
-                while not self._closed.is_set():
-                    if (found := views.receive(1000 * _POLL_S)) is not None:
-                        now_ns, seqs = time.monotonic_ns(), found.header.src.seq
-                        self.arrivals[view].append(Arrival(at_ns=now_ns, age_ms=found.age_ms, seqs=seqs))
+                views.run(note, self._closed)
         except Exception as error:  # the end of a thread: require_alive() raises it
             self._error = error
 

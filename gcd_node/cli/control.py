@@ -16,29 +16,21 @@ from gcd_node.verbs import VERBS, text_arguments
 
 keys = typer.Typer(no_args_is_help=True, help="CURVE keys, for nodes that are reached over a network.")
 
-VerbName: TypeAlias = Annotated[str, Argument(metavar="VERB", help=f"One of {', '.join(VERBS)}.")]
 Settings: TypeAlias = Annotated[list[str] | None, Argument(metavar="[KEY=VALUE]...", help="The verb's arguments.")]
-Endpoint: TypeAlias = Annotated[str, Option(help="The node's control endpoint: ipc, ipc://PATH or tcp://HOST:PORT.")]
-AsJson: TypeAlias = Annotated[bool, Option("--json", help="Print the whole reply as one line of JSON.")]
-DryRun: TypeAlias = Annotated[bool, Option("--dry-run", help="Check everything, change nothing.")]
-IfViewRev: TypeAlias = Annotated[int | None, Option(min=0, help="Only if the view still has this revision.")]
 KeyFolder: TypeAlias = Annotated[Path | None, Option("--keys", help="Our key folder, as `gcd-node keys new` makes it.")]
 NodeKey: TypeAlias = Annotated[str | None, Option(help="The node's public key, or its file.")]
-Timeout: TypeAlias = Annotated[float, Option(min=0.1, help="Seconds to wait for a reply.")]
-NewFolder: TypeAlias = Annotated[Path, Argument(metavar="FOLDER", help="Where the keys go; must hold none yet.")]
-OldFolder: TypeAlias = Annotated[Path, Argument(metavar="FOLDER", help="A key folder.")]
 
 
 def ctl(
-    verb: VerbName,
+    verb: Annotated[str, Argument(metavar="VERB", help=f"One of {', '.join(VERBS)}.")],
     settings: Settings = None,
-    endpoint: Endpoint = "ipc",
-    json: AsJson = False,
-    dry_run: DryRun = False,
-    if_view_rev: IfViewRev = None,
+    endpoint: Annotated[str, Option(help="The node's control endpoint: ipc, ipc://PATH or tcp://HOST:PORT.")] = "ipc",
+    json: Annotated[bool, Option("--json", help="Print the whole reply as one line of JSON.")] = False,
+    dry_run: Annotated[bool, Option("--dry-run", help="Check everything, change nothing.")] = False,
+    if_view_rev: Annotated[int | None, Option(min=0, help="Only if the view still has this revision.")] = None,
     key_folder: KeyFolder = None,
     node_key: NodeKey = None,
-    timeout: Timeout = 2.0,
+    timeout: Annotated[float, Option(min=0.1, help="Seconds to wait for a reply.")] = 2.0,
 ) -> None:
     """Send one request to a running node: `gcd-node ctl set_view view=top azimuth_deg=30`."""
     arguments = parse_settings(verb, settings or [])
@@ -58,14 +50,16 @@ def ctl(
 
 
 @keys.command("new")
-def new_keys(folder: NewFolder) -> None:
+def new_keys(
+    folder: Annotated[Path, Argument(metavar="FOLDER", help="Where the keys go; must hold none yet.")],
+) -> None:
     """Make a key pair, for a node or for a client."""
     write_key_pair(folder, new_key_pair())
     _describe(folder)
 
 
 @keys.command("show")
-def show_keys(folder: OldFolder) -> None:
+def show_keys(folder: Annotated[Path, Argument(metavar="FOLDER", help="A key folder.")]) -> None:
     """Show the public half of a key pair, and how to allow it."""
     _describe(folder)
 

@@ -1,4 +1,4 @@
-"""`gcd-node`: finds the command, and what becomes of errors."""
+"""`gcd-node`: finds the command, and what becomes of errors; the tables that commands print."""
 
 import contextlib
 import logging
@@ -7,14 +7,17 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Generator, Iterable, Sequence
 from importlib import import_module, metadata
-from typing import Annotated, cast
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
 from gcd_client.protocol import ClientError
 from gcd_node.errors import NodeError, SourceError
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("run:demo", "Replay the packaged drive through the model and over ZeroMQ into a second process."),
@@ -23,11 +26,11 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "view": ("watch:view", "Watch the views of a node: a live table, and with --save pictures on disk."),
     "viewer": ("watch:viewer", "Serve the page for a running node; ends with Ctrl-C."),
     "replay": (
-        "replay:replay_launch",
+        "run:replay_launch",
         "Replay a launch file's recording in lockstep, as fast as the model goes, into a run that can be compared.",
     ),
     "diff": (
-        "replay:diff",
+        "run:diff",
         "Compare two runs window by window: identical, or how far apart, where first, and what they were made from.",
     ),
     "status": ("watch:status", "Watch how a node does: states, rates, ages, drops, stage times and events."),
@@ -103,6 +106,32 @@ def new_app(loaded: Collection[str]) -> typer.Typer:
             text = re.sub(r"(\[[a-z])", r"\\\1", command.__doc__ or "")  # [model] is no markup
             app.command(name, help=text)(command)
     return app
+
+
+def table(rows: Iterable[Sequence[object]], columns: Sequence[str] = (), title: str | None = None) -> "Table":
+    """A table to print. columns: headings, ">" before those of numbers; none of a list of facts."""
+    from rich.table import Table  # many commands print none
+
+    made = Table(title=title, show_header=bool(columns))
+    for name in columns:
+        made.add_column(name.removeprefix(">"), justify="right" if name.startswith(">") else "left")
+    for row in rows:
+        made.add_row(*map(str, row))
+    return made
+
+
+@contextlib.contextmanager
+def progress_bar(first: str) -> Generator[Callable[[str, int, int], None]]:
+    """A bar on a terminal. Gives what moves it: what is being done, how much of it is done, and how much there is."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}")
+    console = Console(stderr=True, markup=False)
+    hidden = not console.is_terminal
+    with Progress(*columns, TimeElapsedColumn(), console=console, transient=True, disable=hidden) as bar:
+        task = bar.add_task(first, total=None)
+        yield lambda what, done, total: bar.update(task, description=what, completed=done, total=total)
 
 
 def _print_version(wanted: bool) -> None:

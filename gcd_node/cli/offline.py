@@ -1,22 +1,18 @@
 """`gcd-node synthesize` and `export`: one clip seen from another camera, and a checkpoint as ONNX graphs."""
 
-from collections.abc import Callable, Generator, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 from typer import Argument, Option
 
 from gcd_model import (
     Augmentation,
     EngineName,
     ExportPrecision,
-    Manifest,
     Quality,
     RenderOptions,
     SolverName,
@@ -27,6 +23,7 @@ from gcd_model import (
     load_synthesizer,
     visibility_of,
 )
+from gcd_node.cli.main import progress_bar, table
 from gcd_node.cli.weights import FamilyOption, HeadWidth, ImageHeads
 from gcd_node.errors import SourceError, UsageError
 from gcd_node.image_io import write_npz
@@ -41,7 +38,6 @@ _sampling = partial(Option, rich_help_panel="Sampling")
 _model = partial(Option, rich_help_panel="The model")
 _mount = partial(Option, rich_help_panel="The camera's mount; what is left out is as the model was trained")
 _depth = partial(Option, rich_help_panel="Depth from elsewhere, for the live model; for others it tells what was seen")
-_narrow = partial(Option, rich_help_panel="Narrower numbers")
 
 Input = Annotated[
     Path,
@@ -212,7 +208,7 @@ def _run(
     require_usable(pose, traits)
     source = read_clip(input_path, clip, traits, pose)
     trajectory = path(traits, mount=source.clip.mount)
-    with _progress("encoding") as advance:
+    with progress_bar("encoding") as advance:
         features = model.encode(source.clip, augmentation)
         progress = partial(advance, "denoising")
         view = model.render(features, [trajectory], replace(options, progress=progress))[0]
@@ -253,51 +249,38 @@ def _assumed(
         yield f"The pictures are taken to be {source.hfov_deg:.4g} degrees wide; say it with --hfov-deg."
 
 
-@contextmanager
-def _progress(first: str) -> Generator[Callable[[str, int, int], None]]:
-    """A bar on a terminal. Gives what moves it: what is being done, how much of it is done, and how much there is."""
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
-    console = Console(stderr=True, markup=False)
-    with Progress(
-        *columns, TimeElapsedColumn(), console=console, transient=True, disable=not console.is_terminal
-    ) as bar:
-        task = bar.add_task(first, total=None)
-        yield lambda what, done, total: bar.update(task, description=what, completed=done, total=total)
-
-
 # Export.
-
-OnnxFolder = Annotated[
-    Path, Option("--onnx", metavar="DIR", help="Folder to write; it appears whole or not at all.", show_default=False)
-]
-Checkpoint = Annotated[
-    str, Option(help="A checkpoint, a diffusers folder, package:NAME, or random:FAMILY (noise).", show_default=False)
-]
-Half = Annotated[bool, _narrow("--fp16", help="Half precision, for GPUs; the decoder stays float32.")]
-GraphHeight = Annotated[int | None, Option(help="Instead of the trained height; the graphs take no other.")]
-GraphWidth = Annotated[int | None, Option(help="Instead of the trained width; the graphs take no other.")]
-Adapter = Annotated[Path | None, Option("--adapter", help="Low-rank adapter trained on these weights.")]
-Overwrite = Annotated[bool, Option("--overwrite", help="Replace the export that is there.")]
 
 
 def export(
-    onnx: OnnxFolder,
-    weights: Checkpoint,
-    fp16: Half = False,
-    height: GraphHeight = None,
-    width: GraphWidth = None,
+    onnx: Annotated[
+        Path,
+        Option("--onnx", metavar="DIR", help="Folder to write; it appears whole or not at all.", show_default=False),
+    ],
+    weights: Annotated[
+        str,
+        Option(help="A checkpoint, a diffusers folder, package:NAME, or random:FAMILY (noise).", show_default=False),
+    ],
+    fp16: Annotated[
+        bool,
+        Option(
+            "--fp16", rich_help_panel="Narrower numbers", help="Half precision, for GPUs; the decoder stays float32."
+        ),
+    ] = False,
+    height: Annotated[int | None, Option(help="Instead of the trained height; the graphs take no other.")] = None,
+    width: Annotated[int | None, Option(help="Instead of the trained width; the graphs take no other.")] = None,
     family: FamilyOption = None,
     head_width: HeadWidth = None,
     image_heads: ImageHeads = None,
-    adapter: Adapter = None,
-    overwrite: Overwrite = False,
+    adapter: Annotated[Path | None, Option("--adapter", help="Low-rank adapter trained on these weights.")] = None,
+    overwrite: Annotated[bool, Option("--overwrite", help="Replace the export that is there.")] = False,
 ) -> None:
     """Write every network of a checkpoint as an ONNX graph of one size, with a manifest.
 
     `gcd-node synthesize --weights DIR` and `[model] weights` take the folder. Needs the extra `onnx`.
     """
     precision: ExportPrecision = "float16" if fp16 else "float32"
-    with _progress("loading") as advance:
+    with progress_bar("loading") as advance:
         manifest = export_weights(
             weights,
             onnx,
@@ -312,15 +295,15 @@ def export(
             progress=advance,
         )
     console = Console(markup=False)
-    console.print(_table(manifest))
+    rows = (
+        (
+            name,
+            graph.precision,
+            ", ".join(f"{each.name} {'x'.join(map(str, each.shape))}" for each in graph.inputs),
+            f"{sum(file.size for file in graph.files) / 1e6:,.1f}",
+        )
+        for name, graph in manifest.graphs.items()
+    )
+    title = f"{manifest.card['gcd.name']}, {manifest.precision}, digest {manifest.sha256_12}"
+    console.print(table(rows, ("graph", "precision", "takes", ">MB"), title))
     console.print(f"wrote {onnx}", soft_wrap=True)
-
-
-def _table(manifest: Manifest) -> Table:
-    table = Table(title=f"{manifest.card['gcd.name']}, {manifest.precision}, digest {manifest.sha256_12}")
-    for column in ("graph", "precision", "takes", "MB"):
-        table.add_column(column, justify="right" if column == "MB" else "left")
-    for name, graph in manifest.graphs.items():
-        takes = ", ".join(f"{each.name} {'x'.join(map(str, each.shape))}" for each in graph.inputs)
-        table.add_row(name, graph.precision, takes, f"{sum(file.size for file in graph.files) / 1e6:,.1f}")
-    return table

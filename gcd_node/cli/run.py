@@ -1,13 +1,17 @@
-"""`gcd-node run`, `check` and `demo`: a launch file, and the demo's own. What brings torch is imported when called."""
+"""What is done with a launch file: `gcd-node run`, `check`, `replay` and the `diff` of two runs; and `demo`, which has
+one of its own. What brings torch is imported when called."""
 
 import gc
+import logging
 import os
 import statistics
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
+import msgspec
 import typer
 from rich.console import Console
 from rich.status import Status
@@ -15,12 +19,15 @@ from rich.table import Table
 from rich.text import Text
 from typer import Argument, Option
 
+from gcd_node.cli.main import table
 from gcd_node.config import LifeConfig, load_config, to_toml
 from gcd_node.service import ServiceManager, background_logging
 
 if TYPE_CHECKING:
     from gcd_model import Traits
+    from gcd_node.health import Health
     from gcd_node.inference import WindowReport
+    from gcd_node.node import Node
     from gcd_node.pipeline import Summary
 
 ConfigPath: TypeAlias = Annotated[Path, Argument(metavar="CONFIG", help="A launch file, such as launch/demo.toml.")]
@@ -28,19 +35,22 @@ Changes: TypeAlias = Annotated[
     list[str] | None, Option("--set", metavar="KEY=VALUE", help="Change a setting, as model.steps=4. Again for more.")
 ]
 PrintConfig: TypeAlias = Annotated[bool, Option("--print-config", help="Print the whole configuration, and end.")]
-Once: TypeAlias = Annotated[
-    bool | None, Option("--once/--stay", help="End with the source or the first failure; else wait for commands.")
-]
-DemoOut: TypeAlias = Annotated[Path, Option(help="Folder for the pictures.")]
-Show: TypeAlias = Annotated[
-    bool, Option("--open", help="Run in a loop, and open the page on which to watch and steer it; ends with Ctrl-C.")
-]
 
+
+_LOG = logging.getLogger(__name__)
 _SWITCH_S = 0.001
+_LOOK_S, _QUIET_S = 1.0, 60.0
 _STYLES = {"ok": "green", "warning": "yellow", "failed": "red"}
 
 
-def run(config: ConfigPath, changes: Changes = None, print_config: PrintConfig = False, once: Once = None) -> None:
+def run(
+    config: ConfigPath,
+    changes: Changes = None,
+    print_config: PrintConfig = False,
+    once: Annotated[
+        bool | None, Option("--once/--stay", help="End with the source or the first failure; else wait for commands.")
+    ] = None,
+) -> None:
     """Run the node on a launch file, until its recording ends or it is told to."""
     settings = load_config(config, changes or ())
     if print_config:
@@ -51,15 +61,23 @@ def run(config: ConfigPath, changes: Changes = None, print_config: PrintConfig =
     apply_scheduling(settings.life)
     console = Console(stderr=True, markup=False)
     status = console.status(Text(f"loading {settings.model.weights}"))
+    nodes: list[Node] = []
+    show, warn = _window_printer(console), world_warning(lambda: nodes[0].health)
+
+    def on_window(report: "WindowReport") -> None:
+        show(report)
+        warn()
+
     session = open_session(
         settings,
         once=once,
         on_configured=lambda traits: _show_configured(console, status, traits),
-        on_window=_window_printer(console),
+        on_window=on_window,
         service=ServiceManager(os.environ),
         viewer=True,
     )
     with background_logging(as_json=settings.health.log == "json"), status, session as (node, publisher):
+        nodes.append(node)
         console.print(f"views on {publisher.endpoint}, status on {publisher.status_endpoint}", soft_wrap=True)
         summary = run_until_signal(node, publisher)
     console.print(_summary_table(summary, f"{publisher.stats.sent} messages sent"))
@@ -91,16 +109,23 @@ def check(config: ConfigPath, changes: Changes = None, print_config: PrintConfig
 
     with Console(stderr=True, markup=False).status("looking"):
         findings = list(check_launch(settings))
-    table = Table(show_header=False)
-    for each in findings:
-        table.add_row(each.topic, each.verdict, printable(each.detail, 4000), style=_STYLES[each.verdict])
-    Console(markup=False).print(table)
+    rows = ((each.topic, each.verdict, printable(each.detail, 4000)) for each in findings)
+    shown = table(rows)
+    for row, each in zip(shown.rows, findings, strict=True):
+        row.style = _STYLES[each.verdict]
+    Console(markup=False).print(shown)
     for each in findings:
         if each.error is not None:
             raise each.error
 
 
-def demo(out: DemoOut = Path("gcd-demo"), show: Show = False) -> None:
+def demo(
+    out: Annotated[Path, Option(help="Folder for the pictures.")] = Path("gcd-demo"),
+    show: Annotated[
+        bool,
+        Option("--open", help="Run in a loop, and open the page on which to watch and steer it; ends with Ctrl-C."),
+    ] = False,
+) -> None:
     """Replay the packaged drive through the model and over ZeroMQ into a second process.
 
     Writes side_by_side.mp4, .webp and .png; needs neither camera nor GPU. With --open the drive runs in a loop
@@ -125,6 +150,77 @@ def demo(out: DemoOut = Path("gcd-demo"), show: Show = False) -> None:
     console.print(f"wrote {' and '.join(map(str, report.files))}", soft_wrap=True)
 
 
+def replay_launch(
+    config: ConfigPath,
+    out: Annotated[Path, Option("--out", metavar="RUN", help="Folder for the run; new, or empty.")],
+    changes: Changes = None,
+) -> None:
+    """Replay a launch file's recording in lockstep, as fast as the model goes, into a run that can be compared.
+
+    RUN gets manifest.json (what it was made from, and a SHA-256 of every view of every window) and the pixels without
+    loss. It appears when it is complete. Opens no socket; the same machine gives the same hashes every time.
+    """
+    from gcd_node.replay.lockstep import replay
+
+    settings = load_config(config, changes or ())
+    console = Console(stderr=True, markup=False)
+    with console.status(Text(f"loading {settings.model.weights}")) as status:
+
+        def tell(report: "WindowReport") -> None:
+            status.update(f"window {report.window.window_id}: {report.render_s * 1000:.0f} ms")
+
+        run = replay(settings, out, tell)
+    totals, made_from = run.manifest.totals, run.manifest.made_from
+    machine = ", ".join(made_from[f"machine {name}"] for name in ("device", "processor", "threads"))
+    rows = (
+        ("weights", f"{made_from['weights name']} {made_from['weights sha256_12']}"),
+        ("frames read", totals.frames),
+        ("windows rendered", totals.windows),
+        ("windows rejected", in_words(totals.rejected)),
+        ("windows with NaN", totals.nan_windows),
+        ("views", ", ".join(run.manifest.views)),
+        ("on", f"{machine} threads"),
+    )
+    Console(markup=False).print(table(rows))
+    Console(markup=False).print(f"wrote {run.path}", soft_wrap=True, highlight=False)
+
+
+def diff(
+    run_a: Annotated[Path, Argument(metavar="RUN_A", help="A run of `gcd-node replay`, such as the golden one.")],
+    run_b: Annotated[Path, Argument(metavar="RUN_B", help="The run to compare with it.")],
+    min_psnr: Annotated[
+        float | None,
+        Option(metavar="DB", help="What each frame of each view must reach; else all pixels must be identical."),
+    ] = None,
+    max_class_share: Annotated[
+        float, Option(metavar="SHARE", help="Of a view's class pixels in a window, how many may differ, 0 to 1.")
+    ] = 0.0,
+    out: Annotated[
+        Path | None, Option("--out", metavar="DIR", help="Folder for diff.json and pictures of the worst windows.")
+    ] = None,
+    as_json: Annotated[bool, Option("--json", help="Print the whole comparison as one line of JSON.")] = False,
+) -> None:
+    """Compare two runs window by window: identical, or how far apart, where first, and what they were made from.
+
+    Ends with 0 if they are identical or near enough, with 1 if not, with 65 or 66 if one is damaged or missing.
+    """
+    from gcd_node.replay.compare import REPORT, Tolerance, compare, report_text, to_plain, write_report
+    from gcd_node.replay.run import open_run
+
+    tolerance = Tolerance(min_psnr_db=min_psnr, max_class_share=max_class_share)
+    runs = open_run(run_a), open_run(run_b)
+    with Console(stderr=True, markup=False).status("comparing"):
+        comparison = compare(*runs)
+        written = () if out is None else (out / REPORT, *write_report(out, comparison, tolerance))
+    if as_json:
+        typer.echo(msgspec.json.encode(to_plain(comparison, tolerance)).decode())
+    else:
+        for line in (report_text(comparison, tolerance), *(f"wrote {path}" for path in written)):
+            typer.echo(line)
+    if comparison.failures(tolerance):
+        raise typer.Exit(1)
+
+
 def _show_configured(console: Console, status: Status, traits: "Traits") -> None:
     if traits.classes:
         console.print("each view comes with its class map, topic view/<id>/cls", highlight=False)
@@ -143,20 +239,39 @@ def _window_printer(console: Console) -> Callable[["WindowReport"], None]:
     return show
 
 
+def world_warning(health: Callable[[], "Health"]) -> Callable[[], None]:
+    """Logs, once a minute at most, that the model does not know what its camera shows. To be called for each window."""
+    due_s = 0.0
+
+    def warn() -> None:
+        nonlocal due_s
+        if (now_s := time.monotonic()) < due_s:
+            return
+        is_foreign = "world" in health().snapshot().findings
+        due_s = now_s + (_QUIET_S if is_foreign else _LOOK_S)
+        if is_foreign:
+            _LOG.warning("world: this is another one than the model learned from: depth and classes are guesses")
+
+    return warn
+
+
 def _summary_table(summary: "Summary", delivered: str) -> Table:
-    """What a run came to. Real-time factor: video time per window over inference time; 1 and above keeps up."""
+    """What a run came to."""
     counts = summary.counts
-    rows = {"frames read": str(summary.frames), "windows rendered": str(counts.windows), "delivered": delivered}
+    rows: dict[str, object] = {
+        "frames read": summary.frames,
+        "windows rendered": counts.windows,
+        "delivered": delivered,
+    }
     if counts.windows:
-        median_s = statistics.median(counts.render_s)
         rows |= {
-            "ms per window (median)": f"{median_s * 1000:.0f}",
-            "real-time factor": f"{summary.window_s / median_s:.2f}",
+            "ms per window (median)": f"{statistics.median(counts.render_s) * 1000:.0f}",
             "age at publish, ms (median)": f"{statistics.median(counts.age_ms):.0f}",
         }
-    rejected = ", ".join(f"{count} {reason}" for reason, count in summary.rejected.items()) or "0"
-    rows |= {"windows dropped": str(summary.dropped), "windows rejected": rejected}
-    table = Table(show_header=False)
-    for row in (*rows.items(), ("windows with NaN", str(counts.nan_windows))):
-        table.add_row(*row)
-    return table
+    rows |= {"windows dropped": summary.dropped, "windows rejected": in_words(summary.rejected)}
+    return table((rows | {"windows with NaN": counts.nan_windows}).items())
+
+
+def in_words(rejected: Mapping[str, int]) -> str:
+    """What spoilt windows, and how many."""
+    return ", ".join(f"{count} {reason}" for reason, count in rejected.items()) or "0"

@@ -51,40 +51,25 @@ _SECTIONS = {
 """What the status table shows: of each section its fields, each with what follows its value."""
 
 Endpoint: TypeAlias = Annotated[str, Argument(metavar="ENDPOINT", help="ipc, ipc://PATH or tcp://HOST:PORT.")]
-ViewName: TypeAlias = Annotated[str | None, Option("--view", help="One view's id; else all.")]
-Kind: TypeAlias = Annotated[
-    Literal["win", "frm", "std", "cls", "vis", "depth", "all"],
-    Option(help="Windows, frames at the goal pose, deviations, class maps, what was seen, depth, or all of these."),
-]
-Save: TypeAlias = Annotated[Path | None, Option(help="Folder for PNG files and a lossless MKV per view.")]
-Hatch: TypeAlias = Annotated[
-    bool, Option("--hatch", help="Save windows with lines over their painted pixels; over all where nobody says.")
-]
-Limit: TypeAlias = Annotated[int | None, Option(min=1, help="End after so many messages.")]
-Timeout: TypeAlias = Annotated[
-    float | None, Option(help="End when nothing came for so many seconds; 69 if nothing ever did.")
-]
-Once: TypeAlias = Annotated[bool, Option("--once", help="Print one status and end; 69 if none comes.")]
-AsJson: TypeAlias = Annotated[bool, Option("--json", help="One JSON object a line, for programs.")]
-StaleAfter: TypeAlias = Annotated[
-    float, Option("--timeout", min=0.1, help="A node silent for so many seconds is stale.")
-]
-Http: TypeAlias = Annotated[str, Option(help="Where to serve the page: 127.0.0.1:PORT.")]
-Data: TypeAlias = Annotated[str, Option(help="The node's data endpoint: ipc, ipc://PATH or tcp://HOST:PORT.")]
 Status: TypeAlias = Annotated[str, Option("--status", help="Its status endpoint.")]
 Control: TypeAlias = Annotated[str, Option(help="Its control endpoint; none to look only.")]
-Open: TypeAlias = Annotated[bool, Option("--open", help="Open the page in a browser, where there is a screen.")]
-EndsWithStdin: TypeAlias = Annotated[bool, Option("--ends-with-stdin", hidden=True)]
 
 
 def view(
     endpoint: Endpoint = "ipc",
-    name: ViewName = None,
-    kind: Kind = "win",
-    save: Save = None,
-    hatch: Hatch = False,
-    limit: Limit = None,
-    timeout: Timeout = None,
+    name: Annotated[str | None, Option("--view", help="One view's id; else all.")] = None,
+    kind: Annotated[
+        Literal["win", "frm", "std", "cls", "vis", "depth", "all"],
+        Option(help="Windows, frames at the goal pose, deviations, class maps, what was seen, depth, or all of these."),
+    ] = "win",
+    save: Annotated[Path | None, Option(help="Folder for PNG files and a lossless MKV per view.")] = None,
+    hatch: Annotated[
+        bool, Option("--hatch", help="Save windows with lines over their painted pixels; over all where nobody says.")
+    ] = False,
+    limit: Annotated[int | None, Option(min=1, help="End after so many messages.")] = None,
+    timeout: Annotated[
+        float | None, Option(help="End when nothing came for so many seconds; 69 if nothing ever did.")
+    ] = None,
     key_folder: KeyFolder = None,
     node_key: NodeKey = None,
 ) -> None:
@@ -96,7 +81,7 @@ def view(
     with ExitStack() as stack:
         saver = None
         if save is not None:
-            from gcd_node.cli.view_saver import ViewSaver  # takes seconds, in which a subscriber would lose views
+            from gcd_node.image_io import ViewSaver  # takes seconds, in which a subscriber would lose views
 
             saver = stack.enter_context(ViewSaver(save, hatch=hatch))
         views = stack.enter_context(ViewSubscriber(endpoint, name, kinds, conflate=False, keys=keys))
@@ -127,9 +112,11 @@ def view(
 
 def status(
     endpoint: Endpoint = "ipc",
-    once: Once = False,
-    as_json: AsJson = False,
-    timeout: StaleAfter = STALE_AFTER_S,
+    once: Annotated[bool, Option("--once", help="Print one status and end; 69 if none comes.")] = False,
+    as_json: Annotated[bool, Option("--json", help="One JSON object a line, for programs.")] = False,
+    timeout: Annotated[
+        float, Option("--timeout", min=0.1, help="A node silent for so many seconds is stale.")
+    ] = STALE_AFTER_S,
     key_folder: KeyFolder = None,
     node_key: NodeKey = None,
 ) -> None:
@@ -166,14 +153,14 @@ def status(
 
 
 def viewer(
-    http: Http = "127.0.0.1:8470",
-    data: Data = "ipc",
+    http: Annotated[str, Option(help="Where to serve the page: 127.0.0.1:PORT.")] = "127.0.0.1:8470",
+    data: Annotated[str, Option(help="The node's data endpoint: ipc, ipc://PATH or tcp://HOST:PORT.")] = "ipc",
     status_endpoint: Status = "ipc",
     control: Control = "ipc",
     key_folder: KeyFolder = None,
     node_key: NodeKey = None,
-    show: Open = False,
-    ends_with_stdin: EndsWithStdin = False,
+    show: Annotated[bool, Option("--open", help="Open the page in a browser, where there is a screen.")] = False,
+    ends_with_stdin: Annotated[bool, Option("--ends-with-stdin", hidden=True)] = False,
 ) -> None:
     """Serve the page for a running node; ends with Ctrl-C."""
     from gcd_node.viewer.feed import NodeEndpoints  # the server's libraries: the tables need none
@@ -211,7 +198,8 @@ class ViewTable:
         self._bytes[topic] = self._bytes.get(topic, 0) + len(view.message.payload)
 
     def rows(self, now_s: float, *, ended: bool = False) -> list[tuple[str, ...]]:
-        """By topic: window, shape, age in ms, messages a second, messages missed, MB received, and the state."""
+        """By topic: window, shape, age in ms, messages a second, messages missed, MB received, and the state, with what
+        lies outside the model's training."""
         rows: list[tuple[str, ...]] = []
         for topic, newest in sorted(self._newest.items()):
             header, arrivals = newest.header, self._arrivals[topic]
@@ -222,6 +210,7 @@ class ViewTable:
             numbers = (f"{newest.age_ms + since_ms:.0f}", f"{rate_hz:.2f}", str(self._missed[topic]))
             shape, megabytes = "x".join(map(str, header.shape)), f"{self._bytes[topic] / 1e6:.1f}"
             state = "ended" if ended else "expired" if expired else "live"
+            state = ", ".join((state, *header.quality.ood))
             rows.append((topic, str(header.window_id), shape, *numbers, megabytes, state))
         return rows
 
@@ -234,9 +223,11 @@ class ViewTable:
         table.padding = (0, 1, 0, 0)
         for name in ("topic", "window", "shape", "age ms", "rate Hz", "missed", "MB", "state"):
             left = name in ("topic", "state")
-            table.add_column(name, justify="left" if left else "right", no_wrap=name != "topic", overflow="fold")
+            table.add_column(
+                name, justify="left" if left else "right", no_wrap=name not in ("topic", "state"), overflow="fold"
+            )
         for row in rows:
-            table.add_row(*row[:-1], Text(row[-1], style=_VIEW_STYLES[row[-1]]))
+            table.add_row(*row[:-1], Text(row[-1], style=_VIEW_STYLES.get(row[-1], "yellow")))
         return table
 
 

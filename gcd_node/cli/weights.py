@@ -1,15 +1,16 @@
 """`gcd-node weights`: look into checkpoints, convert them."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 from typer import Argument, Option, Typer
 
 from gcd_model import ModelConfig, WeightsReport, convert_weights, inspect_weights, weights_path
+from gcd_node.cli.main import progress_bar, table
 
 weights = Typer(no_args_is_help=True, help="Look into checkpoints, convert them.")
 
@@ -67,13 +68,7 @@ def convert(
 
     OUT appears whole or not at all.
     """
-    errors = Console(stderr=True, markup=False)
-    with Progress(console=errors, transient=True, disable=not errors.is_terminal) as progress:
-        task = progress.add_task("converting", total=None)
-
-        def advance(done: int, total: int) -> None:
-            progress.update(task, completed=done, total=total)
-
+    with progress_bar("converting") as advance:
         report = convert_weights(
             weights_path(str(file)),
             out,
@@ -83,7 +78,7 @@ def convert(
             head_width=head_width,
             image_heads=image_heads,
             overwrite=overwrite,
-            progress=advance,
+            progress=partial(advance, "converting"),
         )
     console = Console(markup=False)
     _show(console, report)
@@ -92,19 +87,22 @@ def convert(
 
 def _show(console: Console, report: WeightsReport) -> None:
     console.print(_facts(report))
-    networks = Table(title="Used")
-    for column in ("network", "parameters", "tensors", "stored as", "MB"):
-        networks.add_column(column, justify="left" if column in ("network", "stored as") else "right")
-    for network in report.networks:
-        stored = ", ".join(network.dtypes)
-        networks.add_row(network.name, f"{network.parameters:,}", str(network.tensors), stored, _mb(network.size))
-    console.print(networks)
-    if report.leftovers or report.optimizer_size:
-        console.print(_left_out(report))
+    rows = (
+        (each.name, f"{each.parameters:,}", each.tensors, ", ".join(each.dtypes), _mb(each.size))
+        for each in report.networks
+    )
+    console.print(table(rows, ("network", ">parameters", ">tensors", "stored as", ">MB"), "Used"))
+    left_out: list[tuple[object, ...]] = [(each.kind, each.tensors, _mb(each.size)) for each in report.leftovers]
+    if report.optimizer_size:
+        left_out.append(("optimizer state, never read", "", _mb(report.optimizer_size)))
+    if report.other_entries and left_out:
+        left_out.append((f"other entries: {', '.join(report.other_entries)}", "", ""))
+    if left_out:
+        console.print(table(left_out, ("what", ">tensors", ">MB"), "Left out"))
 
 
 def _facts(report: WeightsReport) -> Table:
-    config, facts = report.config, Table(title=report.path, show_header=False)
+    config = report.config
     family = "unknown: no limits are checked, --motion-bucket must be given"
     if report.family is not None:
         family = f"{report.family} (told by {report.told_by})"
@@ -125,9 +123,7 @@ def _facts(report: WeightsReport) -> Table:
         ("trained", "yes" if report.trained else "no: random weights"),
         ("uncertainty scale", scale),
     )
-    for row in rows:
-        facts.add_row(*row)
-    return facts
+    return table(rows, title=report.path)
 
 
 def _widths(report: WeightsReport) -> tuple[tuple[str, str], ...]:
@@ -141,19 +137,6 @@ def _widths(report: WeightsReport) -> tuple[tuple[str, str], ...]:
         ("U-Net widths", ", ".join(map(str, config.unet.widths))),
         ("head width, image heads", f"{config.unet.head_width}, {heads}"),
     )
-
-
-def _left_out(report: WeightsReport) -> Table:
-    table = Table(title="Left out")
-    for column in ("what", "tensors", "MB"):
-        table.add_column(column, justify="left" if column == "what" else "right")
-    for leftover in report.leftovers:
-        table.add_row(leftover.kind, str(leftover.tensors), _mb(leftover.size))
-    if report.optimizer_size:
-        table.add_row("optimizer state, never read", "", _mb(report.optimizer_size))
-    if report.other_entries:
-        table.add_row(f"other entries: {', '.join(report.other_entries)}", "", "")
-    return table
 
 
 def _mb(size: int) -> str:

@@ -1,24 +1,23 @@
-"""Two runs, window by window: the same pixels or how far apart, and what the two were made from; in words, as tables,
-as JSON, and in pictures of where they differ most."""
+"""Two runs, window by window: the same pixels or how far apart, and what the two were made from; in words, as JSON, and
+in pictures of where they differ most."""
 
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import cv2
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from rich.table import Table
 
 from gcd_client.images import paint
 from gcd_model import FileError, decode_toml, printable
 from gcd_node.errors import DamagedRunError, OutputError, UsageError
 from gcd_node.frame import Image
 from gcd_node.image_io import enlarged, make_folder, sheet, strip, write_png
-from gcd_node.replay.run import MANIFEST, Manifest, Pixels, RunFolder, WindowPixels, read_windows
+from gcd_node.replay.run import MANIFEST, Manifest, Pixels, RunFolder, ViewPixels, WindowEntry, read_windows
 
 REPORT = "diff.json"
 WORST = 4
@@ -29,7 +28,7 @@ _ABSENT = "-"  # shown for what one of the runs does not have
 _TOP = 255.0
 _DEPTH_SLACK = 0.01  # ten times what f16 rounds away, a tenth of what depth networks err
 _SECTIONS = ("strict", "source", "model", "view", "window")  # what a replay uses of a launch file
-_ROWS, _LINES = 40, 10
+_LINES = 10
 _HIGHEST_GAIN = 64
 _PATTERN = "window-*-view-*.png"
 
@@ -77,18 +76,20 @@ class Distance:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ViewComparison:
-    """One view of one window that is in both runs.
+    """One view of one window.
 
-    facts: what must agree and does not: "stamps", "seqs", "epoch", "ood", "size", the name of a map. distance: None if
-    the pictures have different sizes. same_input, same_seed: the model was given the same pictures, and the same seed.
+    only_in: the run that has it, if the other has not. facts: what must agree and does not: "stamps", "seqs", "epoch",
+    "ood", "size", the name of a map. distance: None if there are no two pictures of one size. same_input, same_seed:
+    the model was given the same pictures, and the same seed.
     """
 
     window_id: int
     view_id: str
-    facts: tuple[str, ...]
-    same_input: bool
-    same_seed: bool
-    distance: Distance | None
+    only_in: Literal["A", "B"] | None = None
+    facts: tuple[str, ...] = ()
+    same_input: bool = True
+    same_seed: bool = True
+    distance: Distance | None = None
 
     @property
     def identical(self) -> bool:
@@ -105,57 +106,33 @@ class ViewComparison:
         return distance.worst_psnr_db >= least_db and share <= tolerance.max_class_share
 
     def __str__(self) -> str:
-        if self.identical:
-            return "identical"
-        parts: list[str] = []
+        parts = [] if self.only_in is None else [f"only in {self.only_in}"]
         if self.distance is not None:
             far, shares = self.distance, self.distance.shares
             worst = f"frame {far.worst_frame} {far.worst_psnr_db:.2f} dB"
             parts += [f"{far.psnr_db:.2f} dB, {worst}, up to {far.largest} levels"] if far.largest else []
             parts += [f"{share:.3%} of the {_MAP_NAMES[kind]}" for kind, share in shares.items() if share]
-        return "; ".join(parts + [f"other {fact}" for fact in self.facts])
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Missing:
-    """A view of a window that only one of the runs has: "A" or "B"."""
-
-    window_id: int
-    view_id: str
-    only_in: str
-
-    def __str__(self) -> str:
-        return f"only in {self.only_in}"
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Fact:
-    """Something the runs A and B do not have in common. name: such as `config model.steps` or `weights sha256_12`."""
-
-    name: str
-    a: str
-    b: str
+        return "; ".join(parts + [f"other {fact}" for fact in self.facts]) or "identical"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class RunComparison:
-    """Two runs. facts: what they were made from, as far as it differs. views, missing: by window, then view."""
+    """Two runs. facts: what they were made from, in A and in B, where it differs, by names such as `config model.steps`
+    or `weights sha256_12`. views: by window, those that only one has too."""
 
     a: RunFolder
     b: RunFolder
-    facts: tuple[Fact, ...]
+    facts: dict[str, tuple[str, str]]
     views: tuple[ViewComparison, ...]
-    missing: tuple[Missing, ...]
 
     @property
-    def first_divergence(self) -> ViewComparison | Missing | None:
+    def first_divergence(self) -> ViewComparison | None:
         """The first view of the first window that is not identical; None if all are."""
         return next(iter(self.failures(Tolerance())), None)
 
-    def failures(self, tolerance: Tolerance) -> tuple[ViewComparison | Missing, ...]:
-        """Everything that is not near enough, by window."""
-        far = [*(view for view in self.views if not view.within(tolerance)), *self.missing]
-        return tuple(sorted(far, key=lambda each: (each.window_id, each.view_id)))
+    def failures(self, tolerance: Tolerance) -> tuple[ViewComparison, ...]:
+        """Every view that is not near enough."""
+        return tuple(view for view in self.views if not view.within(tolerance))
 
 
 def compare(a: RunFolder, b: RunFolder) -> RunComparison:
@@ -166,21 +143,22 @@ def compare(a: RunFolder, b: RunFolder) -> RunComparison:
         DamagedRunError: see read_windows(); or the configuration of a manifest is not TOML.
     """
     views: list[ViewComparison] = []
-    missing: list[Missing] = []
     same_size = a.manifest.size == b.manifest.size
     for window_id, in_a, in_b in _paired_windows(a, b):
-        ids_a, ids_b = ({} if each is None else each.views for each in (in_a, in_b))
+        ids_a, ids_b = ({} if each is None else each[0].views for each in (in_a, in_b))
         for view_id in dict.fromkeys((*ids_a, *ids_b)):
             if in_a is not None and in_b is not None and view_id in ids_a and view_id in ids_b:
                 views.append(_compare_view(view_id, in_a, in_b, same_size=same_size))
             else:
                 only_in = "A" if view_id in ids_a else "B"
-                missing.append(Missing(window_id=window_id, view_id=view_id, only_in=only_in))
-    facts = _different_facts(a.manifest, b.manifest)
-    return RunComparison(a=a, b=b, facts=facts, views=tuple(views), missing=tuple(missing))
+                views.append(ViewComparison(window_id=window_id, view_id=view_id, only_in=only_in))
+    return RunComparison(a=a, b=b, facts=_different_facts(a.manifest, b.manifest), views=tuple(views))
 
 
-def _paired_windows(a: RunFolder, b: RunFolder) -> Iterator[tuple[int, WindowPixels | None, WindowPixels | None]]:
+_Window: TypeAlias = tuple[WindowEntry, dict[str, ViewPixels]]
+
+
+def _paired_windows(a: RunFolder, b: RunFolder) -> Iterator[tuple[int, _Window | None, _Window | None]]:
     """The windows of two runs by window_id; None where one has no such window."""
     rest_a, rest_b = read_windows(a), read_windows(b)
     ids_a, ids_b = ({window.window_id for window in run.manifest.windows} for run in (a, b))
@@ -190,24 +168,25 @@ def _paired_windows(a: RunFolder, b: RunFolder) -> Iterator[tuple[int, WindowPix
         next(rest, None)  # to look at their ends
 
 
-def _compare_view(view_id: str, a: WindowPixels, b: WindowPixels, *, same_size: bool) -> ViewComparison:
-    entry_a, entry_b = a.entry.views[view_id], b.entry.views[view_id]
-    pixels_a, pixels_b = a.views[view_id], b.views[view_id]
-    facts = [name for name in ("stamps", "seqs", "epoch") if getattr(a.entry, name) != getattr(b.entry, name)]
+def _compare_view(view_id: str, a: _Window, b: _Window, *, same_size: bool) -> ViewComparison:
+    (window_a, views_a), (window_b, views_b) = a, b
+    entry_a, entry_b = window_a.views[view_id], window_b.views[view_id]
+    pixels_a, pixels_b = views_a[view_id], views_b[view_id]
+    facts = [name for name in ("stamps", "seqs", "epoch") if getattr(window_a, name) != getattr(window_b, name)]
     facts += ["ood"] if entry_a.ood != entry_b.ood else []
     facts += [] if same_size else ["size"]
     facts += [name for kind, name in _MAP_NAMES.items() if (kind in pixels_a) != (kind in pixels_b)]
     return ViewComparison(
-        window_id=a.entry.window_id,
+        window_id=window_a.window_id,
         view_id=view_id,
         facts=tuple(facts),
-        same_input=a.entry.input_sha256 == b.entry.input_sha256,
+        same_input=window_a.input_sha256 == window_b.input_sha256,
         same_seed=entry_a.seed == entry_b.seed,
         distance=_distance(pixels_a, pixels_b) if same_size else None,
     )
 
 
-def _distance(a: Mapping[str, Pixels], b: Mapping[str, Pixels]) -> Distance:
+def _distance(a: ViewPixels, b: ViewPixels) -> Distance:
     pairs = list(zip(a["win"], b["win"], strict=True))
     squares = [float(cv2.norm(one, other, cv2.NORM_L2SQR)) for one, other in pairs]
     worst = int(np.argmax(squares))
@@ -236,11 +215,11 @@ def _shares(kind: str, a: Pixels, b: Pixels) -> NDArray[np.float64]:
     return np.maximum(far, (a != b).any(axis=(1, 2)) / one[0].size)
 
 
-def _different_facts(a: Manifest, b: Manifest) -> tuple[Fact, ...]:
+def _different_facts(a: Manifest, b: Manifest) -> dict[str, tuple[str, str]]:
     """What differs: settings, weights, recording, versions, machine, size, totals, troubles; in this order."""
     all_a, all_b = dict(_facts(a)), dict(_facts(b))
-    pairs = ((name, all_a.get(name, _ABSENT), all_b.get(name, _ABSENT)) for name in all_a | all_b)
-    return tuple(Fact(name=printable(name), a=printable(a), b=printable(b)) for name, a, b in pairs if a != b)
+    pairs = {name: (all_a.get(name, _ABSENT), all_b.get(name, _ABSENT)) for name in all_a | all_b}
+    return {printable(name): (printable(a), printable(b)) for name, (a, b) in pairs.items() if a != b}
 
 
 def _facts(manifest: Manifest) -> Iterator[tuple[str, str]]:
@@ -270,7 +249,7 @@ def _flat(group: str, table: Mapping[str, object], place: str = "") -> Iterator[
 
 def verdict(comparison: RunComparison, tolerance: Tolerance) -> str:
     """How the comparison ends, in one line."""
-    total = len(comparison.views) + len(comparison.missing)
+    total = len(comparison.views)
     same, far = sum(view.identical for view in comparison.views), len(comparison.failures(tolerance))
     if same == total:
         return f"identical: all {total} views"
@@ -281,24 +260,23 @@ def verdict(comparison: RunComparison, tolerance: Tolerance) -> str:
 
 def divergence(comparison: RunComparison) -> str | None:
     """Where the runs first differ and what that says, in one line; None if they are identical."""
-    first, cause = comparison.first_divergence, ""
+    first = comparison.first_divergence
     if first is None:
         return None
-    if isinstance(first, ViewComparison):
-        cause = "; the model was given the same pictures"
-        if not first.same_input:
-            cause = "; the model was given other pictures already: look at the recording and its decoder"
-        elif not first.same_seed:
-            cause += " and another seed, as any other setting brings one"
+    cause = "" if first.only_in else "; the model was given the same pictures"
+    if not first.same_input:
+        cause = "; the model was given other pictures already: look at the recording and its decoder"
+    elif not first.same_seed:
+        cause += " and another seed, as any other setting brings one"
     return f"first divergence: window {first.window_id}, view {first.view_id}: {first}{cause}"
 
 
 def report_text(comparison: RunComparison, tolerance: Tolerance) -> str:
-    """The whole comparison for an assertion or a log: verdict, causes, first divergence, the worst views."""
+    """The whole comparison in words: verdict, causes, first divergence, and the first views that are too far apart."""
     lines = [verdict(comparison, tolerance)]
     if comparison.facts:
         lines += ["what A and B were made from differs (A, B):"]
-        lines += [f"  {fact.name}: {fact.a}, {fact.b}" for fact in comparison.facts]
+        lines += [f"  {name}: {a}, {b}" for name, (a, b) in comparison.facts.items()]
     first, failures = divergence(comparison), comparison.failures(tolerance)
     lines += [] if first is None else [first]
     lines += [f"  window {each.window_id}, view {each.view_id}: {each}" for each in failures[:_LINES]]
@@ -306,37 +284,20 @@ def report_text(comparison: RunComparison, tolerance: Tolerance) -> str:
     return "\n".join(lines)
 
 
-def tables(comparison: RunComparison, tolerance: Tolerance) -> list[Table]:
-    """What the runs were made from, if that differs, and every view of every window; of many, those that differ."""
-    facts = Table("differs", "A", "B", title="What the runs were made from", title_style="dim")
-    for fact in comparison.facts:
-        facts.add_row(fact.name, fact.a, fact.b)
-    rows = sorted((*comparison.views, *comparison.missing), key=lambda each: (each.window_id, each.view_id))
-    rows = rows if len(rows) <= _ROWS else list(comparison.failures(Tolerance()))
-    views = Table("window", "view", "difference", title="Views of windows", title_style="dim")
-    failures = comparison.failures(tolerance)
-    for each in rows[:_ROWS]:
-        views.add_row(str(each.window_id), each.view_id, str(each), style="red" if each in failures else None)
-    if len(rows) > _ROWS:
-        views.caption = f"and {len(rows) - _ROWS} more that differ; --json has them all"
-    return [facts, views] if comparison.facts else [views]
-
-
 def to_plain(comparison: RunComparison, tolerance: Tolerance) -> dict[str, Any]:
     """Everything as plain values for JSON, which has null for the PSNR of identical pictures, infinite here."""
-    first = comparison.first_divergence
+    first, views = comparison.first_divergence, [asdict(view) for view in comparison.views]
+    for plain, view in zip(views, comparison.views, strict=True):
+        plain |= {"identical": view.identical, "passed": view.within(tolerance)}
     return {
         "a": str(comparison.a.path),
         "b": str(comparison.b.path),
         "passed": not comparison.failures(tolerance),
         "identical": first is None,
         **asdict(tolerance),
-        "facts": [asdict(fact) for fact in comparison.facts],
+        "facts": [{"name": name, "a": a, "b": b} for name, (a, b) in comparison.facts.items()],
         "first_divergence": None if first is None else {"window_id": first.window_id, "view_id": first.view_id},
-        "views": [
-            {**asdict(view), "identical": view.identical, "passed": view.within(tolerance)} for view in comparison.views
-        ],
-        "missing": [asdict(each) for each in comparison.missing],
+        "views": views,
     }
 
 
@@ -366,14 +327,12 @@ def write_report(folder: Path, comparison: RunComparison, tolerance: Tolerance) 
     for window_id, a, b in _paired_windows(comparison.a, comparison.b) if worst else ():  # cheaper than to keep all
         for path, (view, far) in worst.items():
             if a is not None and b is not None and window_id == view.window_id:
-                pixels = a.views[view.view_id], b.views[view.view_id]
+                pixels = a[1][view.view_id], b[1][view.view_id]
                 write_png(path, _side_by_side(window_id, far, *pixels, comparison))
     return tuple(worst)
 
 
-def _side_by_side(
-    window_id: int, distance: Distance, a: Mapping[str, Pixels], b: Mapping[str, Pixels], comparison: RunComparison
-) -> Image:
+def _side_by_side(window_id: int, distance: Distance, a: ViewPixels, b: ViewPixels, comparison: RunComparison) -> Image:
     """A, B and their difference at the first frame, the one that differs most and the last; class maps below, at the
     frame where most of their pixels differ.
 

@@ -3,7 +3,7 @@
 import hashlib
 import platform
 from collections.abc import Callable, Generator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from gcd_model import Traits
 from gcd_node.config import LifeConfig, NodeConfig, to_toml
 from gcd_node.errors import ConfigError, DamagedRunError, ModelFailedError, OutputError, SourceError
 from gcd_node.frame import FrameSource, SourceInfo
-from gcd_node.image_io import video_writer
+from gcd_node.image_io import VideoWriter
 from gcd_node.inference import WindowReport
 from gcd_node.lifecycle import Parts
 from gcd_node.messages import PublisherStats
@@ -35,7 +35,6 @@ from gcd_node.replay.run import (
     TroubleEntry,
     ViewEntry,
     WindowEntry,
-    append_window,
     encode_manifest,
     new_folder,
     open_run,
@@ -144,8 +143,7 @@ class RunWriter:
         self.size: SizeEntry | None = None
         self.fps = 0.0
         self._folder, self._on_window = folder, on_window
-        self._videos: dict[Path, cv2.VideoWriter] = {}
-        self._open = ExitStack()
+        self._videos: dict[Path, VideoWriter] = {}
         self._views: dict[str, ViewEntry] = {}  # of the window in work
         self._sent = 0
 
@@ -153,7 +151,8 @@ class RunWriter:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._open.close()
+        for video in self._videos.values():
+            video.close()
 
     def send(self, message: ViewMessage) -> bool:
         """Take a view; see MessageSink. Raises OutputError if its video cannot be begun."""
@@ -179,9 +178,8 @@ class RunWriter:
         pixels = pixels.reshape((frames, height, width, 3) if channels == 3 else (frames, height, -1))
         path = pixels_path(self._folder, header.view_id, kind)
         if path not in self._videos:
-            self._videos[path] = video_writer(path, pixels.shape[2], height, header.src.fps_cond)
-            self._open.callback(self._videos[path].release)
-        append_window(self._videos[path], pixels)
+            self._videos[path] = VideoWriter(path, header.src.fps_cond)
+        self._videos[path].add(pixels)
         self._views[header.view_id].sha256[kind] = pixel_digest(pixels)
         return True
 

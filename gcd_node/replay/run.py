@@ -9,7 +9,7 @@ import hashlib
 import os
 import shutil
 from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
@@ -25,7 +25,7 @@ from gcd_model import FileError, read_json
 from gcd_node.config import Count, ViewId
 from gcd_node.errors import DamagedRunError, OutputError, SourceError
 from gcd_node.image_io import make_folder
-from gcd_node.sources.opencv import quiet_opencv
+from gcd_node.sources.files import open_video
 
 MANIFEST = "manifest.json"
 _MAX_MANIFEST, _MAX_WINDOW = 64 * 2**20, 2**28  # bytes: a day of windows; 6 times the largest model's pixels
@@ -181,13 +181,9 @@ def open_run(path: Path) -> RunFolder:
 # Pixels.
 
 
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class WindowPixels:
-    """A window with its pixels by view and kind: of "win" u8 [T, H, W, 3] RGB; of "cls" and "vis" u8 [T, H, W]; of
-    "depth" u8 [T, H, 2 W], the bytes of its values."""
-
-    entry: WindowEntry
-    views: dict[str, dict[str, Pixels]]
+ViewPixels: TypeAlias = dict[KeptKind, Pixels]
+"""Of a view of a window, by kind: of "win" u8 [T, H, W, 3] RGB; of "cls" and "vis" u8 [T, H, W]; of "depth"
+u8 [T, H, 2 W], the bytes of its values."""
 
 
 def pixel_digest(pixels: Pixels) -> str:
@@ -200,60 +196,41 @@ def pixels_path(folder: Path, view_id: str, kind: KeptKind) -> Path:
     return folder / f"{view_id}{_SUFFIXES[kind]}.mkv"
 
 
-def append_window(video: cv2.VideoWriter, pixels: Pixels) -> None:
-    """Append u8 [T, H, W, 3] RGB, or u8 [T, H, W] as grey pictures, to a lossless video.
-
-    A full disk does not show here, because OpenCV does not tell: read the video again to be sure.
-    """
-    for frame in pixels:
-        video.write(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR if frame.ndim == 2 else cv2.COLOR_RGB2BGR))
-
-
-def read_windows(run: RunFolder) -> Iterator[WindowPixels]:
-    """Every window with its pixels, in order; each is checked against its digest.
+def read_windows(run: RunFolder) -> Iterator[tuple[WindowEntry, dict[str, ViewPixels]]]:
+    """Every window with its pixels by view, in order; each is checked against its digest.
 
     Raises:
         DamagedRunError: a video is missing, no video, shorter or longer than the manifest says, has pictures of another
             size, or other pixels than those with that digest.
     """
     videos: dict[Path, cv2.VideoCapture] = {}
-    try:
+    with ExitStack() as stack:
         for window in run.manifest.windows:
-            views: dict[str, dict[str, Pixels]] = {view_id: {} for view_id in window.views}
+            views: dict[str, ViewPixels] = {view_id: {} for view_id in window.views}
             for view_id, view in window.views.items():
                 for kind, sha256 in view.sha256.items():
                     path = pixels_path(run.path, view_id, kind)
-                    video = videos[path] = videos[path] if path in videos else _open_video(path)
+                    video = videos[path] = videos[path] if path in videos else _open_video(path, stack)
                     pixels = views[view_id][kind] = _next_window(video, path, run.manifest.size, kind)
                     if pixel_digest(pixels) != sha256:
                         raise DamagedRunError(
                             f"{path}: the pixels of window {window.window_id} do not have the SHA-256 that "
                             "manifest.json states; one of the two was changed or damaged: replay again"
                         )
-            yield WindowPixels(entry=window, views=views)
+            yield window, views
         for path, video in videos.items():
             if video.read()[0]:
                 raise DamagedRunError(f"{path} has more frames than {MANIFEST} says; replay again")
-    finally:
-        for video in videos.values():
-            video.release()
 
 
-def _open_video(path: Path) -> cv2.VideoCapture:
+def _open_video(path: Path, stack: ExitStack) -> cv2.VideoCapture:
     try:
         with path.open("rb") as file:
-            is_matroska = file.read(len(_MATROSKA)) == _MATROSKA
-    except OSError as error:
-        raise DamagedRunError(
-            f"cannot read {path}: {error.strerror}; copy the whole folder of the run, or replay it again"
-        ) from error
-    if not is_matroska:  # FFmpeg goes by the content: it would follow a play list to addresses nobody named
-        raise DamagedRunError(f"{path} cannot be opened: it is no Matroska video; replay again")
-    with quiet_opencv():
-        video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    if not video.isOpened():
-        raise DamagedRunError(f"{path} cannot be opened as a video: truncated or damaged; replay it again")
-    return video
+            if file.read(len(_MATROSKA)) != _MATROSKA:  # FFmpeg would follow a play list to addresses nobody named
+                raise SourceError(f"{path} is no Matroska video")
+        return stack.enter_context(open_video(path))
+    except (OSError, SourceError) as error:
+        raise DamagedRunError(f"{error}; copy the whole folder of the run, or replay it again") from error
 
 
 def _next_window(video: cv2.VideoCapture, path: Path, size: SizeEntry, kind: KeptKind) -> Pixels:

@@ -34,6 +34,7 @@ PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 _LOGS = (".mcap", ".db3", ".bag")
 _LOWEST_FPS = 0.1
 _LONGEST_STEP_NS = 10_000_000_000
+_SEAM_NS, _SEAM_PERIODS = 60_000_000_000, 30  # more than a window and any hole: a looped recording's next pass is new
 _COMPLETE = 0.9  # of the frames that a container promises
 _NO_VIDEO = ("ansi", None)  # FFmpeg plays a text as pictures of its letters
 _MAX_BYTES = 2**29  # of a picture's file
@@ -65,7 +66,8 @@ _LAYOUTS: dict[str, tuple[int, int | None]] = {
 class Recording:
     """What recordings have in common as FrameSources: their pace, their end, and that they may begin again.
 
-    A subclass sets `info` and gives the frames of one pass; when it is looped, stamps and numbers keep rising.
+    A subclass sets `info` and gives the frames of one pass; when it is looped, stamps and numbers keep rising. Where it
+    begins again the stamps leap by a minute or more, so that the next pass is another epoch: the camera has jumped.
     """
 
     info: SourceInfo
@@ -85,10 +87,11 @@ class Recording:
             SourceError: the recording is damaged or gone.
         """
         offset_ns, newest_ns = 0, None
-        longest_ns = max(_LONGEST_STEP_NS, round(2e9 / self.info.fps_nominal))
+        period_ns = round(1e9 / self.info.fps_nominal)
+        longest_ns = max(_LONGEST_STEP_NS, 2 * period_ns)
         for frame in self._played():
             if newest_ns is None or not 0 <= frame.stamp_ns - newest_ns <= longest_ns:  # longer holes are skipped
-                offset_ns = time.monotonic_ns() - frame.stamp_ns
+                offset_ns = time.monotonic_ns() - frame.stamp_ns + (0 if newest_ns is None else period_ns)
             newest_ns = frame.stamp_ns
             if self._realtime and (left_ns := newest_ns + offset_ns - time.monotonic_ns()) > 0:
                 self._stopped.wait(left_ns / 1e9)
@@ -104,8 +107,9 @@ class Recording:
         raise NotImplementedError
 
     def _played(self) -> Iterator[Frame]:
-        """One pass, or pass after pass, each going on where the last one ended."""
-        begin_ns, begin_seq, period_ns = 0, 0, round(1e9 / self.info.fps_nominal)
+        """One pass, or pass after pass, each with a leap of the stamps after the one before."""
+        begin_ns, begin_seq = 0, 0
+        seam_ns = max(_SEAM_NS, round(_SEAM_PERIODS * 1e9 / self.info.fps_nominal))
         while not self._stopped.is_set():
             first = newest = None
             for frame in self._one_pass():
@@ -116,7 +120,7 @@ class Recording:
                 return
             if first is None or newest is None:
                 raise SourceError(f"{self._name} gives no pictures any more; was it replaced while it was playing?")
-            begin_ns = newest.stamp_ns + period_ns - first.stamp_ns
+            begin_ns = newest.stamp_ns + seam_ns - first.stamp_ns
             begin_seq = newest.seq + 1 - first.seq
 
 
@@ -135,7 +139,7 @@ class VideoFile(Recording):
         super().__init__(str(path), fps=fps, pace=pace, loop=loop)
         _check_file(path)
         self._path, self._stated_fps = path.resolve(), fps
-        with _opened(self._path) as capture:
+        with open_video(self._path) as capture:
             first, codec = capture.read()[1], codec_name(capture.get(cv2.CAP_PROP_FOURCC))
             stated = capture.get(cv2.CAP_PROP_FPS)
         if first is None:  # pyright: ignore[reportUnnecessaryComparison] - the stub hides it
@@ -157,7 +161,7 @@ class VideoFile(Recording):
 
     def _one_pass(self) -> Iterator[Frame]:
         stamp_ns, seq, fps = None, -1, self.info.fps_nominal
-        with _opened(self._path) as capture:
+        with open_video(self._path) as capture:
             while not self._stopped.is_set() and (read := capture.read())[0]:
                 seq += 1
                 if self._stated_fps is None:
@@ -198,7 +202,7 @@ def _check_file(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Generator[cv2.VideoCapture]:
+def open_video(path: Path) -> Generator[cv2.VideoCapture]:
     """FFmpeg on one file, quiet on stderr. Raises SourceError."""
     with quiet_opencv():
         capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)

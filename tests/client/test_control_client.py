@@ -142,11 +142,3 @@ def test_what_is_no_reply_is_a_control_error(node: FakeNode, client: ControlClie
     node.answer = lambda _: part
     with pytest.raises(ControlError, match="no reply of a gcd node"):
         client.call("hello")
-
-
-def test_codes_are_those_of_the_protocol() -> None:
-    named = (
-        "OK ACCEPTED BAD_JSON BAD_PROTO UNKNOWN_VERB BAD_ARG OUT_OF_RANGE VIEW_FIXED UNKNOWN_VIEW WRONG_STATE BUSY "
-        "FORBIDDEN TOO_LARGE NOT_READY INTERNAL"
-    )
-    assert [str(code) for code in Code] == named.split()

@@ -1,13 +1,11 @@
 """Pushed frames as bytes and back."""
 
-import struct
-
 import cv2
 import numpy as np
 import pytest
 
 from gcd_client.frames import PUSH_KEY, decode_frame, encode_frame
-from gcd_client.protocol import PREFIX, MessageError, decode, pack
+from gcd_client.protocol import MessageError, decode, pack
 
 WHO = "0123456789abcdef" * 2
 STAMP_NS = 1_764_000_000_123_456_789
@@ -97,11 +95,3 @@ def header(text: bytes, payload: bytes = b"x" * 64) -> bytes:
 def test_headers_that_promise_what_is_not_there_are_refused(text: bytes) -> None:
     with pytest.raises(MessageError):
         decode_frame(header(text))
-
-
-def test_another_topic_is_no_frame() -> None:
-    good = bytearray(encode_frame(WHO, 0, IMAGE, STAMP_NS, checksum=False))
-    struct.pack_into("<32s", good, 0, b"view/top/win")
-    with pytest.raises(MessageError, match="topic push"):
-        decode_frame(bytes(good))
-    assert len(good) > PREFIX.size

@@ -6,9 +6,9 @@ import random
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from wire_messages import CLASSES, class_map, depth, numbers, pixels, view_header, visibility, window
+from wire_messages import CLASSES, class_map, depth, pixels, view_header, window
 
-from gcd_client.images import colours, decode_jpegs, depth_m, encode_jpegs, images, inverse_depth, payload_of
+from gcd_client.images import colours, decode_jpegs, depth_m, encode_jpegs, images, inverse_depth
 from gcd_client.protocol import MessageError, ViewMessage, decode, encode
 
 
@@ -19,11 +19,6 @@ def test_raw_images_are_the_received_bytes_and_read_only() -> None:
     assert np.shares_memory(shown, np.frombuffer(part, np.uint8))
     with pytest.raises(ValueError, match="read-only"):
         shown[0, 0, 0, 0] = 1
-
-
-def test_class_maps_and_visibility_are_numbers() -> None:
-    assert np.array_equal(images(class_map(5)), numbers(5)[..., None])
-    assert images(visibility(5)).tobytes() == bytes(visibility(5).payload)
 
 
 def test_inverse_depth_and_metres_agree() -> None:
@@ -57,13 +52,6 @@ def test_a_class_map_is_shown_in_the_colours_of_its_ontology() -> None:
     assert [[tuple(pixel) for pixel in row] for row in shown[0].tolist()] == [[of[n] for n in row] for row in drawn[0]]
     with pytest.raises(MessageError, match="got 2"):
         colours(class_map(drawn=np.array([[[0, 1, 2]]], np.uint8)))
-
-
-def test_pictures_are_shown_as_they_are_and_grey_levels_as_grey() -> None:
-    assert np.array_equal(colours(window(images=pixels(2))), pixels(2))
-    grey = pixels(3, channels=1)
-    message = ViewMessage(topic="view/top/win", header=view_header(shape=grey.shape), payload=payload_of(grey))
-    assert np.array_equal(colours(message), np.repeat(grey, 3, axis=-1))
 
 
 # JPEG

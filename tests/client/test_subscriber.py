@@ -81,12 +81,6 @@ def test_a_view_arrives_with_its_pixels_age_and_header(sender: Sender, views: Vi
     assert not view.restarted
 
 
-def test_silence_gives_none_in_time(tmp_path: Path) -> None:
-    with ViewSubscriber(f"ipc://{tmp_path}/nobody", "top") as views:
-        assert views.receive(30) is None
-        assert not views.ended
-
-
 def test_damaged_and_stale_messages_never_end_a_loop_and_are_counted(sender: Sender, views: ViewSubscriber) -> None:
     key, old = topic_key("view/top/win"), window(2, age_ms=61_000.0)
     sender.send(damaged(window()), key, key + b"noise" * 20, window(3), window(4), old, damaged(end()))
@@ -185,17 +179,6 @@ def test_a_stream_ends_and_may_begin_again(sender: Sender, views: ViewSubscriber
     sender.numbered(2, window(1))
     sender.numbered(3, end())
     assert window_ids(views) == [1]
-
-
-def test_all_views_end_when_the_last_one_does(sender: Sender) -> None:
-    with ViewSubscriber(sender.endpoint, conflate=False) as views:
-        sender.wait()
-        for sequence, message in ((0, window(0, view_id="a")), (0, window(0, view_id="b")), (1, end(view_id="a"))):
-            sender.numbered(sequence, message)
-        sender.numbered(1, window(1, view_id="b"))
-        sender.numbered(2, end(view_id="b"))
-        found = [(view.header.view_id, view.header.window_id) for view in views]
-    assert found == [("a", 0), ("b", 0), ("b", 1)]
 
 
 @pytest.mark.parametrize(("view", "kind"), [(None, "win"), ("top", None), (None, None), ("top", ("vis", "depth"))])

@@ -1,12 +1,13 @@
 """What a calibration states, from ROS files and messages, and what no camera has."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from gcd_node.calibration import LensModel, depthai_lens, lens_of, load_lens
+from gcd_node.calibration import LensModel, depthai_lens, lens_of_message, load_lens
 from gcd_node.errors import ConfigError
 
 FILE = b"""# as cameracalibrator writes it
@@ -45,6 +46,15 @@ LENS = LensModel(
     width=640, height=480, fx=433.5, fy=432.75, cx=322.25, cy=241.5,
     distortion="plumb_bob", coefficients=(-0.35, 0.12, 1e-5, -2.5e-4, 0.0),
 )  # fmt: skip
+
+
+def lens_of(**stated: Any) -> LensModel | None:
+    """What a message states."""
+    roi, binning = stated.pop("roi", (0, 0, 0, 0)), stated.pop("binning", (1, 1))
+    part = SimpleNamespace(**dict(zip(("x_offset", "y_offset", "width", "height"), roi, strict=True)))
+    rectified, model = stated.pop("rectified", False), stated.pop("model")
+    sent = SimpleNamespace(distortion_model=model, binning_x=binning[0], binning_y=binning[1], roi=part, **stated)
+    return lens_of_message(sent, rectified=rectified)
 
 
 # --- files -------------------------------------------------------------------------------------------------------

@@ -8,15 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fakes import FakeSynthesizer, traits
 from typer.main import get_command
 
-from gcd_node import session
 from gcd_node.cli.main import COMMANDS, new_app, run_app
-from gcd_node.config import PublishConfig, load_config
-from gcd_node.image_io import write_png, write_video
-from gcd_node.publisher import Publisher
-from gcd_node.session import open_session
+from gcd_node.image_io import write_video
 
 SIZE = (128, 192)  # of the small random model
 KUBRIC = ["--weights", "random:kubric90"]
@@ -149,20 +144,14 @@ def test_poses_near_the_sphere_are_taken(clip: Path, tmp_path: Path) -> None:
         ([*KUBRIC, "--azimuth-deg", "91"], 64, "[-90, 90]"),
         ([*DRIVING, "--azimuth-deg", "5"], 64, "fixed view"),
         ([*KUBRIC, "--trajectory", "sideways"], 64, "gradual or direct"),
-        ([*KUBRIC, "--move-time", "14"], 64, "move_time"),
         ([*KUBRIC, "--samples", "2", "--save", "x.npz"], 64, "one sample"),
         ([*KUBRIC, "--trajectory", "direct", "--move-time", "3"], 64, "give one"),
         ([*KUBRIC, "--guidance", "nan", "1.5"], 64, "finite"),
-        ([*KUBRIC, "--quality", "best"], 64, "fastest"),
-        ([*KUBRIC, "--fps", "nan"], 64, "fps"),
         ([*KUBRIC, "--poses", "none.npy"], 66, "none.npy"),
         ([*KUBRIC, "--noise", "none.npz"], 66, "none.npz"),
         ([*KUBRIC, "--height", "64", "--width", "64"], 64, "own size"),
         ([*KUBRIC, "--device", "abacus"], 64, "abacus"),
-        ([*KUBRIC, "--dtype", "float3"], 64, "float3"),
-        (["--weights", "random:kubric91"], 64, "kubric91"),
         (["--weights", "package:none"], 65, "none"),
-        (["--weights", "nowhere.ckpt"], 65, "nowhere.ckpt"),
         ([*KUBRIC, "--family", "driving"], 64, "family"),
     ],
 )
@@ -173,32 +162,20 @@ def test_bad_options_are_one_line_with_cause_and_remedy(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("name", ["missing.mp4", "empty.mp4", "junk.mp4", "truncated.mp4", "text.png", "empty_folder"])
-@pytest.mark.parametrize("command", ["synthesize", "run"])
+@pytest.mark.parametrize("name", ["missing.mp4", "junk.mp4", "empty_folder"])
 def test_an_input_that_cannot_be_decoded_is_exit_66(
-    command: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / name
-    if name == "empty.mp4":
-        path.touch()
-    elif name == "empty_folder":
+    if name == "empty_folder":
         path.mkdir()
-    elif name == "truncated.mp4":
-        write_video(tmp_path / "whole.mp4", [np.zeros((128, 192, 3), np.uint8)] * 20, 10.0)
-        path.write_bytes((tmp_path / "whole.mp4").read_bytes()[:900])
-    elif name != "missing.mp4":
+    elif name == "junk.mp4":
         path.write_bytes(b"this is no picture" * 100)
-    arguments = synthesize(path, tmp_path / "out", *DRIVING)
-    if command == "run":
-        arguments = ["run", launch_file(tmp_path, path)]
-    assert name in failed(arguments, 66, capsys)
+    assert name in failed(synthesize(path, tmp_path / "out", *DRIVING), 66, capsys)
 
 
 def test_too_few_frames_is_exit_65(video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "n=6" in failed(synthesize(video, tmp_path / "out", *DRIVING, "--start", "10"), 65, capsys)
-    short = tmp_path / "short.mkv"
-    write_video(short, [np.zeros((128, 192, 3), np.uint8)] * 9, 10.0)
-    assert "TOO_SHORT n=9" in failed(["run", launch_file(tmp_path, short)], 65, capsys)
 
 
 def test_a_wrong_checkpoint_is_exit_65(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -221,9 +198,7 @@ def test_run_publishes_and_ends_with_0(video: Path, tmp_path: Path, capsys: pyte
     ("changes", "code", "reason"),
     [
         ({"view": "azimuth_deg = 10.0"}, 64, "fixed view"),
-        ({"view": "azimuth_deg = 100.0", "weights": "random:kubric90"}, 64, "[-90, 90]"),
         ({"view": "azimut_deg = 10.0"}, 78, "azimuth_deg"),
-        ({"publish": "encodng = 'jpeg'"}, 78, "encoding"),
         ({"source": "hfov_deg = -1.0"}, 78, "> 0"),
         ({"weights": "random:unheard"}, 78, "unheard"),
     ],
@@ -232,15 +207,6 @@ def test_a_launch_file_that_asks_for_the_impossible_is_refused(
     changes: dict[str, str], code: int, reason: str, video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert reason in failed(["run", launch_file(tmp_path, video, **changes)], code, capsys)
-
-
-def test_a_missing_launch_file_is_exit_78(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "no.toml" in failed(["run", "no.toml"], 78, capsys)
-
-
-def test_an_endpoint_in_use_is_exit_73(video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with Publisher(PublishConfig(data=f"ipc://{tmp_path}/data", status=f"ipc://{tmp_path}/status"), linger_ms=0):
-        assert f"{tmp_path}/data" in failed(["run", launch_file(tmp_path, video)], 73, capsys)
 
 
 def test_usage_errors_are_exit_64(capsys: pytest.CaptureFixture[str]) -> None:
@@ -292,55 +258,6 @@ def test_the_demo_ends_with_pictures_of_what_arrived_in_the_other_process(tmp_pa
     assert "windows in the other process" in done.stdout
     for name in ("side_by_side.mp4", "side_by_side.webp", "side_by_side.png"):
         assert (tmp_path / "gcd-demo" / name).stat().st_size > 10_000
-
-
-def test_a_still_is_seen_as_a_clip(tmp_path: Path) -> None:
-    write_png(tmp_path / "still.png", np.full((*SIZE, 3), 90, np.uint8))
-    assert run_app([str(a) for a in synthesize(tmp_path / "still.png", tmp_path / "out", *DRIVING)]) == 0
-    assert len(list((tmp_path / "out" / "frames").glob("*.png"))) == 14
-
-
-REAL = Path(__file__).parents[2].parent / "shared" / "real"
-
-
-@pytest.mark.skipif(not REAL.is_dir(), reason="needs the four real clips in ../shared/real")
-@pytest.mark.parametrize(
-    "name",
-    [
-        "kubmv7_scn01992_v11",
-        pytest.param("kubmv7_scn01996_v2", marks=pytest.mark.slow),  # another scene of the same camera
-        "pd_scn00590",
-        pytest.param("pd_scn01969", marks=pytest.mark.slow),
-    ],
-)
-def test_real_recordings_go_through_both_programs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source, windows = REAL / f"{name}.mp4", 4 if name.startswith("kub") else 3
-    weights = KUBRIC if name.startswith("kub") else DRIVING
-    assert run_app([str(a) for a in synthesize(source, tmp_path / "out", *weights)]) == 0
-    assert len(list((tmp_path / "out" / "frames").glob("*.png"))) == 14
-    settings = load_config(launch_file(tmp_path, source, weights=weights[1]))
-    quick = FakeSynthesizer(traits("kubric90" if name.startswith("kub") else "driving"))
-    monkeypatch.setattr(session, "load_model", lambda _: quick)  # what a model makes of it was seen above
-    with open_session(settings) as (node, _):
-        assert node.run().counts.windows == windows
-
-
-@pytest.mark.parametrize("kind", ["clip.npy", "poses.npy", "noise.npz"])
-@pytest.mark.parametrize("damage", ["cut", "huge"])
-def test_damaged_arrays_are_one_line(
-    kind: str, damage: str, clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    whole = tmp_path / "whole.npz"
-    np.savez(whole, initial=np.zeros((14, 4, 16, 24), np.float32))
-    path = tmp_path / f"bad_{kind}"
-    if damage == "cut":
-        path.write_bytes(whole.read_bytes()[:3000])
-    else:
-        header = "{'descr': '<f4', 'fortran_order': False, 'shape': (1048576, 1048576, 2, 3), }".ljust(117) + "\n"
-        path.write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode())
-    options = {"clip.npy": [], "poses.npy": ["--poses", path], "noise.npz": ["--noise", path]}[kind]
-    source = path if kind == "clip.npy" else clip
-    assert path.name in failed(synthesize(source, tmp_path / "out", *KUBRIC, *options), 66, capsys)
 
 
 def test_a_demo_that_cannot_write_says_so_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

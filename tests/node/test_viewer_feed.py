@@ -67,12 +67,6 @@ def test_the_token_is_in_no_log(viewer: ViewerServer, caplog: pytest.LogCaptureF
     assert not [line for line in told if TOKEN in line]
 
 
-def test_the_page_hears_a_beat_though_no_node_lives(viewer: ViewerServer) -> None:
-    with open_feed(viewer) as feed:
-        assert hear(feed, "beat")["silent_ms"] is None
-        assert hear(feed, "beat")["silent_ms"] is None
-
-
 @pytest.mark.parametrize(("role", "verbs"), [("viewer", ("set_view", "set_param", "get_config")), ("operator", ())])
 def test_what_a_page_may_not_ask_is_refused_without_asking_the_node(
     viewer: ViewerServer, role: str, verbs: tuple[str, ...]

@@ -3,7 +3,6 @@
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -35,7 +34,7 @@ from wire_messages import window
 
 from gcd_node.auth import Role, new_key_pair, write_key_pair
 from gcd_node.config import PublishConfig, parse_config
-from gcd_node.errors import ConfigError, EndpointError
+from gcd_node.errors import ConfigError
 from gcd_node.publisher import Publisher
 from gcd_node.session import open_session
 from gcd_node.viewer import server as server_module
@@ -233,14 +232,6 @@ def test_a_viewer_ends_with_a_node_that_is_killed(tmp_path: Path) -> None:
         assert is_served(url)
         process.kill()
         until(lambda: not is_served(url))
-
-
-def test_a_port_in_use_is_refused_before_anything_starts(tmp_path: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        http = f"127.0.0.1:{taken.getsockname()[1]}"
-        settings = rig_config(tmp_path, 'kind = "synthetic"', "[view.main]", f'[viewer]\nhttp = "{http}"')
-        with pytest.raises(EndpointError, match=f"{http}.*in use"), open_session(settings):
-            pass
 
 
 def test_the_demo_opens_its_page_and_ends_with_ctrl_c(tmp_path: Path) -> None:

@@ -22,11 +22,11 @@ from gcd_client.subscriber import ReceivedView
 from gcd_model import hatched
 from gcd_node.auth import Client, ServerSecurity, new_key_pair, write_key_pair
 from gcd_node.cli.main import run_app
-from gcd_node.cli.view_saver import ViewSaver
 from gcd_node.cli.watch import StatusBoard, ViewTable
 from gcd_node.config import PublishConfig
 from gcd_node.errors import OutputError
 from gcd_node.health import Health, Level
+from gcd_node.image_io import ViewSaver
 from gcd_node.publisher import Publisher
 
 pytestmark = pytest.mark.timeout(60)
@@ -89,9 +89,9 @@ def test_a_table_has_the_figures_of_each_topic_and_fits_into_80_columns() -> Non
     table.add(received(window(123_456, view_id="a_view_name_of16")), now_s=12.0)
     long, top = table.rows(now_s=12.25)
     assert long[:2] == ("view/a_view_name_of16/win", "123456")
-    assert top == ("view/top/win", "4", "2x4x6x3", "290", "2.00", "2", "0.0", "live")
-    assert [row[-1] for row in table.rows(now_s=72.2)] == ["expired", "expired"]
-    assert table.rows(now_s=12.25, ended=True)[0][-1] == "ended"
+    assert top == ("view/top/win", "4", "2x4x6x3", "290", "2.00", "2", "0.0", "live, fps")
+    assert [row[-1] for row in table.rows(now_s=72.2)] == ["expired, fps", "expired, fps"]
+    assert table.rows(now_s=12.25, ended=True)[0][-1] == "ended, fps"
     text = text_of(table.render(99.0), width=80)
     assert "…" not in text
     assert max(map(len, text.splitlines())) <= 80
@@ -113,26 +113,12 @@ def test_saved_pictures_and_video_are_the_published_pixels(tmp_path: Path, capsy
     assert np.array_equal(picture(out / "top" / "000001_01.png"), sent[1][1])
 
 
-def test_a_watch_of_all_kinds_ends_when_all_have(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    messages = (window(0, view_id="side"), window(0), class_map(0), end(), class_map(1), end(kind="cls"))
-    assert watch(tmp_path, ["--view", "top", "--kind", "all"], *messages) == 0
-    assert "3 messages, 0 files, 0 damaged; the stream ended" in capsys.readouterr().out
-
-
 def test_a_watch_for_hatching_takes_windows_with_their_visibility(tmp_path: Path) -> None:
     image = pixels(0, height=16, width=16)
     messages = (window(0, images=image), class_map(0), visibility(0, seen=SEEN), end(), end(kind="vis"))
     options = ["--view", "top", "--hatch", "--save", str(tmp_path / "out")]
     assert watch(tmp_path, options, *messages, readers=2) == 0
     assert np.array_equal(read_video(tmp_path / "out" / "top.mkv"), hatched(image, SEEN))
-
-
-def test_views_that_never_come_are_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_app(["view", f"ipc://{tmp_path}/nobody", "--timeout", "0.3"]) == 69
-    said = capsys.readouterr()
-    assert "is the node running?" in said.out
-    assert said.out.endswith("\n")  # an error that follows begins its own line
-    assert said.err.startswith(f"error: no view from ipc://{tmp_path}/nobody within 0.3 s")
 
 
 def test_maps_are_saved_in_colour_and_as_numbers_apart_from_windows(tmp_path: Path) -> None:
@@ -259,13 +245,6 @@ def test_a_working_node_is_shown_with_its_figures_in_80_columns() -> None:
     assert "E11" not in shown  # only the latest
 
 
-def test_a_node_that_is_silent_or_not_ready_is_shown_as_that() -> None:
-    headline = text_of(board_of(note("status", working())).render(20.0)).splitlines()[0]
-    assert headline.split() == ["STALE", "robot_7", "silent", "for", "10", "s", "before:", "active"]
-    text = text_of(board_of(note("status", Health().report())).render(10.0))
-    assert "not ready: NOT_ACTIVE, SRC_NOT_STREAMING" in text
-
-
 HOSTILE: tuple[dict[str, Any], ...] = (
     {},
     {"level": "high", "reasons": "fps", "source": 3, "window": [], "stages": [1], "views": None, "drops": "many"},
@@ -341,17 +320,6 @@ def test_a_stream_of_json_has_every_note_on_its_line(endpoint: str) -> None:
     assert set(lines) == {"status", "meta", "event"}
     assert lines["event"]["code"] == "SRC_LOST"
     assert lines["meta"]["node_id"] == "gcd"
-
-
-def test_a_table_in_a_pipe_is_printed_for_every_status(endpoint: str, silence: Callable[[], None]) -> None:
-    command = [sys.executable, "-m", "gcd_node", "status", endpoint, "--timeout", "0.3"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as reader:
-        assert reader.stdout is not None
-        headlines = 0
-        while headlines < 2:
-            headlines += "robot" in (line := reader.stdout.readline()) or " gcd " in line
-        silence()
-        reader.terminate()
 
 
 @pytest.mark.parametrize(("known", "code"), [(True, 0), (False, 77)])
