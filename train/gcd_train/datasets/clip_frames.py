@@ -43,7 +43,11 @@ class FrameSampling:
         """Frame numbers, stride, and whether they run backwards. Raises DataError if no clip fits."""
         fitting = [stride for stride in self.strides if self.last_start(frames, stride) >= 0]
         if not fitting:
-            raise DataError(f"is too short: {frames} frames hold no clip of {self.clip} at stride {min(self.strides)}")
+            span, spare = (self.clip - 1) * min(self.strides) + 1, "" if self.reach_last else ", of which the last is left out"
+            raise DataError(
+                f"is too short: it has {frames} frames{spare}, and a clip of {self.clip} at stride {min(self.strides)} "
+                f"takes {span}; see data.frames.reach_last"
+            )
         stride = int(rng.choice(fitting))
         start = int(rng.integers(self.last_start(frames, stride) + 1))
         numbers = tuple(range(start, start + self.clip * stride, stride))
