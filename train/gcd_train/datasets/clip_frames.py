@@ -43,10 +43,11 @@ class FrameSampling:
         """Frame numbers, stride, and whether they run backwards. Raises DataError if no clip fits."""
         fitting = [stride for stride in self.strides if self.last_start(frames, stride) >= 0]
         if not fitting:
-            span, spare = (self.clip - 1) * min(self.strides) + 1, "" if self.reach_last else ", of which the last is left out"
+            wanted = frames - self.last_start(frames, min(self.strides))
+            left_out = "" if self.reach_last else " (the last is left out, as published, unless data.frames.reach_last)"
             raise DataError(
-                f"is too short: it has {frames} frames{spare}, and a clip of {self.clip} at stride {min(self.strides)} "
-                f"takes {span}; see data.frames.reach_last"
+                f"is too short: a clip of {self.clip} at stride {min(self.strides)} wants {wanted} frames{left_out}, "
+                f"got {frames}"
             )
         stride = int(rng.choice(fitting))
         start = int(rng.integers(self.last_start(frames, stride) + 1))
