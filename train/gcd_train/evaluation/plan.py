@@ -180,7 +180,7 @@ class Plan:
     def summary(self, rows: Mapping[str, Sequence[ClipRecord]]) -> Summary:
         """What was found. rows: records by method, of the same clips in their order."""
         clips, options, model = self.clips, self.options, self.model
-        released, pairs = options.protocol == "released", clips if isinstance(clips, PairedSet) else None
+        released, pairs = options.protocol == "release", clips if isinstance(clips, PairedSet) else None
         selection = Selection(frames="all") if released else Selection()
         found = {name: evaluation(records, selection, classes=len(clips.classes)) for name, records in rows.items()}
         names = [method.name for method in self.models]
@@ -301,7 +301,7 @@ def _cuts(options: EvaluateOptions, model: Traits | None) -> SceneCuts:
         clips=options.trajectories,
         seed=options.seed,
         bounds=FrameBounds(start=options.frame_start, skip=options.frame_skip),
-        far=suiting.far if options.angles is None else options.angles == "max180",
+        far=options.angles == "max180",
         gradual=suiting.gradual if options.path is None else options.path == "gradual",
         semantic=suiting.semantic if options.modality is None else options.modality == "semantic",
         exact=options.exact,
@@ -357,7 +357,7 @@ def _baselines(
         dtype=options.dtype,
         samples=options.sampling.samples,
         seed=options.seed,
-        published=options.protocol == "released",
+        published=options.protocol == "release",
         hexplane=options.hexplane,
     )
     further = len(clips.dataset.cameras) - 1 if isinstance(clips, SceneSet) else 0  # pairs have one camera

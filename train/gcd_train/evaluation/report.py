@@ -158,7 +158,7 @@ class _Writer:
     @property
     def spans(self) -> tuple[Span, ...]:
         """Frames that tables are over."""
-        return _RELEASED_SPANS if self.of.note.protocol == "released" else _SPANS
+        return _RELEASED_SPANS if self.of.note.protocol == "release" else _SPANS
 
     def sections(self) -> Iterator[str]:
         measured = Measured(of=self.of, seed=self.choices.seed, rows=self.choices.rows)

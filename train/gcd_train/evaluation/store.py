@@ -88,7 +88,7 @@ class RunNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     command: the line that began it. made: UTC, ISO 8601. versions: of gcd-node, torch, python. data: folders.
     data_identity: digest of the clips. kind: "kubric", "driving" or "orbit": which tables they belong to.
-    modality: of the target pictures. protocol: "paper", "released" or "pairs". fps: frames per second of the clips.
+    modality: of the target pictures. protocol: "paper", "release" or "pairs". fps: frames per second of the clips.
     rates: empty where all have that one; else all that clips may have, of which `fps` is the highest, and each record
     tells its clip's. classes: names, empty for none.
     methods: name to what it is: a weight file's digest, steps, guidance, draws, seed, views; all as text.
@@ -101,7 +101,7 @@ class RunNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     data_identity: str
     kind: Literal["kubric", "driving", "orbit"]
     modality: Literal["rgb", "semantic"]
-    protocol: Literal["paper", "released", "pairs"]
+    protocol: Literal["paper", "release", "pairs"]
     frames: int
     height: int
     width: int
