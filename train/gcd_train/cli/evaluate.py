@@ -148,7 +148,7 @@ def _evaluate(
     for line in account.lines():
         _say(line)
     rows = complete_rows(keeper, list(work.makers), plan.clips.keys, account.records)
-    summary = plan.summary(rows)
+    summary = plan.summary(rows, account.failed())
     text = to_markdown(summary)
     write_summary(summary, text, out)
     keys = [record.key for record in next(iter(rows.values())) if record.key in work.sheet]

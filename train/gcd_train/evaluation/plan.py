@@ -177,8 +177,8 @@ class Plan:
             methods={method.name: {**method.told, **lpips} for method in self.methods},
         )
 
-    def summary(self, rows: Mapping[str, Sequence[ClipRecord]]) -> Summary:
-        """What was found. rows: records by method, of the same clips in their order."""
+    def summary(self, rows: Mapping[str, Sequence[ClipRecord]], failed: tuple[str, ...] = ()) -> Summary:
+        """What was found. rows: records by method, of the same clips in their order. failed: see `Conditions`."""
         clips, options, model = self.clips, self.options, self.model
         released, pairs = options.protocol == "release", clips if isinstance(clips, PairedSet) else None
         selection = Selection(frames="all") if released else Selection()
@@ -201,6 +201,7 @@ class Plan:
                 train_clips=0 if self.training is None else len(self.training),
                 samples=options.sampling.samples,
                 first_frame=1 if released else 2,
+                failed=failed,
             ),
             classes=tuple(each.name for each in clips.classes),
             model=tuple(found[name] for name in names if name in found),

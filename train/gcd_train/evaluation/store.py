@@ -12,7 +12,7 @@ Files appear whole or not at all, so a run that was killed goes on where it stop
 import fcntl
 import re
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias, get_args
@@ -132,9 +132,21 @@ class RunKeeper:
 
     @contextmanager
     def in_use(self, note: RunNote) -> Generator[None]:
-        """`begin`, one line at a time; lines that begin before the block is left keep its methods. Raises as it."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        with (self.folder / ".in_use").open("a") as measuring:
+        """`begin`, one line at a time; lines that begin before the block is left keep its methods.
+
+        Raises: RunError as `begin`, and where another line measures one of the methods now.
+        """
+        (self.folder / ".measuring").mkdir(parents=True, exist_ok=True)
+        with ExitStack() as held:
+            measuring = held.enter_context((self.folder / ".in_use").open("a"))
+            for method in note.methods:
+                mine = held.enter_context((self.folder / ".measuring" / folder_name(method)).open("a"))
+                try:
+                    fcntl.flock(mine, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError as error:
+                    raise RunError(
+                        f"another line measures {method} in {self.folder} now; wait for it, or give another --out"
+                    ) from error
             with (self.folder / ".begin").open("a") as turn:
                 fcntl.flock(turn, fcntl.LOCK_EX)
                 try:
