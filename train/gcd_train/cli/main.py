@@ -9,7 +9,7 @@ from rich.table import Table
 
 from gcd_model import FAMILIES, Family, ModelConfig
 from gcd_model.config import PLAIN_SMALL, SMALL, SVD_14
-from gcd_train.cli import bench, generate, lerobot, lora
+from gcd_train.cli import bench, data, generate, lerobot, lora
 from gcd_train.cli.cache import cache
 from gcd_train.cli.calibrate import calibrate_command
 from gcd_train.cli.distill import distill
@@ -29,6 +29,7 @@ app = typer.Typer(
 
 app.add_typer(generate.app, name="generate")
 app.add_typer(bench.app, name="bench")
+app.add_typer(data.app, name="data")
 app.add_typer(lerobot.app, name="export")
 app.add_typer(lora.app, name="lora")
 app.command()(cache)
