@@ -33,7 +33,7 @@ def gallery_command(
     windows: Annotated[int, Option(min=1, help="At most so many windows of each video.")] = 2,
     start: Annotated[float, Option(min=0.0, help="Where the first window begins, seconds.")] = 0.0,
     rate: Annotated[float | None, Option(min=0.1, help="Frames a second of folders of pictures.")] = None,
-    hfov: Annotated[
+    hfov_deg: Annotated[
         float | None,
         Option(min=1.0, max=179.0, help="Field of view of the videos, degrees across; cut to the model's."),
     ] = None,
@@ -72,7 +72,7 @@ def gallery_command(
         )
         model = load_synthesizer(weights, family=family, device=device, dtype=dtype)
         assumed = _assumed(paths(model.traits, recipe), recipe)  # refused before any video is read
-        choice = WindowChoice(count=windows, start_s=start, rate=rate, hfov_deg=hfov)
+        choice = WindowChoice(count=windows, start_s=start, rate=rate, hfov_deg=hfov_deg)
         viewed, faults = _viewed(found, model, choice, recipe, out)
         write_page(viewed, faults, [*_facts(model, recipe), *assumed], out / "index.html")
         for _, told in assumed:
