@@ -61,12 +61,6 @@ def test_another_error_of_the_program_stays_a_traceback() -> None:
         raise RuntimeError("shape mismatch")
 
 
-def test_architectures_lists_all_set_ups() -> None:
-    result = CliRunner().invoke(app, ["architectures"], env={"COLUMNS": "200"})
-    assert "320, 640, 1280, 1280" in result.stdout
-    assert "PLAIN_SMALL" in result.stdout
-
-
 @pytest.mark.parametrize("module", ["gcd_model", "gcd_node", "gcd_node.cli.main", "gcd_train.cli.main"])
 def test_the_core_imports_without_cameras_gpu_ros_and_onnx(module: str) -> None:
     blocked = (

@@ -7,8 +7,7 @@ from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
-from gcd_model import FAMILIES, Family, ModelConfig
-from gcd_model.config import PLAIN_SMALL, SMALL, SVD_14
+from gcd_model import FAMILIES, Family
 from gcd_train.cli import bench, data, generate, lerobot, lora
 from gcd_train.cli.cache import cache
 from gcd_train.cli.calibrate import calibrate_command
@@ -66,17 +65,6 @@ def families(
     Console().print(table)
 
 
-@app.command()
-def architectures() -> None:
-    """List the network set-ups with their sizes."""
-    table = Table(title="Network set-ups")
-    for column in ("set-up", "size", "frames", "U-Net widths", "VAE widths", "image tower", "steps"):
-        table.add_column(column)
-    for name, config in (("SVD_14", SVD_14), ("PLAIN_SMALL", PLAIN_SMALL), ("SMALL", SMALL)):
-        table.add_row(name, *_config_row(config))
-    Console().print(table)
-
-
 def _family_row(family: Family) -> tuple[str, ...]:
     limits = family.limits
     span = "fixed"
@@ -85,18 +73,6 @@ def _family_row(family: Family) -> tuple[str, ...]:
     rates = ", ".join(f"{rate:g}" for rate in family.rates) or "any"
     hfov = "any" if family.hfov_deg is None else f"{family.hfov_deg:g}°"
     return family.name, family.camera, span, rates, hfov, f"{family.width}x{family.height}"
-
-
-def _config_row(config: ModelConfig) -> tuple[str, ...]:
-    tower = config.image_encoder
-    return (
-        f"{config.width}x{config.height}",
-        str(config.frames),
-        ", ".join(map(str, config.unet.widths)),
-        ", ".join(map(str, config.vae.widths)),
-        "none" if tower is None else f"{tower.layers} x {tower.width}",
-        str(config.sampling.steps),
-    )
 
 
 def main() -> None:
