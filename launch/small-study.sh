@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # The study at small scale, whole: do the paper's findings hold for four small driving models? Design and figures are in
-# docs/research.md. About three hours of one CPU core; every step keeps what it has done: after a stop, run the same
+# docs/evaluation.md. About three hours of one CPU core; every step keeps what it has done: after a stop, run the same
 # line again.
 #
 #   launch/small-study.sh [FOLDER]      FOLDER: for data, latents, trainings, evaluations, report (runs/small-study)

@@ -79,11 +79,13 @@ def _serve() -> None:
 
 def _import_what_commands_import() -> None:
     from gcd_node.cli.main import COMMANDS, new_app
+    from gcd_train.cli import main as train
 
     new_app(COMMANDS)
+    train.new_app(train.COMMANDS)
     for name in ("check", "image_io", "demo", "viewer.server"):
         import_module(f"gcd_node.{name}")
-    for name in ("distillation.recipe", "evaluation.run", "gallery", "reports.pages", "show.open_scene", "trainer"):
+    for name in ("distillation.recipe", "evaluation.report", "look.gallery", "look.open_scene", "trainer"):
         import_module(f"gcd_train.{name}")
 
 

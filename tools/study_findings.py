@@ -1,4 +1,4 @@
-"""Whether the claims of the small study (docs/research.md) hold, from folders that `gcd-train evaluate` wrote.
+"""Whether the claims of the small study (docs/evaluation.md) hold, from folders that `gcd-train evaluate` wrote.
 
     python tools/study_findings.py runs/small-study/evaluated/* --out runs/small-study/findings
 

@@ -17,6 +17,7 @@ from gcd_train.errors import DataError, RunError
 from gcd_train.evaluation.clips import HeldOutClip, PairedSet, chosen, identity_of
 from gcd_train.evaluation.galleries import KeptViews, png
 from gcd_train.evaluation.predictors import CopySource, Prediction, Predictor, SourceClip, to_pictures
+from gcd_train.evaluation.report import Choices, make_report
 from gcd_train.evaluation.runner import GIVE_UP_AFTER, Account, ClipWork, assign_gpus, measure_all
 from gcd_train.evaluation.saved_frames import SavedFrames
 from gcd_train.evaluation.store import RunKeeper, folder_name, read_run
@@ -109,8 +110,11 @@ def test_lines_beside_each_other_keep_each_others_methods_before_there_is_a_reco
         with second.in_use(note(methods={"b": {}})), pytest.raises(RunError, match="data_identity"):
             first.in_use(note(methods={"c": {}}, data_identity="another")).__enter__()
         first.keep(record("a", "k"))
+        with pytest.raises(RunError, match="another line measures a in"):
+            second.in_use(note(methods={"b": {}, "a": {}})).__enter__()
     second.keep(record("b", "k"))
-    assert list(read_run(tmp_path)[0].methods) == ["a", "b"]
+    with second.in_use(note(methods={"a": {}})):
+        assert list(read_run(tmp_path)[0].methods) == ["a", "b"]
 
 
 @pytest.mark.parametrize(
@@ -311,11 +315,19 @@ def test_a_line_that_measured_nothing_can_be_corrected(tmp_path: Path, monkeypat
     frames = tmp_path / "run" / "views" / "copy_source"
     code, said = evaluated(tmp_path, "--no-baselines", "--predictions", f"none={tmp_path / 'logs'}")
     assert (code != 0, "clips: 0 measured" in said, "1 failures" in said) == (True, True, True), said
+    saved = f"saved={frames}"
+    code, said = evaluated(
+        tmp_path, "--no-baselines", "--predictions", f"none={tmp_path / 'logs'}", "--predictions", saved
+    )
+    assert code != 0
+    assert "Failed, and in no row: none on 1 of 1 clips" in (tmp_path / "run" / "evaluation.md").read_text()
+    page = make_report([tmp_path / "run"], tmp_path / "report", Choices(drawn=False)).read_text()
+    assert "Failed: none." in page
     monkeypatch.chdir(frames.parent)
     for folder in (str(frames), "copy_source", "./copy_source"):
         code, said = evaluated(tmp_path, "--no-baselines", "--predictions", f"none={folder}")
         assert code == 0, said
-    assert list(read_run(tmp_path / "run")[0].methods) == ["copy_source", "none"]
+    assert list(read_run(tmp_path / "run")[0].methods) == ["copy_source", "saved", "none"]
 
 
 def test_frames_of_a_method_that_was_given_more_are_starred(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -16,12 +16,14 @@ from typer import Typer
 from typer.testing import CliRunner
 
 from gcd_model import (
+    ASSUMED_SOURCE,
     FAMILIES,
     Augmentation,
     CameraMount,
     Clip,
     RenderOptions,
     SourceFeatures,
+    Spherical,
     SphericalDelta,
     Traits,
     Trajectory,
@@ -29,9 +31,10 @@ from gcd_model import (
     load_synthesizer,
 )
 from gcd_model.config import SMALL
+from gcd_model.errors import OptionError
 from gcd_train.cli.gallery import gallery_command
 from gcd_train.errors import DataError
-from gcd_train.look.gallery import ViewRecipe, mounted, view_window
+from gcd_train.look.gallery import ViewRecipe, mounted, paths, view_window
 from gcd_train.look.real_video import WindowChoice, Windowed, find_videos, kept_share, read_windows
 
 T, H, W = 4, 32, 64
@@ -178,6 +181,17 @@ def test_each_angle_is_a_row_below_the_input() -> None:
     assert np.array_equal(viewed.strips[1].frames[0], viewed.strips[0].frames[0])
 
 
+def test_goals_are_counted_from_where_the_source_camera_stands() -> None:
+    high = ViewRecipe(
+        angles=(SphericalDelta(azimuth_deg=40.0),), source=Spherical(azimuth_deg=0.0, elevation_deg=50.0, radius_m=15.0)
+    )
+    usual, told = (paths(traits(), each)[0][1] for each in (replace(high, source=None), high))
+    assert (usual.source, told.source) == (ASSUMED_SOURCE, high.source)
+    assert not torch.allclose(usual.source_from_target[-1], told.source_from_target[-1], atol=0.5)
+    with pytest.raises(OptionError):
+        paths(traits("driving"), replace(high, angles=()))
+
+
 def test_samples_come_with_their_uncertainty() -> None:
     viewed = view_window(Mirror(traits()), a_window(), ViewRecipe(angles=(SphericalDelta(azimuth_deg=9.0),), samples=2))
     names = [strip.name for strip in viewed.strips]
@@ -232,6 +246,8 @@ def test_the_command_shows_good_videos_and_names_bad_ones(tmp_path: Path, weight
     [
         (["--angles", "30,15"], 78, "takes no camera command"),
         (["--angles", "left"], 78, "--angles wants AZIMUTH,ELEVATION,RADIUS"),
+        (["--source-elevation-deg", "50"], 78, "has no use for --source-elevation-deg"),
+        (["--source-radius", "-1"], 78, "radius must be positive"),
         ([], 66, "none of 1 videos can be shown"),
     ],
 )

@@ -355,9 +355,10 @@ class TestCommand:
             (["data", "--pairs", "--compact"], "give one"),
         ],
     )
-    def test_contradictions_are_refused(self, tmp_path: Path, options: list[str], said: str) -> None:
+    @pytest.mark.parametrize("world", ["driving", "drop", "tabletop"])
+    def test_contradictions_are_refused(self, tmp_path: Path, world: str, options: list[str], said: str) -> None:
         options = [str(tmp_path / "data") if option == "data" else option for option in options]
-        made = CliRunner().invoke(app, ["generate", "driving", *options])
+        made = CliRunner().invoke(app, ["generate", world, *options])
         assert made.exit_code == RecipeError.exit_code
         assert said in made.output
         assert inside(tmp_path) == []

@@ -78,14 +78,14 @@ def test_a_table_of_the_paper_has_its_rows_and_nobody_is_given_a_printed_figure(
 
 
 def test_a_released_run_also_has_its_own_figures_over_all_frames(tmp_path: Path) -> None:
-    for protocol in ("released", "paper"):
+    for protocol in ("release", "paper"):
         keeper = RunKeeper(tmp_path / protocol)
         keeper.begin(note(methods={"gradual-90": WEIGHTS, "b": {}}, kind="kubric", protocol=protocol))
         for each in (*records("gradual-90"), *records("b")):
             first = {"all": region((99.0, *(each.regions["all"].psnr_db or ((),))[0][1:]))}
             keeper.keep(msgspec.structs.replace(each, regions={**each.regions, **first}))
     choices = Choices(drawn=False, worst=0)
-    text = make_report([tmp_path / "released"], tmp_path / "out", choices).read_text()
+    text = make_report([tmp_path / "release"], tmp_path / "out", choices).read_text()
     assert f"all {FRAMES} frames" in text
     assert text.index("all_frames.csv") < text.index("table4.csv")
     every, table4 = (
@@ -204,8 +204,8 @@ def test_a_method_measured_with_lpips_in_one_run_and_frames_that_were_moved_stay
 
 
 def test_the_same_clips_measured_in_another_way_are_refused() -> None:
-    one, two = (run(note(protocol=name), records("a"), folder=name) for name in ("paper", "released"))
-    with pytest.raises(RunError, match="released has protocol released, paper has paper"):
+    one, two = (run(note(protocol=name), records("a"), folder=name) for name in ("paper", "release"))
+    with pytest.raises(RunError, match="release has protocol release, paper has paper"):
         gather([one, two])
 
 

@@ -12,7 +12,10 @@ import pytest
 from tiny_scenes4d import draw, kubric_poses, write_driving, write_kubric
 from typer.testing import CliRunner
 
+from gcd_model import FAMILIES, Traits
+from gcd_model.config import SVD_14
 from gcd_model.geometry import Spherical
+from gcd_model.weights.families import FamilyName
 from gcd_train.cli.main import app
 from gcd_train.datasets.clip_frames import FrameSampling
 from gcd_train.datasets.trajectories import OrbitSampling
@@ -20,7 +23,6 @@ from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.clips import EvaluationSet
 from gcd_train.evaluation.opening import Choice, SceneCuts, open_scenes, public_split, public_split_names
 from gcd_train.evaluation.protocol import (
-    PAPER_SOURCE,
     RELEASED_SOURCE,
     DrawnControls,
     FrameBounds,
@@ -61,18 +63,48 @@ def opened(root: Path, cuts: SceneCuts, **choice: object) -> EvaluationSet:
 # --- which clips ---------------------------------------------------------------------------------------------------
 
 
-def test_drawn_clips_start_at_the_papers_source_and_stay_in_bounds() -> None:
-    for scene in ("scn02900", "scn02999"):
-        for name in DRAWN.names(scene):
-            control = DRAWN.control(scene, name, 60)
-            assert control.start == PAPER_SOURCE == Spherical(azimuth_deg=15.0, elevation_deg=5.0, radius_m=15.0)
-            assert control.goal is not None
-            change = control.goal - PAPER_SOURCE
+def test_the_paper_goes_from_one_part_of_a_scene_seen_by_one_low_camera_to_four_goals_in_bounds() -> None:
+    sources: set[Spherical] = set()
+    for scene in (f"scn{number:05d}" for number in range(2900, 2950)):
+        each = [DRAWN.control(scene, name, 60) for name in DRAWN.names(scene)]
+        assert len({(one.start, one.frame_start, one.frame_skip) for one in each}) == 1
+        start, goals = each[0].start, [one.goal for one in each if one.goal is not None]
+        assert start is not None
+        sources.add(start)
+        assert len(set(goals)) == 4
+        for change in (goal - start for goal in goals):
             assert abs(change.azimuth_deg) <= 90
             assert -5 <= change.elevation_deg <= 30
             assert abs(change.radius_m) <= 3
-            assert control.frame_skip in (1, 2)
-            assert 0 <= control.frame_start <= 6
+        assert each[0].frame_skip in (1, 2)
+        assert 0 <= each[0].frame_start <= 6
+    assert {source.elevation_deg for source in sources} == {5.0}
+    assert {int(source.azimuth_deg // 90) for source in sources} == {0, 1, 2, 3}
+    assert min(source.radius_m for source in sources) < 13 < 17 < max(source.radius_m for source in sources)
+
+
+def test_variants_of_one_table_are_measured_at_the_same_goals(kubric: Path) -> None:
+    cuts = replace(KUBRIC, bounds=FrameBounds())
+    names: tuple[FamilyName, ...] = ("kubric90", "kubric180")
+    each = [SceneCuts.suiting(traits(name, move_time)) for name in names for move_time in (0, 13)]
+    clips = [
+        opened(kubric, replace(cuts, far=one.far, gradual=one.gradual)).clip("scn02901.sample_02").change
+        for one in each
+    ]
+    assert clips == [clips[0]] * 4
+    assert abs((clips[0] or (999.0,))[0]) <= 90
+
+
+def traits(family: FamilyName, move_time: int) -> Traits:
+    return Traits(
+        name=family,
+        config=SVD_14,
+        family=FAMILIES[family],
+        move_time=move_time,
+        sha256_12="0" * 12,
+        precision="float32",
+        device="cpu",
+    )
 
 
 def test_a_scene_has_the_same_clips_whatever_others_there_are_and_another_seed_has_others() -> None:
@@ -146,7 +178,7 @@ def test_cameras_that_no_scene_has_are_refused_at_once(kubric: Path, driving: Pa
 def test_rates_follow_the_strides(kubric: Path, tmp_path: Path) -> None:
     drawn = opened(kubric, replace(KUBRIC, bounds=FrameBounds(), protocol="paper"))
     assert (drawn.fps, tuple(drawn.rates)) == (24.0, (24.0, 12.0, 8.0, 6.0))
-    released = opened(kubric, replace(KUBRIC, bounds=FrameBounds(), protocol="released"))
+    released = opened(kubric, replace(KUBRIC, bounds=FrameBounds(), protocol="release"))
     assert (released.fps, tuple(released.rates)) == (12.0, (12.0,))
     listed = opened(kubric, replace(KUBRIC, bounds=FrameBounds(), controls=controls(tmp_path, ["scn02900"])))
     assert tuple(listed.rates) == (24.0,)
@@ -157,7 +189,7 @@ def test_bounds_win_over_controls_in_the_released_protocol_only(kubric: Path, tm
     listed = replace(KUBRIC, controls=controls(tmp_path, ["scn02900"]))
     with pytest.raises(RecipeError, match="the paper's protocol takes frames from the controls"):
         opened(kubric, listed)
-    released = opened(kubric, replace(listed, protocol="released"))
+    released = opened(kubric, replace(listed, protocol="release"))
     assert released.keys == ("scn02900.sample_00",)
 
 

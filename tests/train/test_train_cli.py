@@ -1,3 +1,5 @@
+import importlib
+import inspect
 import subprocess
 import sys
 from pathlib import Path
@@ -8,7 +10,7 @@ import typer
 from typer.testing import CliRunner
 
 from gcd_train.cli.errors import errors_shown
-from gcd_train.cli.main import app
+from gcd_train.cli.main import COMMANDS, app
 from gcd_train.errors import RunError
 
 
@@ -61,12 +63,6 @@ def test_another_error_of_the_program_stays_a_traceback() -> None:
         raise RuntimeError("shape mismatch")
 
 
-def test_architectures_lists_all_set_ups() -> None:
-    result = CliRunner().invoke(app, ["architectures"], env={"COLUMNS": "200"})
-    assert "320, 640, 1280, 1280" in result.stdout
-    assert "PLAIN_SMALL" in result.stdout
-
-
 @pytest.mark.parametrize("module", ["gcd_model", "gcd_node", "gcd_node.cli.main", "gcd_train.cli.main"])
 def test_the_core_imports_without_cameras_gpu_ros_and_onnx(module: str) -> None:
     blocked = (
@@ -83,3 +79,15 @@ def test_the_core_imports_without_cameras_gpu_ros_and_onnx(module: str) -> None:
     code = f"import sys; sys.modules.update(dict.fromkeys({blocked!r})); import {module}; print('imported')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.stdout.strip() == "imported", done.stderr
+
+
+def test_help_imports_no_torch_and_says_of_each_command_what_it_says_itself() -> None:
+    code = "import sys; from gcd_train.cli.main import main; sys.argv = ['gcd-train', '--help']\n"
+    code += "try: main()\nfinally: print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.stdout.splitlines()[-1] == "False", done.stderr
+    for name, (place, summary) in COMMANDS.items():
+        module, _, attribute = place.partition(":")
+        command = getattr(importlib.import_module(f"gcd_train.cli.{module}"), attribute)
+        told = str(command.info.help if isinstance(command, typer.Typer) else inspect.getdoc(command))
+        assert " ".join(told.split("\n\n")[0].split()) == summary, name

@@ -135,7 +135,7 @@ def test_starts_and_strides_are_those_of_the_release() -> None:
 def test_the_last_frame_can_be_reached_by_choice() -> None:
     sampling = FrameSampling(reach_last=True)
     assert sampling.draw(generator(0, 0), 14)[0] == tuple(range(14))
-    with pytest.raises(DataError, match="too short: 14 frames hold no clip of 14 at stride 1"):
+    with pytest.raises(DataError, match=r"clip of 14 at stride 1 wants 15 frames \(the last is left out.*\), got 14"):
         FrameSampling().draw(generator(0, 0), 14)
 
 

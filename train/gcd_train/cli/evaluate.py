@@ -43,14 +43,14 @@ Privileged = Annotated[list[str] | None, Option(help="NAME of --predictions that
 HexPlaneUpdates = Annotated[int, Option("--hexplane-updates", min=1, help="hexplane_K: steps of learning a clip.")]
 HexPlaneRays = Annotated[int, Option("--hexplane-rays", min=1, help="hexplane_K: rays in each of these steps.")]
 LpipsWeights = Annotated[Path | None, Option("--lpips", help="Folder with LPIPS weights; without, no such figure.")]
-ProtocolName = Annotated[Literal["paper", "released"], Option(help="How clips are cut from whole scenes.")]
+ProtocolName = Annotated[Literal["paper", "release"], Option(help="How clips are cut from whole scenes.")]
 Controls = Annotated[Path | None, Option(help="Scenes: control list, JSON.")]
 Split = Annotated[str | None, Option(help="Only scenes of a split: a name as driving-test, or FILE:test.")]
 Listed = Annotated[Path | None, Option("--list", help="Scenes: only those of a list, one a line.")]
-Trajectories = Annotated[int | None, Option(min=1, help="Scenes: clips of each; by default 4, or 1 if released.")]
+Trajectories = Annotated[int | None, Option(min=1, help="Scenes: clips of each; by default 4 (paper, Kubric-4D) or 1.")]
 FrameStart = Annotated[int | None, Option(min=0, help="Scenes: first frame of every clip.")]
 FrameSkip = Annotated[int | None, Option(min=1, help="Scenes: frames from one of the clip to the next.")]
-Angles = Annotated[Literal["max90", "max180"] | None, Option(help="Scenes: how far goals are drawn; as the weights.")]
+Angles = Annotated[Literal["max90", "max180"] | None, Option(help="Scenes: how far goals are drawn; by default max90.")]
 PathKind = Annotated[Literal["gradual", "direct"] | None, Option(help="Scenes: as the weights by default.")]
 Modality = Annotated[Literal["rgb", "semantic"] | None, Option(help="Scenes: targets; as the weights by default.")]
 Exact = Annotated[bool, Option("--exact", help="Our scenes: targets from their geometry instead of from points.")]
@@ -148,7 +148,7 @@ def _evaluate(
     for line in account.lines():
         _say(line)
     rows = complete_rows(keeper, list(work.makers), plan.clips.keys, account.records)
-    summary = plan.summary(rows)
+    summary = plan.summary(rows, account.failed())
     text = to_markdown(summary)
     write_summary(summary, text, out)
     keys = [record.key for record in next(iter(rows.values())) if record.key in work.sheet]

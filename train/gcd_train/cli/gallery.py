@@ -15,7 +15,7 @@ from gcd_train.cli.progress_bar import progress_bar
 from gcd_train.errors import DataError, RecipeError
 
 if TYPE_CHECKING:
-    from gcd_model import SphericalDelta, ViewSynthesizer
+    from gcd_model import Spherical, SphericalDelta, Trajectory, ViewSynthesizer
     from gcd_train.look.gallery import Viewed, ViewRecipe
     from gcd_train.look.real_video import RealVideo, WindowChoice
 
@@ -33,10 +33,14 @@ def gallery_command(
     windows: Annotated[int, Option(min=1, help="At most so many windows of each video.")] = 2,
     start: Annotated[float, Option(min=0.0, help="Where the first window begins, seconds.")] = 0.0,
     rate: Annotated[float | None, Option(min=0.1, help="Frames a second of folders of pictures.")] = None,
-    hfov: Annotated[
+    hfov_deg: Annotated[
         float | None,
         Option(min=1.0, max=179.0, help="Field of view of the videos, degrees across; cut to the model's."),
     ] = None,
+    source_elevation_deg: Annotated[
+        float | None, Option(help="Where a steered model's source camera stands, above its centre. Else 5.")
+    ] = None,
+    source_radius: Annotated[float | None, Option(help="Its distance to the scene's centre. Else 15.")] = None,
     mount_height: Annotated[
         float | None, Option(min=0.1, help="Driving: height of the camera above the road, metres; else as trained.")
     ] = None,
@@ -62,14 +66,17 @@ def gallery_command(
             samples=samples,
             steps=steps,
             seed=seed,
+            source=_source(source_elevation_deg, source_radius),
             height_m=mount_height,
             tilt_deg=mount_tilt,
         )
         model = load_synthesizer(weights, family=family, device=device, dtype=dtype)
-        paths(model.traits, recipe)  # refuses what cannot be viewed before any video is read
-        choice = WindowChoice(count=windows, start_s=start, rate=rate, hfov_deg=hfov)
+        assumed = _assumed(paths(model.traits, recipe), recipe)  # refused before any video is read
+        choice = WindowChoice(count=windows, start_s=start, rate=rate, hfov_deg=hfov_deg)
         viewed, faults = _viewed(found, model, choice, recipe, out)
-        write_page(viewed, faults, _facts(model, recipe), out / "index.html")
+        write_page(viewed, faults, [*_facts(model, recipe), *assumed], out / "index.html")
+        for _, told in assumed:
+            _LOG.print(f"source camera: {told}", markup=False, soft_wrap=True)
         if not viewed:
             raise DataError(f"none of {len(found)} videos can be shown; {faults[0]}")
     _LOG.print(f"wrote {out}/index.html: {len(viewed)} windows", markup=False, soft_wrap=True)
@@ -87,6 +94,28 @@ def _angles(text: str) -> "SphericalDelta":
         raise RecipeError(f"--angles wants AZIMUTH,ELEVATION,RADIUS in numbers such as 30,15,0, got {text!r}")
     azimuth_deg, elevation_deg, radius_m = (*numbers, 0.0, 0.0)[:3]
     return SphericalDelta(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, radius_m=radius_m)
+
+
+def _source(elevation_deg: float | None, radius: float | None) -> "Spherical | None":
+    """None where neither is given. Raises PoseError for what is no camera."""
+    from gcd_model import ASSUMED_SOURCE, Spherical
+
+    if elevation_deg is None and radius is None:
+        return None
+    return Spherical(
+        azimuth_deg=ASSUMED_SOURCE.azimuth_deg,
+        elevation_deg=ASSUMED_SOURCE.elevation_deg if elevation_deg is None else elevation_deg,
+        radius_m=ASSUMED_SOURCE.radius_m if radius is None else radius,
+    )
+
+
+def _assumed(paths: "Sequence[tuple[str, Trajectory]]", recipe: "ViewRecipe") -> list[tuple[str, str]]:
+    """Where a steered model's source camera is taken to stand, if nobody said it."""
+    start = paths[0][1].source
+    if start is None or recipe.source is not None or (recipe.height_m, recipe.tilt_deg) != (None, None):
+        return []
+    stands = f"taken to stand at an elevation of {start.elevation_deg:g} degrees and a radius of {start.radius_m:g}"
+    return [("source camera", f"{stands}; say where with --source-elevation-deg and --source-radius")]
 
 
 def _viewed(

@@ -25,7 +25,8 @@ from gcd_train.scenes.writer import generate
 
 app = typer.Typer(no_args_is_help=True, help="Make training data with a procedural world (extra `scenes`).")
 
-Folder = Annotated[Path, typer.Argument(help="Folder for the scenes; those that are there are kept.")]
+Folder = Annotated[Path | None, typer.Argument(help="As --out.", metavar="OUT")]
+Out = Annotated[Path | None, typer.Option("--out", help="Folder for the data; what is there is kept.")]
 Scenes = Annotated[int | None, typer.Option(min=1, help="How many scenes, one a seed; by default 1.")]
 FirstSeed = Annotated[int, typer.Option(min=0, help="Seed of the first; held-out sets start at 1000000.")]
 Workers = Annotated[int | None, typer.Option(min=1, help="Processes; by default one a core.")]
@@ -49,7 +50,8 @@ def about() -> None:
 
 @app.command()
 def drop(
-    out: Folder,
+    folder: Folder = None,
+    out: Out = None,
     scenes: Scenes = None,
     pairs: Pairs = False,
     clips: Clips = None,
@@ -70,19 +72,20 @@ def drop(
     With --pairs or --clips: a camera that stands, and one that goes round, 192x128 and 14 frames at 12 Hz by default.
     """
     with errors_shown():
-        world = SCENE_WORLDS["drop"]
+        world, place = SCENE_WORLDS["drop"], _one_folder(folder, out)
         if _wants_pairs(pairs, clips, scenes, compact):
             form = PairForm.of(width, height, frames, oversample, clips_per_shard)
             made = orbit_world(world, form, clips_per_scene=clips_per_scene)
-            _make_pairs(out, made, made.seeds_of(first_seed, clips or 100), workers, ray, contact_sheet)
+            _make_pairs(place, made, made.seeds_of(first_seed, clips or 100), workers, ray, contact_sheet)
             return
         form = _form(world, compact, oversample, frames, width, height)
-        _make_scenes(world, out, form, _seeds(first_seed, scenes), workers, ray, contact_sheet)
+        _make_scenes(world, place, form, _seeds(first_seed, scenes), workers, ray, contact_sheet)
 
 
 @app.command()
 def tabletop(
-    out: Folder,
+    folder: Folder = None,
+    out: Out = None,
     scenes: Scenes = None,
     pairs: Pairs = False,
     clips: Clips = None,
@@ -103,20 +106,20 @@ def tabletop(
     With --pairs or --clips: a camera that stands, and one that goes round, 192x128 and 14 frames at 12 Hz by default.
     """
     with errors_shown():
-        world = SCENE_WORLDS["tabletop"]
+        world, place = SCENE_WORLDS["tabletop"], _one_folder(folder, out)
         if _wants_pairs(pairs, clips, scenes, compact):
             form = PairForm.of(width, height, frames, oversample, clips_per_shard)
             made = orbit_world(world, form, clips_per_scene=clips_per_scene)
-            _make_pairs(out, made, made.seeds_of(first_seed, clips or 100), workers, ray, contact_sheet)
+            _make_pairs(place, made, made.seeds_of(first_seed, clips or 100), workers, ray, contact_sheet)
             return
         form = _form(world, compact, oversample, frames, width, height)
-        _make_scenes(world, out, form, _seeds(first_seed, scenes), workers, ray, contact_sheet)
+        _make_scenes(world, place, form, _seeds(first_seed, scenes), workers, ray, contact_sheet)
 
 
 @app.command()
 def driving(
-    folder: Annotated[Path | None, typer.Argument(help="As --out.", metavar="[OUT]")] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for the data; an unfinished one is continued.")] = None,
+    folder: Folder = None,
+    out: Out = None,
     scenes: Scenes = None,
     pairs: Pairs = False,
     clips: Clips = None,
@@ -210,7 +213,7 @@ def _wants_pairs(pairs: bool, clips: int | None, scenes: int | None, compact: bo
 
 def _one_folder(argument: Path | None, option: Path | None) -> Path:
     if (argument is None) == (option is None):
-        raise RecipeError("give one folder for the data: gcd-train generate driving OUT, or --out OUT")
+        raise RecipeError("give one folder for the data, OUT or --out OUT")
     return argument or option or Path()
 
 

@@ -1,103 +1,93 @@
 """`gcd-train`: data, training and evaluation from the command line."""
 
-from typing import Annotated
+import sys
+from collections.abc import Collection
+from importlib import import_module
 
 import typer
-from rich.box import SIMPLE
-from rich.console import Console
-from rich.table import Table
 
-from gcd_model import FAMILIES, Family, ModelConfig
-from gcd_model.config import PLAIN_SMALL, SMALL, SVD_14
-from gcd_train.cli import bench, generate, lerobot, lora
-from gcd_train.cli.cache import cache
-from gcd_train.cli.calibrate import calibrate_command
-from gcd_train.cli.distill import distill
-from gcd_train.cli.evaluate import evaluate_command
-from gcd_train.cli.gallery import gallery_command
-from gcd_train.cli.report import report_command
-from gcd_train.cli.show import show
-from gcd_train.cli.train import recipes, train
-from gcd_train.cli.verify import verify_command
-
-app = typer.Typer(
-    no_args_is_help=True,
-    rich_markup_mode="rich",
-    help="Data, training and evaluation for virtual camera views.",
-)
-
-
-app.add_typer(generate.app, name="generate")
-app.add_typer(bench.app, name="bench")
-app.add_typer(lerobot.app, name="export")
-app.add_typer(lora.app, name="lora")
-app.command()(cache)
-app.command("calibrate")(calibrate_command)
-app.command()(distill)
-app.command("evaluate")(evaluate_command)
-app.command("gallery")(gallery_command)
-app.command("lerobot")(lerobot.lerobot_command)
-app.command("report")(report_command)
-app.command()(show)
-app.command()(recipes)
-app.command()(train)
-app.command("verify")(verify_command)
-
-
-@app.callback()
-def about() -> None:
-    """Keep `gcd-train` a command with sub-commands, however many there are."""
-
-
-@app.command()
-def families(
-    name: Annotated[str | None, typer.Argument(help="Show one family only.", metavar="FAMILY")] = None,
-) -> None:
-    """List the model families: how each was trained, and what a finetuned checkpoint will accept."""
-    if name is not None and name not in FAMILIES:
-        raise typer.BadParameter(f"no family is called {name!r}; there are {', '.join(FAMILIES)}")
-    table = Table(title="Model families", box=SIMPLE, pad_edge=False, padding=(0, 0))
-    for column in ("family", "camera", "az / el / r", "rates", "hfov", "size"):
-        table.add_column(column, no_wrap=True)
-    for family in FAMILIES.values():
-        if name in (None, family.name):
-            table.add_row(*_family_row(family))
-    Console().print(table)
+COMMANDS = {
+    "bench": ("bench:app", "Measure on this machine."),
+    "cache": ("cache:cache", "Encode a driving set once, so that training never runs the frozen encoders again."),
+    "calibrate": (
+        "calibrate:calibrate_command",
+        "Measure how often the truth lies within the intervals of the samples, and the scale that makes it as meant.",
+    ),
+    "data": ("data:app", "Downloaded data sets: repacking."),
+    "distill": (
+        "distill:distill",
+        "Teach a student to do in a few steps what its teacher does in many, or go on where that stopped.",
+    ),
+    "evaluate": (
+        "evaluate:evaluate_command",
+        "Measure weights, baselines and others' frames on held-out clips, and say what is reached.",
+    ),
+    "export": ("lerobot:app", "Write data in other programs' formats."),
+    "families": (
+        "families:families_command",
+        "List the model families: how each was trained, and what a finetuned checkpoint will accept.",
+    ),
+    "gallery": (
+        "gallery:gallery_command",
+        "View real videos from other cameras: sheets, videos, and a page of them all. A bad video is one line.",
+    ),
+    "generate": ("generate:app", "Make training data with a procedural world (extra `scenes`)."),
+    "lerobot": (
+        "lerobot:lerobot_command",
+        "Read pairs of cameras of a LeRobot data set as training would, and say what was left out.",
+    ),
+    "lora": ("lora:app", "Adapters that a run with model.train = lora writes, and their bases."),
+    "recipes": ("train:recipes", "List the recipes that ship, or show one whole: on its bases, with every default."),
+    "report": (
+        "report:report_command",
+        "Write the paper's tables, or the same for our own clips, from what was measured; nothing is measured again.",
+    ),
+    "show": ("show:show", "Contact sheet, video, camera path and facts of one clip of a scene (extra `train`)."),
+    "train": (
+        "train:train",
+        "Train a model on clips, or go on where a run stopped. Ctrl-C stops after the update and saves.",
+    ),
+    "verify": (
+        "verify:verify_command",
+        "Compare every file of generated scenes with its SHA-256; exit code 66 and the files' names if one differs.",
+    ),
+}
+"""Where each command stands in this package, and what its help begins with: only the one that is asked for is imported,
+as torch takes seconds."""
 
 
-@app.command()
-def architectures() -> None:
-    """List the network set-ups with their sizes."""
-    table = Table(title="Network set-ups")
-    for column in ("set-up", "size", "frames", "U-Net widths", "VAE widths", "image tower", "steps"):
-        table.add_column(column)
-    for name, config in (("SVD_14", SVD_14), ("PLAIN_SMALL", PLAIN_SMALL), ("SMALL", SMALL)):
-        table.add_row(name, *_config_row(config))
-    Console().print(table)
-
-
-def _family_row(family: Family) -> tuple[str, ...]:
-    limits = family.limits
-    span = "fixed"
-    if limits is not None:
-        span = f"±{limits.azimuth_deg:g}° ±{limits.elevation_deg:g}° ±{limits.radius_m:g}"
-    rates = ", ".join(f"{rate:g}" for rate in family.rates) or "any"
-    hfov = "any" if family.hfov_deg is None else f"{family.hfov_deg:g}°"
-    return family.name, family.camera, span, rates, hfov, f"{family.width}x{family.height}"
-
-
-def _config_row(config: ModelConfig) -> tuple[str, ...]:
-    tower = config.image_encoder
-    return (
-        f"{config.width}x{config.height}",
-        str(config.frames),
-        ", ".join(map(str, config.unet.widths)),
-        ", ".join(map(str, config.vae.widths)),
-        "none" if tower is None else f"{tower.layers} x {tower.width}",
-        str(config.sampling.steps),
+def new_app(loaded: Collection[str]) -> typer.Typer:
+    """`gcd-train` with these commands, and of the others their names."""
+    app = typer.Typer(
+        no_args_is_help=True,
+        rich_markup_mode="rich",
+        help="Data, training and evaluation for virtual camera views.",
     )
+    app.callback()(_several)
+    for name, (place, summary) in COMMANDS.items():
+        if name not in loaded:
+            app.command(name, help=summary)(lambda: None)  # for the list of commands alone
+            continue
+        module, _, attribute = place.partition(":")
+        command = getattr(import_module(f"gcd_train.cli.{module}"), attribute)
+        if isinstance(command, typer.Typer):
+            app.add_typer(command, name=name)
+        else:
+            app.command(name)(command)
+    return app
+
+
+def __getattr__(name: str) -> typer.Typer:
+    """`app`: with every command."""
+    if name != "app":
+        raise AttributeError(name)
+    return new_app(COMMANDS)
+
+
+def _several() -> None:
+    """It has sub-commands, however many there are."""
 
 
 def main() -> None:
     """Entry point."""
-    app()
+    new_app([next((word for word in sys.argv[1:] if not word.startswith("-")), "")])()

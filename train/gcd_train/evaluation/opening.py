@@ -27,7 +27,6 @@ from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.clips import EvaluationSet, PairedSet, chosen
 from gcd_train.evaluation.protocol import (
     AS_PLANNED,
-    CLIPS,
     SAMPLES,
     ClipControls,
     DrawnControls,
@@ -39,6 +38,7 @@ from gcd_train.evaluation.protocol import (
     released_controls,
     require_cameras,
     scene_number,
+    usual_clips,
 )
 from gcd_train.evaluation.scene_clips import SceneSet
 from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
@@ -176,8 +176,6 @@ DataKind: TypeAlias = Literal["pairs", "kubric4d", "parallel_domain4d"]
 
 _DIGITS = 12
 _SMALL_BYTES = 4 << 20
-_NEAR_DEG = 90.0
-"""Families that were trained up to this azimuth have goals drawn up to it, others up to 180 degrees."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -212,7 +210,6 @@ class SceneCuts:
             return cls()
         family, config = model.family, model.config
         return cls(
-            far=family is not None and family.limits is not None and family.limits.azimuth_deg > _NEAR_DEG,
             gradual=model.move_time > 0,
             semantic=family is not None and family.output == "semantic",
             frames=config.frames,
@@ -290,7 +287,7 @@ def open_scenes(folder: Path, choice: Choice, cuts: SceneCuts) -> tuple[Evaluati
         class_ids=cuts.semantic,
         visible=True,
         exact=cuts.exact,
-        published=cuts.protocol == "released",
+        published=cuts.protocol == "release",
     )
     clips = SceneSet(
         pairs=pairs,
@@ -320,19 +317,19 @@ def _dataset(folder: Path, cuts: SceneCuts, *, orbits: bool) -> Kubric4D | Paral
         return ParallelDomain4D.open(folder, cameras=cuts.cameras or names, classes=cuts.semantic)
     if cuts.semantic:
         raise RecipeError("Kubric-4D has no classes: leave out --modality semantic")
-    return Kubric4D.open(folder, cameras=cuts.cameras or names, published=cuts.protocol == "released")
+    return Kubric4D.open(folder, cameras=cuts.cameras or names, published=cuts.protocol == "release")
 
 
 def _controls(cuts: SceneCuts, scenes: Sequence[str], *, orbits: bool) -> ClipControls:
-    clips = CLIPS[cuts.protocol] if cuts.clips is None else cuts.clips
+    clips = usual_clips(cuts.protocol, orbit=orbits) if cuts.clips is None else cuts.clips
     if cuts.controls is not None:
         if cuts.protocol == "paper" and cuts.bounds != AS_PLANNED:
             raise RecipeError(
                 "the paper's protocol takes frames from the controls; leave out --frame-start and --frame-skip, or "
-                "give --protocol released"
+                "give --protocol release"
             )
         return ListedControls(controls=read_controls(cuts.controls), clips=clips, bounds=cuts.bounds)
-    if cuts.protocol == "released":
+    if cuts.protocol == "release":
         return ListedControls(controls=released_controls(scenes, orbit=orbits), clips=clips, bounds=cuts.bounds)
     sampling = _sampling(cuts, orbits=orbits)
     orbit = sampling if isinstance(sampling, OrbitSampling) else None

@@ -177,10 +177,10 @@ class Plan:
             methods={method.name: {**method.told, **lpips} for method in self.methods},
         )
 
-    def summary(self, rows: Mapping[str, Sequence[ClipRecord]]) -> Summary:
-        """What was found. rows: records by method, of the same clips in their order."""
+    def summary(self, rows: Mapping[str, Sequence[ClipRecord]], failed: tuple[str, ...] = ()) -> Summary:
+        """What was found. rows: records by method, of the same clips in their order. failed: see `Conditions`."""
         clips, options, model = self.clips, self.options, self.model
-        released, pairs = options.protocol == "released", clips if isinstance(clips, PairedSet) else None
+        released, pairs = options.protocol == "release", clips if isinstance(clips, PairedSet) else None
         selection = Selection(frames="all") if released else Selection()
         found = {name: evaluation(records, selection, classes=len(clips.classes)) for name, records in rows.items()}
         names = [method.name for method in self.models]
@@ -201,6 +201,7 @@ class Plan:
                 train_clips=0 if self.training is None else len(self.training),
                 samples=options.sampling.samples,
                 first_frame=1 if released else 2,
+                failed=failed,
             ),
             classes=tuple(each.name for each in clips.classes),
             model=tuple(found[name] for name in names if name in found),
@@ -301,7 +302,7 @@ def _cuts(options: EvaluateOptions, model: Traits | None) -> SceneCuts:
         clips=options.trajectories,
         seed=options.seed,
         bounds=FrameBounds(start=options.frame_start, skip=options.frame_skip),
-        far=suiting.far if options.angles is None else options.angles == "max180",
+        far=options.angles == "max180",
         gradual=suiting.gradual if options.path is None else options.path == "gradual",
         semantic=suiting.semantic if options.modality is None else options.modality == "semantic",
         exact=options.exact,
@@ -357,7 +358,7 @@ def _baselines(
         dtype=options.dtype,
         samples=options.sampling.samples,
         seed=options.seed,
-        published=options.protocol == "released",
+        published=options.protocol == "release",
         hexplane=options.hexplane,
     )
     further = len(clips.dataset.cameras) - 1 if isinstance(clips, SceneSet) else 0  # pairs have one camera

@@ -112,7 +112,7 @@ def all_plots(measured: Measured) -> tuple[Plot, ...]:
 def error_by_angle(measured: Measured) -> Plot:
     """PSNR of the last frame over the angle that the camera has turned by, |azimuth|; no curve on one path for all.
 
-    Source: GCD, the study of angles in section 5: error against the rotation about the scene.
+    Source: GCD, the study of angles in appendix B.2: error against the rotation about the scene.
     """
     curves: list[Curve] = []
     for method in measured.of.methods:

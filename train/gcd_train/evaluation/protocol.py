@@ -1,8 +1,9 @@
 """Which clips of whole scenes are measured: as in the paper, or as its released test script does.
 
-Paper: four clips of each scene. In Kubric-4D the source is the camera at azimuth 15 and elevation 5 degrees, 15 m away,
-and goals are drawn; a control list fixes both, and the frames. Source: Van Hoorick et al. 2024 (GCD), section 5.
-Released: the first clip of each scene's controls, or the script's own angles; frames of the command line win.
+Paper: one part of each scene's video, in Kubric-4D seen on the way to four goals. The source stands at an elevation of
+5 degrees, all else is drawn, goals up to 90 degrees away whatever the model; a control list fixes all of it. Source:
+Van Hoorick et al. 2024 (GCD), appendix.
+Release: the first clip of each scene's controls, or the script's own angles; frames of the command line win.
 """
 
 from collections.abc import Sequence
@@ -21,20 +22,23 @@ from gcd_train.datasets.trajectories import OrbitSampling, generator
 from gcd_train.errors import DataError
 from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
 
-ProtocolName: TypeAlias = Literal["paper", "released"]
+ProtocolName: TypeAlias = Literal["paper", "release"]
 
-PAPER_SOURCE = Spherical(azimuth_deg=15.0, elevation_deg=5.0, radius_m=15.0)
-"""Where the source camera stands in Kubric-4D's evaluation: the data set's view 4."""
+PAPER_ELEVATION_DEG = 5.0
+"""How high the source camera stands in the paper's evaluation on Kubric-4D."""
 RELEASED_SOURCE = Spherical(azimuth_deg=20.0, elevation_deg=10.0, radius_m=15.0)
 """Where the released script's source camera stands without controls."""
 RELEASED_CHANGE = SphericalDelta(azimuth_deg=30.0, elevation_deg=15.0, radius_m=0.0)
 """Where it goes from there."""
 RELEASED_START, RELEASED_SKIP = 0, 2
 """First frame and stride of the released script."""
-CLIPS: dict[ProtocolName, int] = {"paper": 4, "released": 1}
-"""Clips of each scene."""
-SAMPLES: dict[ProtocolName, int] = {"paper": 4, "released": 2}
+SAMPLES: dict[ProtocolName, int] = {"paper": 4, "release": 2}
 """Draws of each clip of a scene; of pairs, which no protocol cuts, there is one."""
+
+
+def usual_clips(protocol: ProtocolName, *, orbit: bool) -> int:
+    """Clips of each scene."""
+    return 4 if protocol == "paper" and orbit else 1
 
 
 class ClipControls(Protocol):
@@ -102,15 +106,15 @@ class ListedControls:
 class DrawnControls:
     """Clips drawn from a seed and the scene's number, so that a scene has the same ones in any list.
 
-    clips: of each scene. orbit: bounds of the goals; None in driving, whose path is fixed. frames: how the first frame
-    and the stride are drawn. source: where the source camera stands. bounds: win over what is drawn.
+    clips: of each scene; orbits have one source and the same frames, and differ in the goal. orbit: bounds of source
+    and goals; None in driving, whose path is fixed. frames: how the first frame and the stride are drawn. bounds: win
+    over what is drawn.
     """
 
     seed: int
     clips: int
     frames: FrameSampling
     orbit: OrbitSampling | None = None
-    source: Spherical = PAPER_SOURCE
     bounds: FrameBounds = AS_PLANNED
 
     def names(self, scene: str, /) -> Sequence[str]:
@@ -120,16 +124,15 @@ class DrawnControls:
 
     def control(self, scene: str, name: str, frames: int, /) -> Control:
         """The same whenever it is asked for. Raises DataError if the scene is too short."""
-        rng = generator(self.seed, scene_number(scene), self.names(scene).index(name))
-        change = None if self.orbit is None else self.orbit.change(rng, self.source)
+        seeds, clip = (self.seed, scene_number(scene)), self.names(scene).index(name)
+        if self.orbit is None:
+            start, skip = self._frames(generator(*seeds, clip), frames)
+            return Control(name=name, frame_start=start, frame_skip=skip)
+        rng = generator(*seeds)
         start, skip = self._frames(rng, frames)
-        return Control(
-            name=name,
-            frame_start=start,
-            frame_skip=skip,
-            start=None if change is None else self.source,
-            goal=None if change is None else self.source + change,
-        )
+        source = replace(self.orbit.source(rng), elevation_deg=PAPER_ELEVATION_DEG)
+        goal = source + self.orbit.change(generator(*seeds, 1 + clip), source)
+        return Control(name=name, frame_start=start, frame_skip=skip, start=source, goal=goal)
 
     def strides(self, scene: str, /) -> Sequence[int]:
         """Those that are drawn from, or the one that is bound."""

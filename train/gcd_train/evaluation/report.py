@@ -1,5 +1,6 @@
 """The report as a folder: `report.md`, its tables as CSV, plots, galleries and videos."""
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -142,8 +143,23 @@ def _note_lines(run: Run) -> list[str]:
         ("protocol", f"{note.protocol}, seed {note.seed}"),
         ("size", f"{note.frames} frames of {note.width}x{note.height} at {note.fps:g} fps"),
     )
-    rows = [[name, ", ".join(f"{key} {value}" for key, value in told.items())] for name, told in note.methods.items()]
-    return [*(f"- {name}: {told}" for name, told in facts), "", *markdown_rows(["method", "what it is"], rows)]
+    clips = Counter(record.method for record in run.records)
+    rows = [
+        [name, str(clips[name]), ", ".join(f"{key} {value}" for key, value in told.items())]
+        for name, told in note.methods.items()
+    ]
+    lines = [
+        *(f"- {name}: {told}" for name, told in facts),
+        "",
+        *markdown_rows(["method", "clips", "what it is"], rows),
+    ]
+    without = [name for name in note.methods if not clips[name]]
+    if without:
+        lines += [
+            "",
+            f"**Failed: {', '.join(without)}. No clip was measured; the line of `gcd-train evaluate` says why.**",
+        ]
+    return lines
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -158,7 +174,7 @@ class _Writer:
     @property
     def spans(self) -> tuple[Span, ...]:
         """Frames that tables are over."""
-        return _RELEASED_SPANS if self.of.note.protocol == "released" else _SPANS
+        return _RELEASED_SPANS if self.of.note.protocol == "release" else _SPANS
 
     def sections(self) -> Iterator[str]:
         measured = Measured(of=self.of, seed=self.choices.seed, rows=self.choices.rows)

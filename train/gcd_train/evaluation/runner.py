@@ -157,6 +157,14 @@ class Account:
         """Whether too many clips in a row had no record."""
         return self._in_a_row >= GIVE_UP_AFTER
 
+    def failed(self) -> tuple[str, ...]:
+        """For each method that failed on clips, on how many and why the first time; all of them for clips that could
+        not be read."""
+        reasons: dict[str, list[str]] = {}
+        for what, why in self.failures.items():
+            reasons.setdefault(what.partition(", ")[2] or "every method", []).append(why)
+        return tuple(f"{name} on {len(each)} of {self.clips} clips ({each[0]})" for name, each in reasons.items())
+
     @property
     def exit_code(self) -> int:
         """Of the command."""

@@ -119,7 +119,7 @@ class EvaluatedSet:
 
 
 _KINDS = {"kubric": "Kubric-4D layout", "driving": "Driving", "orbit": "Orbits"}
-_PROTOCOLS = {"paper": "the paper's protocol", "released": "the released script's protocol", "pairs": "pairs of clips"}
+_PROTOCOLS = {"paper": "the paper's protocol", "release": "the released script's protocol", "pairs": "pairs of clips"}
 
 
 def gather(runs: Sequence[Run]) -> tuple[EvaluatedSet, ...]:

@@ -12,7 +12,7 @@ Files appear whole or not at all, so a run that was killed goes on where it stop
 import fcntl
 import re
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias, get_args
@@ -88,7 +88,7 @@ class RunNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     command: the line that began it. made: UTC, ISO 8601. versions: of gcd-node, torch, python. data: folders.
     data_identity: digest of the clips. kind: "kubric", "driving" or "orbit": which tables they belong to.
-    modality: of the target pictures. protocol: "paper", "released" or "pairs". fps: frames per second of the clips.
+    modality: of the target pictures. protocol: "paper", "release" or "pairs". fps: frames per second of the clips.
     rates: empty where all have that one; else all that clips may have, of which `fps` is the highest, and each record
     tells its clip's. classes: names, empty for none.
     methods: name to what it is: a weight file's digest, steps, guidance, draws, seed, views; all as text.
@@ -101,7 +101,7 @@ class RunNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     data_identity: str
     kind: Literal["kubric", "driving", "orbit"]
     modality: Literal["rgb", "semantic"]
-    protocol: Literal["paper", "released", "pairs"]
+    protocol: Literal["paper", "release", "pairs"]
     frames: int
     height: int
     width: int
@@ -132,9 +132,21 @@ class RunKeeper:
 
     @contextmanager
     def in_use(self, note: RunNote) -> Generator[None]:
-        """`begin`, one line at a time; lines that begin before the block is left keep its methods. Raises as it."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        with (self.folder / ".in_use").open("a") as measuring:
+        """`begin`, one line at a time; lines that begin before the block is left keep its methods.
+
+        Raises: RunError as `begin`, and where another line measures one of the methods now.
+        """
+        (self.folder / ".measuring").mkdir(parents=True, exist_ok=True)
+        with ExitStack() as held:
+            measuring = held.enter_context((self.folder / ".in_use").open("a"))
+            for method in note.methods:
+                mine = held.enter_context((self.folder / ".measuring" / folder_name(method)).open("a"))
+                try:
+                    fcntl.flock(mine, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError as error:
+                    raise RunError(
+                        f"another line measures {method} in {self.folder} now; wait for it, or give another --out"
+                    ) from error
             with (self.folder / ".begin").open("a") as turn:
                 fcntl.flock(turn, fcntl.LOCK_EX)
                 try:

@@ -144,6 +144,7 @@ class Conditions(msgspec.Struct, frozen=True, kw_only=True):
     samples: draws of each view. first_frame: that is measured, counted from 1. shots: the clips, in order.
     size, grid: height and width of pictures and of the class grid. true_mount: of the source camera in the data.
     declared_mount: what methods are given of it; both None where there is no vehicle. train_clips: that means are of.
+    failed: see `Account.failed`.
     """
 
     data: tuple[str, ...]
@@ -161,6 +162,7 @@ class Conditions(msgspec.Struct, frozen=True, kw_only=True):
     train_clips: int
     samples: int = 1
     first_frame: int = 2
+    failed: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -274,6 +276,8 @@ def _conditions(summary: Summary) -> list[str]:
     if summary.classes:
         height, width = given.grid
         lines.append(f"Class figures at {width}x{height}, in brackets at picture size.")
+    if given.failed:
+        lines.append(f"**Failed, and in no row: {'; '.join(given.failed)}.**")
     has = {name: any(not math.isnan(each.value(name)) for each in summary.evaluations) for name in FIGURE_NAMES}
     if has["psnr_db"] and not has["lpips"]:
         lines.append("LPIPS: no weights given (`--lpips`).")

@@ -9,7 +9,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_model import CameraMount, Clip, RenderOptions, SphericalDelta, Traits, Trajectory, View, ViewSynthesizer
+from gcd_model import (
+    CameraMount,
+    Clip,
+    RenderOptions,
+    Spherical,
+    SphericalDelta,
+    Traits,
+    Trajectory,
+    View,
+    ViewSynthesizer,
+)
+from gcd_model.errors import OptionError
 from gcd_train.datasets.clip_source import to_network
 from gcd_train.evaluation.galleries import Strip, painted, to_bytes, write_sheet, write_video
 from gcd_train.files import write_whole
@@ -25,6 +36,7 @@ class ViewRecipe:
 
     angles: goals of steered models, target minus source; empty for the one view of others. samples: draws of each;
     all are shown, and from two on where they differ. steps: None as shipped. seed: of the noise.
+    source: where the camera of steered models stands, as far as its goals depend on it; None as is usual for them.
     height_m, tilt_deg: of the camera on its vehicle, above the ground and down; None as trained.
     """
 
@@ -32,6 +44,7 @@ class ViewRecipe:
     samples: int = 1
     steps: int | None = None
     seed: int = 0
+    source: Spherical | None = None
     height_m: float | None = None
     tilt_deg: float | None = None
 
@@ -51,12 +64,16 @@ class Viewed:
 def paths(traits: Traits, recipe: ViewRecipe, hfov_deg: float | None = None) -> tuple[tuple[str, Trajectory], ...]:
     """Name and camera path of each goal, or of a model's one view.
 
-    hfov_deg: of the pictures, if known. Raises: ViewFixedError, ViewRangeError, OptionError as `Traits.plan_view`.
+    hfov_deg: of the pictures, if known. Raises: ViewFixedError, ViewRangeError as `Traits.plan_view`, OptionError also
+    for a source that the model has no use for, or that its mount tells already.
     """
     mount = mounted(traits, recipe, hfov_deg)
+    if recipe.source is not None and (mount is not None or traits.config.camera == "none"):
+        raise OptionError(f"{traits.name} has no use for --source-elevation-deg and --source-radius; leave them out")
     if traits.config.camera == "none" and not recipe.angles:
         return (("view", traits.plan_view(mount=mount)),)
-    return tuple((_told(each), traits.plan_view(each, mount=mount)) for each in recipe.angles or DEFAULT_ANGLES)
+    angles = recipe.angles or DEFAULT_ANGLES
+    return tuple((_told(each), traits.plan_view(each, source=recipe.source, mount=mount)) for each in angles)
 
 
 def mounted(traits: Traits, recipe: ViewRecipe, hfov_deg: float | None) -> CameraMount | None:

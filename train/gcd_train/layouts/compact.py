@@ -1,0 +1,211 @@
+"""Repacks downloaded scenes into the compact layout: a twentieth of the bytes to read, every picture compared."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from gcd_train.datasets.kubric4d import Kubric4D
+from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
+from gcd_train.datasets.picture_files import bytes_read
+from gcd_train.datasets.skips import FileFault
+from gcd_train.errors import DataError, RecipeError
+from gcd_train.layouts import encodings, kubric4d_names, parallel_domain4d_names
+from gcd_train.layouts.depth_code import FAR_M, NEAR_M
+from gcd_train.layouts.manifest import GEOMETRY, MANIFEST, read_manifest
+from gcd_train.layouts.scene_files import SceneFiles
+from gcd_train.layouts.scene_folder import new_scene
+from gcd_train.scene_view import SceneView
+
+_KUBRIC_WEBP, _STREET_WEBP = 85, 80
+_LEAST_PSNR_DB = 20.0  # what WebP of this quality is far above
+_JSON_FOLDERS = ("calibration", "ontology")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Packed:
+    """made: False for a scene that was there already. read, written: bytes. gaps: views that the source lacks."""
+
+    made: bool
+    read: int = 0
+    written: int = 0
+    gaps: int = 0
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Compaction:
+    """Packs one scene at a time, in any process.
+
+    source, out: folders of scenes. orbits: whether in Kubric-4D's layout, else in ParallelDomain-4D's. cameras: that a
+    scene must have. gaps: a picture may be missing, as some of ParallelDomain-4D are.
+    """
+
+    source: Path
+    out: Path
+    orbits: bool
+    cameras: tuple[str, ...]
+    gaps: bool = False
+
+    @classmethod
+    def of(cls, source: Path, out: Path, *, cameras: tuple[str, ...] = (), gaps: bool = False) -> "Compaction":
+        """cameras: empty for the published ones. Raises DataError: there are no scenes. RecipeError: one folder."""
+        source, out = source.resolve(), out.resolve()
+        if source == out:
+            raise RecipeError(f"{source} cannot be packed into itself; give another OUT")
+        try:
+            names = [path.name for path in source.iterdir()]
+        except OSError as error:
+            raise DataError(f"{source} cannot be read ({error}); give the folder that holds the scenes") from error
+        orbits = any(kubric4d_names.scene_number(name) is not None for name in names)
+        usual = kubric4d_names.CAMERAS if orbits else parallel_domain4d_names.CAMERAS
+        return cls(source=source, out=out, orbits=orbits, cameras=cameras or usual, gaps=gaps)
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """All there are, by number. Raises DataError for none."""
+        if self.orbits:
+            return Kubric4D.open(self.source, cameras=self.cameras).scenes
+        return ParallelDomain4D.open(self.source, cameras=self.cameras, source_camera=self._ahead, classes=False).scenes
+
+    def __call__(self, scene: str) -> Packed:
+        """Pack a scene unless it is there: its folder appears once everything in it was compared with the source.
+
+        Raises: DataError: files are missing or damaged, how many and which first. OSError: nothing can be written.
+        """
+        if (self.out / scene).exists():
+            return Packed(made=False)
+        try:
+            return self._packed(scene)
+        except FileFault as fault:
+            raise DataError(str(fault)) from fault  # which crosses from process to process as what it is
+
+    def _packed(self, scene: str) -> Packed:
+        reader, before = self._reader(self.source, scene), bytes_read()
+        frames = reader.frames(scene)
+        with new_scene(self.out, scene) as folder:
+            files = SceneFiles(folder)
+            for path in self._facts(scene):
+                files.write(folder / path.relative_to(self.source / scene), path.read_bytes())
+            written = self._write_views(reader, scene, files)
+            read = bytes_read() - before
+            packed = self._reader(folder.parent, scene)
+            for time, camera in written:
+                (same,), (view,) = packed.views(scene, time, [camera]), reader.views(scene, time, [camera])
+                _require_alike(same, view, f"{camera} at frame {time}", street=not self.orbits)
+            self._write_manifest(scene, files)
+        gaps = frames * len(self.cameras) - len(written)
+        return Packed(made=True, read=read, written=files.size, gaps=gaps)
+
+    @property
+    def _ahead(self) -> str:
+        """The camera that tells how many frames there are."""
+        forward = parallel_domain4d_names.FORWARD
+        return forward if forward in self.cameras else self.cameras[0]
+
+    def _reader(self, root: Path, scene: str) -> Kubric4D | ParallelDomain4D:
+        if self.orbits:
+            return Kubric4D(root, [scene], cameras=self.cameras, instances=True)
+        return ParallelDomain4D(root, [scene], cameras=self.cameras, source_camera=self._ahead, instances=True)
+
+    def _facts(self, scene: str) -> Iterator[Path]:
+        """Files of a scene that are no pictures."""
+        folder = self.source / scene
+        if self.orbits:
+            yield from (kubric4d_names.metadata_path(folder, _number(camera)) for camera in self.cameras)
+        yield from (path for name in _JSON_FOLDERS for path in sorted((folder / name).glob("*.json")))
+        if (folder / MANIFEST).exists():
+            yield folder / GEOMETRY
+
+    def _write_views(self, reader: Kubric4D | ParallelDomain4D, scene: str, files: SceneFiles) -> list[tuple[int, str]]:
+        """Time and camera of all that were written. Raises DataError."""
+        written, faults = list[tuple[int, str]](), list[FileFault]()
+        encoded = self._orbit_view if self.orbits else self._street_view
+        for time, camera in product(range(reader.frames(scene)), self.cameras):
+            try:
+                (view,) = reader.views(scene, time, [camera])
+            except FileFault as fault:
+                if fault.path.exists() or not self.gaps:
+                    faults.append(fault)
+                continue
+            if not faults:
+                for path, data in encoded(self.source / scene, files.folder, view, time, camera):
+                    files.write(path, data)
+                written.append((time, camera))
+        if faults:
+            missing = sum(not fault.path.exists() for fault in faults)
+            advice = "download them again, or give --gaps" if missing == len(faults) else "download them again"
+            raise DataError(
+                f"{missing} views lack a file and {len(faults) - missing} are damaged; {advice}. First: {faults[0]}"
+            )
+        return written
+
+    def _orbit_view(
+        self, source: Path, out: Path, view: SceneView, time: int, camera: str
+    ) -> Iterator[tuple[Path, bytes]]:
+        def place(folder: Path, layer: kubric4d_names.Layer, *, compact: bool = False) -> Path:
+            return kubric4d_names.frame_path(folder, _number(camera), layer, time, compact=compact)
+
+        _require_published(place(source, "rgba"))
+        yield place(out, "rgba", compact=True), encodings.webp(view.rgb, quality=_KUBRIC_WEBP)
+        yield place(out, "depth", compact=True), encodings.depth_png(view.depth)
+        if view.instances is not None:
+            yield place(out, "segmentation", compact=True), place(source, "segmentation").read_bytes()
+
+    def _street_view(
+        self, source: Path, out: Path, view: SceneView, time: int, camera: str
+    ) -> Iterator[tuple[Path, bytes]]:
+        def place(folder: Path, layer: parallel_domain4d_names.Layer, *, compact: bool = False) -> Path:
+            return parallel_domain4d_names.frame_path(folder, camera, layer, time, compact=compact)
+
+        _require_published(place(source, "rgb"))
+        yield place(out, "rgb", compact=True), encodings.webp(view.rgb, quality=_STREET_WEBP)
+        yield place(out, "depth", compact=True), encodings.street_depth_png(view.depth)
+        if view.classes is not None:
+            yield place(out, "semantic_segmentation_2d"), encodings.packed_id_png(view.classes)
+        if view.instances is not None:
+            path = place(source, "instance_segmentation_2d")
+            small = int(view.instances.max()) < 256
+            data = encodings.packed_id_png(view.instances.astype(np.uint8)) if small else path.read_bytes()
+            yield place(out, "instance_segmentation_2d"), data
+
+    def _write_manifest(self, scene: str, files: SceneFiles) -> None:
+        """Of our own scenes, whose files are others now."""
+        if (self.source / scene / MANIFEST).exists():
+            told = read_manifest(self.source / scene)
+            told = msgspec.structs.replace(told, compact=True, files=dict(sorted(files.checksums.items())))
+            files.write(files.folder / MANIFEST, msgspec.json.format(msgspec.json.encode(told), indent=1))
+
+
+def _number(camera: str) -> int:
+    """Of a view of Kubric-4D."""
+    return int(camera.removeprefix("view"))
+
+
+def _require_published(path: Path) -> None:
+    if not path.exists():
+        raise DataError(f"{path} is not there: the scene is compact already")
+
+
+def _require_alike(packed: SceneView, view: SceneView, place: str, *, street: bool) -> None:
+    """Raises DataError unless a packed view tells what its source told."""
+    faults: list[str] = []
+    error = float(np.mean((packed.rgb.astype(np.float32) - view.rgb) ** 2))
+    if error > 255**2 * 10 ** (-_LEAST_PSNR_DB / 10):
+        faults.append("its colours")
+    depth = np.where(view.depth > 0, view.depth.clip(NEAR_M, FAR_M), 0)
+    off = 0.0013 * (1 + depth / 20) if street else np.float32(0.0006)
+    if not (np.abs(packed.depth - depth) <= off * depth).all():
+        faults.append("its depth")
+    for name in ("classes", "instances"):
+        one, other = getattr(packed, name), getattr(view, name)
+        if (one is None) != (other is None) or (one is not None and not np.array_equal(one, other)):
+            faults.append(f"its {name}")
+    if not np.array_equal(packed.world_from_camera, view.world_from_camera) or packed.lens != view.lens:
+        faults.append("its camera")
+    if faults:
+        raise DataError(
+            f"{place}: {', '.join(faults)} came out of the packing otherwise; the disk or this machine is at fault"
+        )
