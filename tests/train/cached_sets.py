@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
+from gcd_train.latent_cache import MomentPictures
 
+from gcd_train.data.cache import CacheIdentity, ClipPlan
+from gcd_train.data.cache_writer import EncoderChoice, Encoders, load_encoders
 from gcd_train.errors import DataError
-from gcd_train.latent_cache import CacheIdentity, ClipPlan, EncoderChoice, Encoders, MomentPictures
-from gcd_train.latent_cache.encoders import load_encoders
 
 HEIGHT, WIDTH, FRAMES, CLIP = 32, 48, 7, 3
 PLAN = ClipPlan(clip_frames=CLIP)

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from gcd_train.datasets.controls import read_controls
-from gcd_train.datasets.skips import FileFault, Skips
-from gcd_train.datasets.splits import Part, kubric_split, present, read_scene_list, read_split
+from gcd_train.data.skips import FileFault, Skips
+from gcd_train.data.splits import Part, kubric_split, present, read_controls, read_scene_list, read_split
 from gcd_train.errors import DataError
 
 OFFICIAL = Path(__file__).parents[2].parent / "shared" / "spec" / "official"

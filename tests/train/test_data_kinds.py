@@ -13,11 +13,12 @@ from tiny_world import tiny_recipe
 from gcd_model import FAMILIES, ModelConfig
 from gcd_model.loading import random_weights
 from gcd_model.networks import random_networks
-from gcd_train.data_kinds import DataPlaces, RunData, open_data, sampling_of
-from gcd_train.datasets.trajectories import DrivingSampling, OrbitSampling
+from gcd_train.data.cache_writer import CacheJob, cache_scenes
+from gcd_train.data.open import DataPlaces, RunData, open_data, sampling_of
+from gcd_train.data.paths import DrivingSampling, OrbitSampling
+from gcd_train.data.store import only_writer
 from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.latent_cache import CacheJob, cache_scenes, only_writer
 from gcd_train.precision import Precision
 from gcd_train.recipe import DataRecipe, FramesRecipe, LossRecipe, OrbitRecipe, Recipe
 

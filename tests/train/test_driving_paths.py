@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from gcd_model.geometry import CameraMount, driving_trajectory
-from gcd_train.data_kinds import open_pairs
-from gcd_train.datasets.paired import PairedClips
+from gcd_train.data.open import open_data
+from gcd_train.data.pairs import PairedClips
 from gcd_train.errors import DataError
 from gcd_train.evaluation.clips import cameras_of
 from gcd_train.model_setup import model_config

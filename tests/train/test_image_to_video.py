@@ -11,18 +11,16 @@ from tiny_world import FRAMES, Never, TinyClips, TinyOrbits
 from gcd_model import FAMILIES, load_synthesizer
 from gcd_model.networks import Networks, random_networks
 from gcd_train.conditioner import Conditioner
-from gcd_train.data_kinds import open_pairs, require_image_to_video
-from gcd_train.datasets.clip_source import ClipSource
-from gcd_train.datasets.dataset4d import PairSample
-from gcd_train.datasets.latents import LatentClips, LatentVideos
-from gcd_train.datasets.skips import Skips
-from gcd_train.datasets.videos import VideoClips, VideoSamples
+from gcd_train.data.latents import LatentClips, LatentVideos
+from gcd_train.data.latents_writer import LatentsJob, encode_clips
+from gcd_train.data.open import open_data, require_image_to_video
+from gcd_train.data.sample import ClipSource, Sample, VideoClips, VideoSamples
+from gcd_train.data.skips import Skips
 from gcd_train.errors import RecipeError
 from gcd_train.model_setup import model_config
 from gcd_train.precision import Precision
 from gcd_train.recipe import Recipe, load_recipe
 from gcd_train.run_folder import RunFolder
-from gcd_train.stages.latents import LatentsJob, encode_clips
 from gcd_train.start import start_networks
 from gcd_train.trainer import RunInputs, Trainer
 
@@ -104,11 +102,11 @@ class TwoSamples:
     def __len__(self) -> int:
         return 2
 
-    def sample(self, index: int) -> PairSample:
+    def sample(self, index: int) -> Sample:
         source, target = TinyOrbits(2).rgb(index)
         path = TinyOrbits(2).trajectory(index)
         assert path.delta is not None
-        return PairSample(
+        return Sample(
             source=source,
             target=target,
             target_classes=np.zeros(target.shape[:3], np.uint8),

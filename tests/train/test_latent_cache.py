@@ -18,23 +18,14 @@ from torch.testing import assert_close
 from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
-from gcd_train.datasets.clip_source import to_network
-from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
+from gcd_train.data.batches import CachedBatches
+from gcd_train.data.cache import CachedLatents, ClipPlace, ClipPlan, log_variance_codes, log_variance_of
+from gcd_train.data.cache_writer import CacheJob, CacheProgress, DrivingPictures, cache_scenes
+from gcd_train.data.parallel_domain4d import ParallelDomain4D
+from gcd_train.data.sample import to_network
+from gcd_train.data.store import only_writer, read_index
 from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError, RunError
-from gcd_train.latent_cache import (
-    CachedLatents,
-    CacheJob,
-    CacheProgress,
-    ClipPlace,
-    ClipPlan,
-    cache_scenes,
-    only_writer,
-    read_index,
-)
-from gcd_train.latent_cache.batches import CachedBatches
-from gcd_train.latent_cache.driving import DrivingPictures
-from gcd_train.latent_cache.shard import log_variance_codes, log_variance_of
 from gcd_train.precision import Precision
 from gcd_train.recipe import LossRecipe
 

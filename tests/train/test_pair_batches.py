@@ -17,22 +17,20 @@ from gcd_model.conditioning import micro_conditioning, relative_pose_features, s
 from gcd_model.config import SMALL
 from gcd_model.geometry import pose_trajectory
 from gcd_model.networks import Networks, random_networks
-from gcd_train.datasets.clip_frames import FrameSampling
-from gcd_train.datasets.dataset4d import PairSample
-from gcd_train.datasets.kubric4d import Kubric4D
-from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
-from gcd_train.datasets.sample_clips import SampleClips
-from gcd_train.datasets.skips import Skips
-from gcd_train.datasets.trajectories import DrivingSampling, OrbitSampling
-from gcd_train.datasets.view_pairs import ViewPairs, collate
+from gcd_train.data.batches import SampleBatches, motion_of
+from gcd_train.data.kubric4d import Kubric4D
+from gcd_train.data.loader import LoadedBatch, SampleLoader, SampleOrder
+from gcd_train.data.parallel_domain4d import ParallelDomain4D
+from gcd_train.data.paths import DrivingSampling, FrameSampling, OrbitSampling
+from gcd_train.data.sample import Sample, SampleClips, collate
+from gcd_train.data.skips import Skips
+from gcd_train.data.views import ViewPairs
 from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError, RunError
-from gcd_train.pair_batches import PairBatches, told_motion
 from gcd_train.precision import Precision
 from gcd_train.recipe import LoaderRecipe, UNetRecipe
 from gcd_train.recipe.optimiser import OptimiserRecipe
 from gcd_train.recipe.values import Budget
-from gcd_train.sample_loader import LoadedBatch, SampleLoader, SampleOrder
 
 CPU = torch.device("cpu")
 PRECISION = Precision(CPU, half=False, channels_last=False)
@@ -52,14 +50,14 @@ class CountedSamples:
     def __len__(self) -> int:
         return self.length
 
-    def sample(self, index: int) -> PairSample:
+    def sample(self, index: int) -> Sample:
         if index in self.broken:
             raise DataError(f"sample {index} is gone")
         picture = np.full((FRAMES, HEIGHT, WIDTH, 3), index % 256, np.uint8)
         deltas = np.linspace(0, 1, FRAMES)[:, None] * np.array([10.0 * (index % 9), 5.0, -1.0])
         poses = np.tile(np.eye(4), (FRAMES, 1, 1))
         poses[:, 0, 3] = index
-        return PairSample(
+        return Sample(
             source=picture,
             target=255 - picture,
             target_classes=None,
@@ -88,9 +86,9 @@ def networks(camera: str = "spherical") -> Networks:
     return random_networks(config(camera), seed=1)
 
 
-def batches(model: Networks, *, family: str = "kubric90", **changes: object) -> PairBatches:
+def batches(model: Networks, *, family: str = "kubric90", **changes: object) -> SampleBatches:
     recipe = msgspec.structs.replace(UNET, **changes)
-    return PairBatches(CountedSamples(), model, recipe, FAMILIES[family], PRECISION, HERE, 5)
+    return SampleBatches(CountedSamples(), model, recipe, FAMILIES[family], PRECISION, HERE, 5)
 
 
 def draws(number: int) -> Draws:
@@ -211,8 +209,8 @@ def test_the_network_sees_what_the_encoders_make_of_source_and_target() -> None:
 
 def test_a_family_with_one_motion_number_is_told_the_recipes() -> None:
     samples = collate([CountedSamples().sample(2)])
-    assert told_motion(samples, 0, FAMILIES["driving"], UNET) == UNET.motion_bucket == 127
-    assert told_motion(samples, 0, FAMILIES["kubric180"], UNET) < told_motion(samples, 0, FAMILIES["kubric90"], UNET)
+    assert motion_of(samples, 0, FAMILIES["driving"], UNET) == UNET.motion_bucket == 127
+    assert motion_of(samples, 0, FAMILIES["kubric180"], UNET) < motion_of(samples, 0, FAMILIES["kubric90"], UNET)
 
 
 def test_what_samples_cannot_give_is_refused() -> None:

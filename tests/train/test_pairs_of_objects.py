@@ -16,8 +16,9 @@ from typer.testing import CliRunner
 from gcd_model.config import DRIVING_CLASSES
 from gcd_model.geometry import CameraMount, driving_trajectory
 from gcd_train.cli.main import app
-from gcd_train.datasets.clip_source import KeptClips, PaintedClips
-from gcd_train.datasets.paired import PairedClips, require_apart
+from gcd_train.data.pairs import PairedClips
+from gcd_train.data.sample import PaintedClips, SomeClips
+from gcd_train.data.splits import require_apart
 from gcd_train.errors import DataError, RecipeError, RenderError
 from gcd_train.scenes.description import Scene, SceneObject
 from gcd_train.scenes.drop import HFOV_DEG

@@ -25,10 +25,10 @@ from tiny_scenes4d import (
 )
 
 from gcd_model.geometry import Intrinsics
-from gcd_train.datasets.kubric4d import Kubric4D
-from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
-from gcd_train.datasets.picture_files import bytes_read, read_depth, read_ids, read_palette_indices
-from gcd_train.datasets.skips import FileFault
+from gcd_train.data.files import bytes_read, read_depth, read_ids, read_palette_indices
+from gcd_train.data.kubric4d import Kubric4D
+from gcd_train.data.parallel_domain4d import ParallelDomain4D
+from gcd_train.data.skips import FileFault
 from gcd_train.errors import DataError
 from gcd_train.layouts.depth_code import encode_depth
 

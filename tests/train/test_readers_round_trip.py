@@ -10,11 +10,10 @@ from headless import needs_egl
 from stage_world import STAGE, stage
 
 from gcd_model.geometry import Intrinsics
-from gcd_train.datasets.clip_frames import FrameSampling
-from gcd_train.datasets.kubric4d import Kubric4D
-from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
-from gcd_train.datasets.trajectories import DRIVING, MAX90, generator
-from gcd_train.datasets.view_pairs import ViewPairs
+from gcd_train.data.kubric4d import Kubric4D
+from gcd_train.data.parallel_domain4d import ParallelDomain4D
+from gcd_train.data.paths import DRIVING, MAX90, FrameSampling, generator
+from gcd_train.data.views import ViewPairs
 from gcd_train.errors import DataError
 from gcd_train.layouts.depth_code import SKY_M
 from gcd_train.layouts.scene_writer import SceneFormat, write_scene

@@ -15,7 +15,8 @@ from headless import needs_egl
 from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
-from gcd_train.datasets.paired import PairedClips, require_apart
+from gcd_train.data.pairs import PairedClips
+from gcd_train.data.splits import require_apart
 from gcd_train.errors import DataError
 from gcd_train.scenes.driving import driving_scene
 from gcd_train.scenes.film import filmed

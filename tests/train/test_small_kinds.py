@@ -20,9 +20,10 @@ from gcd_model.networks import random_networks
 from gcd_train.batches import EncodedBatches, PixelBatches
 from gcd_train.checkpoint import load_state
 from gcd_train.conditioner import Conditioner, mirrored_path
-from gcd_train.data_kinds import DataPlaces, open_data
-from gcd_train.datasets.clip_source import ClipSource, PaintedClips, SomeClips, to_network
-from gcd_train.datasets.latents import LatentClips, LatentRows
+from gcd_train.data.latents import LatentClips, LatentRows
+from gcd_train.data.latents_writer import LatentsJob, encode_clips
+from gcd_train.data.open import DataPlaces, open_data
+from gcd_train.data.sample import ClipSource, PaintedClips, SomeClips, to_network
 from gcd_train.draws import Draws
 from gcd_train.errors import DataError, Interrupted
 from gcd_train.losses import COLOUR_WEIGHTS, class_emphasis
@@ -30,7 +31,6 @@ from gcd_train.model_setup import model_config, sampled_as_trained
 from gcd_train.precision import Precision
 from gcd_train.recipe import Budget, ClassWeightsName, DataRecipe, FramesRecipe, NoiseRecipe, Recipe
 from gcd_train.run_folder import RunFolder
-from gcd_train.stages.latents import LatentsJob, encode_clips
 from gcd_train.start import start_networks
 from gcd_train.stop import StopSignal
 from gcd_train.trainer import RunInputs, Trainer

@@ -5,24 +5,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gcd_train.datasets.trajectories import DRIVING_DIRECT, MAX90_DIRECT, MAX180_DIRECT
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gcd_model.geometry import Spherical, SphericalDelta
-from gcd_train.datasets.clip_frames import DRIVING_FRAMES, KUBRIC_FRAMES, FrameSampling
-from gcd_train.datasets.controls import Control
-from gcd_train.datasets.trajectories import (
+from gcd_train.data.paths import (
     DRIVING,
-    DRIVING_DIRECT,
+    DRIVING_FRAMES,
+    KUBRIC_FRAMES,
     MAX90,
-    MAX90_DIRECT,
     MAX180,
-    MAX180_DIRECT,
     Draw,
     DrivingSampling,
+    FrameSampling,
     OrbitSampling,
     generator,
 )
+from gcd_train.data.splits import Control
 from gcd_train.errors import DataError, RecipeError
 
 SEEDS = st.integers(0, 2**31)

@@ -26,14 +26,14 @@ from tiny_scenes4d import (
 from torch.utils.data import DataLoader
 
 from gcd_model.geometry import SphericalDelta, relative_pose, to_pose
-from gcd_train.datasets.clip_frames import FrameSampling
-from gcd_train.datasets.controls import Control
-from gcd_train.datasets.kubric4d import Kubric4D
-from gcd_train.datasets.ontology import VOID
-from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
-from gcd_train.datasets.pictures_of_draws import trained_lens, trained_picture
-from gcd_train.datasets.trajectories import DRIVING, MAX90, generator
-from gcd_train.datasets.view_pairs import PairSample, ViewPairs, collate
+from gcd_train.data.kubric4d import Kubric4D
+from gcd_train.data.ontology import VOID
+from gcd_train.data.parallel_domain4d import ParallelDomain4D
+from gcd_train.data.paths import DRIVING, MAX90, FrameSampling, generator
+from gcd_train.data.pictures import trained_lens, trained_picture
+from gcd_train.data.sample import Sample, collate
+from gcd_train.data.splits import Control
+from gcd_train.data.views import ViewPairs
 from gcd_train.errors import DataError, RenderError
 from gcd_train.pointcloud import render_lens
 
@@ -248,7 +248,7 @@ def test_a_bad_sample_is_replaced_counted_and_named(
     path = two_scenes / "scene_000004" / "rgb" / "camera0" / f"{10 * numbers[0] + 5:018d}.png"
     damage(path)
     sample = pairs.sample(0)
-    assert isinstance(sample, PairSample)
+    assert isinstance(sample, Sample)
     assert len(sample.skipped) >= 1
     assert {skipped.scene for skipped in sample.skipped} == {"scene_000004"}
     assert pairs.skips.total == len(sample.skipped)

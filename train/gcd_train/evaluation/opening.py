@@ -14,15 +14,14 @@ import msgspec
 from gcd_model import Traits
 from gcd_model.geometry import CameraMount
 from gcd_model.small_files import read_small
-from gcd_train.datasets.clip_frames import CLIP, DRIVING_FRAMES, KUBRIC_FRAMES, FrameSampling
-from gcd_train.datasets.controls import MOST_BYTES, read_controls
-from gcd_train.datasets.kubric4d import Kubric4D
-from gcd_train.datasets.paired import PairedClips
-from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
-from gcd_train.datasets.skips import Skips
-from gcd_train.datasets.splits import Part, present, read_scene_list, read_split
-from gcd_train.datasets.trajectories import DrivingSampling, OrbitSampling
-from gcd_train.datasets.view_pairs import ViewPairs
+from gcd_train.data.kubric4d import Kubric4D
+from gcd_train.data.pairs import PairedClips
+from gcd_train.data.parallel_domain4d import ParallelDomain4D
+from gcd_train.data.paths import CLIP, DRIVING_FRAMES, KUBRIC_FRAMES, DrivingSampling, FrameSampling, OrbitSampling
+from gcd_train.data.pictures import PictureOptions
+from gcd_train.data.skips import Skips
+from gcd_train.data.splits import MOST_BYTES, Part, present, read_controls, read_scene_list, read_split
+from gcd_train.data.views import ViewPairs
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.clips import EvaluationSet, PairedSet, chosen
 from gcd_train.evaluation.protocol import (
@@ -285,12 +284,14 @@ def open_scenes(folder: Path, choice: Choice, cuts: SceneCuts) -> tuple[Evaluati
         data,
         _sampling(cuts, orbits=orbits),
         cuts.seed,
-        (cuts.width, cuts.height),
-        modality="classes" if cuts.semantic else "rgb",
-        class_ids=cuts.semantic,
-        visible=True,
-        exact=cuts.exact,
-        published=cuts.protocol == "released",
+        PictureOptions(
+            size=(cuts.width, cuts.height),
+            modality="classes" if cuts.semantic else "rgb",
+            class_ids=cuts.semantic,
+            visible=True,
+            exact=cuts.exact,
+            published=cuts.protocol == "released",
+        ),
     )
     clips = SceneSet(
         pairs=pairs,

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from gcd_model.errors import ModelError
 from gcd_model.geometry import center_crop_box, relative_pose, require_rigid
-from gcd_train.datasets.dataset4d import PairSample
-from gcd_train.datasets.skips import FileFault, Skipped, Skips
-from gcd_train.datasets.trajectories import generator
+from gcd_train.data.paths import generator
+from gcd_train.data.sample import Sample
+from gcd_train.data.skips import FileFault, Skipped, Skips
 from gcd_train.errors import DataError, TrainError
 from gcd_train.lerobot.cameras import CameraCalibration, read_cameras
 from gcd_train.lerobot.extra import load_arrow, load_av
@@ -42,7 +42,6 @@ class LeRobotOptions:
     wanted time; by default half a frame of the set.
     cameras: features to choose from, by default all that are calibrated; source and target are drawn from them.
     calibration: a file in place of the set's meta/cameras.json. repeats: the set counts as so many times its episodes.
-    motion: the number that tells the network how far the camera goes.
     episodes: which of the set's, from the first number up to the second, as in a slice: (-10, None) are the last ten.
     """
 
@@ -53,7 +52,6 @@ class LeRobotOptions:
     cameras: tuple[str, ...] | None = None
     calibration: Path | None = None
     repeats: int = 400
-    motion: int = 127
     episodes: tuple[int, int | None] = (0, None)
 
 
@@ -94,13 +92,13 @@ class LeRobotPairs:
     def __len__(self) -> int:
         return self.options.repeats * len(self.episodes)
 
-    def __getitem__(self, index: int) -> PairSample:
+    def __getitem__(self, index: int) -> Sample:
         """As `sample`, for a loader. Raises IndexError beyond the end."""
         if not 0 <= index < len(self):
             raise IndexError(f"{index} is beyond the {len(self)} samples")
         return self.sample(index)
 
-    def sample(self, index: int) -> PairSample:
+    def sample(self, index: int) -> Sample:
         """The sample of a number, or of the one that replaces it.
 
         Raises: DataError naming the last faults if a hundred in a row cannot be read.
@@ -137,25 +135,19 @@ class LeRobotPairs:
             raise DataError(f"pairs need two cameras or more, got {', '.join(wanted)}")
         return tuple(sorted(set(wanted)))
 
-    def _pair(self, episode: EpisodePlace, random: np.random.Generator, skipped: tuple[Skipped, ...]) -> PairSample:
+    def _pair(self, episode: EpisodePlace, random: np.random.Generator, skipped: tuple[Skipped, ...]) -> Sample:
         source, target = (self.cameras[int(k)] for k in random.choice(len(self.cameras), 2, replace=False))
         window = self._window(episode, (source, target), random)
         seen, seen_bytes = self._pictures(episode, source, window)
         aimed, aimed_bytes = self._pictures(episode, target, window)
         poses = (torch.from_numpy(window.poses[name]) for name in (source, target))
-        return PairSample(
+        return Sample(
             source=seen,
             target=aimed,
-            target_classes=None,
             source_from_target=relative_pose(*poses).numpy(),
-            start=None,
-            deltas=None,
-            motion=self.options.motion,
             fps=self.fps,
             scene=episode.name,
             frame_numbers=window.rows,
-            reversed=False,
-            visible=None,
             skipped=skipped,
             bytes_read=seen_bytes + aimed_bytes,
         )

@@ -9,8 +9,7 @@ from pathlib import Path
 from gcd_train.errors import DataError
 
 _LOG = logging.getLogger(__name__)
-_DISTINCT = 10_000
-_SHOWN = 20
+_DISTINCT, _SHOWN = 10_000, 20
 
 
 class FileFault(DataError):  # noqa: N818  a fault of the data, which readers of it name
@@ -37,9 +36,9 @@ class Skipped:
 
 
 class Skips:
-    """Everything left out so far. Each distinct one is logged once, as a warning, unless whoever asks tells it himself.
+    """Everything left out so far. Each distinct one is logged once, as a warning, unless `logged` is false.
 
-    A loader worker has its own; `PairSample.skipped` carries what it left out, for `extend` in the main process.
+    A loader worker has its own; `Sample.skipped` carries what it left out, for `extend` in the main process.
     """
 
     def __init__(self, *, logged: bool = True) -> None:
@@ -54,34 +53,19 @@ class Skips:
         return skipped
 
     def extend(self, others: Iterable[Skipped]) -> None:
-        """Count what somebody else left out."""
+        """Count what was left out elsewhere."""
         for skipped in others:
-            if skipped in self._counts:
-                self._counts[skipped] += 1
-            elif len(self._counts) < _DISTINCT:
-                self._counts[skipped] = 1
-                if self._logged:
-                    _LOG.warning("left out %s", skipped)
-            else:
+            if skipped not in self._counts and len(self._counts) >= _DISTINCT:
                 self._beyond += 1  # a set in which everything is wrong must not fill the memory
+                continue
+            self._counts[skipped] += 1
+            if self._logged and self._counts[skipped] == 1:
+                _LOG.warning("left out %s", skipped)
 
     @property
     def total(self) -> int:
         """How often something was left out."""
         return self._counts.total() + self._beyond
-
-    @property
-    def counts(self) -> dict[Skipped, int]:
-        """How often each was left out, the first 10 000 distinct ones."""
-        return dict(self._counts)
-
-    @property
-    def scenes(self) -> dict[str, int]:
-        """How often something of each scene was left out."""
-        scenes: Counter[str] = Counter()
-        for skipped, count in self._counts.items():
-            scenes[skipped.scene] += count
-        return dict(scenes)
 
     def plain_lines(self, most: int = _SHOWN) -> list[str]:
         """The first ones, a line each, and how many more there are."""
@@ -92,8 +76,8 @@ class Skips:
         """A short account to print, the most frequent first; empty if nothing was left out."""
         if not self.total:
             return []
-        shown = self._counts.most_common(most)
-        rows = [f"left out {self.total} times, {len(self._counts)} distinct faults in {len(self.scenes)} scenes:"]
+        shown, scenes = self._counts.most_common(most), {skipped.scene for skipped in self._counts}
+        rows = [f"left out {self.total} times, {len(self._counts)} distinct faults in {len(scenes)} scenes:"]
         rows += [f"  {count} x {skipped}" for skipped, count in shown]
         rest = self.total - sum(count for _, count in shown)
         return rows + ([f"  and {rest} more"] if rest else [])

@@ -1,6 +1,5 @@
 """Classes of a data set, read from the set itself: ids, names, colours, and the way from one to the other."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,8 +11,8 @@ from numpy.typing import NDArray
 from gcd_model.config import SemanticClass
 from gcd_model.errors import FileError
 from gcd_model.small_files import decode_json
-from gcd_train.datasets.picture_files import MOST_TEXT, read
-from gcd_train.datasets.skips import FileFault
+from gcd_train.data.files import MOST_TEXT, read
+from gcd_train.data.skips import FileFault
 from gcd_train.errors import DataError
 
 Bytes = NDArray[np.uint8]
@@ -121,13 +120,6 @@ class Ontology:
             rows = flat[start : start + _ROWS].astype(np.float32)
             nearest[start : start + _ROWS] = ids[(half - rows @ points.T).argmin(-1)]
         return nearest.reshape(colours.shape[:-1])
-
-    def require(self, names: Sequence[str]) -> None:
-        """Raises DataError if classes that are needed are not among these."""
-        missing = sorted(set(names) - {item.name for item in self.items})
-        if missing:
-            known = ", ".join(item.name for item in self.items)
-            raise DataError(f"wrong ontology: it lacks {', '.join(missing)}; it has {known}")
 
 
 def read_ontology(folder: Path) -> Ontology:
