@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from gcd_train.latent_cache import MomentPictures
 
 from gcd_train.data.cache import CacheIdentity, ClipPlan
 from gcd_train.data.cache_writer import EncoderChoice, Encoders, load_encoders
@@ -28,13 +27,11 @@ class FakePictures:
     def frames(self, scene: str, /) -> int:
         return self.length
 
-    def moment(self, scene: str, time: int, positions: tuple[int, ...], /) -> MomentPictures:
+    def moment(self, scene: str, time: int, positions: tuple[int, ...], /) -> tuple[np.ndarray, np.ndarray]:
         if (scene, time) in self.broken:
             raise DataError(f"{scene}/rgb/yaw-0/{time}.png is cut")
         shade = 20 * self.scenes.index(scene) + 10 * time
-        return MomentPictures(
-            source=_picture(shade, 0), targets=np.stack([_picture(shade, 1 + position) for position in positions])
-        )
+        return _picture(shade, 0), np.stack([_picture(shade, 1 + position) for position in positions])
 
 
 def _picture(shade: int, hue: int) -> np.ndarray:

@@ -25,11 +25,6 @@ def test_every_kubric_scene_is_in_one_part() -> None:
     assert split[2][0] == "scn02900"
 
 
-def test_an_unknown_part_is_refused() -> None:
-    with pytest.raises(DataError, match="train, val and test, got 'dev'"):
-        kubric_split(["scn00000"], "dev")  # pyright: ignore[reportArgumentType]
-
-
 def test_a_split_file_is_read_by_base_name(tmp_path: Path) -> None:
     path = tmp_path / "split.json"
     path.write_text(json.dumps({"seed": 1, "train": ["data/scene_000001"], "val": [], "test": ["scene_000003"]}))
@@ -62,8 +57,8 @@ def test_a_list_is_stripped_of_comments_and_counts_what_it_leaves_out(tmp_path: 
     )
     skips = Skips()
     listed = read_scene_list(path, skips)
-    assert listed.scenes == ("scene_000048", "scene_000072")
-    assert listed.left_out == skips.total == 4
+    assert listed == ("scene_000048", "scene_000072")
+    assert skips.total == 4
     told = "\n".join(skips.lines())
     assert f"scene_000452: {path} line 5: is marked invalid" in told
     assert f"scene_000453: {path} line 6: is marked invalid" in told
@@ -82,7 +77,7 @@ def test_a_list_of_nothing_is_refused(tmp_path: Path) -> None:
 def test_scenes_that_are_not_there_are_counted() -> None:
     skips = Skips()
     assert present(["b", "gone", "a"], ["a", "b"], skips, "list.txt") == ("b", "a")
-    assert skips.scenes == {"gone": 1}
+    assert skips.total == 1
 
 
 def test_kubric_controls_say_cameras_and_driving_ones_do_not(tmp_path: Path) -> None:
@@ -131,7 +126,6 @@ def test_skips_are_counted_logged_once_and_merged(caplog: pytest.LogCaptureFixtu
             skips.add("scene_a", "a.png", "is missing")
         other.extend([skips.add("scene_b", "b.png", "is damaged")])
     assert (skips.total, other.total) == (4, 1)
-    assert skips.scenes == {"scene_a": 3, "scene_b": 1}
     assert [record.getMessage() for record in caplog.records].count("left out scene_a: a.png is missing") == 1
     assert skips.lines(most=1) == [
         "left out 4 times, 2 distinct faults in 2 scenes:",
@@ -169,7 +163,7 @@ def test_the_published_split_has_its_published_sizes() -> None:
 def test_the_published_lists_have_their_usable_scenes(name: str, scenes: int, left_out: int) -> None:
     skips = Skips()
     listed = read_scene_list(OFFICIAL / name, skips)
-    assert (len(listed.scenes), listed.left_out, skips.total) == (scenes, left_out, left_out)
+    assert (len(listed), skips.total) == (scenes, left_out)
 
 
 @needs_official

@@ -101,10 +101,3 @@ def test_a_twice_listed_id_is_named_with_its_file(tmp_path: Path) -> None:
 def test_a_scene_without_an_ontology_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileFault, match="holds no JSON"):
         read_ontology(tmp_path)
-
-
-def test_lacking_classes_are_a_wrong_ontology() -> None:
-    known = made({1: (0, 0, 0)})
-    known.require(["class 1"])
-    with pytest.raises(DataError, match="wrong ontology: it lacks Car; it has class 1"):
-        known.require(["class 1", "Car"])

@@ -22,6 +22,7 @@ from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.loader import LoadedBatch, SampleLoader, SampleOrder
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import DrivingSampling, FrameSampling, OrbitSampling
+from gcd_train.data.pictures import PictureOptions
 from gcd_train.data.sample import Sample, SampleClips, collate
 from gcd_train.data.skips import Skips
 from gcd_train.data.views import ViewPairs
@@ -60,16 +61,11 @@ class CountedSamples:
         return Sample(
             source=picture,
             target=255 - picture,
-            target_classes=None,
             source_from_target=poses,
-            start=None,
             deltas=deltas,
-            motion=0,
             fps=24.0 / (1 + index % 4),
             scene=f"scn{index % 3:05d}",
             frame_numbers=tuple(range(FRAMES)),
-            reversed=False,
-            visible=None,
         )
 
 
@@ -233,7 +229,7 @@ def test_samples_are_clips_with_the_path_they_were_drawn_with(tmp_path: Path) ->
     write_kubric(tmp_path, 2, frames=FRAMES + 1)
     data = Kubric4D.open(tmp_path, cameras=[f"view{n}" for n in range(4)])
     frames = FrameSampling(clip=FRAMES)
-    pairs = ViewPairs(data, OrbitSampling(frames=frames), 0, (WIDTH, HEIGHT), repeats=3)
+    pairs = ViewPairs(data, OrbitSampling(frames=frames), 0, PictureOptions(size=(WIDTH, HEIGHT)), repeats=3)
     clips = SampleClips(pairs, 2, camera="spherical", fps=24.0, origin="x")
     sample, path = pairs.sample(1), clips.trajectory(1)
     assert (len(clips), clips.fps, clips.classes, clips.mount, clips.camera) == (2, 24.0, (), None, "spherical")
@@ -250,7 +246,7 @@ def test_samples_are_clips_with_the_path_they_were_drawn_with(tmp_path: Path) ->
 def test_a_driving_sample_has_a_free_path(tmp_path: Path) -> None:
     write_driving(tmp_path, 2, frames=FRAMES + 1)
     data = ParallelDomain4D.open(tmp_path, cameras=list(DRIVING_POSES), classes=False)
-    pairs = ViewPairs(data, DrivingSampling(frames=FrameSampling(clip=FRAMES)), 0, (48, 32))
+    pairs = ViewPairs(data, DrivingSampling(frames=FrameSampling(clip=FRAMES)), 0, PictureOptions(size=(48, 32)))
     path = SampleClips(pairs, 1, camera="none", fps=10.0, origin="x").trajectory(0)
     assert path.delta is None
     assert_close(

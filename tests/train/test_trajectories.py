@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from gcd_train.datasets.trajectories import DRIVING_DIRECT, MAX90_DIRECT, MAX180_DIRECT
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,6 +24,7 @@ from gcd_train.data.paths import (
 from gcd_train.data.splits import Control
 from gcd_train.errors import DataError, RecipeError
 
+MAX90_DIRECT, MAX180_DIRECT, DRIVING_DIRECT = (replace(each, gradual=False) for each in (MAX90, MAX180, DRIVING))
 SEEDS = st.integers(0, 2**31)
 LAWS = settings(max_examples=25, deadline=None)
 
@@ -129,7 +129,6 @@ def test_starts_and_strides_are_those_of_the_release() -> None:
     driving = [drawn(DRIVING, 3, index) for index in range(30)]
     assert not any(draw.reversed for draw in driving)
     assert {draw.fps for draw in driving} == {10.0, 5.0}
-    assert {draw.motion for draw in driving} == {127}
 
 
 def test_the_last_frame_can_be_reached_by_choice() -> None:
@@ -171,12 +170,6 @@ def test_a_fixed_change_ignores_the_bounds_and_a_fixed_goal_is_met() -> None:
 def test_a_change_over_the_top_is_refused() -> None:
     with pytest.raises(DataError, match="asks for a camera that cannot be"):
         drawn(replace(MAX90, fixed=SphericalDelta(elevation_deg=95.0)), 2)
-
-
-def test_the_motion_number_is_largest_where_both_angles_are() -> None:
-    change = SphericalDelta(azimuth_deg=90.0, elevation_deg=30.0)
-    assert drawn(replace(MAX90, elevation_deg=(0.0, 20.0), fixed=change), 0).motion == 255
-    assert drawn(replace(MAX90, fixed=SphericalDelta()), 0).motion == 0
 
 
 def test_the_driving_path_is_the_published_one() -> None:

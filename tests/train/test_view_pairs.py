@@ -30,7 +30,7 @@ from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.ontology import VOID
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import DRIVING, MAX90, FrameSampling, generator
-from gcd_train.data.pictures import trained_lens, trained_picture
+from gcd_train.data.pictures import PictureOptions, trained_lens, trained_picture
 from gcd_train.data.sample import Sample, collate
 from gcd_train.data.splits import Control
 from gcd_train.data.views import ViewPairs
@@ -72,9 +72,9 @@ def kubric(kubric_root: Path) -> Kubric4D:
     return Kubric4D.open(kubric_root, cameras=VIEWS)
 
 
-def driving_pairs(root: Path, **options: object) -> ViewPairs:
-    dataset = ParallelDomain4D.open(root, cameras=CAMERAS)
-    return ViewPairs(dataset, PATH, 5, SIZE, **options)  # pyright: ignore[reportArgumentType]
+def driving_pairs(root: Path, repeats: int = 400, **options: object) -> ViewPairs:
+    dataset, made = ParallelDomain4D.open(root, cameras=CAMERAS), PictureOptions(size=SIZE, **options)  # pyright: ignore
+    return ViewPairs(dataset, PATH, 5, made, repeats=repeats)
 
 
 def similar(one: np.ndarray, other: np.ndarray) -> float:
@@ -83,7 +83,7 @@ def similar(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def test_a_kubric_pair_shows_the_scene_from_the_drawn_cameras(kubric: Kubric4D) -> None:
-    sample = ViewPairs(kubric, ORBIT, 1, SIZE).sample(8)
+    sample = ViewPairs(kubric, ORBIT, 1, PictureOptions(size=SIZE)).sample(8)
     assert sample.source.shape == sample.target.shape == (4, 32, 48, 3)
     assert sample.start is not None
     assert sample.deltas is not None
@@ -104,7 +104,7 @@ def test_a_kubric_pair_shows_the_scene_from_the_drawn_cameras(kubric: Kubric4D) 
 
 
 def test_the_relative_poses_are_those_of_the_angles(kubric: Kubric4D) -> None:
-    sample = ViewPairs(kubric, ORBIT, 1, SIZE).sample(3)
+    sample = ViewPairs(kubric, ORBIT, 1, PictureOptions(size=SIZE)).sample(3)
     assert sample.start is not None
     assert sample.deltas is not None
     azimuth, elevation, radius = sample.deltas[-1].tolist()
@@ -122,7 +122,6 @@ def test_a_driving_source_is_the_cameras_own_picture(driving_root: Path) -> None
     np.testing.assert_allclose(sample.source_from_target[0], np.eye(4), atol=1e-6)
     assert sample.start is None
     assert sample.deltas is None
-    assert sample.motion == 127
 
 
 def test_the_trained_lens_is_that_of_the_trained_picture() -> None:
@@ -160,7 +159,7 @@ def test_no_edge_is_of_a_third_class_whose_colour_lies_between_and_holes_are_of_
 
 
 def test_what_the_source_saw_is_all_at_first_and_less_later(kubric: Kubric4D, driving_root: Path) -> None:
-    orbit = ViewPairs(kubric, ORBIT, 1, SIZE, visible=True).sample(8).visible
+    orbit = ViewPairs(kubric, ORBIT, 1, PictureOptions(size=SIZE, visible=True)).sample(8).visible
     path = driving_pairs(driving_root, visible=True).sample(8).visible
     assert orbit is not None
     assert path is not None
@@ -172,7 +171,7 @@ def test_what_the_source_saw_is_all_at_first_and_less_later(kubric: Kubric4D, dr
 
 
 def test_a_sample_is_the_same_in_any_order(kubric: Kubric4D) -> None:
-    first, second = ViewPairs(kubric, ORBIT, 2, SIZE), ViewPairs(kubric, ORBIT, 2, SIZE)
+    first, second = (ViewPairs(kubric, ORBIT, 2, PictureOptions(size=SIZE)) for _ in range(2))
     ahead = [first.sample(index) for index in (0, 1)]
     back = [second.sample(index) for index in (1, 0)][::-1]
     for one, other in zip(ahead, back, strict=True):
@@ -300,8 +299,8 @@ def test_a_control_is_followed_and_not_replaced(two_scenes: Path) -> None:
 
 
 def test_classes_of_a_set_without_any_are_refused(kubric: Kubric4D) -> None:
-    with pytest.raises(DataError, match="Kubric-4D tells instances only"):
-        ViewPairs(kubric, ORBIT, 0, SIZE, modality="classes")
+    with pytest.raises(DataError, match="Kubric-4D has instances only"):
+        ViewPairs(kubric, ORBIT, 0, PictureOptions(size=SIZE, modality="classes"))
 
 
 def test_a_scene_without_its_class_layer_is_left_out(two_scenes: Path) -> None:

@@ -33,14 +33,6 @@ class SplitFile(msgspec.Struct, frozen=True, kw_only=True):
     test: tuple[str, ...]
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SceneList:
-    """Scenes of a list in its order, each once, and how many of its lines were left out."""
-
-    scenes: tuple[str, ...]
-    left_out: int
-
-
 def kubric_split(scenes: Iterable[str], part: Part) -> tuple[str, ...]:
     """The scenes of one part of Kubric-4D, by number: 0-2799 train, 2800-2899 val, 2900-2999 test."""
     wanted = _KUBRIC_RANGES[part]
@@ -63,7 +55,7 @@ def read_split(path: Path, part: Part) -> tuple[str, ...]:
     return tuple(Path(name).name for name in getattr(split, part))
 
 
-def read_scene_list(path: Path, skips: Skips) -> SceneList:
+def read_scene_list(path: Path, skips: Skips) -> tuple[str, ...]:
     """A list of scenes, one path a line, of which only the last component counts.
 
     Blank lines and comments (from # on) do not count. A line whose comment says "invalid", also one that is a comment
@@ -77,19 +69,17 @@ def read_scene_list(path: Path, skips: Skips) -> SceneList:
     except FileError as error:
         raise DataError(f"{path} is no list of scenes: it {error}") from error
     scenes: list[str] = []
-    left_out = 0
     for number, line in enumerate(lines, 1):
         name, reason = _entry(line)
         if name and not reason and name in scenes:
             reason = "stands there twice"
         if reason:
             skips.add(name, path, f"line {number}: {reason}")
-            left_out += 1
         elif name:
             scenes.append(name)
     if not scenes:
         raise DataError(f"{path} lists no scene; it wants one path like data/scene_000048 a line")
-    return SceneList(scenes=tuple(scenes), left_out=left_out)
+    return tuple(scenes)
 
 
 def present(wanted: Sequence[str], available: Sequence[str], skips: Skips, origin: Path | str) -> tuple[str, ...]:

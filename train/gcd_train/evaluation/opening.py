@@ -133,7 +133,7 @@ def wanted_scenes(folder: Path, there: Sequence[str], choice: Choice, notes: Ski
     if choice.listed is not None and choice.split is not None:
         raise RecipeError("give --list or --split, not both")
     if choice.listed is not None:
-        return present(read_scene_list(choice.listed, notes).scenes, there, notes, choice.listed)
+        return present(read_scene_list(choice.listed, notes), there, notes, choice.listed)
     if choice.split is None:
         return tuple(there)
     place, _, part = choice.split.rpartition(":")

@@ -318,8 +318,7 @@ def _training(options: EvaluateOptions, clips: EvaluationSet) -> PairedClips | N
         raise RecipeError("means are taken over pairs, and these are scenes: leave out --train")
     training = PairedClips.open(list(options.train), options.train_limit)
     require_same_kind(training, clips.clips)
-    if isinstance(clips.clips, PairedClips):
-        require_apart(training.scenes, clips.clips.scenes)
+    require_apart(training.scenes, clips.clips.scenes)
     return training
 
 
