@@ -19,6 +19,7 @@ from gcd_train.data.pictures import PictureOptions
 from gcd_train.data.sample import ClipSource, PaintedClips, SampleClips, Samples, VideoClips, VideoSamples
 from gcd_train.data.skips import Skips
 from gcd_train.data.splits import Part, kubric_split, present, read_split, require_apart
+from gcd_train.data.videos import FilmedPairs, filmed_scenes
 from gcd_train.data.views import ViewPairs
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.layouts.manifest import MANIFEST, read_manifest
@@ -74,6 +75,8 @@ def open_data(recipe: Recipe, config: ModelConfig, family: Family, places: DataP
             return opening.views()
         case "lerobot":
             return opening.lerobot()
+        case "videos":
+            return opening.videos()
         case "cache":
             return opening.cache()
 
@@ -126,6 +129,28 @@ class _Opening:
             clips=self._clips(learned, len(learned), learned.fps),
             valid=self._clips(held, len(held.episodes), held.fps),
             batches=self._sampled(learned),
+        )
+
+    def videos(self) -> RunData:
+        scenes, held_out = filmed_scenes(self.places.data), self._data.held_out
+        if self.places.valid is None:
+            if len(scenes) <= held_out:
+                raise DataError(
+                    f"{self.places.data} has {len(scenes)} scenes and data.held_out keeps {held_out} of them to measure "
+                    "on; hold out fewer, or give --valid FOLDER"
+                )
+            learned, held = scenes[:-held_out], scenes[-held_out:]
+        else:
+            learned, held = scenes, filmed_scenes(self.places.valid)
+        require_apart(*({scene.name: scene.cameras[0].video for scene in part} for part in (learned, held)))
+        fps, seed, repeats = self.recipe.unet.fps, self.recipe.seed, self._data.repeats
+        size, frames = (self.config.width, self.config.height), self.config.frames
+        pairs = FilmedPairs(learned, size=size, frames=frames, fps=fps, seed=seed, repeats=repeats)
+        valid = FilmedPairs(held, size=size, frames=frames, fps=fps, seed=_FIXED_SEED)
+        return RunData(
+            clips=self._clips(pairs, len(pairs), fps),
+            valid=self._clips(valid, len(valid), fps),
+            batches=self._sampled(pairs),
         )
 
     def cache(self) -> RunData:

@@ -1,6 +1,8 @@
 """Training pairs of a 4D data set: what a source camera saw, and what a camera on another path would have seen."""
 
-from collections.abc import Iterator
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 
 import torch
 
@@ -61,20 +63,19 @@ class ViewPairs:
             DataError: a hundred in a row cannot be read; it names the last faults.
             RenderError, RecipeError: exact pictures cannot be drawn on this machine, or an option is wrong.
         """
-        skipped: list[Skipped] = []
-        read_before = bytes_read()
-        for number in self._numbers(index):
+        before = bytes_read()
+
+        def made(number: int) -> Sample:
             scene = self.dataset.scenes[number % len(self.dataset.scenes)]
-            try:
-                frames, rng = self.dataset.frames(scene), generator(self.seed, number)
-                draw = self.sampling.draw(rng, frames, self.dataset.fps)
-                return self._pair(scene, draw, tuple(skipped), read_before)
-            except (RenderError, RecipeError):
-                raise  # no other sample would do better
-            except (TrainError, ModelError, OSError) as error:
-                skipped.append(self._left_out(scene, error))
-        last = "; ".join(map(str, skipped[-_NAMED:]))
-        raise DataError(f"{len(skipped)} samples in a row cannot be read, the last: {last}")
+            frames, random = self.dataset.frames(scene), generator(self.seed, number)
+            return self._pair(scene, self.sampling.draw(random, frames, self.dataset.fps))
+
+        def place(number: int) -> tuple[str, Path]:
+            scene = self.dataset.scenes[number % len(self.dataset.scenes)]
+            return scene, self.dataset.folder(scene)
+
+        sample = readable(self.seed, index, len(self), self.skips, made, place)
+        return replace(sample, bytes_read=bytes_read() - before)
 
     def controlled(self, scene: str, control: Control) -> Sample:
         """The sample of a scene that a control list asks for.
@@ -86,9 +87,10 @@ class ViewPairs:
 
     def pair(self, scene: str, draw: Draw) -> Sample:
         """A sample drawn elsewhere. Raises DataError, FileFault: it cannot be read."""
-        return self._pair(scene, draw, (), bytes_read())
+        before = bytes_read()
+        return replace(self._pair(scene, draw), bytes_read=bytes_read() - before)
 
-    def _pair(self, scene: str, draw: Draw, skipped: tuple[Skipped, ...], read_before: int) -> Sample:
+    def _pair(self, scene: str, draw: Draw) -> Sample:
         made = self._pictures.make(scene, draw)
         world_from_source, world_from_target = map(torch.from_numpy, (made.world_from_source, draw.world_from_target))
         return Sample(
@@ -102,18 +104,36 @@ class ViewPairs:
             scene=scene,
             frame_numbers=draw.frame_numbers,
             visible=made.visible,
-            skipped=skipped,
-            bytes_read=bytes_read() - read_before,
         )
 
-    def _numbers(self, index: int) -> Iterator[int]:
-        """The sample's own number, then others in its stead."""
-        yield index
-        for attempt in range(1, _TRIES + 1):
-            yield int(generator(self.seed, index, attempt).integers(len(self)))
 
-    def _left_out(self, scene: str, error: Exception) -> Skipped:
-        if isinstance(error, FileFault):
-            return self.skips.add(scene, error.path, error.reason)
-        file = error.filename if isinstance(error, OSError) and error.filename else self.dataset.folder(scene)
-        return self.skips.add(scene, str(file), str(error))
+def readable(
+    seed: int,
+    index: int,
+    length: int,
+    skips: Skips,
+    made: Callable[[int], Sample],
+    place: Callable[[int], tuple[str, Path]],
+) -> Sample:
+    """The sample of a number or, where it cannot be read, of the first of a hundred stand-ins that can.
+
+    made: the sample of a number. place: its scene, and the folder or file that is named for a fault that names none.
+    Raises: DataError if none can be read; it names the last faults. RenderError, RecipeError: no other would do better.
+    """
+    skipped: list[Skipped] = []
+    for attempt in range(_TRIES + 1):
+        number = index if attempt == 0 else int(generator(seed, index, attempt).integers(length))
+        try:
+            return replace(made(number), skipped=tuple(skipped))
+        except (RenderError, RecipeError):
+            raise
+        except (TrainError, ModelError, OSError) as error:
+            scene, file = place(number)
+            reason = str(error)
+            if isinstance(error, FileFault):
+                file, reason = error.path, error.reason
+            elif isinstance(error, OSError) and error.filename:
+                file = Path(str(error.filename))
+            skipped.append(skips.add(scene, file, reason))
+    last = "; ".join(map(str, skipped[-_NAMED:]))
+    raise DataError(f"{len(skipped)} samples in a row cannot be read, the last: {last}")

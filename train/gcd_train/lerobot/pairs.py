@@ -4,7 +4,7 @@ Both cameras filmed the same moments, so one is the source, the other the target
 stand to each other. See `cameras` for what the calibration file holds.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,8 +17,9 @@ from gcd_model.errors import ModelError
 from gcd_model.geometry import center_crop_box, relative_pose, require_rigid
 from gcd_train.data.paths import generator
 from gcd_train.data.sample import Sample
-from gcd_train.data.skips import FileFault, Skipped, Skips
-from gcd_train.errors import DataError, TrainError
+from gcd_train.data.skips import FileFault, Skips
+from gcd_train.data.views import readable
+from gcd_train.errors import DataError
 from gcd_train.lerobot.cameras import CameraCalibration, read_cameras
 from gcd_train.lerobot.extra import load_arrow, load_av
 from gcd_train.lerobot.folder import EpisodePlace, LeRobotFolder, read_rows
@@ -26,7 +27,6 @@ from gcd_train.lerobot.video import read_pictures
 
 __all__ = ["LeRobotOptions", "LeRobotPairs"]
 
-_TRIES, _TOLD = 100, 5
 _SLACK_S = 1e-4
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float64]
@@ -103,23 +103,12 @@ class LeRobotPairs:
 
         Raises: DataError naming the last faults if a hundred in a row cannot be read.
         """
-        skipped: list[Skipped] = []
-        for number in self._numbers(index):
-            episode = self.episodes[number % len(self.episodes)]
-            try:
-                return self._pair(episode, generator(self.seed, number), tuple(skipped))
-            except FileFault as fault:
-                skipped.append(self.skips.add(episode.name, fault.path, fault.reason))
-            except (TrainError, ModelError, OSError) as error:
-                skipped.append(self.skips.add(episode.name, episode.data, str(error)))
-        last = "; ".join(map(str, skipped[-_TOLD:]))
-        raise DataError(f"{len(skipped)} samples in a row cannot be read, the last: {last}")
 
-    def _numbers(self, index: int) -> Iterator[int]:
-        """The sample's own number, then others in its stead."""
-        yield index
-        for attempt in range(1, _TRIES + 1):
-            yield int(generator(self.seed, index, attempt).integers(len(self)))
+        def place(number: int) -> tuple[str, Path]:
+            episode = self.episodes[number % len(self.episodes)]
+            return episode.name, episode.data
+
+        return readable(self.seed, index, len(self), self.skips, self._pair, place)
 
     def _chosen_cameras(self) -> tuple[str, ...]:
         """Calibrated cameras that the set has."""
@@ -135,7 +124,8 @@ class LeRobotPairs:
             raise DataError(f"pairs need two cameras or more, got {', '.join(wanted)}")
         return tuple(sorted(set(wanted)))
 
-    def _pair(self, episode: EpisodePlace, random: np.random.Generator, skipped: tuple[Skipped, ...]) -> Sample:
+    def _pair(self, number: int) -> Sample:
+        episode, random = self.episodes[number % len(self.episodes)], generator(self.seed, number)
         source, target = (self.cameras[int(k)] for k in random.choice(len(self.cameras), 2, replace=False))
         window = self._window(episode, (source, target), random)
         seen, seen_bytes = self._pictures(episode, source, window)
@@ -148,7 +138,6 @@ class LeRobotPairs:
             fps=self.fps,
             scene=episode.name,
             frame_numbers=window.rows,
-            skipped=skipped,
             bytes_read=seen_bytes + aimed_bytes,
         )
 

@@ -7,7 +7,7 @@ from msgspec import Meta
 
 from gcd_train.recipe.values import Count, NotNegative, Positive, Share
 
-DataKind: TypeAlias = Literal["pairs", "kubric4d", "parallel_domain4d", "lerobot", "cache"]
+DataKind: TypeAlias = Literal["pairs", "kubric4d", "parallel_domain4d", "lerobot", "videos", "cache"]
 Modality: TypeAlias = Literal["rgb", "semantic"]
 DataTask: TypeAlias = Literal["views", "image-to-video"]
 Bounds: TypeAlias = tuple[float, float]
@@ -67,7 +67,7 @@ class DataRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     """What --data holds, and how clips are drawn from it.
 
     kind: "pairs" of `gcd-train generate`; a set in the layout of "kubric4d" or "parallel_domain4d", published or
-    ours; "lerobot" with calibrated cameras; a latent "cache" (unet.source "cache").
+    ours; "lerobot" with calibrated cameras; own "videos" with poses; a latent "cache" (unet.source "cache").
     task: "views" of the source along the target camera's path; or "image-to-video", to start from: both sides of every
     pair are videos, each to be continued from its first frame, and nobody is told of cameras.
     modality: targets in colour, or painted by class.
