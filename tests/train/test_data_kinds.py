@@ -179,9 +179,3 @@ def test_every_difference_of_the_release_can_be_chosen() -> None:
     slip = sampling_of(recipe(msgspec.structs.replace(other, move_time=13)), 14)
     assert isinstance(slip, OrbitSampling)
     assert slip.move_time == 13  # as the released file of the direct 180-degree model has it
-
-
-def test_clips_that_are_measured_on_have_one_rate_and_run_forwards() -> None:
-    orbit = sampling_of(recipe(KUBRIC), 14, stride=2)
-    assert isinstance(orbit, OrbitSampling)
-    assert (orbit.frames.strides, orbit.frames.reverse) == ((2,), 0.0)

@@ -177,12 +177,6 @@ def test_a_model_for_something_else_is_refused(tmp_path: Path) -> None:
         open_data(told, model_config(told.model), family_of(told.model), DataPlaces(data=tmp_path, valid=tmp_path))
 
 
-@pytest.mark.parametrize("change", ["data.modality=semantic", "data.kind=cache"])
-def test_painted_targets_and_caches_are_no_videos(change: str) -> None:
-    with pytest.raises(RecipeError, match="learns from videos in colour"):
-        recipe("study-pretrain", change)
-
-
 def test_latents_that_were_encoded_unalike_are_no_videos(tmp_path: Path) -> None:
     told = recipe("study-pretrain", "latents.sample=true")
     with pytest.raises(RecipeError, match="one shared autoencoder"):

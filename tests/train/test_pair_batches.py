@@ -9,19 +9,17 @@ import msgspec
 import numpy as np
 import pytest
 import torch
-from tiny_scenes4d import DRIVING_POSES, write_driving, write_kubric
+from tiny_scenes4d import write_kubric
 from torch.testing import assert_close
 
 from gcd_model import FAMILIES, ModelConfig
 from gcd_model.conditioning import micro_conditioning, relative_pose_features, spherical_features
 from gcd_model.config import SMALL
-from gcd_model.geometry import pose_trajectory
 from gcd_model.networks import Networks, random_networks
-from gcd_train.data.batches import SampleBatches, motion_of
+from gcd_train.data.batches import SampleBatches
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.loader import LoadedBatch, SampleLoader, SampleOrder
-from gcd_train.data.parallel_domain4d import ParallelDomain4D
-from gcd_train.data.paths import DrivingSampling, FrameSampling, OrbitSampling
+from gcd_train.data.paths import FrameSampling, OrbitSampling
 from gcd_train.data.pictures import PictureOptions
 from gcd_train.data.sample import Sample, SampleClips, collate
 from gcd_train.data.skips import Skips
@@ -203,12 +201,6 @@ def test_the_network_sees_what_the_encoders_make_of_source_and_target() -> None:
     assert 0.8 < float(away.std()) < 1.2  # drawn from the posterior, not its mean
 
 
-def test_a_family_with_one_motion_number_is_told_the_recipes() -> None:
-    samples = collate([CountedSamples().sample(2)])
-    assert motion_of(samples, 0, FAMILIES["driving"], UNET) == UNET.motion_bucket == 127
-    assert motion_of(samples, 0, FAMILIES["kubric180"], UNET) < motion_of(samples, 0, FAMILIES["kubric90"], UNET)
-
-
 def test_what_samples_cannot_give_is_refused() -> None:
     model = networks()
     with pytest.raises(RecipeError, match="image_share"):
@@ -241,15 +233,3 @@ def test_samples_are_clips_with_the_path_they_were_drawn_with(tmp_path: Path) ->
     np.testing.assert_array_equal(source, sample.source)
     np.testing.assert_array_equal(target, sample.target)
     assert not clips.target_classes(1).any()
-
-
-def test_a_driving_sample_has_a_free_path(tmp_path: Path) -> None:
-    write_driving(tmp_path, 2, frames=FRAMES + 1)
-    data = ParallelDomain4D.open(tmp_path, cameras=list(DRIVING_POSES), classes=False)
-    pairs = ViewPairs(data, DrivingSampling(frames=FrameSampling(clip=FRAMES)), 0, PictureOptions(size=(48, 32)))
-    path = SampleClips(pairs, 1, camera="none", fps=10.0, origin="x").trajectory(0)
-    assert path.delta is None
-    assert_close(
-        path.source_from_target,
-        pose_trajectory(torch.from_numpy(pairs.sample(0).source_from_target)).source_from_target,
-    )

@@ -160,12 +160,6 @@ def test_the_classes_of_a_driving_set_are_measured_and_end_in_the_weight_file(tm
     assert all(0 <= found[stage]["miou_full"] <= 1 for stage in ("vae", "unet", "export"))
 
 
-def test_the_target_of_a_painted_clip_is_what_the_latents_hold(painted_run: Path) -> None:
-    meta = LatentClips.open(painted_run / "latents").meta
-    assert meta.emphasis
-    assert meta.control == 0
-
-
 @pytest.mark.slow
 def test_a_resumed_run_on_orbits_equals_an_uninterrupted_one(orbit_run: Path, tmp_path: Path) -> None:
     """Bit for bit, what is steered included; slow because other runs show the same of fixed paths."""

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gcd_model.geometry import Spherical, SphericalDelta
+from gcd_model.geometry import Spherical
 from gcd_train.data.paths import (
     DRIVING,
     DRIVING_FRAMES,
@@ -131,13 +131,6 @@ def test_starts_and_strides_are_those_of_the_release() -> None:
     assert {draw.fps for draw in driving} == {10.0, 5.0}
 
 
-def test_the_last_frame_can_be_reached_by_choice() -> None:
-    sampling = FrameSampling(reach_last=True)
-    assert sampling.draw(generator(0, 0), 14)[0] == tuple(range(14))
-    with pytest.raises(DataError, match="too short: 14 frames hold no clip of 14 at stride 1"):
-        FrameSampling().draw(generator(0, 0), 14)
-
-
 def test_short_scenes_take_the_strides_that_fit() -> None:
     strides = {KUBRIC_FRAMES.draw(generator(0, index), 30)[1] for index in range(60)}
     assert strides == {1, 2}
@@ -150,26 +143,6 @@ def test_a_reversed_clip_runs_backwards_under_the_same_camera() -> None:
     assert one.frame_numbers == other.frame_numbers[::-1]
     assert (one.reversed, other.reversed) == (False, True)
     np.testing.assert_array_equal(one.world_from_target, other.world_from_target)
-
-
-def test_the_papers_elevations_are_an_option() -> None:
-    paper = replace(MAX180, elevation_deg=(0.0, 90.0))
-    goals = [goal_of(drawn(paper, 0, index))[1] for index in range(60)]
-    assert max(goals) > 60
-    assert max(goals) <= 90
-
-
-def test_a_fixed_change_ignores_the_bounds_and_a_fixed_goal_is_met() -> None:
-    fixed = drawn(replace(MAX90, fixed=SphericalDelta(azimuth_deg=170.0, elevation_deg=0.0, radius_m=9.0)), 2)
-    assert fixed.deltas is not None
-    np.testing.assert_allclose(fixed.deltas[-1], [170.0, 0.0, 9.0])
-    goal = Spherical(azimuth_deg=10.0, elevation_deg=60.0, radius_m=20.0)
-    np.testing.assert_allclose(goal_of(drawn(replace(MAX90, goal=goal), 2)), [10.0, 60.0, 20.0])
-
-
-def test_a_change_over_the_top_is_refused() -> None:
-    with pytest.raises(DataError, match="asks for a camera that cannot be"):
-        drawn(replace(MAX90, fixed=SphericalDelta(elevation_deg=95.0)), 2)
 
 
 def test_the_driving_path_is_the_published_one() -> None:
@@ -208,7 +181,6 @@ def test_a_driving_control_says_frames_only() -> None:
         {"elevation_deg": (0.0, 91.0)},
         {"radius_m": (0.0, 5.0)},
         {"max_azimuth_deg": -1.0},
-        {"fixed": SphericalDelta(), "goal": Spherical(azimuth_deg=0.0, elevation_deg=0.0, radius_m=1.0)},
     ],
 )
 def test_bounds_that_mean_nothing_are_refused(options: dict[str, object]) -> None:

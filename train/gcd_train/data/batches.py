@@ -13,14 +13,14 @@ import torch
 from torch import Tensor, nn
 
 from gcd_model import Family
-from gcd_model.conditioning import micro_conditioning, relative_pose_features, spherical_features
-from gcd_model.config import ModelConfig
-from gcd_model.geometry import SphericalDelta, motion_bucket
+from gcd_model.conditioning import micro_conditioning
+from gcd_model.geometry import Trajectory
 from gcd_model.image_encoder import clip_pixels
 from gcd_model.networks import Networks
+from gcd_train.conditioner import Conditioner
 from gcd_train.data.cache import CachedClip, CachedLatents, PathKind, encoders_digest
 from gcd_train.data.loader import LoadedBatch, SampleLoader
-from gcd_train.data.sample import SampleBatch, Samples, to_network
+from gcd_train.data.sample import Samples, to_network
 from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.losses import COLOUR_WEIGHTS, class_emphasis
@@ -107,9 +107,8 @@ class SampleBatches:
     ) -> None:
         if recipe.image_share:
             raise RecipeError(_WHOLE_CLIPS)
-        if networks.config.extra_condition_channels:
-            raise RecipeError("no data here has further condition channels; take a base without them")
-        self._networks, self._recipe, self._family, self._precision = networks, recipe, family, precision
+        self._networks, self._recipe, self._precision = networks, recipe, precision
+        self._conditioner = Conditioner(networks.config, recipe, precision, family)
         self._loader = SampleLoader(samples, seed, loader)
 
     def single_frames(self, draws: Draws, count: int) -> Batch:
@@ -123,13 +122,17 @@ class SampleBatches:
     def batch(self, loaded: LoadedBatch, draws: Draws) -> Batch:
         """The batch of some samples."""
         samples, config, recipe = loaded.samples, self._networks.config, self._recipe
-        clips, frames = _require_size(samples, config)
+        given = list(samples.source.shape[1:4])
+        wanted = [config.frames, config.height, config.width]
+        if given != wanted:
+            raise DataError(f"samples must be T, H, W = {wanted} for this model, got {given}")
+        frames, paths = config.frames, samples.paths
         encoded = encode_frames(
             self._networks, recipe, self._frames(samples.source), self._frames(samples.target), draws
         )
         condition, tokens = drop_streams(self._precision.frames(encoded.source), encoded.tokens, frames, draws, recipe)
-        camera = _camera_features(samples, config)
-        vectors = [self._vector(samples, clip) for clip in range(clips)]
+        cameras = [camera for path in paths if (camera := self._conditioner.camera(path)) is not None]
+        vectors = [self._vector(float(fps), path) for fps, path in zip(samples.fps, paths, strict=True)]
         names = zip(samples.scenes, loaded.numbers, strict=True)
         return Batch(
             target=self._precision.frames(encoded.target),
@@ -138,7 +141,7 @@ class SampleBatches:
             tokens=tokens,
             emphasis=encoded.emphasis,
             frames=frames,
-            camera=None if camera is None else camera.to(self._precision.device),
+            camera=torch.cat(cameras).to(self._precision.device) if cameras else None,
             ids=tuple(f"{scene} (sample {number})" for scene, number in names),
             wait_s=loaded.wait_s,
         )
@@ -148,77 +151,36 @@ class SampleBatches:
         there = clips.to(self._precision.device, non_blocking=True)
         return self._precision.frames(to_network(there.flatten(0, 1)))
 
-    def _vector(self, samples: SampleBatch, clip: int) -> Tensor:
+    def _vector(self, fps: float, path: Trajectory) -> Tensor:
         """Micro-conditioning of a clip, [V]."""
-        motion = motion_of(samples, clip, self._family, self._recipe)
-        width = self._networks.config.unet.vector_width
-        return micro_conditioning(float(samples.fps[clip]), motion, self._recipe.augmentation, width)
-
-
-def motion_of(samples: SampleBatch, clip: int, family: Family, recipe: UNetRecipe) -> float:
-    """The number that tells the network how far a clip's camera goes, worked out as it will be in use.
-
-    From the whole way in azimuth and elevation, and the family's largest; the recipe's constant for a family without.
-    """
-    if family.motion_bucket is not None or family.limits is None or samples.deltas is None:
-        return recipe.motion_bucket
-    azimuth_deg, elevation_deg, radius_m = samples.deltas[clip, -1].tolist()
-    return motion_bucket(
-        SphericalDelta(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, radius_m=radius_m),
-        max_azimuth_deg=family.limits.azimuth_deg,
-        max_elevation_deg=family.limits.elevation_deg,
-    )
-
-
-def _camera_features(samples: SampleBatch, config: ModelConfig) -> Tensor | None:
-    """What the model is steered by, [B*T, F]; None for a model without camera control.
-
-    Raises: DataError for a model steered by angles where the samples' cameras have none.
-    """
-    if config.camera == "none":
-        return None
-    if config.camera == "relative_pose":
-        return relative_pose_features(samples.source_from_target.flatten(0, 1))
-    if samples.deltas is None:
-        raise DataError(
-            "the model is steered by angles and radius, and these cameras are not on a sphere; take a recipe with "
-            'model.camera "relative_pose" or "none"'
-        )
-    return spherical_features(samples.deltas.flatten(0, 1))
-
-
-def _require_size(samples: SampleBatch, config: ModelConfig) -> tuple[int, int]:
-    """Clips and frames of a clip. Raises DataError unless samples are as long and large as the model takes them."""
-    clips, *given = samples.source.shape[:4]
-    wanted = [config.frames, config.height, config.width]
-    if given != wanted:
-        raise DataError(f"samples must be T, H, W = {wanted} for this model, got {given}")
-    return clips, config.frames
+        recipe, width = self._recipe, self._networks.config.unet.vector_width
+        motion = recipe.motion_bucket if path.delta is None else self._conditioner.motion(path)
+        return micro_conditioning(fps, motion, recipe.augmentation, width)
 
 
 class CachedBatches:
     """A `BatchSource` of whole clips: noise copy of every frame, posterior sample and dropout drawn anew each time.
 
-    The frame rate a clip is told is its own, after the stride; the recipe's `fps` is not used.
-    Raises RecipeError for what a cache does not have: single frames, a camera to steer,
-    another augmentation, size or path than it was made with, or class emphasis where it was made in colour.
+    The frame rate of a clip is its own, after the stride; the recipe's `fps` is not used.
+    Raises RecipeError unless the cache was made with these networks' encoders.
     """
 
     def __init__(
-        self, cache: CachedLatents, config: ModelConfig, recipe: UNetRecipe, precision: Precision, path: PathKind
+        self,
+        cache: CachedLatents,
+        networks: Networks,
+        recipe: UNetRecipe,
+        precision: Precision,
+        path: PathKind,
     ) -> None:
-        _require_cached(cache, config, recipe, path)
-        self._cache, self._config, self._recipe, self._precision = cache, config, recipe, precision
-        self._path: PathKind = path
-
-    def require_encoders(self, networks: Networks) -> None:
-        """Raises RecipeError unless the cache was made with these networks' encoders."""
-        kept, given = self._cache.index.identity.encoders, encoders_digest(networks)
+        kept, given = cache.index.identity.encoders, encoders_digest(networks)
         if kept != given:
             raise RecipeError(
-                f"{self._cache.folder} was made with other encoders ({kept}) than the run's ({given}); give the same "
+                f"{cache.folder} was made with other encoders ({kept}) than the run's ({given}); give the same "
                 "model.weights, or make the cache anew"
             )
+        self._cache, self._config, self._recipe, self._precision = cache, networks.config, recipe, precision
+        self._path: PathKind = path
 
     def single_frames(self, draws: Draws, count: int) -> Batch:
         """Not offered; refused when this was made."""
@@ -257,26 +219,3 @@ class CachedBatches:
     def _joined_if(self, rows: Sequence[Tensor | None]) -> Tensor | None:
         there = [row for row in rows if row is not None]
         return self._joined(there) if len(there) == len(rows) else None
-
-
-def _require_cached(cache: CachedLatents, config: ModelConfig, recipe: UNetRecipe, path: PathKind) -> None:
-    """Raises RecipeError for what model or recipe want and the cache does not have."""
-    kept = cache.index.identity
-    if recipe.image_share:
-        raise RecipeError(_WHOLE_CLIPS)
-    if config.camera != "none":
-        raise RecipeError("a latent cache is of one path; take a model without camera control")
-    if recipe.augmentation != kept.augmentation:
-        raise RecipeError(
-            f"the recipe's unet.augmentation is {recipe.augmentation:g}, {cache.folder} was made with "
-            f"{kept.augmentation:g}; change the recipe, or make the cache anew"
-        )
-    if (config.frames, config.height, config.width) != (kept.plan.clip_frames, kept.height, kept.width):
-        raise RecipeError(
-            f"{cache.folder} holds clips of {kept.plan.clip_frames} frames of {kept.width}x{kept.height}, the "
-            f"model takes {config.frames} of {config.width}x{config.height}; make a cache with its weights"
-        )
-    if path not in kept.plan.paths:
-        raise RecipeError(f"{cache.folder} holds {' and '.join(kept.plan.paths)} clips, the recipe wants {path} ones")
-    if recipe.loss.class_weights != "none" and not kept.emphasis:
-        raise RecipeError(f"{cache.folder} holds no class emphasis; make it with `gcd-train cache --semantic`")

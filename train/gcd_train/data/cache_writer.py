@@ -1,11 +1,9 @@
 """Makes the latent cache, scene by scene, here or on many machines; a run that was killed goes on.
 
-What a scene costs, both paths, K = 4: 713 encoder passes of 0.411 TFLOP and 49 of the image tower of 0.324 TFLOP, 309
-TFLOP together (counted by torch on one 384 x 256 frame of the published shapes, random weights). The released trainer
-spends 16 TFLOP on them in every sample: 13 000 updates of 24 clips are 5.0 EFLOP, the cache of 1 533 scenes 0.47. One
-such frame took 6.9 CPU s in the encoder and 6.1 in the tower on the development machine, so a scene is 1.45 CPU hours
-there (extrapolated): this is work for a GPU. Its 517 targets are 0.38 CPU s each from the points of 19 cameras, 0.18
-drawn exactly (measured on one generated frame of 640 x 480).
+What a scene of 50 frames costs, both paths, K = 4: 713 encoder passes of 0.411 TFLOP and 49 of the image tower of 0.324
+TFLOP (counted by torch on one 384 x 256 frame of the published shapes), 1.45 CPU hours (extrapolated from one frame).
+The released trainer spends 16 TFLOP on them in every sample: its 13 000 updates of 24 clips are 5.0 EFLOP, the cache of
+1 533 scenes 0.47.
 """
 
 import logging

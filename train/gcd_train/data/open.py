@@ -22,6 +22,7 @@ from gcd_train.data.splits import Part, kubric_split, present, read_split, requi
 from gcd_train.data.videos import FilmedPairs, filmed_scenes
 from gcd_train.data.views import ViewPairs
 from gcd_train.errors import DataError, RecipeError
+from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
 from gcd_train.layouts.manifest import MANIFEST, read_manifest
 from gcd_train.lerobot.pairs import LeRobotOptions, LeRobotPairs
 from gcd_train.model_setup import digest_of
@@ -136,8 +137,8 @@ class _Opening:
         if self.places.valid is None:
             if len(scenes) <= held_out:
                 raise DataError(
-                    f"{self.places.data} has {len(scenes)} scenes and data.held_out keeps {held_out} of them to measure "
-                    "on; hold out fewer, or give --valid FOLDER"
+                    f"{self.places.data} has {len(scenes)} scenes, and data.held_out keeps {held_out} of them to "
+                    "measure on; hold out fewer, or give --valid FOLDER"
                 )
             learned, held = scenes[:-held_out], scenes[-held_out:]
         else:
@@ -165,9 +166,7 @@ class _Opening:
         clips = self._one_rate(held, held.fps)
 
         def batches(networks: Networks, precision: Precision, /) -> BatchSource:
-            cached = CachedBatches(cache, self.config, self.recipe.unet, precision, self._data.path)
-            cached.require_encoders(networks)
-            return cached
+            return CachedBatches(cache, networks, self.recipe.unet, precision, self._data.path)
 
         return RunData(clips=clips, valid=clips, batches=batches)
 
@@ -181,16 +180,12 @@ class _Opening:
         )
 
     def _kubric(self, root: Path) -> Kubric4D:
-        data = self._data
-        if data.cameras is None:
-            return Kubric4D.open(root, published=data.published)
-        return Kubric4D.open(root, cameras=data.cameras, published=data.published)
+        cameras = self._data.cameras or kubric4d_names.CAMERAS
+        return Kubric4D.open(root, cameras=cameras, published=self._data.published)
 
     def _driving(self, root: Path) -> ParallelDomain4D:
-        data, classes = self._data, self._data.modality == "semantic"
-        if data.cameras is None:
-            return ParallelDomain4D.open(root, classes=classes)
-        return ParallelDomain4D.open(root, cameras=data.cameras, classes=classes)
+        cameras = self._data.cameras or parallel_domain4d_names.CAMERAS
+        return ParallelDomain4D.open(root, cameras=cameras, classes=self._data.modality == "semantic")
 
     def _parts(self, whole: Set) -> tuple[Set, Set]:
         """What to learn from, and what to measure on."""
@@ -288,22 +283,32 @@ class _Opening:
         return self.places.valid
 
     def _require_drawn_as_cached(self, cache: CachedLatents) -> None:
-        """What a cache was made of cannot be drawn otherwise. Raises RecipeError naming the option."""
-        data, told, kept = self._data, self._data.frames, cache.index.identity
+        """What a cache was made of cannot be drawn otherwise. Raises RecipeError naming the options."""
+        data, unet, config, kept = self._data, self.recipe.unet, self.config, cache.index.identity
+        frames = data.frames
         wrong = {
+            "model.camera": config.camera != "none",
+            "model.frames": config.frames != kept.plan.clip_frames,
+            "model.height and model.width": (config.height, config.width) != (kept.height, kept.width),
+            "unet.image_share": unet.image_share > 0,
+            "unet.augmentation": unet.augmentation != kept.augmentation,
+            "unet.loss.class_weights": unet.loss.class_weights != "none" and not kept.emphasis,
+            "data.path": data.path not in kept.plan.paths,
             "data.modality": (data.modality == "semantic") != kept.emphasis,
-            "data.move_time": data.move_time not in (None, 0 if data.path == "direct" else self.config.frames - 1),
-            "data.frames.strides": told.strides is not None and set(told.strides) != set(kept.plan.strides),
-            "data.frames.latest_start": told.latest_start is not None,
-            "data.frames.reverse": bool(told.reverse),
-            "data.frames.reach_last": told.reach_last,
+            "data.move_time": data.move_time not in (None, 0 if data.path == "direct" else config.frames - 1),
+            "data.frames.strides": frames.strides is not None and set(frames.strides) != set(kept.plan.strides),
+            "data.frames.latest_start": frames.latest_start is not None,
+            "data.frames.reverse": bool(frames.reverse),
+            "data.frames.reach_last": frames.reach_last,
         }
         named = [name for name, is_wrong in wrong.items() if is_wrong]
         if named:
             kind = "class colours" if kept.emphasis else "colour"
             raise RecipeError(
-                f"{cache.folder} holds {kind} at strides {kept.plan.strides}, forwards, up to the last frame but one; "
-                f"the recipe's {', '.join(named)} wants another thing: change the recipe, or make the cache anew"
+                f"{cache.folder} holds {' and '.join(kept.plan.paths)} clips in {kind}, {kept.plan.clip_frames} "
+                f"frames of {kept.width}x{kept.height} at strides {kept.plan.strides}, forwards, of one path, up to "
+                f"the last frame but one, with augmentation {kept.augmentation:g}; the recipe's {', '.join(named)} "
+                "wants another thing: change the recipe, or make the cache anew"
             )
 
     def _require_plain_latents(self) -> None:

@@ -21,7 +21,7 @@ from gcd_model.small_files import decode_json
 from gcd_train.data.dataset4d import KEPT_SCENES, Dataset4D, pose_from_quaternion, scene_names
 from gcd_train.data.files import MOST_TEXT, Recent, one_of, read, read_colour, read_depth, read_ids, require_size
 from gcd_train.data.ontology import Ontology, read_ontology
-from gcd_train.data.sample import Bytes, SceneView
+from gcd_train.data.sample import SceneView
 from gcd_train.data.skips import FileFault
 from gcd_train.errors import DataError
 from gcd_train.layouts import parallel_domain4d_names as names
@@ -136,22 +136,19 @@ class ParallelDomain4D(Dataset4D):
         depth_path = self._path(scene, camera, "depth", time)
         depth = read_depth(depth_path, names.DEPTH_KEY)
         require_size(depth_path, depth, known.height, known.width, told)
+        classes = instances = None
+        if self._classes:
+            classes = self._ids(scene, known, camera, "semantic_segmentation_2d", time, _U8)
+        if self._instances:
+            instances = self._ids(scene, known, camera, "instance_segmentation_2d", time, _U16)
         return SceneView(
             rgb=rgb,
             depth=depth,
-            classes=self._class_ids(scene, known, camera, time) if self._classes else None,
-            instances=self._instance_ids(scene, known, camera, time) if self._instances else None,
+            classes=None if classes is None else classes.astype(np.uint8),
+            instances=None if instances is None else instances.astype(np.uint16),
             world_from_camera=known.cameras[camera].vehicle_from_camera,
             lens=known.cameras[camera].lens(known.width, known.height),
         )
-
-    def _class_ids(self, scene: str, known: _Scene, camera: str, time: int) -> Bytes | None:
-        ids = self._ids(scene, known, camera, "semantic_segmentation_2d", time, _U8)
-        return None if ids is None else ids.astype(np.uint8)
-
-    def _instance_ids(self, scene: str, known: _Scene, camera: str, time: int) -> NDArray[np.uint16] | None:
-        ids = self._ids(scene, known, camera, "instance_segmentation_2d", time, _U16)
-        return None if ids is None else ids.astype(np.uint16)
 
     def _ids(
         self, scene: str, known: _Scene, camera: str, layer: names.Layer, time: int, most: int

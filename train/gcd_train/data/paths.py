@@ -6,7 +6,7 @@ in any number of workers.
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -104,18 +104,6 @@ class Draw:
     deltas: NDArray[np.float64] | None
 
 
-class Sampling(Protocol):
-    """Draws samples."""
-
-    def draw(self, rng: np.random.Generator, frames: int, fps: float) -> Draw:
-        """A sample of a scene with so many frames at this rate. Raises DataError if the scene is too short."""
-        ...
-
-    def controlled(self, control: Control, frames: int, fps: float) -> Draw:
-        """The sample that a control list asks for. Raises DataError if the scene is too short for it."""
-        ...
-
-
 def generator(seed: int, index: int, attempt: int = 0) -> np.random.Generator:
     """The generator of one sample; of another one for each attempt to replace it."""
     return np.random.default_rng((seed, index, attempt))
@@ -128,7 +116,6 @@ class OrbitSampling:
     azimuth_deg, elevation_deg, radius_m: where the source may stand and the goal too (its azimuth may be any). The
     source's elevation is uniform in its sine, so that directions are; the goal's is uniform in degrees.
     max_azimuth_deg, max_elevation_deg, max_radius_m: largest change to the goal.
-    fixed: this change instead of a drawn one, whatever the bounds. goal: this goal instead.
     gradual: the camera moves all the way through the clip; otherwise it is at the goal from the first frame on.
     move_time: the frame in which a gradual move is done, the last by default.
     Source: Van Hoorick et al. 2024 (GCD), section 4; bounds of elevation as released (the paper prints 0..90 for
@@ -141,8 +128,6 @@ class OrbitSampling:
     azimuth_deg: Range = (0.0, 360.0)
     elevation_deg: Range = (0.0, 50.0)
     radius_m: Range = (12.0, 18.0)
-    fixed: SphericalDelta | None = None
-    goal: Spherical | None = None
     gradual: bool = True
     move_time: int | None = None
     frames: FrameSampling = KUBRIC_FRAMES
@@ -161,8 +146,6 @@ class OrbitSampling:
             )
         if min(self.max_azimuth_deg, self.max_elevation_deg, self.max_radius_m) < 0.0:
             raise RecipeError("largest changes of azimuth, elevation and radius are 0 or more")
-        if self.fixed is not None and self.goal is not None:
-            raise RecipeError("give a fixed change or a fixed goal, not both")
 
     def draw(self, rng: np.random.Generator, frames: int, fps: float) -> Draw:
         """A sample. Raises DataError if the scene is too short."""
@@ -188,10 +171,6 @@ class OrbitSampling:
 
     def change(self, rng: np.random.Generator, start: Spherical) -> SphericalDelta:
         """The way from a source to a goal."""
-        if self.fixed is not None:
-            return self.fixed
-        if self.goal is not None:
-            return self.goal - start
         return SphericalDelta(
             azimuth_deg=float(rng.uniform(-self.max_azimuth_deg, self.max_azimuth_deg)),
             elevation_deg=_step(rng, start.elevation_deg, self.max_elevation_deg, self.elevation_deg),
@@ -264,6 +243,10 @@ class DrivingSampling:
 
 DRIVING = DrivingSampling()
 """ParallelDomain-4D, gradual."""
+
+
+Sampling: TypeAlias = OrbitSampling | DrivingSampling
+"""Draws samples."""
 
 
 def _vehicle_from_source() -> NDArray[np.float64]:

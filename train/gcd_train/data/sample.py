@@ -102,6 +102,14 @@ class SampleBatch:
     scenes: tuple[str, ...]
     skipped: tuple[Skipped, ...]
 
+    @property
+    def paths(self) -> list[Trajectory]:
+        """Of the target cameras, seen from the source cameras."""
+        paths = [pose_trajectory(poses) for poses in self.source_from_target]
+        if self.deltas is None:
+            return paths
+        return [replace(path, delta=delta) for path, delta in zip(paths, self.deltas, strict=True)]
+
     def pin_memory(self) -> "SampleBatch":
         """The pictures in page-locked memory, as a loader wants to hand them over to CUDA."""
         return replace(self, source=self.source.pin_memory(), target=self.target.pin_memory())
