@@ -28,7 +28,7 @@ class FramesRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 class OrbitRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Cameras about the scene's centre; see `trajectories.OrbitSampling`.
+    """Cameras about the scene's centre; see `paths.OrbitSampling`.
 
     max_azimuth_deg, max_elevation_deg, max_radius_m: largest change from source to goal.
     azimuth_deg, elevation_deg, radius_m: where cameras may stand. The elevation is as released, also for the 180-degree
