@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 from gcd_model import FAMILIES, ModelConfig
 from gcd_train.cli.main import app
 from gcd_train.data.open import DataPlaces, RunData, open_data
+from gcd_train.data.sample import Sample
 from gcd_train.data.skips import FileFault
 from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.lerobot.cameras import CAMERA_FILE, CameraCalibration
@@ -166,6 +167,25 @@ def test_a_lower_rate_takes_the_rows_nearest_in_time(made: Path) -> None:
 def test_pictures_are_cropped_to_the_wanted_shape_and_resized(made: Path) -> None:
     sample = LeRobotPairs(made, options=LeRobotOptions(frames=2, size=(30, 20))).sample(0)
     assert sample.source.shape == sample.target.shape == (2, 20, 30, 3)
+
+
+def test_of_two_lenses_both_sides_have_the_narrower_one(copied: Path) -> None:
+    same = _only(copied, LEFT, RIGHT).sample(0)
+    path = copied / CAMERA_FILE
+    told = json.loads(path.read_text())
+    told["cameras"][RIGHT].update(fx=120.0, fy=120.0)
+    path.write_text(json.dumps(told))
+    zoomed = _only(copied, LEFT, RIGHT).sample(0)
+
+    def ramps(sample: Sample) -> list[float]:
+        return sorted(float(side[0, HEIGHT // 2, -1, 0]) - float(side[0, HEIGHT // 2, 0, 0]) for side in sides(sample))
+
+    def sides(sample: Sample) -> tuple[np.ndarray, np.ndarray]:
+        return sample.source, sample.target
+
+    assert ramps(same)[0] > 105
+    assert 50 < ramps(zoomed)[0] < 70
+    assert ramps(zoomed)[1] > 105
 
 
 def test_the_layout_is_that_of_version_three(made: Path) -> None:

@@ -22,10 +22,11 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from gcd_model.errors import FileError, ModelError
-from gcd_model.geometry import Intrinsics, center_crop_box, relative_pose, require_rigid
+from gcd_model.geometry import Intrinsics, relative_pose, require_rigid
 from gcd_model.small_files import read_json
 from gcd_train.data.files import MOST_PICTURE
 from gcd_train.data.paths import generator
+from gcd_train.data.pictures import narrower, seen_through
 from gcd_train.data.sample import Bytes, Sample
 from gcd_train.data.skips import FileFault, Skips
 from gcd_train.data.views import readable
@@ -188,7 +189,7 @@ class FilmedPairs:
         stride = self._stride(scene)
         start = int(random.integers(scene.frames - (self._frames - 1) * stride))
         numbers = range(start, start + self._frames * stride, stride)
-        lens = max(source.lens, target.lens, key=lambda each: each.fx / each.width)
+        lens = narrower(source.lens, target.lens)
         poses = (torch.from_numpy(camera.poses[list(numbers)]) for camera in (source, target))
         return Sample(
             source=self._pictures(source, numbers, lens),
@@ -201,19 +202,7 @@ class FilmedPairs:
 
     def _pictures(self, camera: FilmedCamera, numbers: range, lens: Intrinsics) -> Bytes:
         """Frames of a video as a camera with this lens sees them, at the size of the samples. u8 [T, H, W, 3]."""
-        wide, high = self._size
-        left, top, across, along = center_crop_box(lens.width, lens.height, wide / high)
-        between = (lens.matrix @ torch.linalg.inv(camera.lens.matrix)).numpy()
-        corner = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # OpenCV counts from the pixel's middle
-        warp = np.linalg.inv(corner) @ between @ corner
-        made: list[Bytes] = []
-        for picture in _decoded(camera.video, numbers):
-            if lens != camera.lens:
-                picture = cv2.warpPerspective(picture, warp, (lens.width, lens.height))
-            kept = picture[top : top + along, left : left + across]
-            how = cv2.INTER_AREA if across >= wide else cv2.INTER_LINEAR
-            made.append(cv2.resize(kept, (wide, high), interpolation=how).astype(np.uint8, copy=False))
-        return np.stack(made)
+        return np.stack([seen_through(each, camera.lens, lens, self._size) for each in _decoded(camera.video, numbers)])
 
 
 def _decoded(video: Path, numbers: range) -> list[Bytes]:

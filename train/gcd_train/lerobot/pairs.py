@@ -8,14 +8,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from gcd_model.errors import ModelError
-from gcd_model.geometry import center_crop_box, relative_pose, require_rigid
+from gcd_model.geometry import Intrinsics, relative_pose, require_rigid
 from gcd_train.data.paths import generator
+from gcd_train.data.pictures import narrower, seen_through
 from gcd_train.data.sample import Sample
 from gcd_train.data.skips import FileFault, Skips
 from gcd_train.data.views import readable
@@ -38,7 +38,7 @@ class LeRobotOptions:
 
     frames: T. fps: of the clips, at most the set's own, which is the default; rows and pictures are taken that are
     nearest in time. size: width and height of the samples; pictures are cropped about their middle to its shape and
-    resized, so cameras of one field of view make the best pairs. tolerance_s: how far a row or picture may be from the
+    resized; of two lenses both sides have the narrower one. tolerance_s: how far a row or picture may be from the
     wanted time; by default half a frame of the set.
     cameras: features to choose from, by default all that are calibrated; source and target are drawn from them.
     calibration: a file in place of the set's meta/cameras.json. repeats: the set counts as so many times its episodes.
@@ -128,8 +128,9 @@ class LeRobotPairs:
         episode, random = self.episodes[number % len(self.episodes)], generator(self.seed, number)
         source, target = (self.cameras[int(k)] for k in random.choice(len(self.cameras), 2, replace=False))
         window = self._window(episode, (source, target), random)
-        seen, seen_bytes = self._pictures(episode, source, window)
-        aimed, aimed_bytes = self._pictures(episode, target, window)
+        lens = narrower(self._calibrations[source].lens, self._calibrations[target].lens)
+        seen, seen_bytes = self._pictures(episode, source, window, lens)
+        aimed, aimed_bytes = self._pictures(episode, target, window, lens)
         poses = (torch.from_numpy(window.poses[name]) for name in (source, target))
         return Sample(
             source=seen,
@@ -164,20 +165,17 @@ class LeRobotPairs:
         }
         return _Window(tuple(chosen.tolist()), tuple(times[chosen].tolist()), poses)
 
-    def _pictures(self, episode: EpisodePlace, camera: str, window: _Window) -> tuple[Bytes, int]:
-        """[T, H, W, 3] at the wanted size, and the bytes that were read."""
+    def _pictures(self, episode: EpisodePlace, camera: str, window: _Window, lens: Intrinsics) -> tuple[Bytes, int]:
+        """[T, H, W, 3] through this lens at the wanted size, and the bytes that were read."""
         path, begin = episode.videos[camera]
         clip = read_pictures(path, [begin + time for time in window.times_s], self._tolerance_s)
         height, width = clip.pictures.shape[1:3]
-        told = self._calibrations[camera]
-        if (width, height) != (told.width, told.height):
-            raise FileFault(path, f"is {width} x {height}, its calibration says {told.width} x {told.height}")
-        wide, high = self.options.size
-        left, top, kept_width, kept_height = center_crop_box(width, height, wide / high)
-        kept = clip.pictures[:, top : top + kept_height, left : left + kept_width]
-        how = cv2.INTER_AREA if kept_width >= wide else cv2.INTER_LINEAR
-        sized = [cv2.resize(picture, (wide, high), interpolation=how) for picture in kept]
-        return np.stack(sized).astype(np.uint8), clip.bytes_read
+        calibration = self._calibrations[camera]
+        if (width, height) != (calibration.width, calibration.height):
+            said = f"{calibration.width} x {calibration.height}"
+            raise FileFault(path, f"is {width} x {height}, its calibration says {said}")
+        sized = [seen_through(picture, calibration.lens, lens, self.options.size) for picture in clip.pictures]
+        return np.stack(sized), clip.bytes_read
 
 
 def _number(value: float | list[float]) -> float:
