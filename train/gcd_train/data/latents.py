@@ -24,24 +24,16 @@ class LatentsMeta(Index, frozen=True, kw_only=True):
     """The index of a folder of latents.
 
     identity: the autoencoder and the options it was made with. seeds: of the N clips there are to be; `shards` hold
-    them in this order. flips: F. control: K, 0 for a model that is not steered. emphasis: whether classes count
-    unequally. When all are there: sensitivity, what a unit change of each latent channel does to the decoded picture,
-    one on average; mean, std of each target channel.
+    them in this order. frames: T. flips: F. sensitivity, when all are there: what a unit change of each latent channel
+    does to the decoded picture, one on average.
     """
 
     identity: str
     seeds: tuple[int, ...]
     frames: int
     flips: int
-    channels: int
-    height: int
-    width: int
-    control: int
-    emphasis: bool
     shards: tuple[Shard, ...] = ()
     sensitivity: tuple[float, ...] = ()
-    mean: tuple[float, ...] = ()
-    std: tuple[float, ...] = ()
 
     @property
     def clips(self) -> int:
@@ -139,8 +131,6 @@ class LatentVideos:
         self.meta = msgspec.structs.replace(
             metas[0],
             seeds=tuple(seed for meta in metas for seed in meta.seeds for _ in range(2)),
-            control=0,
-            emphasis=False,
             sensitivity=tuple(sum(row) / len(metas) for row in sensitivities),
         )
 

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from gcd_model import Family, ModelConfig
-from gcd_model.config import CAMERA_FEATURES
 from gcd_model.networks import Networks, weights_digest
 from gcd_train.conditioner import Conditioner, mirrored_path
 from gcd_train.data.latents import EncodedClips, LatentClips, LatentsMeta, LatentVideos
@@ -28,7 +27,7 @@ from gcd_train.stop import StopSignal
 _log = logging.getLogger(__name__)
 _SHARD = 32  # clips
 _LOG_S = 15.0
-_STATISTICS_CLIPS, _SENSITIVITY_CLIPS, _NUDGE = 64, 8, 0.25
+_SENSITIVITY_CLIPS, _NUDGE = 8, 0.25
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -84,7 +83,9 @@ def encode_clips(job: LatentsJob) -> None:
             rows.clear()
         if stopped:
             raise Interrupted(f"stopped after clip {number + 1} of {meta.clips} of latents; run again to go on")
-    _finish(job, meta)
+    parts = [map_shard(job.folder, shard)["target"] for shard in meta.shards[:_SENSITIVITY_CLIPS]]
+    target = torch.cat(parts)[:_SENSITIVITY_CLIPS, 0].float()
+    write_index(job.folder, msgspec.structs.replace(meta, sensitivity=tuple(_sensitivity(job, target).tolist())))
 
 
 def _description(job: LatentsJob) -> LatentsMeta:
@@ -97,17 +98,12 @@ def _description(job: LatentsJob) -> LatentsMeta:
             f"clips must be {config.frames} frames of {config.width}x{config.height} for this model, "
             f"got {frames} of {width}x{height}; generate them anew, or change [model] in the recipe"
         )
-    down, count = config.vae.down_factor, min(len(job.clips), job.recipe.limit or len(job.clips))
+    count = min(len(job.clips), job.recipe.limit or len(job.clips))
     return LatentsMeta(
         identity=job.identity,
         seeds=tuple(job.clips.seed(number) for number in range(count)),
         frames=frames,
         flips=2 if job.recipe.flip else 1,
-        channels=config.vae.latent_channels,
-        height=height // down,
-        width=width // down,
-        control=CAMERA_FEATURES[config.camera],
-        emphasis=bool(job.class_weights),
     )
 
 
@@ -126,8 +122,9 @@ def _encoded(job: LatentsJob, meta: LatentsMeta, number: int) -> dict[str, Tenso
     steered = [each.float() for each in features if each is not None]
     if steered:
         rows["control"] = torch.stack(steered)
-    if meta.emphasis:
-        rows["emphasis"] = class_emphasis(target, job.class_weights, (meta.height, meta.width)).half()
+    if job.class_weights:
+        size = (rows["target"].shape[-2], rows["target"].shape[-1])
+        rows["emphasis"] = class_emphasis(target, job.class_weights, size).half()
     return {name: value.cpu() for name, value in rows.items()}
 
 
@@ -144,22 +141,6 @@ def _target(job: LatentsJob, frames: Tensor, draws: Draws, mirrored: bool) -> Te
         posterior = job.networks.target_encoder(frames.flip(-1) if mirrored else frames)
     latents = posterior.sample(draws.normal(*posterior.mean.shape)) if job.recipe.sample else posterior.mean
     return latents.float() * job.networks.config.vae.scale
-
-
-def _finish(job: LatentsJob, meta: LatentsMeta) -> None:
-    parts: list[Tensor] = []
-    for shard in meta.shards:
-        if sum(map(len, parts)) < _STATISTICS_CLIPS:
-            parts.append(map_shard(job.folder, shard)["target"])
-    target = torch.cat(parts)[:_STATISTICS_CLIPS].float()
-    values = target.movedim(3, 0).flatten(1)  # [C, everything]
-    finished = msgspec.structs.replace(
-        meta,
-        sensitivity=tuple(_sensitivity(job, target[:_SENSITIVITY_CLIPS, 0]).tolist()),
-        mean=tuple(values.mean(1).tolist()),
-        std=tuple(values.std(1).tolist()),
-    )
-    write_index(job.folder, finished)
 
 
 @torch.no_grad()
