@@ -20,6 +20,7 @@ from gcd_train.layouts.depth_code import FAR_M, stored_depth
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
+Key = TypeVar("Key")
 Value = TypeVar("Value")
 
 ZIP_FAULTS = (OSError, KeyError, ValueError, NotImplementedError, EOFError, zlib.error, zipfile.BadZipFile)
@@ -31,21 +32,21 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_PALETTE, _PNG_GREY = 3, 0
 
 
-class Recent(Generic[Value]):
-    """The last `most` values that were made, by name."""
+class Recent(Generic[Key, Value]):
+    """The last `most` values that were made, by key."""
 
-    def __init__(self, make: Callable[[str], Value], most: int) -> None:
+    def __init__(self, make: Callable[[Key], Value], most: int) -> None:
         self._make, self._most = make, most
-        self._kept: OrderedDict[str, Value] = OrderedDict()
+        self._kept: OrderedDict[Key, Value] = OrderedDict()
 
-    def __call__(self, name: str) -> Value:
-        """The value of a name, made where it is not kept. Raises what `make` raises."""
-        if name not in self._kept:
-            self._kept[name] = self._make(name)
+    def __call__(self, key: Key) -> Value:
+        """The value of a key, made where it is not kept. Raises what `make` raises."""
+        if key not in self._kept:
+            self._kept[key] = self._make(key)
             if len(self._kept) > self._most:
                 self._kept.popitem(last=False)
-        self._kept.move_to_end(name)
-        return self._kept[name]
+        self._kept.move_to_end(key)
+        return self._kept[key]
 
 
 class _Tally(threading.local):

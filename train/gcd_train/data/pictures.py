@@ -8,6 +8,7 @@ blur, and hardly a byte to read.
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from gcd_model.geometry import Intrinsics, center_crop_box
 from gcd_train.data.dataset4d import Dataset4D
+from gcd_train.data.files import Recent
 from gcd_train.data.ontology import VOID, Ontology
 from gcd_train.data.paths import Draw
 from gcd_train.data.sample import Bytes, SceneView
@@ -78,7 +80,7 @@ class SplatPictures:
 
     def make(self, scene: str, draw: Draw) -> DrawnPictures:
         """The pictures. Raises DataError, FileFault: a file is missing, damaged or does not fit."""
-        lens, read = self._dataset.lens(scene), _LastViews(self._dataset, scene)
+        lens, read = self._dataset.lens(scene), Recent(partial(self._dataset.views, scene), 1)
         place = list(self._dataset.cameras).index(self._dataset.source_camera)
         world_from_source, frames = draw.world_from_source, list[tuple[Bytes, ...]]()
         classes, masks = list[Bytes](), list[NDArray[np.bool_]]()
@@ -261,19 +263,6 @@ def _renderer_kind() -> "type[Renderer]":
     except ImportError as error:
         raise RenderError(f"exact targets are drawn and need pip install 'gcd-node[scenes]' ({error})") from error
     return Renderer
-
-
-class _LastViews:
-    """What all cameras saw; of a time step that is asked for several times in a row, read once."""
-
-    def __init__(self, dataset: Dataset4D, scene: str) -> None:
-        self._dataset, self._scene = dataset, scene
-        self._last: tuple[int, list[SceneView]] | None = None
-
-    def __call__(self, time: int) -> list[SceneView]:
-        if self._last is None or self._last[0] != time:
-            self._last = time, self._dataset.views(self._scene, time)
-        return self._last[1]
 
 
 def _view(rgb: Bytes, depth: NDArray[np.float32], world_from_camera: Doubles, lens: Intrinsics) -> SceneView:
