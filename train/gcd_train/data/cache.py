@@ -152,7 +152,7 @@ class CachedLatents:
 
     def __init__(self, folder: Path, index: CacheIndex, keep: int = 8) -> None:
         self.folder, self.index = folder, index
-        self._shard = Recent(lambda scene: read_shard(folder, index.scenes[scene]), keep)
+        self._shard = Recent(self._read, keep)
 
     @classmethod
     def open(cls, folder: Path | str, keep: int = 8) -> "CachedLatents":
@@ -213,6 +213,9 @@ class CachedLatents:
             scene=scene,
             place=place,
         )
+
+    def _read(self, scene: str) -> dict[str, Tensor]:
+        return read_shard(self.folder, self.index.scenes[scene])
 
     def _target(self, tensors: dict[str, Tensor], rows: Tensor, draws: Draws | None) -> Tensor:
         mean = tensors["target_mean"][rows].float()
