@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gcd_train.data.skips import FileFault, Skips
+from gcd_train.data.files import FileFault, Skips
 from gcd_train.data.splits import Part, kubric_split, read_controls, read_scene_list, read_split
 from gcd_train.errors import DataError
 

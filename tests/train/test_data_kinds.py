@@ -14,9 +14,9 @@ from gcd_model import FAMILIES, ModelConfig
 from gcd_model.loading import random_weights
 from gcd_model.networks import random_networks
 from gcd_train.data.cache_writer import CacheJob, cache_scenes
+from gcd_train.data.latents import only_writer
 from gcd_train.data.open import DataPlaces, RunData, open_data, sampling_of
 from gcd_train.data.paths import DrivingSampling, OrbitSampling
-from gcd_train.data.store import only_writer
 from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.precision import Precision

@@ -11,11 +11,11 @@ from tiny_world import FRAMES, Never, TinyClips, TinyOrbits
 from gcd_model import FAMILIES, load_synthesizer
 from gcd_model.networks import Networks, random_networks
 from gcd_train.conditioner import Conditioner
+from gcd_train.data.files import Skips
 from gcd_train.data.latents import LatentClips, LatentVideos
 from gcd_train.data.latents_writer import LatentsJob, encode_clips
 from gcd_train.data.open import DataPlaces, open_data
 from gcd_train.data.sample import ClipSource, Sample, VideoClips, VideoSamples
-from gcd_train.data.skips import Skips
 from gcd_train.errors import RecipeError
 from gcd_train.model_setup import family_of, model_config
 from gcd_train.precision import Precision

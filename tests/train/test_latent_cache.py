@@ -22,10 +22,10 @@ from gcd_train.cli.main import app
 from gcd_train.data.batches import CachedBatches
 from gcd_train.data.cache import CachedLatents, CacheIndex, ClipPlace, ClipPlan, log_variance_codes, log_variance_of
 from gcd_train.data.cache_writer import CacheJob, CacheProgress, DrivingPictures, cache_scenes
+from gcd_train.data.latents import only_writer, read_index
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.pictures import PictureOptions
 from gcd_train.data.sample import to_network
-from gcd_train.data.store import only_writer, read_index
 from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.precision import Precision

@@ -16,9 +16,9 @@ from typer.testing import CliRunner
 
 from gcd_model import FAMILIES, ModelConfig
 from gcd_train.cli.main import app
+from gcd_train.data.files import FileFault
 from gcd_train.data.open import DataPlaces, RunData, open_data
 from gcd_train.data.sample import Sample
-from gcd_train.data.skips import FileFault
 from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.lerobot.cameras import CAMERA_FILE, CameraCalibration
 from gcd_train.lerobot.pairs import LeRobotOptions, LeRobotPairs

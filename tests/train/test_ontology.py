@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_scenes4d import BOX, GROUND, SKY, ontology
 
-from gcd_train.data.ontology import VOID, Ontology, OntologyItem, read_ontology
-from gcd_train.data.skips import FileFault
+from gcd_train.data.dataset4d import VOID, Ontology, OntologyItem, read_ontology
+from gcd_train.data.files import FileFault
 from gcd_train.errors import DataError
 
 COLOUR = st.tuples(*[st.integers(0, 255)] * 3)

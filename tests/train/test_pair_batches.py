@@ -17,12 +17,12 @@ from gcd_model.conditioning import micro_conditioning, relative_pose_features, s
 from gcd_model.config import SMALL
 from gcd_model.networks import Networks, random_networks
 from gcd_train.data.batches import SampleBatches
+from gcd_train.data.files import Skips
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.loader import LoadedBatch, SampleLoader, SampleOrder
 from gcd_train.data.paths import FrameSampling, OrbitSampling
 from gcd_train.data.pictures import PictureOptions
 from gcd_train.data.sample import Sample, SampleClips, collate
-from gcd_train.data.skips import Skips
 from gcd_train.data.views import ViewPairs
 from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError, RunError

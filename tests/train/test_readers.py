@@ -23,10 +23,9 @@ from tiny_scenes4d import (
 )
 
 from gcd_model.geometry import Intrinsics
-from gcd_train.data.files import read_ids, read_palette_indices
+from gcd_train.data.files import FileFault, read_ids, read_palette_indices
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
-from gcd_train.data.skips import FileFault
 from gcd_train.errors import DataError
 from gcd_train.layouts.depth_code import encode_depth
 

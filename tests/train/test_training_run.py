@@ -12,9 +12,8 @@ from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips, tiny_reci
 
 from gcd_model import Clip, load_synthesizer
 from gcd_train.checkpoint import load_state
-from gcd_train.data.latents import LatentClips
+from gcd_train.data.latents import LatentClips, write_index
 from gcd_train.data.sample import to_network
-from gcd_train.data.store import write_index
 from gcd_train.errors import DataError, Interrupted, RecipeError, RunError
 from gcd_train.model_setup import model_config, sampled_as_trained
 from gcd_train.recipe import Budget, Recipe, StageName

@@ -13,8 +13,8 @@ import pytest
 from tiny_world import tiny_recipe
 
 from gcd_model import FAMILIES, ModelConfig
+from gcd_train.data.files import FileFault
 from gcd_train.data.open import DataPlaces, RunData, open_data
-from gcd_train.data.skips import FileFault
 from gcd_train.data.videos import CAMERA_FILE, FilmedPairs, filmed_scenes
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.recipe import DataRecipe

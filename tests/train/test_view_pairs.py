@@ -25,8 +25,8 @@ from tiny_scenes4d import (
 from torch.utils.data import DataLoader
 
 from gcd_model.geometry import SphericalDelta, to_pose
+from gcd_train.data.dataset4d import VOID
 from gcd_train.data.kubric4d import Kubric4D
-from gcd_train.data.ontology import VOID
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import DRIVING, MAX90, FrameSampling, generator
 from gcd_train.data.pictures import PictureOptions, trained_lens, trained_picture

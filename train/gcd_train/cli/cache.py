@@ -101,8 +101,8 @@ def cache(
 def _dataset(
     root: Path, split: "Part | None", split_file: Path | None, limit: int | None, semantic: bool
 ) -> "Dataset4D":
+    from gcd_train.data.files import Skips
     from gcd_train.data.parallel_domain4d import ParallelDomain4D
-    from gcd_train.data.skips import Skips
     from gcd_train.data.splits import present, read_split
 
     data = ParallelDomain4D.open(root, classes=semantic)
@@ -119,7 +119,7 @@ def _dataset(
 
 def _run(job: "CacheJob", workers: int, ray: str | None) -> None:
     from gcd_train.data.cache_writer import cache_scenes
-    from gcd_train.data.store import only_writer
+    from gcd_train.data.latents import only_writer
 
     folder, scenes = job.folder, job.pictures.scenes
     with only_writer(folder):
@@ -174,7 +174,7 @@ def _size(count: float) -> str:
 
 def _close(folder: Path, scenes: Sequence[str], account: _Account) -> None:
     from gcd_train.data.cache import CacheIndex
-    from gcd_train.data.store import read_index
+    from gcd_train.data.latents import read_index
 
     index = read_index(folder, CacheIndex)
     kept = {} if index is None else {name: index.scenes[name] for name in scenes if name in index.scenes}

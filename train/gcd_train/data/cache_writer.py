@@ -37,10 +37,10 @@ from gcd_train.data.cache import (
     log_variance_codes,
 )
 from gcd_train.data.dataset4d import Dataset4D
+from gcd_train.data.latents import fault, read_index, write_index, write_shard
 from gcd_train.data.paths import Draw
 from gcd_train.data.pictures import PictureOptions, pictures_of, trained_picture
 from gcd_train.data.sample import Bytes, to_network
-from gcd_train.data.store import fault, read_index, write_index, write_shard
 from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.losses import PARALLEL_DOMAIN_WEIGHTS, class_emphasis

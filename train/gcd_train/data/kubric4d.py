@@ -19,6 +19,7 @@ from gcd_model.small_files import decode_json
 from gcd_train.data.dataset4d import KEPT_SCENES, Dataset4D, pose_from_quaternion, scene_names
 from gcd_train.data.files import (
     MOST_TEXT,
+    FileFault,
     Recent,
     one_of,
     read,
@@ -28,7 +29,6 @@ from gcd_train.data.files import (
     require_size,
 )
 from gcd_train.data.sample import SceneView
-from gcd_train.data.skips import FileFault
 from gcd_train.errors import DataError
 from gcd_train.layouts import kubric4d_names as names
 from gcd_train.pointcloud import planar_from_distance

@@ -13,9 +13,18 @@ from torch import Tensor
 from gcd_model import Family, ModelConfig
 from gcd_model.networks import Networks, weights_digest
 from gcd_train.conditioner import Conditioner, mirrored_path
-from gcd_train.data.latents import EncodedClips, LatentClips, LatentsMeta, LatentVideos
+from gcd_train.data.latents import (
+    EncodedClips,
+    LatentClips,
+    LatentsMeta,
+    LatentVideos,
+    Shard,
+    map_shard,
+    read_index,
+    write_index,
+    write_shard,
+)
 from gcd_train.data.sample import ClipSource, numbers_of, to_network
-from gcd_train.data.store import Shard, map_shard, read_index, write_index, write_shard
 from gcd_train.draws import Draws
 from gcd_train.errors import DataError, Interrupted, RunError
 from gcd_train.losses import COLOUR_WEIGHTS, ClassWeight, class_emphasis

@@ -9,15 +9,14 @@ from gcd_model.networks import Networks
 from gcd_train.batches import BatchMaker, BatchSource
 from gcd_train.data.batches import CachedBatches, SampleBatches
 from gcd_train.data.cache import CachedLatents
-from gcd_train.data.dataset4d import Dataset4D
+from gcd_train.data.dataset4d import Dataset4D, Ontology
+from gcd_train.data.files import Skips
 from gcd_train.data.kubric4d import Kubric4D
-from gcd_train.data.ontology import Ontology
 from gcd_train.data.pairs import PairedClips, data_folders
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import DRIVING_FRAMES, KUBRIC_FRAMES, DrivingSampling, FrameSampling, OrbitSampling, Sampling
 from gcd_train.data.pictures import PictureOptions
 from gcd_train.data.sample import ClipSource, PaintedClips, SampleClips, Samples, VideoClips, VideoSamples
-from gcd_train.data.skips import Skips
 from gcd_train.data.splits import Part, kubric_split, present, read_split, require_apart
 from gcd_train.data.videos import FilmedPairs, filmed_scenes
 from gcd_train.data.views import ViewPairs

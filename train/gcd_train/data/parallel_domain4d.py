@@ -18,11 +18,19 @@ from numpy.typing import NDArray
 from gcd_model.errors import FileError, ModelError
 from gcd_model.geometry import Intrinsics
 from gcd_model.small_files import decode_json
-from gcd_train.data.dataset4d import KEPT_SCENES, Dataset4D, pose_from_quaternion, scene_names
-from gcd_train.data.files import MOST_TEXT, Recent, one_of, read, read_colour, read_depth, read_ids, require_size
-from gcd_train.data.ontology import Ontology, read_ontology
+from gcd_train.data.dataset4d import KEPT_SCENES, Dataset4D, Ontology, pose_from_quaternion, read_ontology, scene_names
+from gcd_train.data.files import (
+    MOST_TEXT,
+    FileFault,
+    Recent,
+    one_of,
+    read,
+    read_colour,
+    read_depth,
+    read_ids,
+    require_size,
+)
 from gcd_train.data.sample import SceneView
-from gcd_train.data.skips import FileFault
 from gcd_train.errors import DataError
 from gcd_train.layouts import parallel_domain4d_names as names
 

@@ -17,12 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_model.geometry import Intrinsics, center_crop_box
-from gcd_train.data.dataset4d import Dataset4D
-from gcd_train.data.files import Recent
-from gcd_train.data.ontology import VOID, Ontology
+from gcd_train.data.dataset4d import VOID, Dataset4D, Ontology
+from gcd_train.data.files import FileFault, Recent
 from gcd_train.data.paths import Draw
 from gcd_train.data.sample import Bytes, SceneView
-from gcd_train.data.skips import FileFault
 from gcd_train.errors import DataError, RenderError
 from gcd_train.layouts.manifest import GEOMETRY, MANIFEST, read_manifest
 from gcd_train.pointcloud import SplatOptions, depth_visibility, published_picture, render_lens, splat, visibility

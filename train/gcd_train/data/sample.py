@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gcd_model.config import CameraControl, SemanticClass
 from gcd_model.geometry import CameraMount, Intrinsics, Spherical, Trajectory, pose_trajectory
-from gcd_train.data.skips import Skipped, Skips
+from gcd_train.data.files import Skipped, Skips
 from gcd_train.errors import DataError
 
 Bytes: TypeAlias = NDArray[np.uint8]

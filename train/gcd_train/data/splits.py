@@ -12,7 +12,7 @@ import msgspec
 from gcd_model.errors import FileError, PoseError
 from gcd_model.geometry import Spherical
 from gcd_model.small_files import read_json, read_small
-from gcd_train.data.skips import Skips
+from gcd_train.data.files import Skips
 from gcd_train.errors import DataError
 from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
 

@@ -24,11 +24,10 @@ from numpy.typing import NDArray
 from gcd_model.errors import FileError, ModelError
 from gcd_model.geometry import Intrinsics, relative_pose, require_rigid
 from gcd_model.small_files import read_json
-from gcd_train.data.files import MOST_PICTURE
+from gcd_train.data.files import MOST_PICTURE, FileFault, Skips
 from gcd_train.data.paths import generator
 from gcd_train.data.pictures import narrower, seen_through
 from gcd_train.data.sample import Bytes, Sample
-from gcd_train.data.skips import FileFault, Skips
 from gcd_train.data.views import readable
 from gcd_train.errors import DataError, RecipeError
 

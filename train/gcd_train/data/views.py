@@ -9,11 +9,10 @@ import torch
 from gcd_model.errors import ModelError
 from gcd_model.geometry import relative_pose
 from gcd_train.data.dataset4d import Dataset4D
-from gcd_train.data.files import bytes_read
+from gcd_train.data.files import FileFault, Skipped, Skips, bytes_read
 from gcd_train.data.paths import Draw, Sampling, generator
 from gcd_train.data.pictures import PictureOptions, pictures_of
 from gcd_train.data.sample import Sample
-from gcd_train.data.skips import FileFault, Skipped, Skips
 from gcd_train.data.splits import Control
 from gcd_train.errors import DataError, RecipeError, RenderError, TrainError
 

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from gcd_model.config import CameraControl, SemanticClass
 from gcd_model.geometry import CameraMount, center_crop_box, pose_trajectory, to_pose
-from gcd_train.data.dataset4d import Dataset4D
-from gcd_train.data.ontology import Ontology
+from gcd_train.data.dataset4d import Dataset4D, Ontology
 from gcd_train.data.pictures import SAME_POSE, trained_lens, trained_picture
 from gcd_train.data.sample import Bytes, Sample, SceneView
 from gcd_train.data.splits import Control

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from gcd_model.errors import ModelError
 from gcd_model.geometry import Intrinsics, relative_pose, require_rigid
+from gcd_train.data.files import FileFault, Skips
 from gcd_train.data.paths import generator
 from gcd_train.data.pictures import narrower, seen_through
 from gcd_train.data.sample import Sample
-from gcd_train.data.skips import FileFault, Skips
 from gcd_train.data.views import readable
 from gcd_train.errors import DataError
 from gcd_train.lerobot.cameras import CameraCalibration, read_cameras

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from gcd_model.geometry import DRIVING_GOAL_TARGET, LOOK_AT, Intrinsics
 from gcd_model.small_files import decode_json
+from gcd_train.data.dataset4d import read_ontology
 from gcd_train.data.files import ZIP_FAULTS, read_member
 from gcd_train.data.kubric4d import Kubric4D
-from gcd_train.data.ontology import read_ontology
 from gcd_train.data.pairs import PairedClip, PairedClips
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.sample import SceneView
