@@ -131,6 +131,13 @@ def test_starts_and_strides_are_those_of_the_release() -> None:
     assert {draw.fps for draw in driving} == {10.0, 5.0}
 
 
+def test_the_last_frame_can_be_reached_by_choice() -> None:
+    sampling = FrameSampling(reach_last=True)
+    assert sampling.draw(generator(0, 0), 14)[0] == tuple(range(14))
+    with pytest.raises(DataError, match=r"clip of 14 at stride 1 wants 15 frames \(the last is left out.*\), got 14"):
+        FrameSampling().draw(generator(0, 0), 14)
+
+
 def test_short_scenes_take_the_strides_that_fit() -> None:
     strides = {KUBRIC_FRAMES.draw(generator(0, index), 30)[1] for index in range(60)}
     assert strides == {1, 2}

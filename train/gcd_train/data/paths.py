@@ -63,7 +63,12 @@ class FrameSampling:
         """Frame numbers, stride, and whether they run backwards. Raises DataError if no clip fits."""
         fitting = [stride for stride in self.strides if self.last_start(frames, stride) >= 0]
         if not fitting:
-            raise DataError(f"is too short: {frames} frames hold no clip of {self.clip} at stride {min(self.strides)}")
+            wanted = frames - self.last_start(frames, min(self.strides))
+            left_out = "" if self.reach_last else " (the last is left out, as published, unless data.frames.reach_last)"
+            raise DataError(
+                f"is too short: a clip of {self.clip} at stride {min(self.strides)} wants {wanted} frames{left_out}, "
+                f"got {frames}"
+            )
         stride = int(rng.choice(fitting))
         start = int(rng.integers(self.last_start(frames, stride) + 1))
         numbers = tuple(range(start, start + self.clip * stride, stride))
