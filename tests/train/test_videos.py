@@ -32,7 +32,7 @@ def film(path: Path, hue: int, frames: int = FRAMES, size: tuple[int, int] = (WI
     """A flat picture that gets brighter from frame to frame, but for the channel `hue`."""
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
     for number in range(frames):
-        picture = np.full((size[1], size[0], 3), 8 * number, np.uint8)
+        picture = np.full((size[1], size[0], 3), 8 * number % 256, np.uint8)
         picture[..., hue] = 120
         writer.write(picture)
     writer.release()
@@ -77,6 +77,17 @@ def test_both_sides_show_the_frames_whose_poses_they_have(folder: Path) -> None:
     assert samples.skips.total == 0
     again = pairs(folder).sample(3)
     np.testing.assert_array_equal(again.target, samples.sample(3).target)
+
+
+def test_a_clip_deep_in_a_video_has_its_own_frames(folder: Path) -> None:
+    for name, hue in ((LEFT, 0), (RIGHT, 1)):
+        film(folder / name, hue, frames=240)
+    edited(lambda told: told["cameras"][RIGHT].update(world_from_camera=[pose(1.0)]))(folder)
+    for index in range(5):
+        sample = pairs(folder).sample(index)
+        wanted = 8 * np.array(sample.frame_numbers) % 256
+        assert np.abs(sample.source[..., 0].mean((1, 2)) - wanted).max() < 6
+    assert max(pairs(folder).sample(index).frame_numbers[0] for index in range(5)) > 100
 
 
 def test_of_two_lenses_both_sides_have_the_narrower_one(tmp_path: Path) -> None:

@@ -205,10 +205,14 @@ class FilmedPairs:
 
 
 def _decoded(video: Path, numbers: range) -> list[Bytes]:
-    """Frames of these numbers, RGB; all before them are decoded, as seeking is not exact. Raises FileFault."""
+    """Frames of these numbers, RGB. Raises FileFault if the video ends before."""
     opened, found = cv2.VideoCapture(str(video)), list[Bytes]()
     try:
-        for number in range(numbers[-1] + 1):
+        first = numbers[0]
+        if not opened.set(cv2.CAP_PROP_POS_FRAMES, first) or opened.get(cv2.CAP_PROP_POS_FRAMES) != first:
+            opened.release()  # a video in which numbers cannot be sought is decoded from its beginning
+            opened, first = cv2.VideoCapture(str(video)), 0
+        for number in range(first, numbers[-1] + 1):
             if not opened.grab():
                 raise FileFault(video, f"ends at frame {number}, wanted frame {numbers[-1]}")
             if number in numbers:
