@@ -16,11 +16,11 @@ from statistics import median
 import numpy as np
 import torch
 
-from gcd_train.datasets.kubric4d import Kubric4D
-from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
-from gcd_train.datasets.picture_files import bytes_read
-from gcd_train.datasets.trajectories import DRIVING, MAX90
-from gcd_train.datasets.view_pairs import ViewPairs
+from gcd_train.data.files import bytes_read
+from gcd_train.data.kubric4d import Kubric4D
+from gcd_train.data.parallel_domain4d import ParallelDomain4D
+from gcd_train.data.paths import DRIVING, MAX90
+from gcd_train.data.views import ViewPairs
 from gcd_train.layouts.scene_writer import SceneFormat, write_scene
 from gcd_train.map_items import one_thread_each
 from gcd_train.pointcloud import published_picture

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from gcd_model.geometry import Intrinsics, sphere_poses
-from gcd_train.scene_view import SceneView
+from gcd_train.data.sample import SceneView
 
 Array = NDArray[np.float64]
 DOME_M, FLOOR, DOME, BALL = 40.0, 24, 29, 5

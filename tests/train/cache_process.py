@@ -8,7 +8,8 @@ from pathlib import Path
 import torch
 from cached_sets import CHOICE, FakePictures, tiny_identity
 
-from gcd_train.latent_cache import CacheJob, cache_scenes, only_writer
+from gcd_train.data.cache_writer import CacheJob, cache_scenes
+from gcd_train.data.latents import only_writer
 
 RENAME = Path.replace
 _HANG_S = 100

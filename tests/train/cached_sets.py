@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gcd_train.data.cache import CacheIdentity, ClipPlan
+from gcd_train.data.cache_writer import EncoderChoice, Encoders, load_encoders
 from gcd_train.errors import DataError
-from gcd_train.latent_cache import CacheIdentity, ClipPlan, EncoderChoice, Encoders, MomentPictures
-from gcd_train.latent_cache.encoders import load_encoders
 
 HEIGHT, WIDTH, FRAMES, CLIP = 32, 48, 7, 3
 PLAN = ClipPlan(clip_frames=CLIP)
@@ -27,13 +27,11 @@ class FakePictures:
     def frames(self, scene: str, /) -> int:
         return self.length
 
-    def moment(self, scene: str, time: int, positions: tuple[int, ...], /) -> MomentPictures:
+    def moment(self, scene: str, time: int, positions: tuple[int, ...], /) -> tuple[np.ndarray, np.ndarray]:
         if (scene, time) in self.broken:
             raise DataError(f"{scene}/rgb/yaw-0/{time}.png is cut")
         shade = 20 * self.scenes.index(scene) + 10 * time
-        return MomentPictures(
-            source=_picture(shade, 0), targets=np.stack([_picture(shade, 1 + position) for position in positions])
-        )
+        return _picture(shade, 0), np.stack([_picture(shade, 1 + position) for position in positions])
 
 
 def _picture(shade: int, hue: int) -> np.ndarray:

@@ -24,7 +24,7 @@ from gcd_model.geometry import (
     driving_trajectory,
     spherical_trajectory,
 )
-from gcd_train.datasets.paired import PairedClip
+from gcd_train.data.pairs import PairedClip
 from gcd_train.evaluation.baselines import BaselineSettings, build, usual_baselines
 from gcd_train.evaluation.clips import PairedSet
 from gcd_train.evaluation.measure import predicted_and_measured as measured

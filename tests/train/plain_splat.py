@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_model.geometry import Intrinsics
-from gcd_train.scene_view import SceneView
+from gcd_train.data.sample import SceneView
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from driving_plane import STAGE_SOURCE, PlaneClips, plane_clip
 from torch.testing import assert_close
 
 from gcd_model.geometry import CameraMount, SphericalDelta, spherical_trajectory
-from gcd_train.datasets.paired import PairedClip
+from gcd_train.data.pairs import PairedClip
 from gcd_train.evaluation.predictors import (
     CameraPair,
     GroundHomography,

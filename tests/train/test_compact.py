@@ -10,8 +10,8 @@ from tiny_scenes4d import DRIVING_POSES, write_driving, write_kubric
 from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
-from gcd_train.datasets.kubric4d import Kubric4D
-from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
+from gcd_train.data.kubric4d import Kubric4D
+from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.errors import DataError
 from gcd_train.layouts import encodings
 from gcd_train.layouts.compact import Compaction

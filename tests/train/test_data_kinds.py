@@ -13,11 +13,12 @@ from tiny_world import tiny_recipe
 from gcd_model import FAMILIES, ModelConfig
 from gcd_model.loading import random_weights
 from gcd_model.networks import random_networks
-from gcd_train.data_kinds import DataPlaces, RunData, open_data, sampling_of
-from gcd_train.datasets.trajectories import DrivingSampling, OrbitSampling
+from gcd_train.data.cache_writer import CacheJob, cache_scenes
+from gcd_train.data.latents import only_writer
+from gcd_train.data.open import DataPlaces, RunData, open_data, sampling_of
+from gcd_train.data.paths import DrivingSampling, OrbitSampling
 from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.latent_cache import CacheJob, cache_scenes, only_writer
 from gcd_train.precision import Precision
 from gcd_train.recipe import DataRecipe, FramesRecipe, LossRecipe, OrbitRecipe, Recipe
 
@@ -178,9 +179,3 @@ def test_every_difference_of_the_release_can_be_chosen() -> None:
     slip = sampling_of(recipe(msgspec.structs.replace(other, move_time=13)), 14)
     assert isinstance(slip, OrbitSampling)
     assert slip.move_time == 13  # as the released file of the direct 180-degree model has it
-
-
-def test_clips_that_are_measured_on_have_one_rate_and_run_forwards() -> None:
-    orbit = sampling_of(recipe(KUBRIC), 14, stride=2)
-    assert isinstance(orbit, OrbitSampling)
-    assert (orbit.frames.strides, orbit.frames.reverse) == ((2,), 0.0)

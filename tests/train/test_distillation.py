@@ -18,7 +18,8 @@ from gcd_model.weights.families import FAMILIES
 from gcd_model.weights.load import load_weights, read_adapter, save_weights
 from gcd_train.batches import PixelBatches
 from gcd_train.checkpoint import load_state
-from gcd_train.datasets.clip_source import to_network
+from gcd_train.data.open import RunData
+from gcd_train.data.sample import to_network
 from gcd_train.distillation.distiller import Distiller, DistillInputs
 from gcd_train.distillation.paired import sampled, schedule_of
 from gcd_train.distillation.recipe import (
@@ -37,7 +38,6 @@ from gcd_train.precision import Precision
 from gcd_train.recipe import ComputeRecipe, OptimiserRecipe, UNetRecipe
 from gcd_train.recipe.loading import checked_recipe
 from gcd_train.recipe.values import Budget
-from gcd_train.run_data import RunData
 from gcd_train.run_folder import RunFolder
 from gcd_train.start import loaded_base
 from gcd_train.stop import StopSignal

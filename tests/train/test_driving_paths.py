@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from gcd_model.geometry import CameraMount, driving_trajectory
-from gcd_train.data_kinds import open_pairs
-from gcd_train.datasets.paired import PairedClips
+from gcd_train.data.open import DataPlaces, RunData, open_data
+from gcd_train.data.pairs import PairedClips
 from gcd_train.errors import DataError
 from gcd_train.evaluation.clips import cameras_of
-from gcd_train.model_setup import model_config
-from gcd_train.recipe import load_recipe
+from gcd_train.model_setup import family_of, model_config
+from gcd_train.recipe import Recipe, load_recipe
 from gcd_train.scenes.driving.pair_scene import driving_scene
 from gcd_train.scenes.pair_world import CameraWay, PairForm, World, agree, driving_world, read_world
 from gcd_train.scenes.worlds import WorldOptions
@@ -32,6 +32,11 @@ def folder(place: Path, path: CameraWay, first_seed: int = 0) -> Path:
     with zipfile.ZipFile(place / f"shard-{first_seed:08d}-0001.zip", "w") as archive:
         archive.writestr(f"{first_seed:08d}/scene.json", "{}")
     return place
+
+
+def opened(recipe: Recipe, data: Path, valid: Path) -> RunData:
+    model = recipe.model
+    return open_data(recipe, model_config(model), family_of(model), DataPlaces(data=data, valid=valid))
 
 
 # laws
@@ -79,11 +84,11 @@ def test_clips_of_both_paths_do_not_go_together(tmp_path: Path) -> None:
 
 def test_a_recipe_for_the_other_path_is_refused(tmp_path: Path) -> None:
     recipe = load_recipe("package:study-gradual-scratch")
-    places = folder(tmp_path / "train", "direct"), folder(tmp_path / "valid", "direct", 1_000_000)
+    data, valid = folder(tmp_path / "train", "direct"), folder(tmp_path / "valid", "direct", 1_000_000)
     with pytest.raises(DataError, match=r"goal in frame 0, the recipe's data\.path says frame 2"):
-        open_pairs(recipe, model_config(recipe.model), *places)
+        opened(recipe, data, valid)
     direct = load_recipe("package:study-direct-scratch")
-    assert len(open_pairs(direct, model_config(direct.model), *places).clips) == 1
+    assert len(opened(direct, data, valid).clips) == 1
 
 
 def test_image_to_video_takes_both_paths_and_no_scene_that_is_held_out(tmp_path: Path) -> None:
@@ -91,8 +96,8 @@ def test_image_to_video_takes_both_paths_and_no_scene_that_is_held_out(tmp_path:
         folder(tmp_path / "train" / path, path)
         folder(tmp_path / "valid" / path, path, 1_000_000)
     recipe = load_recipe("package:study-pretrain")
-    opened = open_pairs(recipe, model_config(recipe.model), tmp_path / "train", tmp_path / "valid")
-    assert (len(opened.clips), len(opened.parts), len(opened.valid)) == (4, 2, 4)
-    assert opened.parts[0].origin != opened.parts[1].origin
+    run = opened(recipe, tmp_path / "train", tmp_path / "valid")
+    assert (len(run.clips), len(run.parts), len(run.valid)) == (4, 2, 4)
+    assert run.parts[0].origin != run.parts[1].origin
     with pytest.raises(DataError, match="share 1 scenes"):
-        open_pairs(recipe, model_config(recipe.model), tmp_path / "train", tmp_path / "train" / "direct")
+        opened(recipe, tmp_path / "train", tmp_path / "train" / "direct")

@@ -12,7 +12,7 @@ from made_records import note, record
 from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
-from gcd_train.datasets.paired import PairedClips
+from gcd_train.data.pairs import PairedClips
 from gcd_train.errors import DataError, RunError
 from gcd_train.evaluation.clips import HeldOutClip, PairedSet, chosen, identity_of
 from gcd_train.evaluation.galleries import KeptViews, png

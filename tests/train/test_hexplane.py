@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from gcd_model.geometry import Intrinsics, Spherical, Trajectory, relative_pose, to_pose
+from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError
 from gcd_train.evaluation.hexplane import (
     SPACE,
@@ -23,7 +24,6 @@ from gcd_train.evaluation.hexplane import (
 )
 from gcd_train.evaluation.hexplane_learning import Camera, HexPlane, PosedPicture
 from gcd_train.evaluation.predictors import CameraPair, SourceClip
-from gcd_train.scene_view import SceneView
 
 LENS = Intrinsics.from_hfov(53.0, 24, 16)
 FRAMES = 2

@@ -11,18 +11,16 @@ from tiny_world import FRAMES, Never, TinyClips, TinyOrbits
 from gcd_model import FAMILIES, load_synthesizer
 from gcd_model.networks import Networks, random_networks
 from gcd_train.conditioner import Conditioner
-from gcd_train.data_kinds import open_pairs, require_image_to_video
-from gcd_train.datasets.clip_source import ClipSource
-from gcd_train.datasets.dataset4d import PairSample
-from gcd_train.datasets.latents import LatentClips, LatentVideos
-from gcd_train.datasets.skips import Skips
-from gcd_train.datasets.videos import VideoClips, VideoSamples
+from gcd_train.data.files import Skips
+from gcd_train.data.latents import LatentClips, LatentVideos
+from gcd_train.data.latents_writer import LatentsJob, encode_clips
+from gcd_train.data.open import DataPlaces, open_data
+from gcd_train.data.sample import ClipSource, Sample, VideoClips, VideoSamples
 from gcd_train.errors import RecipeError
-from gcd_train.model_setup import model_config
+from gcd_train.model_setup import family_of, model_config
 from gcd_train.precision import Precision
 from gcd_train.recipe import Recipe, load_recipe
 from gcd_train.run_folder import RunFolder
-from gcd_train.stages.latents import LatentsJob, encode_clips
 from gcd_train.start import start_networks
 from gcd_train.trainer import RunInputs, Trainer
 
@@ -104,22 +102,20 @@ class TwoSamples:
     def __len__(self) -> int:
         return 2
 
-    def sample(self, index: int) -> PairSample:
+    def sample(self, index: int) -> Sample:
         source, target = TinyOrbits(2).rgb(index)
         path = TinyOrbits(2).trajectory(index)
         assert path.delta is not None
-        return PairSample(
+        return Sample(
             source=source,
             target=target,
             target_classes=np.zeros(target.shape[:3], np.uint8),
             source_from_target=path.source_from_target.numpy(),
             start=path.source,
             deltas=path.delta.numpy(),
-            motion=100,
             fps=12.0,
             scene=f"scene {index}",
             frame_numbers=(0, 2, 4, 6),
-            reversed=False,
             visible=np.ones(target.shape[:3], np.bool_),
         )
 
@@ -161,12 +157,12 @@ def test_views_start_from_what_continues_pictures_and_nothing_is_encoded_twice(t
     weights = tmp_path / "first" / "study-pretrain-small.safetensors"
     made = load_synthesizer(weights, device="cpu")
     assert made.traits.family is FAMILIES["svd"]
-    before = {path: path.stat().st_mtime_ns for path in latents.rglob("*.npy")}
+    before = {path: path.stat().st_mtime_ns for path in latents.rglob("*.safetensors")}
     assert len({path.parent for path in before}) == 2
     assert not (tmp_path / "first" / "latents").exists()
     then = recipe("study-gradual-pretrained", f"model.weights={weights}")
     trainer(tmp_path / "second", then, latents).run("latents")
-    assert {path: path.stat().st_mtime_ns for path in latents.rglob("*.npy")} == before
+    assert {path: path.stat().st_mtime_ns for path in latents.rglob("*.safetensors")} == before
     start = start_networks(then.model, model_config(then.model), then.seed)
     assert torch.equal(start.unet.conv_out.weight, made.networks.unet.conv_out.weight.float())
     scratch = recipe("study-gradual-scratch", f"model.weights={weights}")
@@ -175,19 +171,13 @@ def test_views_start_from_what_continues_pictures_and_nothing_is_encoded_twice(t
     assert torch.equal(anew.decoder.stem.weight, start.decoder.stem.weight)
 
 
-def test_a_model_for_something_else_is_refused() -> None:
+def test_a_model_for_something_else_is_refused(tmp_path: Path) -> None:
     told = recipe("study-pretrain", "model.family=driving")
     with pytest.raises(RecipeError, match=r'give model\.family "svd"'):
-        require_image_to_video(told, model_config(told.model))
-
-
-@pytest.mark.parametrize("change", ["data.modality=semantic", "data.kind=cache"])
-def test_painted_targets_and_caches_are_no_videos(change: str) -> None:
-    with pytest.raises(RecipeError, match="learns from videos in colour"):
-        recipe("study-pretrain", change)
+        open_data(told, model_config(told.model), family_of(told.model), DataPlaces(data=tmp_path, valid=tmp_path))
 
 
 def test_latents_that_were_encoded_unalike_are_no_videos(tmp_path: Path) -> None:
     told = recipe("study-pretrain", "latents.sample=true")
     with pytest.raises(RecipeError, match="one shared autoencoder"):
-        open_pairs(told, model_config(told.model), tmp_path, tmp_path)
+        open_data(told, model_config(told.model), family_of(told.model), DataPlaces(data=tmp_path, valid=tmp_path))

@@ -17,24 +17,17 @@ from tiny_world import tiny_recipe
 from torch.testing import assert_close
 from typer.testing import CliRunner
 
+from gcd_model.loading import random_weights
 from gcd_train.cli.main import app
-from gcd_train.datasets.clip_source import to_network
-from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
+from gcd_train.data.batches import CachedBatches
+from gcd_train.data.cache import CachedLatents, CacheIndex, ClipPlace, ClipPlan, log_variance_codes, log_variance_of
+from gcd_train.data.cache_writer import CacheJob, CacheProgress, DrivingPictures, cache_scenes
+from gcd_train.data.latents import only_writer, read_index
+from gcd_train.data.parallel_domain4d import ParallelDomain4D
+from gcd_train.data.pictures import PictureOptions
+from gcd_train.data.sample import to_network
 from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError, RunError
-from gcd_train.latent_cache import (
-    CachedLatents,
-    CacheJob,
-    CacheProgress,
-    ClipPlace,
-    ClipPlan,
-    cache_scenes,
-    only_writer,
-    read_index,
-)
-from gcd_train.latent_cache.batches import CachedBatches
-from gcd_train.latent_cache.driving import DrivingPictures
-from gcd_train.latent_cache.shard import log_variance_codes, log_variance_of
 from gcd_train.precision import Precision
 from gcd_train.recipe import LossRecipe
 
@@ -70,23 +63,12 @@ def test_a_published_scene_needs_so_many_target_pictures(paths: tuple[str, ...],
     assert {time for time, _ in pairs} == set(range(49))  # as published, the last frame is never reached
 
 
-def test_stride_two_needs_no_target_that_stride_one_does_not() -> None:
-    one, two = (set(ClipPlan(strides=(stride,), paths=("gradual",)).pairs(50, range(50))) for stride in (1, 2))
-    assert two < one
-
-
 def test_a_plan_leaves_out_clips_with_missing_frames() -> None:
     there = set(range(50)) - {20}
     clips = ClipPlan().clips(50, there)
     assert clips
     assert all(20 not in ClipPlan().times(place) for place in clips)
     assert len(clips) < 59
-
-
-@pytest.mark.parametrize("wrong", [{"clip_frames": 1}, {"strides": ()}, {"strides": (0,)}, {"paths": ()}])
-def test_an_impossible_plan_is_refused(wrong: dict[str, object]) -> None:
-    with pytest.raises(RecipeError):
-        ClipPlan(**wrong)  # pyright: ignore[reportArgumentType]
 
 
 # a clip read back
@@ -98,46 +80,37 @@ def test_a_cached_clip_is_what_the_encoders_make_of_it(folder: Path, place: Clip
     encoders, pictures = tiny_encoders(), FakePictures()
     moments = [pictures.moment("scene_000002", time, (i,)) for i, time in enumerate(PLAN.times(place))]
     with torch.no_grad():
-        source = torch.cat([to_network(moment.source[None]) for moment in moments])
-        target = torch.cat([to_network(moment.targets) for moment in moments])
+        source = torch.cat([to_network(picture[None]) for picture, _ in moments])
+        target = torch.cat([to_network(pictures) for _, pictures in moments])
         mean = encoders.posterior(target).mean * 0.18215
         tokens, plain = encoders.tokens(source), encoders.condition_mean(source)
-    assert_close(clip.rows.target, mean, atol=1e-3, rtol=2e-3)  # float16
+    assert_close(clip.target, mean, atol=1e-3, rtol=2e-3)  # float16
     assert tokens is not None
     assert clip.tokens is not None
     assert_close(clip.tokens, tokens, atol=1e-3, rtol=2e-3)
-    assert (clip.rows.source - plain).abs().max() < 0.2  # the noise that the encoder saw
-    assert not torch.equal(clip.rows.source, plain)
-    assert clip.rows.frame_numbers.tolist() == [0, 1, 2]
-    assert clip.rows.half.shape == (CLIP, 3, 0, 0)
+    assert (clip.source - plain).abs().max() < 0.2  # the noise that the encoder saw
+    assert not torch.equal(clip.source, plain)
 
 
 def test_on_the_direct_path_every_target_is_seen_from_the_goal(folder: Path) -> None:
     cache = CachedLatents.open(folder)
     direct, gradual = (cache.clip("scene_000000", ClipPlace(2, 1), path) for path in ("direct", "gradual"))  # pyright: ignore
-    assert torch.equal(direct.rows.target[-1], gradual.rows.target[-1])
-    assert not torch.equal(direct.rows.target[0], gradual.rows.target[0])
+    assert torch.equal(direct.target[-1], gradual.target[-1])
+    assert not torch.equal(direct.target[0], gradual.target[0])
     later = cache.clip("scene_000000", ClipPlace(0, 1), "direct")
-    assert torch.equal(direct.rows.target[0], later.rows.target[2])  # the same moment, whatever clip it is in
+    assert torch.equal(direct.target[0], later.target[2])  # the same moment, whatever clip it is in
 
 
 def test_noise_copies_are_drawn_for_each_frame_and_repeat_with_the_seed(folder: Path) -> None:
     cache, place = CachedLatents.open(folder), ClipPlace(0, 1)
-    drawn = [cache.clip("scene_000001", place, "gradual", draws(n)).rows for n in range(12)]
-    again = cache.clip("scene_000001", place, "gradual", draws(0)).rows
+    drawn = [cache.clip("scene_000001", place, "gradual", draws(n)) for n in range(12)]
+    again = cache.clip("scene_000001", place, "gradual", draws(0))
     assert torch.equal(drawn[0].source, again.source)
     assert torch.equal(drawn[0].target, again.target)
     for frame in range(CLIP):
         assert len({rows.source[frame].numpy().tobytes() for rows in drawn}) == 2  # copies
     assert len({rows.source.numpy().tobytes() for rows in drawn}) > 2  # mixed anew in every clip
     assert len({rows.target.numpy().tobytes() for rows in drawn}) == 12  # samples of the posterior
-
-
-def test_the_noise_between_copies_has_the_strength_asked_for(tmp_path: Path) -> None:
-    cached(tmp_path, FakePictures(scenes=("a",)), augmentation=0.0, moments="mean")
-    rows = [CachedLatents.open(tmp_path).clip("a", ClipPlace(0, 1), "direct", draws(n)).rows for n in range(6)]
-    assert len({each.source.numpy().tobytes() for each in rows}) == 1
-    assert len({each.target.numpy().tobytes() for each in rows}) == 1
 
 
 def test_log_variances_survive_one_byte() -> None:
@@ -151,7 +124,7 @@ def test_semantic_targets_keep_their_class_emphasis(tmp_path: Path) -> None:
     cached(tmp_path, FakePictures(scenes=("a",), semantic=True), emphasis=True)
     clip = CachedLatents.open(tmp_path).clip("a", ClipPlace(0, 1), "gradual")
     assert clip.emphasis is not None
-    assert clip.emphasis.shape == (CLIP, 1, *clip.rows.target.shape[-2:])
+    assert clip.emphasis.shape == (CLIP, 1, *clip.target.shape[-2:])
 
 
 def test_drawn_places_follow_the_published_odds(folder: Path) -> None:
@@ -168,9 +141,9 @@ def test_batches_tell_each_clip_its_own_frame_rate(folder: Path) -> None:
     unet = msgspec.structs.replace(
         tiny_recipe().unet, image_share=0.0, augmentation=0.02, loss=LossRecipe(), dropout=0.0
     )
-    config = msgspec.structs.replace(tiny_encoders().config, frames=CLIP, height=HEIGHT, width=WIDTH)
+    networks = random_weights("driving", frames=CLIP).networks
     precision = Precision(CPU, half=False, channels_last=False)
-    source = CachedBatches(cache, config, unet, precision, "gradual")
+    source = CachedBatches(cache, networks, unet, precision, "gradual")
     batch = source.whole_clips(draws(), 6)
     assert batch.target.shape == batch.condition.shape == (6 * CLIP, 4, HEIGHT // 8, WIDTH // 8)
     assert batch.tokens is not None
@@ -182,22 +155,20 @@ def test_batches_tell_each_clip_its_own_frame_rate(folder: Path) -> None:
     again = source.whole_clips(draws(), 6)
     assert torch.equal(batch.target, again.target)
     assert torch.equal(batch.condition, again.condition)
-    with pytest.raises(RecipeError, match=r"made with 0\.02"):
-        CachedBatches(cache, config, msgspec.structs.replace(unet, augmentation=0.0), precision, "gradual")
 
 
 def test_a_job_travels_to_another_process(tmp_path: Path) -> None:
     write_driving(tmp_path, 3, frames=2)
     data = ParallelDomain4D.open(tmp_path, cameras=tuple(DRIVING_POSES))
-    pictures = DrivingPictures(data=data, clip_frames=CLIP, width=WIDTH, height=HEIGHT)
+    pictures = DrivingPictures(data, CLIP, PictureOptions(size=(WIDTH, HEIGHT)))
     job = CacheJob(folder=tmp_path, pictures=pictures, choice=CHOICE, identity=tiny_identity())
     arrived = pickle.loads(pickle.dumps(job))
     assert arrived.identity == job.identity
-    here, there = (each.pictures.moment("scene_000003", 1, (0, 2)) for each in (job, arrived))
-    assert np.array_equal(here.source, there.source)
-    assert np.array_equal(here.targets, there.targets)
-    assert here.targets.shape == (2, HEIGHT, WIDTH, 3)
-    apart = np.abs(here.targets.astype(int) - here.source).mean(axis=(1, 2, 3))
+    (source, targets), there = (each.pictures.moment("scene_000003", 1, (0, 2)) for each in (job, arrived))
+    assert np.array_equal(source, there[0])
+    assert np.array_equal(targets, there[1])
+    assert targets.shape == (2, HEIGHT, WIDTH, 3)
+    apart = np.abs(targets.astype(int) - source).mean(axis=(1, 2, 3))
     assert apart[0] < 0.5 * apart[1]  # the path begins where the source stands
 
 
@@ -219,7 +190,7 @@ def test_a_run_killed_at_any_moment_goes_on_to_the_same_result(tmp_path: Path, f
 def _lasting(folder: Path) -> dict[str, object]:
     """Every file's content; of the index without the seconds."""
     found: dict[str, object] = {path.name: path.read_bytes() for path in folder.glob("*.safetensors")}
-    index = read_index(folder)
+    index = read_index(folder, CacheIndex)
     if index is not None:
         scenes = {name: msgspec.structs.replace(entry, seconds=0.0) for name, entry in index.scenes.items()}
         found["index.json"] = (index.identity, scenes)
@@ -267,26 +238,24 @@ def test_a_cache_made_otherwise_is_refused_and_says_what_differs(tmp_path: Path)
         cached(tmp_path, encoders="other")
 
 
-def test_other_weights_on_a_workers_machine_are_refused(tmp_path: Path) -> None:
-    (step,) = cached(tmp_path, FakePictures(scenes=("a",)), encoders="other")
+@pytest.mark.parametrize(
+    ("pictures", "identity", "said"),
+    [
+        ({}, {"encoders": "other"}, "copy the same file there"),
+        ({}, {"height": 2 * HEIGHT}, f"{2 * HEIGHT} x {WIDTH}"),
+        ({"length": 2}, {}, "a: 2 frames are too few for a clip"),
+    ],
+)
+def test_a_scene_that_cannot_be_cached_is_named_with_why(
+    pictures: dict[str, int], identity: dict[str, object], said: str, tmp_path: Path
+) -> None:
+    (step,) = cached(tmp_path, FakePictures(scenes=("a",), **pictures), **identity)
     assert step.error is not None
-    assert "copy the same file there" in step.error
-
-
-def test_pictures_of_another_size_are_refused_by_scene(tmp_path: Path) -> None:
-    (step,) = cached(tmp_path, FakePictures(scenes=("a",)), height=2 * HEIGHT)
-    assert step.error is not None
-    assert f"({HEIGHT}, {WIDTH})" in step.error
-
-
-def test_a_scene_too_short_for_a_clip_is_refused_by_name(tmp_path: Path) -> None:
-    (step,) = cached(tmp_path, FakePictures(scenes=("a",), length=2))
-    assert step.error is not None
-    assert "a: 2 frames are too few for a clip" in step.error
+    assert said in step.error
 
 
 def test_two_runs_never_write_to_one_folder(tmp_path: Path) -> None:
-    with only_writer(tmp_path), pytest.raises(RunError, match="another `gcd-train cache`"):
+    with only_writer(tmp_path), pytest.raises(RunError, match="another run"):
         cached(tmp_path)
 
 
@@ -354,7 +323,7 @@ def test_the_command_caches_a_set_in_the_published_layout_and_then_has_nothing_t
     (place,) = cache.clips("scene_000003")
     clip = cache.clip("scene_000003", place, "direct")
     config = tiny_encoders().config
-    assert clip.rows.source.shape == (14, 4, config.height // 8, config.width // 8)
+    assert clip.source.shape == (14, 4, config.height // 8, config.width // 8)
     written = (tmp_path / "cache" / "scene_000003.safetensors").stat().st_mtime_ns
     assert ran(*told)[0] == 0
     assert (tmp_path / "cache" / "scene_000003.safetensors").stat().st_mtime_ns == written

@@ -12,7 +12,7 @@ from torch.testing import assert_close
 from gcd_model.diffusion import preconditioning
 from gcd_model.networks import Networks, random_networks
 from gcd_train.batches import PixelBatches
-from gcd_train.datasets.clip_source import to_network
+from gcd_train.data.sample import to_network
 from gcd_train.draws import Draws
 from gcd_train.model_setup import model_config
 from gcd_train.objective import Batch, Denoiser, diffusion_loss, draw_noise, draw_sigma, drop_streams

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_scenes4d import BOX, GROUND, SKY, ontology
 
-from gcd_train.datasets.ontology import VOID, Ontology, OntologyItem, read_ontology
-from gcd_train.datasets.skips import FileFault
+from gcd_train.data.dataset4d import VOID, Ontology, OntologyItem, read_ontology
+from gcd_train.data.files import FileFault
 from gcd_train.errors import DataError
 
 COLOUR = st.tuples(*[st.integers(0, 255)] * 3)
@@ -40,12 +40,6 @@ def test_decoding_finds_the_nearest_colour(
     for colour, number in zip(asked, found.tolist(), strict=True):
         distances = {i: sum((a - b) ** 2 for a, b in zip(colour, c, strict=True)) for i, c in colours.items()}
         assert number == min(distances, key=lambda i: (distances[i], i))
-
-
-def test_decoding_keeps_the_shape_of_pictures_larger_than_a_chunk() -> None:
-    known = made({3: (255, 0, 0), 9: (0, 0, 255)})
-    ids = np.random.default_rng(0).choice(np.array([3, 9], np.uint8), (2, 140, 130))
-    np.testing.assert_array_equal(known.decode(known.encode(ids)), ids)
 
 
 def test_duplicate_colours_are_reported_and_merged() -> None:
@@ -96,15 +90,3 @@ def test_a_twice_listed_id_is_named_with_its_file(tmp_path: Path) -> None:
         FileFault, match=r"o\.json is no usable ontology: an ontology has each id once, got \[1\] twice"
     ):
         read_ontology(tmp_path)
-
-
-def test_a_scene_without_an_ontology_is_named(tmp_path: Path) -> None:
-    with pytest.raises(FileFault, match="holds no JSON"):
-        read_ontology(tmp_path)
-
-
-def test_lacking_classes_are_a_wrong_ontology() -> None:
-    known = made({1: (0, 0, 0)})
-    known.require(["class 1"])
-    with pytest.raises(DataError, match="wrong ontology: it lacks Car; it has class 1"):
-        known.require(["class 1", "Car"])

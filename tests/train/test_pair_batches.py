@@ -9,30 +9,27 @@ import msgspec
 import numpy as np
 import pytest
 import torch
-from tiny_scenes4d import DRIVING_POSES, write_driving, write_kubric
+from tiny_scenes4d import write_kubric
 from torch.testing import assert_close
 
 from gcd_model import FAMILIES, ModelConfig
 from gcd_model.conditioning import micro_conditioning, relative_pose_features, spherical_features
 from gcd_model.config import SMALL
-from gcd_model.geometry import pose_trajectory
 from gcd_model.networks import Networks, random_networks
-from gcd_train.datasets.clip_frames import FrameSampling
-from gcd_train.datasets.dataset4d import PairSample
-from gcd_train.datasets.kubric4d import Kubric4D
-from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
-from gcd_train.datasets.sample_clips import SampleClips
-from gcd_train.datasets.skips import Skips
-from gcd_train.datasets.trajectories import DrivingSampling, OrbitSampling
-from gcd_train.datasets.view_pairs import ViewPairs, collate
+from gcd_train.data.batches import SampleBatches
+from gcd_train.data.files import Skips
+from gcd_train.data.kubric4d import Kubric4D
+from gcd_train.data.loader import LoadedBatch, SampleLoader, SampleOrder
+from gcd_train.data.paths import FrameSampling, OrbitSampling
+from gcd_train.data.pictures import PictureOptions
+from gcd_train.data.sample import Sample, SampleClips, collate
+from gcd_train.data.views import ViewPairs
 from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError, RunError
-from gcd_train.pair_batches import PairBatches, told_motion
 from gcd_train.precision import Precision
 from gcd_train.recipe import LoaderRecipe, UNetRecipe
 from gcd_train.recipe.optimiser import OptimiserRecipe
 from gcd_train.recipe.values import Budget
-from gcd_train.sample_loader import LoadedBatch, SampleLoader, SampleOrder
 
 CPU = torch.device("cpu")
 PRECISION = Precision(CPU, half=False, channels_last=False)
@@ -52,26 +49,21 @@ class CountedSamples:
     def __len__(self) -> int:
         return self.length
 
-    def sample(self, index: int) -> PairSample:
+    def sample(self, index: int) -> Sample:
         if index in self.broken:
             raise DataError(f"sample {index} is gone")
         picture = np.full((FRAMES, HEIGHT, WIDTH, 3), index % 256, np.uint8)
         deltas = np.linspace(0, 1, FRAMES)[:, None] * np.array([10.0 * (index % 9), 5.0, -1.0])
         poses = np.tile(np.eye(4), (FRAMES, 1, 1))
         poses[:, 0, 3] = index
-        return PairSample(
+        return Sample(
             source=picture,
             target=255 - picture,
-            target_classes=None,
             source_from_target=poses,
-            start=None,
             deltas=deltas,
-            motion=0,
             fps=24.0 / (1 + index % 4),
             scene=f"scn{index % 3:05d}",
             frame_numbers=tuple(range(FRAMES)),
-            reversed=False,
-            visible=None,
         )
 
 
@@ -88,9 +80,9 @@ def networks(camera: str = "spherical") -> Networks:
     return random_networks(config(camera), seed=1)
 
 
-def batches(model: Networks, *, family: str = "kubric90", **changes: object) -> PairBatches:
+def batches(model: Networks, *, family: str = "kubric90", **changes: object) -> SampleBatches:
     recipe = msgspec.structs.replace(UNET, **changes)
-    return PairBatches(CountedSamples(), model, recipe, FAMILIES[family], PRECISION, HERE, 5)
+    return SampleBatches(CountedSamples(), model, recipe, FAMILIES[family], PRECISION, HERE, 5)
 
 
 def draws(number: int) -> Draws:
@@ -209,12 +201,6 @@ def test_the_network_sees_what_the_encoders_make_of_source_and_target() -> None:
     assert 0.8 < float(away.std()) < 1.2  # drawn from the posterior, not its mean
 
 
-def test_a_family_with_one_motion_number_is_told_the_recipes() -> None:
-    samples = collate([CountedSamples().sample(2)])
-    assert told_motion(samples, 0, FAMILIES["driving"], UNET) == UNET.motion_bucket == 127
-    assert told_motion(samples, 0, FAMILIES["kubric180"], UNET) < told_motion(samples, 0, FAMILIES["kubric90"], UNET)
-
-
 def test_what_samples_cannot_give_is_refused() -> None:
     model = networks()
     with pytest.raises(RecipeError, match="image_share"):
@@ -235,7 +221,7 @@ def test_samples_are_clips_with_the_path_they_were_drawn_with(tmp_path: Path) ->
     write_kubric(tmp_path, 2, frames=FRAMES + 1)
     data = Kubric4D.open(tmp_path, cameras=[f"view{n}" for n in range(4)])
     frames = FrameSampling(clip=FRAMES)
-    pairs = ViewPairs(data, OrbitSampling(frames=frames), 0, (WIDTH, HEIGHT), repeats=3)
+    pairs = ViewPairs(data, OrbitSampling(frames=frames), 0, PictureOptions(size=(WIDTH, HEIGHT)), repeats=3)
     clips = SampleClips(pairs, 2, camera="spherical", fps=24.0, origin="x")
     sample, path = pairs.sample(1), clips.trajectory(1)
     assert (len(clips), clips.fps, clips.classes, clips.mount, clips.camera) == (2, 24.0, (), None, "spherical")
@@ -247,15 +233,3 @@ def test_samples_are_clips_with_the_path_they_were_drawn_with(tmp_path: Path) ->
     np.testing.assert_array_equal(source, sample.source)
     np.testing.assert_array_equal(target, sample.target)
     assert not clips.target_classes(1).any()
-
-
-def test_a_driving_sample_has_a_free_path(tmp_path: Path) -> None:
-    write_driving(tmp_path, 2, frames=FRAMES + 1)
-    data = ParallelDomain4D.open(tmp_path, cameras=list(DRIVING_POSES), classes=False)
-    pairs = ViewPairs(data, DrivingSampling(frames=FrameSampling(clip=FRAMES)), 0, (48, 32))
-    path = SampleClips(pairs, 1, camera="none", fps=10.0, origin="x").trajectory(0)
-    assert path.delta is None
-    assert_close(
-        path.source_from_target,
-        pose_trajectory(torch.from_numpy(pairs.sample(0).source_from_target)).source_from_target,
-    )

@@ -16,8 +16,9 @@ from typer.testing import CliRunner
 from gcd_model.config import DRIVING_CLASSES
 from gcd_model.geometry import CameraMount, driving_trajectory
 from gcd_train.cli.main import app
-from gcd_train.datasets.clip_source import KeptClips, PaintedClips
-from gcd_train.datasets.paired import PairedClips, require_apart
+from gcd_train.data.pairs import PairedClips
+from gcd_train.data.sample import PaintedClips, SomeClips
+from gcd_train.data.splits import require_apart
 from gcd_train.errors import DataError, RecipeError, RenderError
 from gcd_train.scenes.description import Scene, SceneObject
 from gcd_train.scenes.drop import HFOV_DEG
@@ -152,9 +153,9 @@ def test_no_scene_is_on_both_sides_of_a_split(folder: Path, tmp_path: Path) -> N
         held_out = PairedClips.open(written(tmp_path / name, world, seeds))
         if shared:
             with pytest.raises(DataError, match="stage 1"):
-                require_apart(PairedClips((training.world,), training.places[3:]), held_out)
+                require_apart(PairedClips((training.world,), training.places[3:]).scenes, held_out.scenes)
         else:
-            require_apart(training, held_out)
+            require_apart(training.scenes, held_out.scenes)
 
 
 @needs_egl
@@ -198,7 +199,7 @@ def test_folders_that_differ_do_not_go_together(folder: Path, tmp_path: Path) ->
 @needs_egl
 def test_what_wraps_clips_tells_of_the_same_path(folder: Path) -> None:
     clips = PairedClips.open(folder)
-    kept = KeptClips(clips, (5, 2))
+    kept = SomeClips(clips, (5, 2), keep=True)
     assert (kept.camera, kept.mount, kept.fps) == ("spherical", None, 12.0)
     np.testing.assert_array_equal(kept.trajectory(0).delta, clips.trajectory(5).delta)
     np.testing.assert_array_equal(kept.rgb(1)[0], clips.rgb(2)[0])

@@ -10,6 +10,7 @@ from ball_room import FLOOR, RIG, meet, photograph, rig_poses
 from plain_splat import plain_splat
 
 from gcd_model.geometry import Intrinsics
+from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError
 from gcd_train.pointcloud import (
     SplatOptions,
@@ -23,7 +24,6 @@ from gcd_train.pointcloud import (
     unproject,
     visibility,
 )
-from gcd_train.scene_view import SceneView
 
 LENS = Intrinsics.from_hfov(53.13, 72, 48)
 SMALL = Intrinsics.from_hfov(53.13, 48, 32)

@@ -176,7 +176,8 @@ def test_torchrun_trains_a_recipe_from_its_clips_to_its_weights(tmp_path: Path) 
     command += ["--out", str(tmp_path / "run"), "--set", "compute.parallel=ddp", "--set", "unet.batch=2"]
     command += ["--set", "unet.clip_batch=1", "--set", "unet.budget.updates=40"]
     run = subprocess.Popen(command, env=QUIET, stderr=subprocess.PIPE, text=True)
-    while not (tmp_path / "run" / "latents" / "meta.json").exists() and run.poll() is None:
+    index = tmp_path / "run" / "latents" / "index.json"
+    while not (index.exists() and json.loads(index.read_text())["sensitivity"]) and run.poll() is None:
         time.sleep(0.05)
     run.send_signal(signal.SIGTERM)
     _, said = run.communicate(timeout=300)

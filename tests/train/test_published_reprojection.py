@@ -10,13 +10,13 @@ from driving_plane import PlaneClips, plane_clip
 
 from gcd_model.config import SemanticClass
 from gcd_model.geometry import CameraMount
+from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.baselines import BaselineSettings, ClassesAlone, build, described, usual_baselines
 from gcd_train.evaluation.metrics import NO_CLASS
 from gcd_train.evaluation.predictors import CameraPair, SourceClip, fit_statistics
 from gcd_train.evaluation.reprojection import ReprojectRgbd, ReprojectSemd, source_views
 from gcd_train.pointcloud import visibility
-from gcd_train.scene_view import SceneView
 
 FRAMES, HEIGHT, WIDTH = 3, 64, 96
 CLASSES = PlaneClips.make(1).classes

@@ -10,11 +10,11 @@ from headless import needs_egl
 from stage_world import STAGE, stage
 
 from gcd_model.geometry import Intrinsics
-from gcd_train.datasets.clip_frames import FrameSampling
-from gcd_train.datasets.kubric4d import Kubric4D
-from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
-from gcd_train.datasets.trajectories import DRIVING, MAX90, generator
-from gcd_train.datasets.view_pairs import ViewPairs
+from gcd_train.data.kubric4d import Kubric4D
+from gcd_train.data.parallel_domain4d import ParallelDomain4D
+from gcd_train.data.paths import DRIVING, MAX90, FrameSampling, generator
+from gcd_train.data.pictures import PictureOptions
+from gcd_train.data.views import ViewPairs
 from gcd_train.errors import DataError
 from gcd_train.layouts.depth_code import SKY_M
 from gcd_train.layouts.scene_writer import SceneFormat, write_scene
@@ -64,8 +64,8 @@ def test_a_kubric_scene_is_read_as_it_was_drawn(stage_root: Path, tmp_path: Path
 
 def test_an_exact_orbit_looks_like_its_point_cloud(stage_root: Path) -> None:
     dataset, orbit = Kubric4D.open(stage_root), replace(MAX90, frames=CLIP)
-    exact = ViewPairs(dataset, orbit, 4, (48, 32), exact=True, visible=True).sample(2)
-    splatted = ViewPairs(dataset, orbit, 4, (48, 32), visible=True).sample(2)
+    exact = ViewPairs(dataset, orbit, 4, PictureOptions(size=(48, 32), exact=True, visible=True)).sample(2)
+    splatted = ViewPairs(dataset, orbit, 4, PictureOptions(size=(48, 32), visible=True)).sample(2)
     assert exact.skipped == splatted.skipped == ()
     np.testing.assert_array_equal(exact.source_from_target, splatted.source_from_target)
     np.testing.assert_array_equal(exact.source[0], exact.target[0])
@@ -129,7 +129,7 @@ def test_the_driving_source_stands_where_the_path_starts(root: Path) -> None:
 def test_exact_pairs_start_with_the_same_picture_and_read_hardly_anything(root: Path) -> None:
     dataset = ParallelDomain4D.open(root)
     sampling = replace(DRIVING, frames=CLIP)
-    pairs = ViewPairs(dataset, sampling, 0, (WIDTH, 24), exact=True, visible=True, class_ids=True)
+    pairs = ViewPairs(dataset, sampling, 0, PictureOptions(size=(WIDTH, 24), exact=True, visible=True, class_ids=True))
     sample = pairs.sample(0)
     assert sample.skipped == ()
     np.testing.assert_array_equal(sample.source[0], sample.target[0])
@@ -141,7 +141,7 @@ def test_exact_pairs_start_with_the_same_picture_and_read_hardly_anything(root: 
     assert sample.visible[1].mean() < sample.visible[0].mean()
     assert sample.bytes_read < 3_000_000
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(pairs)).sample(0).target, sample.target)
-    splatted = ViewPairs(dataset, sampling, 0, (WIDTH, 24), class_ids=True).sample(0)
+    splatted = ViewPairs(dataset, sampling, 0, PictureOptions(size=(WIDTH, 24), class_ids=True)).sample(0)
     assert np.abs(splatted.target.astype(int) - sample.target).mean() < 25
     assert splatted.target_classes is not None
     assert np.mean(splatted.target_classes == sample.target_classes) > 0.6
@@ -153,7 +153,7 @@ def test_exact_pairs_of_a_damaged_geometry_are_left_out_by_name(root: Path, tmp_
     content = geometry.read_bytes()
     try:
         geometry.write_bytes(content[:1000])
-        pairs = ViewPairs(dataset, replace(DRIVING, frames=CLIP), 0, (WIDTH, 24), exact=True)
+        pairs = ViewPairs(dataset, replace(DRIVING, frames=CLIP), 0, PictureOptions(size=(WIDTH, 24), exact=True))
         with pytest.raises(DataError, match=r"geometry\.npz is no drawable scene"):
             pairs.sample(0)
     finally:

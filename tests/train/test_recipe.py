@@ -6,8 +6,8 @@ import msgspec
 import pytest
 from tiny_world import RECIPE, tiny_recipe
 
-from gcd_train.data_kinds import sampling_of
-from gcd_train.datasets.trajectories import DRIVING, MAX90, MAX180
+from gcd_train.data.open import sampling_of
+from gcd_train.data.paths import DRIVING, MAX90, MAX180
 from gcd_train.errors import RecipeError
 from gcd_train.live.recipe import LiveRecipe, live_recipes, load_live_recipe
 from gcd_train.model_setup import family_of, model_config, require_exportable

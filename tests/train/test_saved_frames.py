@@ -9,7 +9,7 @@ import torch
 from driving_plane import PlaneClips
 
 from gcd_model.geometry import CameraMount
-from gcd_train.datasets.skips import FileFault
+from gcd_train.data.files import FileFault
 from gcd_train.errors import DataError
 from gcd_train.evaluation.predictors import CameraPair, SourceClip, to_pictures
 from gcd_train.evaluation.saved_frames import SavedFrames

@@ -17,8 +17,7 @@ from gcd_model.config import SVD_14
 from gcd_model.geometry import Spherical
 from gcd_model.weights.families import FamilyName
 from gcd_train.cli.main import app
-from gcd_train.datasets.clip_frames import FrameSampling
-from gcd_train.datasets.trajectories import OrbitSampling
+from gcd_train.data.paths import FrameSampling, OrbitSampling
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.clips import EvaluationSet
 from gcd_train.evaluation.opening import Choice, SceneCuts, open_scenes, public_split, public_split_names

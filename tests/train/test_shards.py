@@ -15,7 +15,8 @@ from headless import needs_egl
 from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
-from gcd_train.datasets.paired import PairedClips, require_apart
+from gcd_train.data.pairs import PairedClips
+from gcd_train.data.splits import require_apart
 from gcd_train.errors import DataError
 from gcd_train.scenes.driving import driving_scene
 from gcd_train.scenes.film import filmed
@@ -199,9 +200,9 @@ def test_sets_that_share_scenes_are_refused(tmp_path: Path) -> None:
     for name, seeds in (("a", range(3)), ("b", range(2, 4)), ("c", range(7, 8))):
         list(generate(tmp_path / name, TINY, seeds, workers=1))
     first, second, third = (PairedClips.open(tmp_path / name) for name in "abc")
-    require_apart(first, third)
+    require_apart(first.scenes, third.scenes)
     with pytest.raises(DataError, match="driving 2"):
-        require_apart(first, second)
+        require_apart(first.scenes, second.scenes)
 
 
 @needs_egl

@@ -93,7 +93,11 @@ def test_the_whole_study_runs_in_its_tiny_form(tmp_path: Path) -> None:
     assert all(f"| {name}-small |" in table for name in VIEWS)
     assert table.count("not run") == 1  # HexPlane
     assert (tmp_path / "report" / "report.md").stat().st_size > 1000
-    kept = [path for path in tmp_path.rglob("*") if path.suffix in (".npy", ".pt", ".zip") or "records" in path.parts]
+    kept = [
+        path
+        for path in tmp_path.rglob("*")
+        if path.suffix in (".safetensors", ".pt", ".zip") or "records" in path.parts
+    ]
     before = {path: path.stat().st_mtime_ns for path in kept if path.is_file()}
     subprocess.run(call, env=told, check=True)
     assert {path: path.stat().st_mtime_ns for path in before} == before

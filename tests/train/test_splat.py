@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from plain_splat import plain_splat
 
 from gcd_model.geometry import Intrinsics
+from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.pointcloud import SplatOptions, Splatted, splat
-from gcd_train.scene_view import SceneView
 
 SOURCE = Intrinsics.from_hfov(53.13, 72, 48)
 TARGET = Intrinsics.from_hfov(53.13, 52, 35)

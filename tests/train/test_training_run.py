@@ -6,15 +6,14 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import msgspec
-import numpy as np
 import pytest
 import torch
 from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips, tiny_recipe
 
 from gcd_model import Clip, load_synthesizer
 from gcd_train.checkpoint import load_state
-from gcd_train.datasets.clip_source import to_network
-from gcd_train.datasets.latents import LatentClips
+from gcd_train.data.latents import LatentClips, write_index
+from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, Interrupted, RecipeError, RunError
 from gcd_train.model_setup import model_config, sampled_as_trained
 from gcd_train.recipe import Budget, Recipe, StageName
@@ -75,15 +74,21 @@ def test_every_stage_writes_metrics_and_samples(run: Path) -> None:
 
 
 def test_a_finished_run_does_nothing_but_export_again(run: Path) -> None:
-    before = {path: path.stat().st_mtime_ns for path in run.rglob("*") if path.suffix in (".pt", ".npy")}
+    before = {
+        path: path.stat().st_mtime_ns
+        for path in run.rglob("*")
+        if path.suffix == ".pt" or path.parent.name == "latents"
+    }
     trainer(run).run()
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
 def test_latents_have_zero_mean_and_unit_spread(run: Path) -> None:
-    meta = LatentClips.open(run / "latents").meta
-    assert np.abs(meta.mean).max() < 1.0
-    assert 0.3 < min(meta.std) <= max(meta.std) < 3.0
+    clips = LatentClips.open(run / "latents")
+    every = torch.arange(2).repeat_interleave(FRAMES), torch.arange(FRAMES).repeat(2), torch.zeros(2 * FRAMES).bool()
+    values, meta = clips.rows(*every, torch.device("cpu")).target.movedim(1, 0).flatten(1), clips.meta
+    assert values.mean(1).abs().max() < 1.0
+    assert 0.3 < values.std(1).min() <= values.std(1).max() < 3.0
     assert sum(meta.sensitivity) / len(meta.sensitivity) == pytest.approx(1.0)
 
 
@@ -149,9 +154,10 @@ def test_encoding_goes_on_where_it_stopped(run: Path, tmp_path: Path) -> None:
     with pytest.raises(RunError, match="no finished latents"):
         LatentClips.open(path / "latents")
     trainer(path, clips=3).run("latents")  # the data has grown; the run keeps the clips it began with
-    for name in ("source", "target"):
-        first, second = (np.load(folder / "latents" / f"{name}.npy") for folder in (path, run))
-        assert np.array_equal(first, second), name
+    every = torch.arange(2).repeat_interleave(FRAMES), torch.arange(FRAMES).repeat(2), torch.arange(2 * FRAMES) % 2 > 0
+    one, other = (LatentClips.open(folder / "latents").rows(*every, torch.device("cpu")) for folder in (path, run))
+    assert torch.equal(one.source, other.source)
+    assert torch.equal(one.target, other.target)
 
 
 def test_a_longer_budget_trains_on(run: Path, tmp_path: Path) -> None:
@@ -210,15 +216,15 @@ def test_clips_of_another_size_are_refused(run: Path, tmp_path: Path) -> None:
         trainer(path, recipe=tiny_recipe(model=larger)).run("latents")
 
 
-def test_a_kill_between_the_last_renames_of_the_latents_loses_nothing(run: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("lost", ["statistics", "index"])
+def test_a_kill_while_latents_are_written_loses_nothing(lost: str, run: Path, tmp_path: Path) -> None:
     path = folder_with(run, tmp_path / "again", "vae")
     shutil.copytree(run / "latents", path / "latents")
-    meta = json.loads((path / "latents" / "meta.json").read_text())
-    (path / "latents" / "meta.json").unlink()
-    (path / "latents" / "clips.json").write_text(json.dumps({"meta": meta, "done": 2}))
-    (path / "latents" / "motion.npy").rename(path / "latents" / "motion.npy.part")  # the others had their names already
+    meta = LatentClips.open(run / "latents").meta
+    begun = msgspec.structs.replace(meta, sensitivity=())
+    write_index(path / "latents", begun if lost == "statistics" else msgspec.structs.replace(begun, shards=()))
     trainer(path).run("latents")
-    assert LatentClips.open(path / "latents").meta == LatentClips.open(run / "latents").meta
+    assert LatentClips.open(path / "latents").meta == meta
 
 
 def test_weights_of_two_runs_are_never_exported_together(run: Path, tmp_path: Path) -> None:

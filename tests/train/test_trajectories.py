@@ -8,23 +8,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gcd_model.geometry import Spherical, SphericalDelta
-from gcd_train.datasets.clip_frames import DRIVING_FRAMES, KUBRIC_FRAMES, FrameSampling
-from gcd_train.datasets.controls import Control
-from gcd_train.datasets.trajectories import (
+from gcd_model.geometry import Spherical
+from gcd_train.data.paths import (
     DRIVING,
-    DRIVING_DIRECT,
+    DRIVING_FRAMES,
+    KUBRIC_FRAMES,
     MAX90,
-    MAX90_DIRECT,
     MAX180,
-    MAX180_DIRECT,
     Draw,
     DrivingSampling,
+    FrameSampling,
     OrbitSampling,
     generator,
 )
+from gcd_train.data.splits import Control
 from gcd_train.errors import DataError, RecipeError
 
+MAX90_DIRECT, MAX180_DIRECT, DRIVING_DIRECT = (replace(each, gradual=False) for each in (MAX90, MAX180, DRIVING))
 SEEDS = st.integers(0, 2**31)
 LAWS = settings(max_examples=25, deadline=None)
 
@@ -129,7 +129,6 @@ def test_starts_and_strides_are_those_of_the_release() -> None:
     driving = [drawn(DRIVING, 3, index) for index in range(30)]
     assert not any(draw.reversed for draw in driving)
     assert {draw.fps for draw in driving} == {10.0, 5.0}
-    assert {draw.motion for draw in driving} == {127}
 
 
 def test_the_last_frame_can_be_reached_by_choice() -> None:
@@ -151,32 +150,6 @@ def test_a_reversed_clip_runs_backwards_under_the_same_camera() -> None:
     assert one.frame_numbers == other.frame_numbers[::-1]
     assert (one.reversed, other.reversed) == (False, True)
     np.testing.assert_array_equal(one.world_from_target, other.world_from_target)
-
-
-def test_the_papers_elevations_are_an_option() -> None:
-    paper = replace(MAX180, elevation_deg=(0.0, 90.0))
-    goals = [goal_of(drawn(paper, 0, index))[1] for index in range(60)]
-    assert max(goals) > 60
-    assert max(goals) <= 90
-
-
-def test_a_fixed_change_ignores_the_bounds_and_a_fixed_goal_is_met() -> None:
-    fixed = drawn(replace(MAX90, fixed=SphericalDelta(azimuth_deg=170.0, elevation_deg=0.0, radius_m=9.0)), 2)
-    assert fixed.deltas is not None
-    np.testing.assert_allclose(fixed.deltas[-1], [170.0, 0.0, 9.0])
-    goal = Spherical(azimuth_deg=10.0, elevation_deg=60.0, radius_m=20.0)
-    np.testing.assert_allclose(goal_of(drawn(replace(MAX90, goal=goal), 2)), [10.0, 60.0, 20.0])
-
-
-def test_a_change_over_the_top_is_refused() -> None:
-    with pytest.raises(DataError, match="asks for a camera that cannot be"):
-        drawn(replace(MAX90, fixed=SphericalDelta(elevation_deg=95.0)), 2)
-
-
-def test_the_motion_number_is_largest_where_both_angles_are() -> None:
-    change = SphericalDelta(azimuth_deg=90.0, elevation_deg=30.0)
-    assert drawn(replace(MAX90, elevation_deg=(0.0, 20.0), fixed=change), 0).motion == 255
-    assert drawn(replace(MAX90, fixed=SphericalDelta()), 0).motion == 0
 
 
 def test_the_driving_path_is_the_published_one() -> None:
@@ -215,7 +188,6 @@ def test_a_driving_control_says_frames_only() -> None:
         {"elevation_deg": (0.0, 91.0)},
         {"radius_m": (0.0, 5.0)},
         {"max_azimuth_deg": -1.0},
-        {"fixed": SphericalDelta(), "goal": Spherical(azimuth_deg=0.0, elevation_deg=0.0, radius_m=1.0)},
     ],
 )
 def test_bounds_that_mean_nothing_are_refused(options: dict[str, object]) -> None:

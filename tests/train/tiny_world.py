@@ -12,6 +12,7 @@ from gcd_model.geometry import (
     driving_trajectory,
     spherical_trajectory,
 )
+from gcd_train.data.sample import ClipSource, Sample
 from gcd_train.recipe import Recipe, parse_recipe
 
 FRAMES, HEIGHT, WIDTH = 4, 32, 64
@@ -53,7 +54,7 @@ loss = { weight_limit = 5.0, sensitivity = true }
 """
 
 
-class TinyClips:
+class TinyClips(ClipSource):
     """Random gradients; the target is the source upside down."""
 
     def __init__(self, count: int = 2, seed: int = 0) -> None:
@@ -79,6 +80,14 @@ class TinyClips:
 
     def trajectory(self, number: int, /) -> Trajectory:
         return driving_trajectory(frames=FRAMES, move_time=FRAMES - 1, mount=self.mount)
+
+    def sample(self, number: int, /) -> Sample:
+        source, target = self.rgb(number)
+        path, frames = self.trajectory(number), tuple(range(FRAMES))
+        poses = path.source_from_target.numpy()
+        return Sample(
+            source=source, target=target, source_from_target=poses, fps=self.fps, scene="tiny", frame_numbers=frames
+        )
 
     def rgb(self, number: int, /) -> tuple[np.ndarray, np.ndarray]:
         return self._clips[number], self._clips[number][:, ::-1]

@@ -9,12 +9,12 @@ from torch import Tensor
 from gcd_model import Family, ModelConfig
 from gcd_model.networks import Networks
 from gcd_train.conditioner import Conditioner
-from gcd_train.datasets.clip_source import ClipSource, to_network
-from gcd_train.datasets.latents import EncodedClips, LatentRows
+from gcd_train.data.batches import encode_frames
+from gcd_train.data.latents import EncodedClips, LatentRows
+from gcd_train.data.sample import ClipSource, to_network
 from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.objective import Batch, drop_streams
-from gcd_train.pixel_encoding import encode_frames
 from gcd_train.precision import Precision
 from gcd_train.recipe import UNetRecipe
 

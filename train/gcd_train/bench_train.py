@@ -17,13 +17,13 @@ from gcd_model import FAMILIES, ModelConfig
 from gcd_model.config import SMALL, SVD_14
 from gcd_model.networks import Networks, empty_networks, random_networks
 from gcd_train.conditioner import Conditioner
+from gcd_train.data.batches import encode_frames
 from gcd_train.draws import Draws
 from gcd_train.engine.blocks import recompute_blocks
 from gcd_train.engine.optimisers import build_optimiser
 from gcd_train.lora import add_lora, is_adapted
 from gcd_train.memory_account import PLANS, Account, Kept, Plan, account, kept_by_update
 from gcd_train.objective import Batch, Denoiser, diffusion_loss, drop_streams
-from gcd_train.pixel_encoding import encode_frames
 from gcd_train.precision import Precision
 from gcd_train.recipe import (
     Budget,

@@ -13,9 +13,9 @@ from gcd_model.networks import Networks
 from gcd_model.weights.adapter import Adapter, base_digest
 from gcd_model.weights.card import Card
 from gcd_train.batches import BatchMaker, BatchSource, EncodedBatches, PixelBatches
-from gcd_train.datasets.clip_source import ClipSource
-from gcd_train.datasets.latents import EncodedClips
-from gcd_train.encodings import Encodings, autoencoder_digest
+from gcd_train.data.latents import EncodedClips
+from gcd_train.data.latents_writer import Encodings, autoencoder_digest
+from gcd_train.data.sample import ClipSource
 from gcd_train.engine.engine import Engine
 from gcd_train.engine.processes import ALONE, Processes
 from gcd_train.errors import DataError, RecipeError

@@ -8,7 +8,7 @@ from torch import Tensor
 from gcd_model import Clip, Family, Synthesizer, Traits
 from gcd_model.colours import palette
 from gcd_model.networks import Networks
-from gcd_train.datasets.clip_source import ClipSource, to_network
+from gcd_train.data.sample import ClipSource, to_network
 from gcd_train.evaluation.metrics import NO_CLASS, mean_iou, named_confusion, psnr
 from gcd_train.model_setup import copy_of
 from gcd_train.pictures import write_sheet

@@ -14,9 +14,9 @@ from gcd_train.cli.errors import errors_shown
 from gcd_train.errors import DataError, RecipeError
 
 if TYPE_CHECKING:
-    from gcd_train.datasets.splits import Part
-    from gcd_train.datasets.view_pairs import Dataset4D
-    from gcd_train.latent_cache import CacheJob, CacheProgress
+    from gcd_train.data.cache_writer import CacheJob, CacheProgress
+    from gcd_train.data.dataset4d import Dataset4D
+    from gcd_train.data.splits import Part
 
 Data: TypeAlias = Annotated[
     Path, Argument(metavar="DATA", help="Folder with scene_000000 and so on (ParallelDomain-4D's layout).")
@@ -80,8 +80,9 @@ def cache(
     batch: Batch = 2,
 ) -> None:
     """Encode a driving set once, so that training never runs the frozen encoders again."""
-    from gcd_train.latent_cache import CacheJob, CacheOptions, ClipPlan, EncoderChoice, identity_of, load_encoders
-    from gcd_train.latent_cache.driving import DrivingPictures, exact_targets
+    from gcd_train.data.cache import ClipPlan
+    from gcd_train.data.cache_writer import CacheJob, DrivingPictures, EncoderChoice, identity_of, load_encoders
+    from gcd_train.data.pictures import PictureOptions
 
     with errors_shown():
         choice = EncoderChoice(weights=weights, family=family, device=device, dtype=dtype, batch=batch)
@@ -89,25 +90,20 @@ def cache(
         config = encoders.config
         plan = ClipPlan(clip_frames=config.frames, paths=("gradual", "direct") if path == "both" else (path,))
         scenes = _dataset(data, split, split_file, limit, semantic)
-        pictures = DrivingPictures(
-            data=scenes,
-            clip_frames=config.frames,
-            width=config.width,
-            height=config.height,
-            semantic=semantic,
-            exact=exact_targets(scenes, config.width, config.height, semantic=semantic) if exact else None,
+        drawn = PictureOptions(
+            size=(config.width, config.height), modality="classes" if semantic else "rgb", exact=exact
         )
-        options = CacheOptions(plan=plan, copies=copies, moments=moments, seed=seed)
-        job = CacheJob(folder=out, pictures=pictures, choice=choice, identity=identity_of(encoders, pictures, options))
-        _run(job, workers, ray)
+        pictures = DrivingPictures(scenes, config.frames, drawn)
+        identity = identity_of(encoders, pictures, plan, copies=copies, moments=moments, seed=seed)
+        _run(CacheJob(folder=out, pictures=pictures, choice=choice, identity=identity), workers, ray)
 
 
 def _dataset(
     root: Path, split: "Part | None", split_file: Path | None, limit: int | None, semantic: bool
 ) -> "Dataset4D":
-    from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
-    from gcd_train.datasets.skips import Skips
-    from gcd_train.datasets.splits import present, read_split
+    from gcd_train.data.files import Skips
+    from gcd_train.data.parallel_domain4d import ParallelDomain4D
+    from gcd_train.data.splits import present, read_split
 
     data = ParallelDomain4D.open(root, classes=semantic)
     if (split is None) != (split_file is None):
@@ -122,7 +118,8 @@ def _dataset(
 
 
 def _run(job: "CacheJob", workers: int, ray: str | None) -> None:
-    from gcd_train.latent_cache import cache_scenes, only_writer
+    from gcd_train.data.cache_writer import cache_scenes
+    from gcd_train.data.latents import only_writer
 
     folder, scenes = job.folder, job.pictures.scenes
     with only_writer(folder):
@@ -176,9 +173,10 @@ def _size(count: float) -> str:
 
 
 def _close(folder: Path, scenes: Sequence[str], account: _Account) -> None:
-    from gcd_train.latent_cache import read_index
+    from gcd_train.data.cache import CacheIndex
+    from gcd_train.data.latents import read_index
 
-    index = read_index(folder)
+    index = read_index(folder, CacheIndex)
     kept = {} if index is None else {name: index.scenes[name] for name in scenes if name in index.scenes}
     if kept:
         size, seconds = (sum(numbers) for numbers in zip(*((e.bytes, e.seconds) for e in kept.values()), strict=True))

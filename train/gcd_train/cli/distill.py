@@ -23,8 +23,8 @@ from gcd_train.errors import RecipeError
 from gcd_train.recipe import DistillStageName
 
 if TYPE_CHECKING:
+    from gcd_train.data.open import DataPlaces
     from gcd_train.distillation.recipe import DistillRecipe
-    from gcd_train.run_data import DataPlaces
 
 RecipeFile: TypeAlias = Annotated[
     str,
@@ -51,8 +51,8 @@ def distill(
     Ctrl-C stops after the update and saves.
     """
     prepare_process(threads)
+    from gcd_train.data.open import DataPlaces
     from gcd_train.distillation.recipe import load_distillation
-    from gcd_train.run_data import DataPlaces
 
     with errors_shown():
         _require_one_process()
@@ -63,7 +63,7 @@ def distill(
 def _run(
     recipe: "DistillRecipe", places: "DataPlaces", out: Path, latents: Path | None, stage: DistillStageName | None
 ) -> None:
-    from gcd_train.data_kinds import open_data
+    from gcd_train.data.open import open_data
     from gcd_train.distillation.distiller import Distiller, DistillInputs
     from gcd_train.distillation.teacher import as_training, teacher_of
     from gcd_train.monitor.board import TensorBoard

@@ -28,8 +28,8 @@ from gcd_train.live.recipe import LiveRecipe, is_live, live_recipes, live_toml, 
 from gcd_train.recipe import ComputeRecipe, Recipe, StageName, load_recipe, packaged_recipes, to_toml
 
 if TYPE_CHECKING:
+    from gcd_train.data.open import DataPlaces
     from gcd_train.engine.processes import Processes
-    from gcd_train.run_data import DataPlaces
 
 RecipeFile: TypeAlias = Annotated[
     str, Argument(metavar="RECIPE", help="A TOML file, or package:NAME for one that ships (`gcd-train recipes`).")
@@ -58,7 +58,7 @@ def train(
     # projected embeddings are views of what their layer made; nobody writes into them
     warnings.filterwarnings("ignore", message="FSDP2-wrapped module")
     prepare_process(threads)
-    from gcd_train.run_data import DataPlaces
+    from gcd_train.data.open import DataPlaces
 
     with errors_shown():
         if is_live(recipe):
@@ -139,7 +139,7 @@ def _run(
     stage: StageName | None,
     processes: "Processes",
 ) -> None:
-    from gcd_train.data_kinds import open_data
+    from gcd_train.data.open import open_data
     from gcd_train.model_setup import family_of, model_config
     from gcd_train.monitor.board import TensorBoard
     from gcd_train.run_folder import RunFolder

@@ -14,12 +14,13 @@ from gcd_model.networks import Networks
 from gcd_model.weights.adapter import Adapter, base_digest
 from gcd_model.weights.card import Card
 from gcd_train.batches import BatchSource, EncodedBatches, PixelBatches
-from gcd_train.datasets.latents import EncodedClips
+from gcd_train.data.latents import EncodedClips
+from gcd_train.data.latents_writer import Encodings
+from gcd_train.data.open import RunData
 from gcd_train.distillation.paired import PairedTask
 from gcd_train.distillation.recipe import DistillRecipe, SampleLossRecipe
 from gcd_train.distillation.sample_losses import SampleLoss
 from gcd_train.distillation.teacher import Teacher, as_training, student_config
-from gcd_train.encodings import Encodings
 from gcd_train.engine.engine import Engine
 from gcd_train.errors import RecipeError
 from gcd_train.loop import Loop, LoopOptions, Task
@@ -27,7 +28,6 @@ from gcd_train.lora import adapter_of, merge_lora
 from gcd_train.model_setup import digest_of, fill, require_exportable
 from gcd_train.precision import Precision
 from gcd_train.recipe import DistillStageName
-from gcd_train.run_data import RunData
 from gcd_train.run_folder import RunFolder
 from gcd_train.stages.export import ExportJob, export
 from gcd_train.start import carried_leftovers, start_networks

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_model.config import CameraControl, SemanticClass
-from gcd_model.geometry import CameraMount, Trajectory
-from gcd_train.array_files import ZIP_FAULTS
-from gcd_train.datasets.clip_source import Bytes, ClipSource
-from gcd_train.datasets.paired import PairedClip, PairedClips
+from gcd_model.geometry import CameraMount
+from gcd_train.data.files import ZIP_FAULTS
+from gcd_train.data.pairs import PairedClip, PairedClips
+from gcd_train.data.sample import Bytes
 from gcd_train.errors import DataError
 from gcd_train.evaluation.predictors import FAR_M, CameraPair, SourceClip, own_views
 from gcd_train.pointcloud import depth_visibility
@@ -86,25 +86,7 @@ class EvaluationSet(ClipFacts, Protocol):
         ...
 
 
-class HeldOutClips(ClipSource, ClipFacts, Protocol):
-    """Clips to be measured on; `PairedClips` is one.
-
-    hfov_deg: across the pictures, of orbits both cameras' own.
-    scene: world and seed of the scene that a clip was cut from. trajectory: of a clip, from source to target.
-    name: of a clip in its world, its number in digits.
-    """
-
-    def __getitem__(self, number: int, /) -> PairedClip: ...
-    def scene(self, number: int, /) -> tuple[str, int]: ...
-    def trajectory(self, number: int, /) -> Trajectory: ...
-    def name(self, number: int, /) -> str: ...
-    @property
-    def mount(self) -> CameraMount | None: ...
-    @property
-    def hfov_deg(self) -> float: ...
-
-
-def cameras_of(clips: HeldOutClips, number: int, declared: CameraMount | None = None) -> CameraPair:
+def cameras_of(clips: PairedClips, number: int, declared: CameraMount | None = None) -> CameraPair:
     """Both cameras of a clip.
 
     Args:
@@ -117,7 +99,7 @@ def cameras_of(clips: HeldOutClips, number: int, declared: CameraMount | None = 
     return CameraPair.orbit(clips.trajectory(number), hfov_deg=clips.hfov_deg, height=clips.height, width=clips.width)
 
 
-def source_side(clips: HeldOutClips, number: int, clip: PairedClip, declared: CameraMount | None) -> SourceClip:
+def source_side(clips: PairedClips, number: int, clip: PairedClip, declared: CameraMount | None) -> SourceClip:
     """What predictors may see of a clip. declared: see `cameras_of`."""
     return SourceClip(
         source=clip.source,
@@ -133,7 +115,7 @@ def class_grid(clips: ClipFacts) -> tuple[int, int]:
     return clips.height // 2, clips.width // 2
 
 
-def require_same_kind(training: HeldOutClips, clips: HeldOutClips) -> None:
+def require_same_kind(training: PairedClips, clips: PairedClips) -> None:
     """Raises DataError unless means over the training clips fit the held-out ones."""
     sizes = [(each.frames, each.height, each.width) for each in (training, clips)]
     if sizes[0] != sizes[1] or names_of(training.classes) != names_of(clips.classes):
@@ -165,7 +147,7 @@ class PairedSet:
     lower right corner.
     """
 
-    clips: HeldOutClips
+    clips: PairedClips
     identity: str
     declared: CameraMount | None = None
     picked: float = 0.0
@@ -261,7 +243,7 @@ def seen_too(clip: PairedClip, cameras: CameraPair, *, picked: float = 0.0) -> N
     return np.stack([depth_visibility(view, depth[t], poses[t], target) for t, view in enumerate(views)])
 
 
-def _keys(clips: HeldOutClips) -> list[str]:
+def _keys(clips: PairedClips) -> list[str]:
     """Names of all clips; what is there again, in another folder, gets a number."""
     keys, times = list[str](), Counter[str]()
     for number in range(len(clips)):

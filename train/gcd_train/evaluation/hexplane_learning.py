@@ -8,10 +8,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gcd_model.geometry import Intrinsics
+from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError
 from gcd_train.evaluation.hexplane import HexField, HexPlaneSettings, Rays, SceneBounds, render
 from gcd_train.evaluation.predictors import Prediction, SourceClip, to_pictures
-from gcd_train.scene_view import SceneView
 
 _RAYS_AT_ONCE = 4096
 """Rays drawn together without gradients: 4096 rays of 48 samples with 48 features are 38 MB."""

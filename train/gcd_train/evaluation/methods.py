@@ -23,7 +23,7 @@ from gcd_model import (
 )
 from gcd_model.colours import nearest_classes
 from gcd_model.config import SemanticClass
-from gcd_train.datasets.clip_source import to_network
+from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.baselines import BaselineSettings, build, described, hexplane_views, usual_baselines
 from gcd_train.evaluation.clips import ClipFacts, names_of

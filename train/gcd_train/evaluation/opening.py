@@ -14,15 +14,14 @@ import msgspec
 from gcd_model import Traits
 from gcd_model.geometry import CameraMount
 from gcd_model.small_files import read_small
-from gcd_train.datasets.clip_frames import CLIP, DRIVING_FRAMES, KUBRIC_FRAMES, FrameSampling
-from gcd_train.datasets.controls import MOST_BYTES, read_controls
-from gcd_train.datasets.kubric4d import Kubric4D
-from gcd_train.datasets.paired import PairedClips
-from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
-from gcd_train.datasets.skips import Skips
-from gcd_train.datasets.splits import Part, present, read_scene_list, read_split
-from gcd_train.datasets.trajectories import DrivingSampling, OrbitSampling
-from gcd_train.datasets.view_pairs import ViewPairs
+from gcd_train.data.files import Skips
+from gcd_train.data.kubric4d import Kubric4D
+from gcd_train.data.pairs import PairedClips
+from gcd_train.data.parallel_domain4d import ParallelDomain4D
+from gcd_train.data.paths import CLIP, DRIVING_FRAMES, KUBRIC_FRAMES, DrivingSampling, FrameSampling, OrbitSampling
+from gcd_train.data.pictures import PictureOptions
+from gcd_train.data.splits import MOST_BYTES, Part, present, read_controls, read_scene_list, read_split
+from gcd_train.data.views import ViewPairs
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.clips import EvaluationSet, PairedSet, chosen
 from gcd_train.evaluation.protocol import (
@@ -134,7 +133,7 @@ def wanted_scenes(folder: Path, there: Sequence[str], choice: Choice, notes: Ski
     if choice.listed is not None and choice.split is not None:
         raise RecipeError("give --list or --split, not both")
     if choice.listed is not None:
-        return present(read_scene_list(choice.listed, notes).scenes, there, notes, choice.listed)
+        return present(read_scene_list(choice.listed, notes), there, notes, choice.listed)
     if choice.split is None:
         return tuple(there)
     place, _, part = choice.split.rpartition(":")
@@ -282,12 +281,14 @@ def open_scenes(folder: Path, choice: Choice, cuts: SceneCuts) -> tuple[Evaluati
         data,
         _sampling(cuts, orbits=orbits),
         cuts.seed,
-        (cuts.width, cuts.height),
-        modality="classes" if cuts.semantic else "rgb",
-        class_ids=cuts.semantic,
-        visible=True,
-        exact=cuts.exact,
-        published=cuts.protocol == "release",
+        PictureOptions(
+            size=(cuts.width, cuts.height),
+            modality="classes" if cuts.semantic else "rgb",
+            class_ids=cuts.semantic,
+            visible=True,
+            exact=cuts.exact,
+            published=cuts.protocol == "release",
+        ),
     )
     clips = SceneSet(
         pairs=pairs,

@@ -13,7 +13,8 @@ import torch
 
 from gcd_model import Quality, RenderOptions, SolverName, Traits
 from gcd_model.geometry import CameraMount
-from gcd_train.datasets.paired import PairedClips, require_apart
+from gcd_train.data.pairs import PairedClips
+from gcd_train.data.splits import require_apart
 from gcd_train.errors import RecipeError
 from gcd_train.evaluation.baselines import BaselineSettings
 from gcd_train.evaluation.clips import EvaluationSet, PairedSet, class_grid, identity_of, require_same_kind
@@ -318,8 +319,7 @@ def _training(options: EvaluateOptions, clips: EvaluationSet) -> PairedClips | N
         raise RecipeError("means are taken over pairs, and these are scenes: leave out --train")
     training = PairedClips.open(list(options.train), options.train_limit)
     require_same_kind(training, clips.clips)
-    if isinstance(clips.clips, PairedClips):
-        require_apart(training, clips.clips)
+    require_apart(training.scenes, clips.clips.scenes)
     return training
 
 

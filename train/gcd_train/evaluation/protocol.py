@@ -14,11 +14,10 @@ from typing import Literal, Protocol, TypeAlias
 import numpy as np
 
 from gcd_model.geometry import Spherical, SphericalDelta
-from gcd_train.datasets.clip_frames import FrameSampling
-from gcd_train.datasets.controls import Control, Controls
-from gcd_train.datasets.dataset4d import Dataset4D
-from gcd_train.datasets.skips import Skips
-from gcd_train.datasets.trajectories import OrbitSampling, generator
+from gcd_train.data.dataset4d import Dataset4D
+from gcd_train.data.files import Skips
+from gcd_train.data.paths import FrameSampling, OrbitSampling, generator
+from gcd_train.data.splits import Control, Controls
 from gcd_train.errors import DataError
 from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from gcd_model.colours import nearest_classes, palette
 from gcd_model.config import SemanticClass
 from gcd_model.geometry import Intrinsics, invert_rigid
-from gcd_train.datasets.clip_source import Bytes
+from gcd_train.data.sample import Bytes, SceneView
 from gcd_train.errors import DataError
 from gcd_train.evaluation.metrics import NO_CLASS
 from gcd_train.evaluation.predictors import (
@@ -26,7 +26,6 @@ from gcd_train.evaluation.predictors import (
     to_pixels,
 )
 from gcd_train.pointcloud import SplatOptions, published_tensor
-from gcd_train.scene_view import SceneView
 
 # Depth and classes are picked a quarter pixel off the middle of a pixel drawn at twice the size, colours are its mean.
 # Rays through the middle are still best: 17.50 dB on 16 held-out clips, against 17.42 through where depth was picked.

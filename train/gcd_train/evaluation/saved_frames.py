@@ -12,9 +12,8 @@ from torch import Tensor
 
 from gcd_model.colours import nearest_classes
 from gcd_model.config import SemanticClass
-from gcd_train.datasets.clip_source import Bytes
-from gcd_train.datasets.picture_files import read_colour
-from gcd_train.datasets.skips import FileFault
+from gcd_train.data.files import FileFault, read_colour
+from gcd_train.data.sample import Bytes
 from gcd_train.errors import DataError
 from gcd_train.evaluation.predictors import Prediction, SourceClip, to_pictures
 

@@ -12,19 +12,16 @@ from numpy.typing import NDArray
 
 from gcd_model.config import CameraControl, SemanticClass
 from gcd_model.geometry import CameraMount, center_crop_box, pose_trajectory, to_pose
-from gcd_train.datasets.clip_source import Bytes
-from gcd_train.datasets.controls import Control
-from gcd_train.datasets.dataset4d import Dataset4D, PairSample
-from gcd_train.datasets.ontology import Ontology
-from gcd_train.datasets.pictures_of_draws import trained_lens, trained_picture
-from gcd_train.datasets.splat_pictures import SAME_POSE
-from gcd_train.datasets.view_pairs import ViewPairs
+from gcd_train.data.dataset4d import Dataset4D, Ontology
+from gcd_train.data.pictures import SAME_POSE, trained_lens, trained_picture
+from gcd_train.data.sample import Bytes, Sample, SceneView
+from gcd_train.data.splits import Control
+from gcd_train.data.views import ViewPairs
 from gcd_train.errors import DataError
 from gcd_train.evaluation.clips import HeldOutClip, SetKind
 from gcd_train.evaluation.predictors import CameraPair, SourceClip
 from gcd_train.evaluation.protocol import ClipControls
 from gcd_train.pointcloud import render_lens, splat
-from gcd_train.scene_view import SceneView
 
 Number = TypeVar("Number", bound=np.generic)
 
@@ -112,7 +109,7 @@ class SceneSet:
     def _ontology(self) -> Ontology | None:
         return self.dataset.ontology if self.semantic else None
 
-    def _source_side(self, key: str, sample: PairSample) -> SourceClip:
+    def _source_side(self, key: str, sample: Sample) -> SourceClip:
         seen_by = [self.dataset.source_camera]
         views = [view for time in sample.frame_numbers for view in self.dataset.views(sample.scene, time, seen_by)]
         views = [replace(view, classes=self._places_of(view.classes)) for view in views]
@@ -137,7 +134,7 @@ class SceneSet:
             points=partial(tuple[SceneView, ...], views) if own else None,
         )
 
-    def _cameras(self, sample: PairSample, first: SceneView) -> CameraPair:
+    def _cameras(self, sample: Sample, first: SceneView) -> CameraPair:
         """Both cameras, in the scene's world or, in driving, in the vehicle's frame."""
         lens = render_lens(self.dataset.lens(sample.scene), self.width, self.height)
         path = pose_trajectory(torch.from_numpy(sample.source_from_target))

@@ -21,7 +21,7 @@ from gcd_model import (
     weights_path,
 )
 from gcd_model.diffusion import unit_noise
-from gcd_train.datasets.clip_source import to_network
+from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError
 from gcd_train.evaluation.predictors import Prediction, SourceClip
 

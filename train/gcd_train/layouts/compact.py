@@ -8,17 +8,16 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from gcd_train.datasets.kubric4d import Kubric4D
-from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
-from gcd_train.datasets.picture_files import bytes_read
-from gcd_train.datasets.skips import FileFault
+from gcd_train.data.files import FileFault, bytes_read
+from gcd_train.data.kubric4d import Kubric4D
+from gcd_train.data.parallel_domain4d import ParallelDomain4D
+from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.layouts import encodings, kubric4d_names, parallel_domain4d_names
 from gcd_train.layouts.depth_code import FAR_M, NEAR_M
 from gcd_train.layouts.manifest import GEOMETRY, MANIFEST, read_manifest
 from gcd_train.layouts.scene_files import SceneFiles
 from gcd_train.layouts.scene_folder import new_scene
-from gcd_train.scene_view import SceneView
 
 _KUBRIC_WEBP, _STREET_WEBP = 85, 80
 _LEAST_PSNR_DB = 20.0  # what WebP of this quality is far above

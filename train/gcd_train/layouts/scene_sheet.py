@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_model.small_files import read_json
-from gcd_train.array_files import read_npz
+from gcd_train.data.files import read_npz
 from gcd_train.errors import DataError
 from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
 from gcd_train.layouts.depth_code import stored_depth

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from gcd_model.errors import FileError, ModelError
 from gcd_model.geometry import Intrinsics, require_rigid
 from gcd_model.small_files import read_json
-from gcd_train.datasets.skips import FileFault
+from gcd_train.data.files import FileFault
 from gcd_train.errors import DataError
 
 CAMERA_FILE = "meta/cameras.json"

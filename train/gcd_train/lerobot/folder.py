@@ -12,7 +12,7 @@ import msgspec
 
 from gcd_model.errors import FileError
 from gcd_model.small_files import decode_json, read_json, read_small
-from gcd_train.datasets.skips import FileFault
+from gcd_train.data.files import FileFault
 from gcd_train.errors import DataError
 from gcd_train.lerobot.extra import load_arrow
 

@@ -4,21 +4,22 @@ Both cameras filmed the same moments, so one is the source, the other the target
 stand to each other. See `cameras` for what the calibration file holds.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from gcd_model.errors import ModelError
-from gcd_model.geometry import center_crop_box, relative_pose, require_rigid
-from gcd_train.datasets.dataset4d import PairSample
-from gcd_train.datasets.skips import FileFault, Skipped, Skips
-from gcd_train.datasets.trajectories import generator
-from gcd_train.errors import DataError, TrainError
+from gcd_model.geometry import Intrinsics, relative_pose, require_rigid
+from gcd_train.data.files import FileFault, Skips
+from gcd_train.data.paths import generator
+from gcd_train.data.pictures import narrower, seen_through
+from gcd_train.data.sample import Sample
+from gcd_train.data.views import readable
+from gcd_train.errors import DataError
 from gcd_train.lerobot.cameras import CameraCalibration, read_cameras
 from gcd_train.lerobot.extra import load_arrow, load_av
 from gcd_train.lerobot.folder import EpisodePlace, LeRobotFolder, read_rows
@@ -26,7 +27,6 @@ from gcd_train.lerobot.video import read_pictures
 
 __all__ = ["LeRobotOptions", "LeRobotPairs"]
 
-_TRIES, _TOLD = 100, 5
 _SLACK_S = 1e-4
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float64]
@@ -38,11 +38,10 @@ class LeRobotOptions:
 
     frames: T. fps: of the clips, at most the set's own, which is the default; rows and pictures are taken that are
     nearest in time. size: width and height of the samples; pictures are cropped about their middle to its shape and
-    resized, so cameras of one field of view make the best pairs. tolerance_s: how far a row or picture may be from the
+    resized; of two lenses both sides have the narrower one. tolerance_s: how far a row or picture may be from the
     wanted time; by default half a frame of the set.
     cameras: features to choose from, by default all that are calibrated; source and target are drawn from them.
     calibration: a file in place of the set's meta/cameras.json. repeats: the set counts as so many times its episodes.
-    motion: the number that tells the network how far the camera goes.
     episodes: which of the set's, from the first number up to the second, as in a slice: (-10, None) are the last ten.
     """
 
@@ -53,7 +52,6 @@ class LeRobotOptions:
     cameras: tuple[str, ...] | None = None
     calibration: Path | None = None
     repeats: int = 400
-    motion: int = 127
     episodes: tuple[int, int | None] = (0, None)
 
 
@@ -94,34 +92,23 @@ class LeRobotPairs:
     def __len__(self) -> int:
         return self.options.repeats * len(self.episodes)
 
-    def __getitem__(self, index: int) -> PairSample:
+    def __getitem__(self, index: int) -> Sample:
         """As `sample`, for a loader. Raises IndexError beyond the end."""
         if not 0 <= index < len(self):
             raise IndexError(f"{index} is beyond the {len(self)} samples")
         return self.sample(index)
 
-    def sample(self, index: int) -> PairSample:
+    def sample(self, index: int) -> Sample:
         """The sample of a number, or of the one that replaces it.
 
         Raises: DataError naming the last faults if a hundred in a row cannot be read.
         """
-        skipped: list[Skipped] = []
-        for number in self._numbers(index):
-            episode = self.episodes[number % len(self.episodes)]
-            try:
-                return self._pair(episode, generator(self.seed, number), tuple(skipped))
-            except FileFault as fault:
-                skipped.append(self.skips.add(episode.name, fault.path, fault.reason))
-            except (TrainError, ModelError, OSError) as error:
-                skipped.append(self.skips.add(episode.name, episode.data, str(error)))
-        last = "; ".join(map(str, skipped[-_TOLD:]))
-        raise DataError(f"{len(skipped)} samples in a row cannot be read, the last: {last}")
 
-    def _numbers(self, index: int) -> Iterator[int]:
-        """The sample's own number, then others in its stead."""
-        yield index
-        for attempt in range(1, _TRIES + 1):
-            yield int(generator(self.seed, index, attempt).integers(len(self)))
+        def place(number: int) -> tuple[str, Path]:
+            episode = self.episodes[number % len(self.episodes)]
+            return episode.name, episode.data
+
+        return readable(self.seed, index, len(self), self.skips, self._pair, place)
 
     def _chosen_cameras(self) -> tuple[str, ...]:
         """Calibrated cameras that the set has."""
@@ -137,26 +124,21 @@ class LeRobotPairs:
             raise DataError(f"pairs need two cameras or more, got {', '.join(wanted)}")
         return tuple(sorted(set(wanted)))
 
-    def _pair(self, episode: EpisodePlace, random: np.random.Generator, skipped: tuple[Skipped, ...]) -> PairSample:
+    def _pair(self, number: int) -> Sample:
+        episode, random = self.episodes[number % len(self.episodes)], generator(self.seed, number)
         source, target = (self.cameras[int(k)] for k in random.choice(len(self.cameras), 2, replace=False))
         window = self._window(episode, (source, target), random)
-        seen, seen_bytes = self._pictures(episode, source, window)
-        aimed, aimed_bytes = self._pictures(episode, target, window)
+        lens = narrower(self._calibrations[source].lens, self._calibrations[target].lens)
+        seen, seen_bytes = self._pictures(episode, source, window, lens)
+        aimed, aimed_bytes = self._pictures(episode, target, window, lens)
         poses = (torch.from_numpy(window.poses[name]) for name in (source, target))
-        return PairSample(
+        return Sample(
             source=seen,
             target=aimed,
-            target_classes=None,
             source_from_target=relative_pose(*poses).numpy(),
-            start=None,
-            deltas=None,
-            motion=self.options.motion,
             fps=self.fps,
             scene=episode.name,
             frame_numbers=window.rows,
-            reversed=False,
-            visible=None,
-            skipped=skipped,
             bytes_read=seen_bytes + aimed_bytes,
         )
 
@@ -183,20 +165,17 @@ class LeRobotPairs:
         }
         return _Window(tuple(chosen.tolist()), tuple(times[chosen].tolist()), poses)
 
-    def _pictures(self, episode: EpisodePlace, camera: str, window: _Window) -> tuple[Bytes, int]:
-        """[T, H, W, 3] at the wanted size, and the bytes that were read."""
+    def _pictures(self, episode: EpisodePlace, camera: str, window: _Window, lens: Intrinsics) -> tuple[Bytes, int]:
+        """[T, H, W, 3] through this lens at the wanted size, and the bytes that were read."""
         path, begin = episode.videos[camera]
         clip = read_pictures(path, [begin + time for time in window.times_s], self._tolerance_s)
         height, width = clip.pictures.shape[1:3]
-        told = self._calibrations[camera]
-        if (width, height) != (told.width, told.height):
-            raise FileFault(path, f"is {width} x {height}, its calibration says {told.width} x {told.height}")
-        wide, high = self.options.size
-        left, top, kept_width, kept_height = center_crop_box(width, height, wide / high)
-        kept = clip.pictures[:, top : top + kept_height, left : left + kept_width]
-        how = cv2.INTER_AREA if kept_width >= wide else cv2.INTER_LINEAR
-        sized = [cv2.resize(picture, (wide, high), interpolation=how) for picture in kept]
-        return np.stack(sized).astype(np.uint8), clip.bytes_read
+        calibration = self._calibrations[camera]
+        if (width, height) != (calibration.width, calibration.height):
+            said = f"{calibration.width} x {calibration.height}"
+            raise FileFault(path, f"is {width} x {height}, its calibration says {said}")
+        sized = [seen_through(picture, calibration.lens, lens, self.options.size) for picture in clip.pictures]
+        return np.stack(sized), clip.bytes_read
 
 
 def _number(value: float | list[float]) -> float:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_train.datasets.skips import FileFault
+from gcd_train.data.files import FileFault
 from gcd_train.lerobot.extra import load_av
 
 _EARLY_S = 0.5

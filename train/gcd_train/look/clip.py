@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_model.geometry import Intrinsics
+from gcd_train.data.sample import SceneView
 from gcd_train.pointcloud import splat
-from gcd_train.scene_view import SceneView
 
 Bytes = NDArray[np.uint8]
 

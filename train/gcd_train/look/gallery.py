@@ -21,7 +21,7 @@ from gcd_model import (
     ViewSynthesizer,
 )
 from gcd_model.errors import OptionError
-from gcd_train.datasets.clip_source import to_network
+from gcd_train.data.sample import to_network
 from gcd_train.evaluation.galleries import Strip, painted, to_bytes, write_sheet, write_video
 from gcd_train.files import write_whole
 from gcd_train.look.real_video import Bytes, Windowed

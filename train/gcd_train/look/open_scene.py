@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 
 from gcd_model.geometry import DRIVING_GOAL_TARGET, LOOK_AT, Intrinsics
 from gcd_model.small_files import decode_json
-from gcd_train.array_files import ZIP_FAULTS, read_member
-from gcd_train.datasets.kubric4d import Kubric4D
-from gcd_train.datasets.ontology import read_ontology
-from gcd_train.datasets.paired import PairedClip, PairedClips
-from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
+from gcd_train.data.dataset4d import read_ontology
+from gcd_train.data.files import ZIP_FAULTS, read_member
+from gcd_train.data.kubric4d import Kubric4D
+from gcd_train.data.pairs import PairedClip, PairedClips
+from gcd_train.data.parallel_domain4d import ParallelDomain4D
+from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
 from gcd_train.look.clip import SKY_M, Footage, LabelName, instance_colour, splatted
 from gcd_train.look.scene_clip import ShowOptions, dataset_clip
 from gcd_train.pointcloud import depth_visibility
-from gcd_train.scene_view import SceneView
 
 
 def pair_clip(folder: Path, seed: int | None) -> Footage:

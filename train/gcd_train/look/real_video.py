@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gcd_model import Traits
 from gcd_model.geometry import center_crop_box
-from gcd_train.datasets.picture_files import decoded, read
+from gcd_train.data.files import decoded, read
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.store import folder_name
 

@@ -18,18 +18,18 @@ from gcd_model.geometry import (
     spherical_trajectory,
 )
 from gcd_model.small_files import read_json
-from gcd_train.datasets.dataset4d import Dataset4D
-from gcd_train.datasets.kubric4d import Kubric4D
-from gcd_train.datasets.picture_files import MOST_TEXT, bytes_read
-from gcd_train.datasets.pictures_of_draws import trained_picture
-from gcd_train.datasets.trajectories import DRIVING, DRIVING_FRAMES, KUBRIC_FRAMES, MAX90, FrameSampling, generator
+from gcd_train.data.dataset4d import Dataset4D
+from gcd_train.data.files import MOST_TEXT, bytes_read
+from gcd_train.data.kubric4d import Kubric4D
+from gcd_train.data.paths import DRIVING, DRIVING_FRAMES, KUBRIC_FRAMES, MAX90, FrameSampling, generator
+from gcd_train.data.pictures import trained_picture
+from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError, RecipeError, RenderError
 from gcd_train.evaluation.scene_clips import nearest_resized
 from gcd_train.layouts import kubric4d_names
 from gcd_train.layouts.manifest import GEOMETRY, SceneManifest, read_manifest
 from gcd_train.look.clip import SKY_M, Bytes, Footage, LabelName, instance_colour, splatted
 from gcd_train.pointcloud import depth_visibility, published_picture, render_lens, visibility
-from gcd_train.scene_view import SceneView
 from gcd_train.scenes.frozen import FrozenScene
 
 Poses = NDArray[np.float64]

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gcd_model.geometry import Intrinsics
+from gcd_train.data.sample import SceneView
 from gcd_train.pointcloud.options import SplatOptions
 from gcd_train.pointcloud.pixel_map import Doubles, PixelMap
 from gcd_train.pointcloud.tiles import Tiles, contributing
-from gcd_train.scene_view import SceneView
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gcd_model.geometry import Intrinsics
+from gcd_train.data.sample import SceneView
 from gcd_train.pointcloud.holes import fill_holes
 from gcd_train.pointcloud.options import SplatOptions
 from gcd_train.pointcloud.pixel_map import Doubles
 from gcd_train.pointcloud.splat import Bytes, splat
-from gcd_train.scene_view import SceneView
 
 OVERSIZE = 1.09375
 """Drawn at 420 x 280 for 384 x 256."""

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gcd_model.geometry import Intrinsics
+from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError
 from gcd_train.pointcloud.options import SplatOptions
 from gcd_train.pointcloud.pixel_map import Doubles
 from gcd_train.pointcloud.project import Hits, project, to_device, where_true
 from gcd_train.pointcloud.taps import Gathered, show
-from gcd_train.scene_view import SceneView
 
 Bytes = NDArray[np.uint8]
 Labels = NDArray[np.uint8] | NDArray[np.uint16]

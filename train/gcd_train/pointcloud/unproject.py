@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_model.geometry import Intrinsics
+from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError
 from gcd_train.pointcloud.options import SplatOptions
-from gcd_train.scene_view import SceneView
 
 Floats = NDArray[np.float32]
 

@@ -4,12 +4,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_model.geometry import Intrinsics
+from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError
 from gcd_train.pointcloud.options import SplatOptions
 from gcd_train.pointcloud.pixel_map import Doubles, PixelMap
 from gcd_train.pointcloud.published import published_tensor
 from gcd_train.pointcloud.unproject import Floats
-from gcd_train.scene_view import SceneView
 
 _BLACK = 1e-7
 _KERNEL, _SIGMA = 3, 0.75

@@ -7,7 +7,7 @@ from msgspec import Meta
 
 from gcd_train.recipe.values import Count, NotNegative, Positive, Share
 
-DataKind: TypeAlias = Literal["pairs", "kubric4d", "parallel_domain4d", "lerobot", "cache"]
+DataKind: TypeAlias = Literal["pairs", "kubric4d", "parallel_domain4d", "lerobot", "videos", "cache"]
 Modality: TypeAlias = Literal["rgb", "semantic"]
 DataTask: TypeAlias = Literal["views", "image-to-video"]
 Bounds: TypeAlias = tuple[float, float]
@@ -28,7 +28,7 @@ class FramesRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 class OrbitRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Cameras about the scene's centre; see `trajectories.OrbitSampling`.
+    """Cameras about the scene's centre; see `paths.OrbitSampling`.
 
     max_azimuth_deg, max_elevation_deg, max_radius_m: largest change from source to goal.
     azimuth_deg, elevation_deg, radius_m: where cameras may stand. The elevation is as released, also for the 180-degree
@@ -67,7 +67,7 @@ class DataRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     """What --data holds, and how clips are drawn from it.
 
     kind: "pairs" of `gcd-train generate`; a set in the layout of "kubric4d" or "parallel_domain4d", published or
-    ours; "lerobot" with calibrated cameras; a latent "cache" (unet.source "cache").
+    ours; "lerobot" with calibrated cameras; own "videos" with poses; a latent "cache" (unet.source "cache").
     task: "views" of the source along the target camera's path; or "image-to-video", to start from: both sides of every
     pair are videos, each to be continued from its first frame, and nobody is told of cameras.
     modality: targets in colour, or painted by class.

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_train.datasets.paired import PairedClip, PairedClips
+from gcd_train.data.pairs import PairedClip, PairedClips
 from gcd_train.errors import DataError
 from gcd_train.look.clip import instance_colour
 

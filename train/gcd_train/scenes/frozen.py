@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from gcd_model.small_files import decode_json
-from gcd_train.array_files import read_npz
+from gcd_train.data.files import read_npz
 from gcd_train.errors import DataError
 from gcd_train.scenes.compile import VERTEX, Vertices, vertices_of
 from gcd_train.scenes.description import STREET, Extent, Floats, Light, Scene

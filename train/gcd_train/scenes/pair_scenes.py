@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_model.geometry import CameraMount
-from gcd_train.datasets.clip_frames import FrameSampling
-from gcd_train.datasets.trajectories import Draw, OrbitSampling
+from gcd_train.data.paths import Draw, FrameSampling, OrbitSampling
 from gcd_train.errors import RenderError
 from gcd_train.scenes.description import Scene, rotations
 from gcd_train.scenes.driving import driving_scene

@@ -12,7 +12,7 @@ from gcd_model.colours import nearest_classes
 from gcd_model.layers import zeroed
 from gcd_model.networks import Networks
 from gcd_model.vae import Encoder, Posterior, TemporalDecoder
-from gcd_train.datasets.clip_source import Bytes, ClipSource, KeptClips, to_network
+from gcd_train.data.sample import Bytes, ClipSource, SomeClips, to_network
 from gcd_train.draws import Draws
 from gcd_train.errors import RecipeError
 from gcd_train.evaluation.metrics import mean_iou, named_confusion, psnr
@@ -55,7 +55,7 @@ class VAETask:
         self._precision, self._seed, self._recipe, self._valid = precision, seed, recipe, valid
         self._painted = config.semantic_classes
         order = Draws(seed, "vae-pool", 0, torch.device("cpu")).order(len(clips))
-        self._clips = KeptClips(clips, order[: recipe.pool])
+        self._clips = SomeClips(clips, order[: recipe.pool], keep=True)
         if config.vae.linear:
             start_from_components(networks.target_encoder, networks.decoder, self._some_frames(_STATISTICS_CLIPS))
         self._pair = precision.placed(Autoencoder(networks))

@@ -1,33 +1,130 @@
-"""Decoding of the picture files of 4D data sets: colour, depth, ids. Every fault names the file.
+"""Files of data sets, archives and pictures: nothing is unpickled or unfolds without limit, and a fault names its file.
 
-What each thread reads is counted, see `bytes_read`.
+What could not be read and was left out is counted and named, so that no fault in the data is silent or fatal.
 """
 
 import io
+import logging
 import struct
 import threading
+import zipfile
 import zlib
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import cv2
 import imagesize
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_train.array_files import read_npz
-from gcd_train.datasets.skips import FileFault
 from gcd_train.errors import DataError
 from gcd_train.layouts.depth_code import FAR_M, stored_depth
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
+Key = TypeVar("Key")
+Value = TypeVar("Value")
 
+_LOG = logging.getLogger(__name__)
+_DISTINCT, _SHOWN = 10_000, 20
+ZIP_FAULTS = (OSError, KeyError, ValueError, NotImplementedError, EOFError, zlib.error, zipfile.BadZipFile)
+"""What zipfile raises for a damaged or hostile file, and `read_member`."""
 MOST_TEXT, MOST_PICTURE = 1 << 24, 1 << 28
 """Bytes of a data set's JSON, and of a picture's file."""
-_MOST_PIXELS = 1 << 27
+_MOST_ARRAYS, _MOST_MEMBER, _MOST_PIXELS = 1 << 30, 1 << 28, 1 << 27
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_PALETTE, _PNG_GREY = 3, 0
+
+
+class FileFault(DataError):  # noqa: N818  a fault of the data, which readers of it name
+    """A file of a data set is missing, damaged or does not fit the others. path: which; reason: what is wrong."""
+
+    def __init__(self, path: Path, reason: str) -> None:
+        super().__init__(f"{path} {reason}")
+        self.path, self.reason = path, reason
+
+    def __reduce__(self) -> tuple[type["FileFault"], tuple[Path, str]]:
+        return FileFault, (self.path, self.reason)  # a fault crosses from loader workers to the main process
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Skipped:
+    """One thing left out. scene: its name. file: the file at fault, or the scene's folder. reason: what is wrong."""
+
+    scene: str
+    file: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.scene}: {self.file} {self.reason}"
+
+
+class Skips:
+    """Everything left out so far. Each distinct one is logged once, as a warning, unless `logged` is false.
+
+    A loader worker has its own; `Sample.skipped` carries what it left out, for `extend` in the main process.
+    """
+
+    def __init__(self, *, logged: bool = True) -> None:
+        self._logged = logged
+        self._counts: Counter[Skipped] = Counter()
+        self._beyond = 0
+
+    def add(self, scene: str, file: Path | str, reason: str) -> Skipped:
+        """Count one and return it."""
+        skipped = Skipped(scene=scene, file=str(file), reason=reason)
+        self.extend([skipped])
+        return skipped
+
+    def extend(self, others: Iterable[Skipped]) -> None:
+        """Count what was left out elsewhere."""
+        for skipped in others:
+            if skipped not in self._counts and len(self._counts) >= _DISTINCT:
+                self._beyond += 1  # a set in which everything is wrong must not fill the memory
+                continue
+            self._counts[skipped] += 1
+            if self._logged and self._counts[skipped] == 1:
+                _LOG.warning("left out %s", skipped)
+
+    @property
+    def total(self) -> int:
+        """How often something was left out."""
+        return self._counts.total() + self._beyond
+
+    def plain_lines(self, most: int = _SHOWN) -> list[str]:
+        """The first ones, a line each, and how many more there are."""
+        rest = len(self._counts) - most
+        return [*map(str, list(self._counts)[:most]), *([f"and {rest} more"] if rest > 0 else [])]
+
+    def lines(self, most: int = _SHOWN) -> list[str]:
+        """A short account to print, the most frequent first; empty if nothing was left out."""
+        if not self.total:
+            return []
+        shown, scenes = self._counts.most_common(most), {skipped.scene for skipped in self._counts}
+        rows = [f"left out {self.total} times, {len(self._counts)} distinct faults in {len(scenes)} scenes:"]
+        rows += [f"  {count} x {skipped}" for skipped, count in shown]
+        rest = self.total - sum(count for _, count in shown)
+        return rows + ([f"  and {rest} more"] if rest else [])
+
+
+class Recent(Generic[Key, Value]):
+    """The last `most` values that were made, by key."""
+
+    def __init__(self, make: Callable[[Key], Value], most: int) -> None:
+        self._make, self._most = make, most
+        self._kept: OrderedDict[Key, Value] = OrderedDict()
+
+    def __call__(self, key: Key) -> Value:
+        """The value of a key, made where it is not kept. Raises what `make` raises."""
+        if key not in self._kept:
+            self._kept[key] = self._make(key)
+            if len(self._kept) > self._most:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(key)
+        return self._kept[key]
 
 
 class _Tally(threading.local):
@@ -61,17 +158,32 @@ def read(path: Path, most: int = MOST_PICTURE) -> bytes:
     return content
 
 
-def count_read(path: Path) -> None:
-    """Count a file that something else has read."""
-    _read.count += path.stat().st_size
-
-
 def one_of(*paths: Path) -> Path:
     """The first of several spellings of a file that is there. Raises FileFault naming the first if none is."""
     for path in paths:
         if path.exists():
             return path
     raise FileFault(paths[0], "is missing: download or generate the scene again")
+
+
+def read_npz(path: Path) -> dict[str, NDArray[Any]]:
+    """All arrays of an npz by name. Raises FileFault if it is damaged, no regular file, or unfolds to over a GiB."""
+    content = read(path, _MOST_ARRAYS)
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > _MOST_ARRAYS:
+                raise ValueError(f"it unfolds to more than {_MOST_ARRAYS} bytes")
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+            return dict(arrays)
+    except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
+        raise FileFault(path, f"is damaged ({error}); make or download it again") from error
+
+
+def read_member(archive: zipfile.ZipFile, name: str) -> bytes:
+    """One file of an archive. Raises one of ZIP_FAULTS; ValueError for one that unfolds to over 256 MiB."""
+    if archive.getinfo(name).file_size > _MOST_MEMBER:
+        raise ValueError(f"{name} unfolds to more than {_MOST_MEMBER} bytes")
+    return archive.read(name)
 
 
 def read_colour(path: Path) -> Bytes:
@@ -145,6 +257,7 @@ def require_size(path: Path, picture: NDArray[np.generic], height: int, width: i
 
 
 def decoded(path: Path, content: bytes, flags: int) -> NDArray[Any]:
+    """The picture in a file's content, as OpenCV decodes it with these flags. Raises FileFault."""
     try:
         width, height = imagesize.get(io.BytesIO(content), exif_rotation=False)
     except Exception as error:  # of any kind, where a header is damaged
@@ -168,15 +281,9 @@ def _float_tiff(path: Path) -> Floats:
 
 
 def _npz(path: Path, key: str) -> Floats:
-    try:
-        array = read_npz(one_of(path))[key]
-        count_read(path)
-    except KeyError as error:
-        raise FileFault(path, f"lacks its array `{key}`") from error
-    except FileFault:
-        raise
-    except DataError as error:
-        raise FileFault(path, str(error).removeprefix(f"{path} ")) from error
+    array = read_npz(path).get(key)
+    if array is None:
+        raise FileFault(path, f"lacks its array `{key}`")
     if array.dtype.kind != "f" or array.ndim < 2 or array.size == 0 or array.size != array.shape[0] * array.shape[1]:
         raise FileFault(path, f"should hold float depth [H, W], got {array.dtype} {list(array.shape)}")
     return array.reshape(array.shape[:2]).astype(np.float32, copy=False)

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_model.config import CameraControl, SemanticClass
+from gcd_model.config import CameraControl
 from gcd_model.errors import FileError
 from gcd_model.geometry import (
     CameraMount,
@@ -24,12 +24,11 @@ from gcd_model.geometry import (
     spherical_trajectory,
 )
 from gcd_model.small_files import decode_json
-from gcd_train.array_files import ZIP_FAULTS, read_member
-from gcd_train.datasets.splits import require_none_shared
+from gcd_train.data.files import ZIP_FAULTS, read_member
+from gcd_train.data.sample import Bytes, ClipSource, Sample
 from gcd_train.errors import DataError
 from gcd_train.scenes.pair_world import DEPTH_UNIT_M, Orbit, World, read_world
 
-Bytes = NDArray[np.uint8]
 _FOLDER_SEEDS = 10**12
 """Clips of the second folder count from here, of the third from twice this: no clip's own number is as large."""
 
@@ -53,18 +52,30 @@ class PairedClip:
     seed: int
 
 
-@dataclass(frozen=True, slots=True)
-class PairedClips:
+@dataclass(eq=False)
+class PairedClips(ClipSource):
     """All clips of some folders, read when asked for, safe to share between processes.
 
     One folder's clips are ordered by their number. Those of several alternate, so that the first ones are a fair mix.
     worlds: what each folder says about itself. places: shard and name of each clip. folders: in which folder it lies,
-    empty where there is but one.
+    empty where there is but one. frames, height, width: T, H, W. hfov_deg: angle across the source pictures, and
+    across the targets of an orbit. mount: how the source camera really sits on the vehicle.
     """
 
     worlds: tuple[World, ...]
     places: tuple[tuple[Path, str], ...]
     folders: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        world = self.world
+        self.frames, self.height, self.width = world.frames, world.height, world.width
+        self.hfov_deg, self.fps, self.classes = world.hfov_deg, world.fps, world.classes
+        self.camera: CameraControl = "none" if world.camera == "fixed" else "spherical"
+        if world.camera == "fixed":
+            options = world.options
+            self.mount = CameraMount(height_m=options.height_m, tilt_deg=options.tilt_deg, hfov_deg=world.hfov_deg)
+        described = [msgspec.json.encode(msgspec.structs.replace(each, clips_per_shard=0)) for each in self.worlds]
+        self.origin = hashlib.sha256(b"\n".join(described)).hexdigest()[:8]
 
     @classmethod
     def open(cls, folder: Path | str | Sequence[Path | str], limit: int | None = None) -> Self:
@@ -96,6 +107,11 @@ class PairedClips:
         world = self.world_of(index)
         return world.name, world.scene_of(int(self.places[index][1]))
 
+    @property
+    def scenes(self) -> dict[str, str]:
+        """World and seed of all scenes there are clips of, with the world."""
+        return {f"{world} {seed}": world for world, seed in map(self.scene, range(len(self)))}
+
     def name(self, index: int) -> str:
         """Of a clip in its world: the number it was made from, in digits."""
         return self.places[index][1]
@@ -116,19 +132,34 @@ class PairedClips:
             seed=self.seed(index),
         )
 
-    def rgb(self, index: int) -> tuple[Bytes, Bytes]:
+    def sample(self, number: int, /) -> Sample:
+        """See ClipSource."""
+        (source, target), path = self.rgb(number), self.trajectory(number)
+        return Sample(
+            source=source,
+            target=target,
+            target_classes=self.target_classes(number) if self.classes else None,
+            source_from_target=path.source_from_target.numpy(),
+            start=path.source,
+            deltas=None if path.delta is None else path.delta.numpy(),
+            fps=self.fps,
+            scene=str(self.scene(number)),
+            frame_numbers=tuple(range(self.frames)),
+        )
+
+    def rgb(self, index: int, /) -> tuple[Bytes, Bytes]:
         """Source and target pictures alone."""
         return self._colour(index, "source"), self._colour(index, "target")
 
-    def target_classes(self, index: int) -> Bytes:
+    def target_classes(self, index: int, /) -> Bytes:
         """Class ids of the target view alone, [T, H, W]; zeros where the world has no classes."""
         return self._classes(index, "target")
 
-    def seed(self, index: int) -> int:
+    def seed(self, index: int, /) -> int:
         """The number a clip was made from; in other folders than the first it is made different from all others."""
         return int(self.places[index][1]) + _FOLDER_SEEDS * self._folder(index)
 
-    def trajectory(self, index: int) -> Trajectory:
+    def trajectory(self, index: int, /) -> Trajectory:
         """The path from source to target. For an orbit its source stands at azimuth 0: only the change in it counts.
 
         Raises: DataError if the shard is damaged.
@@ -151,55 +182,6 @@ class PairedClips:
             return decode_json(self._read(index, "scene.json"), _Scene).orbit
         except FileError as error:
             raise DataError(f"{path}: {name}/scene.json {error}; generate the shard again") from error
-
-    @property
-    def camera(self) -> CameraControl:
-        """How a network is told where the target camera goes."""
-        return "none" if self.world.camera == "fixed" else "spherical"
-
-    @property
-    def classes(self) -> tuple[SemanticClass, ...]:
-        """The ontology, by id."""
-        return self.world.classes
-
-    @property
-    def fps(self) -> float:
-        """Frames per second."""
-        return self.world.fps
-
-    @property
-    def mount(self) -> CameraMount | None:
-        """How the source camera really sits on the vehicle; None in a world without one."""
-        if self.world.camera != "fixed":
-            return None
-        options = self.world.options
-        return CameraMount(height_m=options.height_m, tilt_deg=options.tilt_deg, hfov_deg=self.world.hfov_deg)
-
-    @property
-    def origin(self) -> str:
-        """Names the worlds and their options, whatever number of clips there is."""
-        told = [_told(world) for world in self.worlds]
-        return hashlib.sha256(told[0] if len(told) == 1 else b"\n".join(told)).hexdigest()[:8]
-
-    @property
-    def frames(self) -> int:
-        """T."""
-        return self.world.frames
-
-    @property
-    def height(self) -> int:
-        """H."""
-        return self.world.height
-
-    @property
-    def width(self) -> int:
-        """W."""
-        return self.world.width
-
-    @property
-    def hfov_deg(self) -> float:
-        """Angle across the source pictures, and across the targets of an orbit."""
-        return self.world.hfov_deg
 
     def _folder(self, index: int) -> int:
         return self.folders[index] if self.folders else 0
@@ -229,12 +211,6 @@ class PairedClips:
             path, name = self.places[index]
             raise DataError(f"{path}: {name}/{kind}.png is damaged; delete the shard and generate again")
         return strip.reshape(self.frames, self.height, *strip.shape[1:])  # pyright: ignore[reportReturnType]
-
-
-def require_apart(training: PairedClips, held_out: PairedClips) -> None:
-    """Raises DataError naming the scenes that two sets share."""
-    shared = {training.scene(i) for i in range(len(training))} & {held_out.scene(i) for i in range(len(held_out))}
-    require_none_shared([f"{world} {seed}" for world, seed in shared])
 
 
 def data_folders(folder: Path | str | Sequence[Path | str]) -> list[Path]:
@@ -276,10 +252,6 @@ def _alternating(counts: Sequence[int]) -> list[tuple[int, int]]:
     """Folder and place in it of all clips, each folder spread evenly over the whole."""
     every = [((k + 0.5) / count, i, k) for i, count in enumerate(counts) for k in range(count)]
     return [(i, k) for _, i, k in sorted(every)]
-
-
-def _told(world: World) -> bytes:
-    return msgspec.json.encode(msgspec.structs.replace(world, clips_per_shard=0))
 
 
 def _clip_names(path: Path) -> list[str]:

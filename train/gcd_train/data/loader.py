@@ -5,36 +5,16 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing import get_context
-from typing import Protocol
 
 import cv2
 import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from gcd_train.datasets.dataset4d import PairSample
-from gcd_train.datasets.skips import Skips
-from gcd_train.datasets.view_pairs import PairBatch, collate
+from gcd_train.data.sample import Sample, SampleBatch, Samples, collate
 from gcd_train.errors import RunError, TrainError
 from gcd_train.map_items import one_thread_each
 from gcd_train.recipe import LoaderRecipe
-
-
-class Samples(Protocol):
-    """Samples of a data set by number; `ViewPairs` and `LeRobotPairs` are two.
-
-    Any number from 0 up may be asked for; the set repeats its scenes after its length, with other draws.
-    """
-
-    skips: Skips
-
-    def __len__(self) -> int:
-        """Samples that are drawn before a scene comes again more often than another."""
-        ...
-
-    def sample(self, index: int) -> PairSample:
-        """The sample of a number, the same in any process. Raises DataError if too many in a row cannot be read."""
-        ...
 
 
 @dataclass(slots=True)
@@ -65,7 +45,7 @@ class SampleOrder:
 class LoadedBatch:
     """Samples, their numbers, and how long they were waited for."""
 
-    samples: PairBatch
+    samples: SampleBatch
     numbers: tuple[int, ...]
     wait_s: float
 
@@ -80,7 +60,7 @@ class SampleLoader:
         self._samples, self._recipe = samples, recipe
         self._order = SampleOrder(len(samples), seed)
         self._count, self._step, self._next = 0, 1, -1
-        self._batches: Iterator[PairBatch | TrainError] | None = None
+        self._batches: Iterator[SampleBatch | TrainError] | None = None
 
     def batch(self, number: int, count: int) -> LoadedBatch:
         """Batch `number` of `count` samples. Raises: as `Samples.sample`; RunError if a process was killed."""
@@ -95,7 +75,7 @@ class SampleLoader:
         numbers = tuple(self._order.batch(number, count))
         return LoadedBatch(samples, numbers, time.perf_counter() - started)
 
-    def _following(self, batches: "Iterator[PairBatch | TrainError]") -> PairBatch:
+    def _following(self, batches: "Iterator[SampleBatch | TrainError]") -> SampleBatch:
         try:
             samples = next(batches)
         except RuntimeError as error:  # what torch makes of a process that is gone
@@ -114,11 +94,11 @@ class SampleLoader:
         self._count = count
         self._batches = iter(self._loader(number)) if self._recipe.workers else self._here(number)
 
-    def _here(self, number: int) -> Iterator[PairBatch | TrainError]:
+    def _here(self, number: int) -> Iterator[SampleBatch | TrainError]:
         for indices in _Batches(self._order, number, self._step, self._count):
             yield collate([self._samples.sample(index) for index in indices])
 
-    def _loader(self, number: int) -> DataLoader[PairSample | TrainError]:
+    def _loader(self, number: int) -> DataLoader[Sample | TrainError]:
         recipe = self._recipe
         order = SampleOrder(self._order.length, self._order.seed)  # read ahead, so not the one that is looked up
         return DataLoader(
@@ -149,22 +129,22 @@ class _Batches:
             number += self.step
 
 
-class _Numbered(Dataset[PairSample | TrainError]):
+class _Numbered(Dataset[Sample | TrainError]):
     """Samples as torch's loader takes them; an error is handed over as it is, torch would bury it in a trace."""
 
     def __init__(self, samples: Samples) -> None:
         self._samples = samples
 
-    def __getitem__(self, index: int) -> PairSample | TrainError:
+    def __getitem__(self, index: int) -> Sample | TrainError:
         try:
             return self._samples.sample(index)
         except TrainError as error:
             return error
 
 
-def _collated(samples: list[PairSample | TrainError]) -> PairBatch | TrainError:
+def _collated(samples: list[Sample | TrainError]) -> SampleBatch | TrainError:
     failed = [sample for sample in samples if isinstance(sample, TrainError)]
-    return failed[0] if failed else collate([sample for sample in samples if isinstance(sample, PairSample)])
+    return failed[0] if failed else collate([sample for sample in samples if isinstance(sample, Sample)])
 
 
 def _settle(_worker: int) -> None:

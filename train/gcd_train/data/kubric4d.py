@@ -4,7 +4,6 @@ Sixteen cameras stand still around a scene; depth is stored as distance to the c
 the optical axis. There are instances but no classes. Folders and names: `gcd_train.layouts.kubric4d_names`.
 """
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +16,11 @@ from numpy.typing import NDArray
 from gcd_model.errors import ModelError
 from gcd_model.geometry import Intrinsics
 from gcd_model.small_files import decode_json
-from gcd_train.datasets.picture_files import (
+from gcd_train.data.dataset4d import KEPT_SCENES, Dataset4D, pose_from_quaternion, scene_names
+from gcd_train.data.files import (
     MOST_TEXT,
+    FileFault,
+    Recent,
     one_of,
     read,
     read_colour,
@@ -26,14 +28,11 @@ from gcd_train.datasets.picture_files import (
     read_palette_indices,
     require_size,
 )
-from gcd_train.datasets.rotations import pose_from_quaternion
-from gcd_train.datasets.skips import FileFault
+from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError
 from gcd_train.layouts import kubric4d_names as names
 from gcd_train.pointcloud import planar_from_distance
-from gcd_train.scene_view import SceneView
 
-_KEPT_SCENES = 64
 _PLANAR = f".{names.COMPACT_SUFFIXES['depth']}"
 """Depth files of compact scenes tell depth along the axis, the published ones the distance."""
 _BLENDER_FROM_CAMERA = np.diag([1.0, -1.0, -1.0])
@@ -67,14 +66,16 @@ class _View:
     poses: NDArray[np.float64]
 
 
-class Kubric4D:
-    """Scenes of a folder. Reads when asked; one object for each process or thread.
+class Kubric4D(Dataset4D):
+    """See Dataset4D.
 
     root: the folder with `scn00000` and so on; gaps in the numbers are fine.
     published: turn distance into depth by the published approximation instead of exactly.
     instances: read the instance numbers too, where the layer is there.
-    cameras: which views there are, `view0` to `view15` by default; all must be there at a time step.
+    cameras: which views there are, `view0` to `view15` by default.
     """
+
+    fps = names.FPS
 
     def __init__(
         self,
@@ -82,14 +83,12 @@ class Kubric4D:
         scenes: Sequence[str],
         *,
         cameras: Sequence[str] = names.CAMERAS,
-        source_camera: str = "view4",
         published: bool = False,
         instances: bool = False,
     ) -> None:
-        self._root, self.scenes, self.cameras = root, tuple(scenes), tuple(cameras)
-        self.source_camera = source_camera if source_camera in self.cameras else self.cameras[0]
+        super().__init__(root, scenes, cameras, "view4" if "view4" in cameras else cameras[0])
         self._published, self._instances = published, instances
-        self._kept: OrderedDict[str, dict[str, _View]] = OrderedDict()
+        self._views = Recent(self._read_views, KEPT_SCENES)
 
     @classmethod
     def open(
@@ -97,73 +96,27 @@ class Kubric4D:
         root: Path | str,
         *,
         cameras: Sequence[str] = names.CAMERAS,
-        source_camera: str = "view4",
         published: bool = False,
         instances: bool = False,
     ) -> Self:
         """Every scene of a folder, by number. Raises DataError if there is none."""
-        root = Path(root)
-        try:
-            found = [path.name for path in root.iterdir() if names.scene_number(path.name) is not None]
-        except OSError as error:
-            raise DataError(f"{root} cannot be read ({error}); give the folder that holds scn00000") from error
-        if not found:
-            raise DataError(f"{root} holds no Kubric-4D scene; give the folder that holds scn00000 and so on")
-        return cls(
-            root,
-            sorted(found, key=lambda name: names.scene_number(name) or 0),
-            cameras=cameras,
-            source_camera=source_camera,
-            published=published,
-            instances=instances,
-        )
-
-    def only(self, scenes: Sequence[str]) -> Self:
-        """The same set, reduced to these scenes and in their order. Raises DataError if none is left."""
-        if not scenes:
-            raise DataError(f"no scene of the list or split is in {self._root}; look at how its scenes are named")
-        return type(self)(
-            self._root,
-            scenes,
-            cameras=self.cameras,
-            source_camera=self.source_camera,
-            published=self._published,
-            instances=self._instances,
-        )
-
-    @property
-    def fps(self) -> float:
-        """Frames per second."""
-        return names.FPS
-
-    @property
-    def ontology(self) -> None:
-        """None: there are no classes."""
-        return None
-
-    @property
-    def palette(self) -> None:
-        """None: there are no classes."""
-        return None
-
-    def folder(self, scene: str) -> Path:
-        """Where the scene lies."""
-        return self._root / scene
+        scenes = scene_names(Path(root), names.scene_number, "scn00000")
+        return cls(Path(root), scenes, cameras=cameras, published=published, instances=instances)
 
     def frames(self, scene: str) -> int:
-        """Time steps. Raises FileFault."""
+        """See Dataset4D."""
         return min(len(view.poses) for view in self._views(scene).values())
 
     def lens(self, scene: str) -> Intrinsics:
-        """Of the source camera. Raises FileFault."""
+        """See Dataset4D."""
         return self._views(scene)[self.source_camera].lens
 
-    def poses(self, scene: str, camera: str) -> NDArray[np.float64]:
-        """world_from_camera of a view, f64 [T, 4, 4], metres. Raises FileFault."""
-        return self._views(scene)[camera].poses
+    def pose(self, scene: str, camera: str, time: int = 0) -> NDArray[np.float64]:
+        """See Dataset4D."""
+        return self._views(scene)[camera].poses[time]
 
     def views(self, scene: str, time: int, cameras: Sequence[str] | None = None) -> list[SceneView]:
-        """What the cameras saw at a time step. Raises FileFault naming the file at fault."""
+        """See Dataset4D."""
         known = self._views(scene)
         return [self._view(scene, camera, known[camera], time) for camera in cameras or self.cameras]
 
@@ -204,15 +157,11 @@ class Kubric4D:
         published = names.frame_path(folder, view, layer, time)
         return one_of(published, names.frame_path(folder, view, layer, time, compact=True))
 
-    def _views(self, scene: str) -> dict[str, _View]:
-        if scene not in self._kept:
-            folder = self.folder(scene)
-            views = {camera: _read_view(names.metadata_path(folder, _number(camera))) for camera in self.cameras}
-            _require_one_size(list(views.values()))
-            self._kept[scene] = views
-            while len(self._kept) > _KEPT_SCENES:
-                self._kept.popitem(last=False)
-        return self._kept[scene]
+    def _read_views(self, scene: str) -> dict[str, _View]:
+        folder = self.folder(scene)
+        views = {camera: _read_view(names.metadata_path(folder, _number(camera))) for camera in self.cameras}
+        _require_one_size(list(views.values()))
+        return views
 
 
 def _number(camera: str) -> int:

@@ -6,7 +6,7 @@ in any number of workers.
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -20,15 +20,74 @@ from gcd_model.geometry import (
     SphericalDelta,
     driving_trajectory,
     look_at,
-    motion_bucket,
     spherical_trajectory,
     to_pose,
 )
-from gcd_train.datasets.clip_frames import DRIVING_FRAMES, KUBRIC_FRAMES, FrameSampling
-from gcd_train.datasets.controls import Control
+from gcd_train.data.splits import Control
 from gcd_train.errors import DataError, RecipeError
 
 Range = tuple[float, float]
+CLIP = 14
+"""Frames of a clip."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class FrameSampling:
+    """Which frames of a scene a clip is.
+
+    clip: T. strides: one of them is drawn, of those for which the scene is long enough. latest_start: largest first
+    frame number, None for no such limit. reach_last: let a clip end with the scene's last frame, which an off-by-one in
+    the released code keeps out of reach. reverse: probability that the clip runs backwards.
+    """
+
+    clip: int = CLIP
+    strides: tuple[int, ...] = (1,)
+    latest_start: int | None = None
+    reach_last: bool = False
+    reverse: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.clip < 1 or not self.strides or min(self.strides) < 1:
+            raise RecipeError(f"a clip needs frames and strides from 1 up, got {self.clip} and {self.strides}")
+        if not 0.0 <= self.reverse <= 1.0 or (self.latest_start is not None and self.latest_start < 0):
+            raise RecipeError(
+                f"a probability lies within 0..1 and a start from 0 up, got {self.reverse} and {self.latest_start}"
+            )
+
+    def last_start(self, frames: int, stride: int) -> int:
+        """Largest first frame number, below 0 if no clip fits: min(frames - ((T - 1) stride + 1) - 1, latest)."""
+        last = frames - ((self.clip - 1) * stride + 1) - (0 if self.reach_last else 1)
+        return last if self.latest_start is None else min(last, self.latest_start)
+
+    def draw(self, rng: np.random.Generator, frames: int) -> tuple[tuple[int, ...], int, bool]:
+        """Frame numbers, stride, and whether they run backwards. Raises DataError if no clip fits."""
+        fitting = [stride for stride in self.strides if self.last_start(frames, stride) >= 0]
+        if not fitting:
+            wanted = frames - self.last_start(frames, min(self.strides))
+            left_out = "" if self.reach_last else " (the last is left out, as published, unless data.frames.reach_last)"
+            raise DataError(
+                f"is too short: a clip of {self.clip} at stride {min(self.strides)} wants {wanted} frames{left_out}, "
+                f"got {frames}"
+            )
+        stride = int(rng.choice(fitting))
+        start = int(rng.integers(self.last_start(frames, stride) + 1))
+        numbers = tuple(range(start, start + self.clip * stride, stride))
+        if rng.random() < self.reverse:
+            return numbers[::-1], stride, True
+        return numbers, stride, False
+
+    def controlled(self, control: Control, frames: int) -> tuple[int, ...]:
+        """Frame numbers a control asks for. Raises DataError if the scene does not have them."""
+        numbers = control.frame_numbers(self.clip)
+        if numbers[-1] >= frames:
+            raise DataError(f"is too short: {control.name} asks for frame {numbers[-1]} of {frames}")
+        return numbers
+
+
+KUBRIC_FRAMES = FrameSampling(strides=(1, 2, 3, 4), latest_start=6, reverse=0.2)
+"""Clips of Kubric-4D, 24, 12, 8 or 6 frames a second."""
+DRIVING_FRAMES = FrameSampling(strides=(1, 2))
+"""Clips of ParallelDomain-4D, 10 or 5 frames a second."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -38,7 +97,7 @@ class Draw:
     frame_numbers: T numbers of the scene's frames, falling where the clip is `reversed`. fps: of the clip.
     world_from_source: f64 [4, 4], it stands still. world_from_target: f64 [T, 4, 4]. The world is the scene's, or the
     vehicle in driving. start: the source on the sphere, deltas: f64 [T, 3] target minus source in azimuth and elevation
-    in degrees and radius in metres; None in driving. motion: the number that tells the network how far it goes.
+    in degrees and radius in metres; None in driving.
     """
 
     frame_numbers: tuple[int, ...]
@@ -48,19 +107,6 @@ class Draw:
     world_from_target: NDArray[np.float64]
     start: Spherical | None
     deltas: NDArray[np.float64] | None
-    motion: int
-
-
-class Sampling(Protocol):
-    """Draws samples."""
-
-    def draw(self, rng: np.random.Generator, frames: int, fps: float) -> Draw:
-        """A sample of a scene with so many frames at this rate. Raises DataError if the scene is too short."""
-        ...
-
-    def controlled(self, control: Control, frames: int, fps: float) -> Draw:
-        """The sample that a control list asks for. Raises DataError if the scene is too short for it."""
-        ...
 
 
 def generator(seed: int, index: int, attempt: int = 0) -> np.random.Generator:
@@ -75,7 +121,6 @@ class OrbitSampling:
     azimuth_deg, elevation_deg, radius_m: where the source may stand and the goal too (its azimuth may be any). The
     source's elevation is uniform in its sine, so that directions are; the goal's is uniform in degrees.
     max_azimuth_deg, max_elevation_deg, max_radius_m: largest change to the goal.
-    fixed: this change instead of a drawn one, whatever the bounds. goal: this goal instead.
     gradual: the camera moves all the way through the clip; otherwise it is at the goal from the first frame on.
     move_time: the frame in which a gradual move is done, the last by default.
     Source: Van Hoorick et al. 2024 (GCD), section 4; bounds of elevation as released (the paper prints 0..90 for
@@ -88,8 +133,6 @@ class OrbitSampling:
     azimuth_deg: Range = (0.0, 360.0)
     elevation_deg: Range = (0.0, 50.0)
     radius_m: Range = (12.0, 18.0)
-    fixed: SphericalDelta | None = None
-    goal: Spherical | None = None
     gradual: bool = True
     move_time: int | None = None
     frames: FrameSampling = KUBRIC_FRAMES
@@ -108,8 +151,6 @@ class OrbitSampling:
             )
         if min(self.max_azimuth_deg, self.max_elevation_deg, self.max_radius_m) < 0.0:
             raise RecipeError("largest changes of azimuth, elevation and radius are 0 or more")
-        if self.fixed is not None and self.goal is not None:
-            raise RecipeError("give a fixed change or a fixed goal, not both")
 
     def draw(self, rng: np.random.Generator, frames: int, fps: float) -> Draw:
         """A sample. Raises DataError if the scene is too short."""
@@ -135,10 +176,6 @@ class OrbitSampling:
 
     def change(self, rng: np.random.Generator, start: Spherical) -> SphericalDelta:
         """The way from a source to a goal."""
-        if self.fixed is not None:
-            return self.fixed
-        if self.goal is not None:
-            return self.goal - start
         return SphericalDelta(
             azimuth_deg=float(rng.uniform(-self.max_azimuth_deg, self.max_azimuth_deg)),
             elevation_deg=_step(rng, start.elevation_deg, self.max_elevation_deg, self.elevation_deg),
@@ -164,35 +201,24 @@ class OrbitSampling:
             world_from_target=world_from_source @ path.source_from_target.numpy(),
             start=start,
             deltas=deltas,
-            motion=self._motion(change),
         )
-
-    def _motion(self, change: SphericalDelta) -> int:
-        if not (self.max_azimuth_deg or self.max_elevation_deg):
-            return 0
-        return motion_bucket(change, max_azimuth_deg=self.max_azimuth_deg, max_elevation_deg=self.max_elevation_deg)
 
 
 MAX90 = OrbitSampling()
 """Kubric-4D, up to 90 degrees of azimuth and 30 of elevation, gradual."""
 MAX180 = OrbitSampling(max_azimuth_deg=180.0, max_elevation_deg=60.0)
 """Kubric-4D, up to 180 degrees of azimuth and 60 of elevation, gradual."""
-MAX90_DIRECT = OrbitSampling(gradual=False)
-"""As MAX90, at the goal from the first frame on."""
-MAX180_DIRECT = OrbitSampling(max_azimuth_deg=180.0, max_elevation_deg=60.0, gradual=False)
-"""As MAX180, at the goal from the first frame on."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class DrivingSampling:
     """ParallelDomain-4D's one path, from the forward camera up and back, at a sine pace; only the frames are drawn.
 
-    gradual, move_time: as in OrbitSampling. motion: the constant number the network is told.
+    gradual, move_time: as in OrbitSampling.
     """
 
     gradual: bool = True
     move_time: int | None = None
-    motion: int = 127
     frames: FrameSampling = DRIVING_FRAMES
 
     def draw(self, rng: np.random.Generator, frames: int, fps: float) -> Draw:
@@ -217,14 +243,15 @@ class DrivingSampling:
             world_from_target=vehicle_from_source @ path.source_from_target.numpy(),
             start=None,
             deltas=None,
-            motion=self.motion,
         )
 
 
 DRIVING = DrivingSampling()
 """ParallelDomain-4D, gradual."""
-DRIVING_DIRECT = DrivingSampling(gradual=False)
-"""ParallelDomain-4D, at the goal from the first frame on."""
+
+
+Sampling: TypeAlias = OrbitSampling | DrivingSampling
+"""Draws samples."""
 
 
 def _vehicle_from_source() -> NDArray[np.float64]:

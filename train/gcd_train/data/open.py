@@ -1,40 +1,58 @@
 """From a recipe's [data] and the folders a user names to what a run learns from and is measured on."""
 
 from dataclasses import dataclass
-from filecmp import cmp
 from pathlib import Path
 from typing import TypeVar
 
 from gcd_model import Family, ModelConfig
 from gcd_model.networks import Networks
 from gcd_train.batches import BatchMaker, BatchSource
-from gcd_train.datasets.clip_frames import DRIVING_FRAMES, KUBRIC_FRAMES, FrameSampling
-from gcd_train.datasets.clip_source import PaintedClips
-from gcd_train.datasets.dataset4d import Dataset4D
-from gcd_train.datasets.kubric4d import Kubric4D
-from gcd_train.datasets.ontology import Ontology
-from gcd_train.datasets.paired import PairedClips, data_folders, require_apart
-from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
-from gcd_train.datasets.sample_clips import SampleClips
-from gcd_train.datasets.skips import Skips
-from gcd_train.datasets.splits import Part, kubric_split, present, read_split, require_none_shared
-from gcd_train.datasets.trajectories import DrivingSampling, OrbitSampling, Sampling
-from gcd_train.datasets.videos import VideoClips, VideoSamples
-from gcd_train.datasets.view_pairs import ViewPairs
+from gcd_train.data.batches import CachedBatches, SampleBatches
+from gcd_train.data.cache import CachedLatents
+from gcd_train.data.dataset4d import Dataset4D, Ontology
+from gcd_train.data.files import Skips
+from gcd_train.data.kubric4d import Kubric4D
+from gcd_train.data.pairs import PairedClips, data_folders
+from gcd_train.data.parallel_domain4d import ParallelDomain4D
+from gcd_train.data.paths import DRIVING_FRAMES, KUBRIC_FRAMES, DrivingSampling, FrameSampling, OrbitSampling, Sampling
+from gcd_train.data.pictures import PictureOptions
+from gcd_train.data.sample import ClipSource, PaintedClips, SampleClips, Samples, VideoClips, VideoSamples
+from gcd_train.data.splits import Part, kubric_split, present, read_split, require_apart
+from gcd_train.data.videos import FilmedPairs, filmed_scenes
+from gcd_train.data.views import ViewPairs
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.latent_cache import CachedLatents
-from gcd_train.latent_cache.batches import CachedBatches
+from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
 from gcd_train.layouts.manifest import MANIFEST, read_manifest
 from gcd_train.lerobot.pairs import LeRobotOptions, LeRobotPairs
 from gcd_train.model_setup import digest_of
-from gcd_train.pair_batches import PairBatches
 from gcd_train.precision import Precision
 from gcd_train.recipe import DataRecipe, Recipe
-from gcd_train.run_data import DataPlaces, RunData
-from gcd_train.sample_loader import Samples
 
 _FIXED_SEED = 0  # of the clips that are measured on: the same ones in every run
+_VIDEO_FAMILY = "svd"
 Set = TypeVar("Set", Kubric4D, ParallelDomain4D)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RunData:
+    """clips: to learn from, for stages that take them one by one, all at the recipe's fps. valid: held out.
+
+    batches: how the U-Net's batches are made where they come neither from encoded clips nor from `clips`.
+    parts: the pairs that `clips` are videos of, encoded in their stead, each by itself; empty where `clips` are pairs.
+    """
+
+    clips: ClipSource
+    valid: ClipSource
+    batches: BatchMaker | None = None
+    parts: tuple[ClipSource, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DataPlaces:
+    """The folders a user names. data: to learn from. valid: held out; None to hold out a part of `data`."""
+
+    data: Path
+    valid: Path | None = None
 
 
 def open_data(recipe: Recipe, config: ModelConfig, family: Family, places: DataPlaces) -> RunData:
@@ -44,8 +62,11 @@ def open_data(recipe: Recipe, config: ModelConfig, family: Family, places: DataP
         DataError: no such data there, nothing is left to measure on, or both parts share scenes or episodes.
         RecipeError: an option does not fit the data or the family.
     """
-    if recipe.data.task == "image-to-video":
-        require_image_to_video(recipe, config)
+    if recipe.data.task == "image-to-video" and recipe.model.family != _VIDEO_FAMILY:
+        raise RecipeError(
+            f'data.task "image-to-video" makes a model without views, model.family is {recipe.model.family!r}: give '
+            f'model.family "{_VIDEO_FAMILY}"'
+        )
     opening = _Opening(recipe, config, family, places)
     match recipe.data.kind:
         case "pairs":
@@ -54,6 +75,8 @@ def open_data(recipe: Recipe, config: ModelConfig, family: Family, places: DataP
             return opening.views()
         case "lerobot":
             return opening.lerobot()
+        case "videos":
+            return opening.videos()
         case "cache":
             return opening.cache()
 
@@ -70,8 +93,26 @@ class _Opening:
         return self.recipe.data
 
     def pairs(self) -> RunData:
-        valid = self._valid_folder("pairs have no split of their own")
-        return open_pairs(self.recipe, self.config, self.places.data, valid)
+        data, valid = self.places.data, self._valid_folder("pairs have no split of their own")
+        if self._data.task == "image-to-video":  # both sides of all pairs: the folders need not go the same way
+            self._require_plain_latents()
+            learned, held = (tuple(map(PairedClips.open, data_folders(place))) for place in (data, valid))
+            require_apart(
+                *({name: world for each in part for name, world in each.scenes.items()} for part in (learned, held))
+            )
+            return RunData(clips=VideoClips(learned), valid=VideoClips(held), parts=learned)
+        clips, held_out = PairedClips.open(data), PairedClips.open(valid)
+        require_apart(clips.scenes, held_out.scenes)
+        for each, folder in ((clips, data), (held_out, valid)):
+            goal, reached = self._data.goal_frame(each.frames), each.trajectory(0).at_goal.index(True)
+            if goal != reached:
+                raise DataError(
+                    f"the cameras in {folder} are at their goal in frame {reached}, the recipe's data.path says frame "
+                    f"{goal}; change data.path, or make the clips with `gcd-train generate driving --path` so"
+                )
+        if self._data.modality == "semantic":
+            return RunData(clips=PaintedClips(clips), valid=PaintedClips(held_out))
+        return RunData(clips=clips, valid=held_out)
 
     def views(self) -> RunData:
         if self._data.kind == "kubric4d":
@@ -83,11 +124,33 @@ class _Opening:
         held_out = 0 if self.places.valid else self._data.held_out
         learned = self._episodes(self.places.data, (0, -held_out or None))
         held = self._episodes(self.places.valid or self.places.data, (-held_out, None))
-        require_none_shared(_shared_episodes(learned, held))
+        require_apart(*({episode.name: episode.data for episode in part.episodes} for part in (learned, held)))
         return RunData(
             clips=self._clips(learned, len(learned), learned.fps),
             valid=self._clips(held, len(held.episodes), held.fps),
             batches=self._sampled(learned),
+        )
+
+    def videos(self) -> RunData:
+        scenes, held_out = filmed_scenes(self.places.data), self._data.held_out
+        if self.places.valid is None:
+            if len(scenes) <= held_out:
+                raise DataError(
+                    f"{self.places.data} has {len(scenes)} scenes, and data.held_out keeps {held_out} of them to "
+                    "measure on; hold out fewer, or give --valid FOLDER"
+                )
+            learned, held = scenes[:-held_out], scenes[-held_out:]
+        else:
+            learned, held = scenes, filmed_scenes(self.places.valid)
+        require_apart(*({scene.name: scene.cameras[0].video for scene in part} for part in (learned, held)))
+        fps, seed, repeats = self.recipe.unet.fps, self.recipe.seed, self._data.repeats
+        size, frames = (self.config.width, self.config.height), self.config.frames
+        pairs = FilmedPairs(learned, size=size, frames=frames, fps=fps, seed=seed, repeats=repeats)
+        valid = FilmedPairs(held, size=size, frames=frames, fps=fps, seed=_FIXED_SEED)
+        return RunData(
+            clips=self._clips(pairs, len(pairs), fps),
+            valid=self._clips(valid, len(valid), fps),
+            batches=self._sampled(pairs),
         )
 
     def cache(self) -> RunData:
@@ -98,18 +161,16 @@ class _Opening:
         held = self._driving(valid)
         if self._data.split == "last" or self._data.split_file is not None:
             held = held.only(self._part(held, "val"))
-        require_none_shared(set(cache.scenes) & set(held.scenes))
+        require_apart(dict.fromkeys(cache.scenes, ""), dict.fromkeys(held.scenes, ""))
         clips = self._one_rate(held, held.fps)
 
         def batches(networks: Networks, precision: Precision, /) -> BatchSource:
-            cached = CachedBatches(cache, self.config, self.recipe.unet, precision, self._data.path)
-            cached.require_encoders(networks)
-            return cached
+            return CachedBatches(cache, networks, self.recipe.unet, precision, self._data.path)
 
         return RunData(clips=clips, valid=clips, batches=batches)
 
     def _views(self, learned: Kubric4D | ParallelDomain4D, held: Kubric4D | ParallelDomain4D) -> RunData:
-        require_none_shared(_shared_scenes(learned, held))
+        require_apart(_worlds_of(learned), _worlds_of(held))
         sampling = sampling_of(self.recipe, self.config.frames)
         return RunData(
             clips=self._one_rate(learned, learned.fps, repeats=self._data.repeats),
@@ -118,16 +179,12 @@ class _Opening:
         )
 
     def _kubric(self, root: Path) -> Kubric4D:
-        data = self._data
-        if data.cameras is None:
-            return Kubric4D.open(root, published=data.published)
-        return Kubric4D.open(root, cameras=data.cameras, published=data.published)
+        cameras = self._data.cameras or kubric4d_names.CAMERAS
+        return Kubric4D.open(root, cameras=cameras, published=self._data.published)
 
     def _driving(self, root: Path) -> ParallelDomain4D:
-        data, classes = self._data, self._data.modality == "semantic"
-        if data.cameras is None:
-            return ParallelDomain4D.open(root, classes=classes)
-        return ParallelDomain4D.open(root, cameras=data.cameras, classes=classes)
+        cameras = self._data.cameras or parallel_domain4d_names.CAMERAS
+        return ParallelDomain4D.open(root, cameras=cameras, classes=self._data.modality == "semantic")
 
     def _parts(self, whole: Set) -> tuple[Set, Set]:
         """What to learn from, and what to measure on."""
@@ -157,22 +214,19 @@ class _Opening:
         return present(read_split(Path(data.split_file), part), scenes, Skips(), data.split_file)
 
     def _pairs(
-        self, data: Kubric4D | ParallelDomain4D, sampling: Sampling, seed: int, repeats: int, *, class_ids: bool = False
+        self, data: Dataset4D, sampling: Sampling, seed: int, repeats: int, *, class_ids: bool = False
     ) -> ViewPairs:
-        told = self._data
-        return ViewPairs(
-            data,
-            sampling,
-            seed,
-            (self.config.width, self.config.height),
-            repeats=repeats,
-            modality="classes" if told.modality == "semantic" else "rgb",
+        recipe = self._data
+        options = PictureOptions(
+            size=(self.config.width, self.config.height),
+            modality="classes" if recipe.modality == "semantic" else "rgb",
             class_ids=class_ids,
-            exact=told.exact,
-            published=told.published,
+            exact=recipe.exact,
+            published=recipe.published,
         )
+        return ViewPairs(data, sampling, seed, options, repeats=repeats)
 
-    def _one_rate(self, data: Kubric4D | ParallelDomain4D, fps: float, repeats: int = 1) -> SampleClips:
+    def _one_rate(self, data: Dataset4D, fps: float, repeats: int = 1) -> SampleClips:
         """Clips at the rate that the recipe names, forwards; always the same ones."""
         wanted = self.recipe.unet.fps
         stride = max(round(fps / wanted), 1)
@@ -187,7 +241,15 @@ class _Opening:
         origin = digest_of(self._data, str(self.places.data))
         if self._data.task == "image-to-video":
             samples, count = VideoSamples(samples), 2 * count
-        return SampleClips(samples, count, camera=self.config.camera, fps=fps, origin=origin, ontology=ontology)
+        return SampleClips(
+            samples,
+            count,
+            camera=self.config.camera,
+            fps=fps,
+            origin=origin,
+            classes=() if ontology is None else ontology.classes,
+            places=None if ontology is None else ontology.places,
+        )
 
     def _sampled(self, samples: Samples) -> BatchMaker:
         recipe = self.recipe
@@ -196,7 +258,7 @@ class _Opening:
 
         def batches(networks: Networks, precision: Precision, /) -> BatchSource:
             loader = recipe.data.loader
-            return PairBatches(samples, networks, recipe.unet, self.family, precision, loader, recipe.seed)
+            return SampleBatches(samples, networks, recipe.unet, self.family, precision, loader, recipe.seed)
 
         return batches
 
@@ -210,7 +272,6 @@ class _Opening:
             cameras=told.cameras,
             calibration=None if told.calibration is None else Path(told.calibration),
             repeats=self._data.repeats,
-            motion=round(self.recipe.unet.motion_bucket),
             episodes=episodes,
         )
         return LeRobotPairs(folder, self.recipe.seed, options)
@@ -221,22 +282,43 @@ class _Opening:
         return self.places.valid
 
     def _require_drawn_as_cached(self, cache: CachedLatents) -> None:
-        """What a cache was made of cannot be drawn otherwise. Raises RecipeError naming the option."""
-        data, told, kept = self._data, self._data.frames, cache.index.identity
+        """What a cache was made of cannot be drawn otherwise. Raises RecipeError naming the options."""
+        data, unet, config, kept = self._data, self.recipe.unet, self.config, cache.index.identity
+        frames = data.frames
         wrong = {
+            "model.camera": config.camera != "none",
+            "model.frames": config.frames != kept.plan.clip_frames,
+            "model.height and model.width": (config.height, config.width) != (kept.height, kept.width),
+            "unet.image_share": unet.image_share > 0,
+            "unet.augmentation": unet.augmentation != kept.augmentation,
+            "unet.loss.class_weights": unet.loss.class_weights != "none" and not kept.emphasis,
+            "data.path": data.path not in kept.plan.paths,
             "data.modality": (data.modality == "semantic") != kept.emphasis,
-            "data.move_time": data.move_time not in (None, 0 if data.path == "direct" else self.config.frames - 1),
-            "data.frames.strides": told.strides is not None and set(told.strides) != set(kept.plan.strides),
-            "data.frames.latest_start": told.latest_start is not None,
-            "data.frames.reverse": bool(told.reverse),
-            "data.frames.reach_last": told.reach_last,
+            "data.move_time": data.move_time not in (None, 0 if data.path == "direct" else config.frames - 1),
+            "data.frames.strides": frames.strides is not None and set(frames.strides) != set(kept.plan.strides),
+            "data.frames.latest_start": frames.latest_start is not None,
+            "data.frames.reverse": bool(frames.reverse),
+            "data.frames.reach_last": frames.reach_last,
         }
         named = [name for name, is_wrong in wrong.items() if is_wrong]
         if named:
             kind = "class colours" if kept.emphasis else "colour"
             raise RecipeError(
-                f"{cache.folder} holds {kind} at strides {kept.plan.strides}, forwards, up to the last frame but one; "
-                f"the recipe's {', '.join(named)} wants another thing: change the recipe, or make the cache anew"
+                f"{cache.folder} holds {' and '.join(kept.plan.paths)} clips in {kind}, {kept.plan.clip_frames} "
+                f"frames of {kept.width}x{kept.height} at strides {kept.plan.strides}, forwards, of one path, up to "
+                f"the last frame but one, with augmentation {kept.augmentation:g}; the recipe's {', '.join(named)} "
+                "wants another thing: change the recipe, or make the cache anew"
+            )
+
+    def _require_plain_latents(self) -> None:
+        """Encoded pairs serve as videos where both sides were encoded alike."""
+        latents = self.recipe.latents
+        if self.recipe.unet.source != "latents" or latents is None:
+            return
+        if latents.augmentation or latents.sample or not self.config.vae.shared:
+            raise RecipeError(
+                'data.task "image-to-video" takes both sides of the encoded pairs as videos: it wants one shared '
+                'autoencoder, latents.augmentation 0 and latents.sample false; or give unet.source "pixels"'
             )
 
     def _require_family_covers_orbit(self) -> None:
@@ -252,24 +334,13 @@ class _Opening:
             )
 
 
-def _shared_scenes(learned: Dataset4D, held: Dataset4D) -> list[str]:
-    """Scenes of one name, and of one world where they are ours."""
-
-    def world(folder: Path) -> str | None:
-        return read_manifest(folder).world if (folder / MANIFEST).exists() else None
-
-    both = sorted(set(learned.scenes) & set(held.scenes))
-    return [scene for scene in both if world(learned.folder(scene)) == world(held.folder(scene))]
-
-
-def _shared_episodes(learned: LeRobotPairs, held: LeRobotPairs) -> list[str]:
-    """Episodes of one number whose rows lie in the same file, or in one with the same content."""
-    places = {episode.number: episode.data for episode in learned.episodes}
-
-    def same(one: Path, other: Path) -> bool:
-        return one.is_file() and other.is_file() and cmp(one, other, shallow=False)
-
-    return [each.name for each in held.episodes if each.number in places and same(places[each.number], each.data)]
+def _worlds_of(data: Dataset4D) -> dict[str, str]:
+    """Scenes by name, with their world where they are ours."""
+    folders = {scene: data.folder(scene) for scene in data.scenes}
+    return {
+        scene: str(read_manifest(folder).world) if (folder / MANIFEST).exists() else ""
+        for scene, folder in folders.items()
+    }
 
 
 def sampling_of(recipe: Recipe, frames: int, *, stride: int | None = None) -> Sampling:
@@ -289,8 +360,7 @@ def sampling_of(recipe: Recipe, frames: int, *, stride: int | None = None) -> Sa
     )
     move_time = data.goal_frame(frames)
     if not orbits:
-        motion = round(recipe.unet.motion_bucket)
-        return DrivingSampling(move_time=move_time, motion=motion, frames=chosen)
+        return DrivingSampling(move_time=move_time, frames=chosen)
     orbit = data.orbit
     return OrbitSampling(
         max_azimuth_deg=orbit.max_azimuth_deg,
@@ -302,65 +372,3 @@ def sampling_of(recipe: Recipe, frames: int, *, stride: int | None = None) -> Sa
         move_time=move_time,
         frames=chosen,
     )
-
-
-_VIDEO_FAMILY = "svd"
-
-
-def open_pairs(recipe: Recipe, config: ModelConfig, data: Path, valid: Path) -> RunData:
-    """The pairs of two folders, or of the folders in them.
-
-    Raises:
-        DataError: no such data there, both share scenes, or their cameras go another way than the recipe says.
-        RecipeError: the recipe's task does not go together with its model or its latents.
-    """
-    if recipe.data.task == "image-to-video":
-        return _videos(recipe, config, data, valid)
-    clips, held_out = PairedClips.open(data), PairedClips.open(valid)
-    require_apart(clips, held_out)
-    for each, folder in ((clips, data), (held_out, valid)):
-        _require_path(each, folder, recipe)
-    if recipe.data.modality == "semantic":
-        return RunData(clips=PaintedClips(clips), valid=PaintedClips(held_out))
-    return RunData(clips=clips, valid=held_out)
-
-
-def require_image_to_video(recipe: Recipe, config: ModelConfig) -> None:
-    """Raises RecipeError if the recipe's model is made for something else than a video out of its first frame."""
-    model = recipe.model
-    if model.family != _VIDEO_FAMILY:
-        raise RecipeError(
-            f'data.task "image-to-video" makes a model without views, model.family is {model.family!r}: give '
-            f'model.family "{_VIDEO_FAMILY}"'
-        )
-
-
-def _videos(recipe: Recipe, config: ModelConfig, data: Path, valid: Path) -> RunData:
-    """Both sides of all pairs; the folders in one need not go the same way."""
-    _require_plain_latents(recipe, config)
-    learned, held_out = (tuple(map(PairedClips.open, data_folders(place))) for place in (data, valid))
-    for one in learned:
-        for other in held_out:
-            require_apart(one, other)
-    return RunData(clips=VideoClips(learned), valid=VideoClips(held_out), parts=learned)
-
-
-def _require_plain_latents(recipe: Recipe, config: ModelConfig) -> None:
-    """Encoded pairs serve as videos where both sides were encoded alike."""
-    latents = recipe.latents
-    if recipe.unet.source != "latents" or latents is None:
-        return
-    if latents.augmentation or latents.sample or not config.vae.shared:
-        raise RecipeError(
-            'data.task "image-to-video" takes both sides of the encoded pairs as videos: it wants one shared '
-            'autoencoder, latents.augmentation 0 and latents.sample false; or give unet.source "pixels"'
-        )
-
-
-def _require_path(clips: PairedClips, folder: Path, recipe: Recipe) -> None:
-    goal, reached = recipe.data.goal_frame(clips.frames), clips.trajectory(0).at_goal.index(True)
-    if goal != reached:
-        raise DataError(
-            f"the cameras in {folder} are at their goal in frame {reached}, the recipe's data.path says frame {goal}; "
-            "change data.path, or make the clips with `gcd-train generate driving --path direct` or gradual"
-        )

@@ -1,0 +1,221 @@
+"""Batches of the diffusion objective from samples of a data set or from a latent cache.
+
+Each clip has its own camera, rate and motion. From samples, the frozen networks run on every batch: with fresh
+augmentation noise, and targets drawn from their posterior. From a cache they never run.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from gcd_model import Family
+from gcd_model.conditioning import micro_conditioning
+from gcd_model.geometry import Trajectory
+from gcd_model.image_encoder import clip_pixels
+from gcd_model.networks import Networks
+from gcd_train.conditioner import Conditioner
+from gcd_train.data.cache import CachedClip, CachedLatents, PathKind, encoders_digest
+from gcd_train.data.loader import LoadedBatch, SampleLoader
+from gcd_train.data.sample import Samples, to_network
+from gcd_train.draws import Draws
+from gcd_train.errors import DataError, RecipeError
+from gcd_train.losses import COLOUR_WEIGHTS, class_emphasis
+from gcd_train.objective import Batch, drop_streams
+from gcd_train.precision import Precision
+from gcd_train.recipe import LoaderRecipe, UNetRecipe
+
+Made = TypeVar("Made")
+_AT_ONCE = 14  # frames; changes memory, not the result
+_WHOLE_CLIPS = "samples of a data set and a latent cache are whole clips; set image_share to 0"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class EncodedFrames:
+    """N frames. target: [N, C, h, w], scaled. source: [N, C, h, w], not scaled. tokens: [N, D] or None.
+
+    emphasis: [N, 1, h, w] of `class_emphasis`, or None.
+    """
+
+    target: Tensor
+    source: Tensor
+    tokens: Tensor | None
+    emphasis: Tensor | None
+
+
+@torch.no_grad()
+def encode_frames(
+    networks: Networks, recipe: UNetRecipe, source: Tensor, target: Tensor, draws: Draws
+) -> EncodedFrames:
+    """What the frozen networks make of frames [N, 3, H, W] in [-1, 1].
+
+    The augmentation is noise on the pixels that the condition encoder sees, and on nothing else; the image tower sees
+    clean frames. Source: Generative Camera Dolly, as released.
+    """
+    noisy = source + recipe.augmentation * draws.normal(*source.shape)
+    moments = [_in_kept_precision(networks.target_encoder, frames) for frames in target.split(_AT_ONCE)]
+    unit = draws.normal(target.shape[0], *moments[0].mean.shape[1:])
+    parts = zip(moments, unit.split(_AT_ONCE), strict=True)
+    latents = torch.cat([part.sample(noise).float() for part, noise in parts]) * networks.config.vae.scale
+    by_colour = COLOUR_WEIGHTS[recipe.loss.class_weights]
+    size = (latents.shape[-2], latents.shape[-1])
+    return EncodedFrames(
+        target=latents,
+        source=_in_parts(lambda frames: _in_kept_precision(networks.condition_encoder, frames).mean, noisy),
+        tokens=_tokens(networks, source),
+        emphasis=class_emphasis(target, by_colour, size) if by_colour else None,
+    )
+
+
+def _tokens(networks: Networks, source: Tensor) -> Tensor | None:
+    tower = networks.image_encoder
+    if tower is None:
+        return None
+    size = tower.config.image_size
+    return _in_parts(lambda frames: _in_kept_precision(tower, clip_pixels(frames, size)), source)
+
+
+def _in_parts(network: Callable[[Tensor], Tensor], frames: Tensor) -> Tensor:
+    return torch.cat([network(part).float() for part in frames.split(_AT_ONCE)])
+
+
+def _in_kept_precision(network: Callable[[Tensor], Made], frames: Tensor) -> Made:
+    """What a network makes of frames in the precision its weights are kept in."""
+    assert isinstance(network, nn.Module), "weights are asked for their precision"
+    return network(frames.to(next(network.parameters()).dtype))
+
+
+class SampleBatches:
+    """A `BatchSource` of whole clips. Batch n, by `Draws.number`, always has the same samples.
+
+    samples: `ViewPairs`, `LeRobotPairs`. family: says what the network is told of a camera's way.
+    Raises RecipeError for single frames: those learn from pairs of clips.
+    """
+
+    def __init__(
+        self,
+        samples: Samples,
+        networks: Networks,
+        recipe: UNetRecipe,
+        family: Family,
+        precision: Precision,
+        loader: LoaderRecipe,
+        seed: int,
+    ) -> None:
+        if recipe.image_share:
+            raise RecipeError(_WHOLE_CLIPS)
+        self._networks, self._recipe, self._precision = networks, recipe, precision
+        self._conditioner = Conditioner(networks.config, recipe, precision, family)
+        self._loader = SampleLoader(samples, seed, loader)
+
+    def single_frames(self, draws: Draws, count: int) -> Batch:
+        """Not offered; refused when this was made."""
+        raise RecipeError(_WHOLE_CLIPS)
+
+    def whole_clips(self, draws: Draws, count: int) -> Batch:
+        """See BatchSource. Raises DataError if samples cannot be read or do not fit the model."""
+        return self.batch(self._loader.batch(draws.number, count), draws)
+
+    def batch(self, loaded: LoadedBatch, draws: Draws) -> Batch:
+        """The batch of some samples."""
+        samples, config, recipe = loaded.samples, self._networks.config, self._recipe
+        given = list(samples.source.shape[1:4])
+        wanted = [config.frames, config.height, config.width]
+        if given != wanted:
+            raise DataError(f"samples must be T, H, W = {wanted} for this model, got {given}")
+        frames, paths = config.frames, samples.paths
+        encoded = encode_frames(
+            self._networks, recipe, self._frames(samples.source), self._frames(samples.target), draws
+        )
+        condition, tokens = drop_streams(self._precision.frames(encoded.source), encoded.tokens, frames, draws, recipe)
+        cameras = [camera for path in paths if (camera := self._conditioner.camera(path)) is not None]
+        vectors = [self._vector(float(fps), path) for fps, path in zip(samples.fps, paths, strict=True)]
+        names = zip(samples.scenes, loaded.numbers, strict=True)
+        return Batch(
+            target=self._precision.frames(encoded.target),
+            condition=condition,
+            vector=torch.stack(vectors).repeat_interleave(frames, dim=0).to(self._precision.device),
+            tokens=tokens,
+            emphasis=encoded.emphasis,
+            frames=frames,
+            camera=torch.cat(cameras).to(self._precision.device) if cameras else None,
+            ids=tuple(f"{scene} (sample {number})" for scene, number in names),
+            wait_s=loaded.wait_s,
+        )
+
+    def _frames(self, clips: Tensor) -> Tensor:
+        """u8 [B, T, H, W, 3] -> float32 [B*T, 3, H, W] in [-1, 1], on the device."""
+        there = clips.to(self._precision.device, non_blocking=True)
+        return self._precision.frames(to_network(there.flatten(0, 1)))
+
+    def _vector(self, fps: float, path: Trajectory) -> Tensor:
+        """Micro-conditioning of a clip, [V]."""
+        recipe, width = self._recipe, self._networks.config.unet.vector_width
+        motion = recipe.motion_bucket if path.delta is None else self._conditioner.motion(path)
+        return micro_conditioning(fps, motion, recipe.augmentation, width)
+
+
+class CachedBatches:
+    """A `BatchSource` of whole clips: noise copy of every frame, posterior sample and dropout drawn anew each time.
+
+    The frame rate of a clip is its own, after the stride; the recipe's `fps` is not used.
+    Raises RecipeError unless the cache was made with these networks' encoders.
+    """
+
+    def __init__(
+        self,
+        cache: CachedLatents,
+        networks: Networks,
+        recipe: UNetRecipe,
+        precision: Precision,
+        path: PathKind,
+    ) -> None:
+        kept, given = cache.index.identity.encoders, encoders_digest(networks)
+        if kept != given:
+            raise RecipeError(
+                f"{cache.folder} was made with other encoders ({kept}) than the run's ({given}); give the same "
+                "model.weights, or make the cache anew"
+            )
+        self._cache, self._config, self._recipe, self._precision = cache, networks.config, recipe, precision
+        self._path: PathKind = path
+
+    def single_frames(self, draws: Draws, count: int) -> Batch:
+        """Not offered; refused when this was made."""
+        raise RecipeError(_WHOLE_CLIPS)
+
+    def whole_clips(self, draws: Draws, count: int) -> Batch:
+        """See BatchSource."""
+        started = time.perf_counter()
+        on_cpu = Draws(int(draws.below(2**31, 1)), "latent cache", 0, torch.device("cpu"))
+        clips = [self._cache.clip(*self._cache.drawn_place(on_cpu), self._path, on_cpu) for _ in range(count)]
+        wait_s = time.perf_counter() - started
+        source = self._precision.frames(self._joined([clip.source for clip in clips]))
+        tokens = self._joined_if([clip.tokens for clip in clips])
+        condition, tokens = drop_streams(source, tokens, self._config.frames, draws, self._recipe)
+        by_class = self._recipe.loss.class_weights != "none"
+        return Batch(
+            target=self._precision.frames(self._joined([clip.target for clip in clips])),
+            condition=condition,
+            vector=torch.cat([self._vector(clip) for clip in clips]).to(self._precision.device),
+            tokens=tokens,
+            emphasis=self._joined_if([clip.emphasis for clip in clips]) if by_class else None,
+            frames=self._config.frames,
+            ids=tuple(f"{clip.scene} from {clip.place.start} by {clip.place.stride}" for clip in clips),
+            wait_s=wait_s,
+        )
+
+    def _vector(self, clip: CachedClip) -> Tensor:
+        """Micro-conditioning of a clip's frames, [T, V]."""
+        recipe, width = self._recipe, self._config.unet.vector_width
+        vector = micro_conditioning(clip.fps, recipe.motion_bucket, recipe.augmentation, width)
+        return vector.expand(self._config.frames, -1)
+
+    def _joined(self, rows: Sequence[Tensor]) -> Tensor:
+        return torch.cat(list(rows)).to(self._precision.device)
+
+    def _joined_if(self, rows: Sequence[Tensor | None]) -> Tensor | None:
+        there = [row for row in rows if row is not None]
+        return self._joined(there) if len(there) == len(rows) else None

@@ -1,0 +1,351 @@
+"""Makes the latent cache, scene by scene, here or on many machines; a run that was killed goes on.
+
+What a scene of 50 frames costs, both paths, K = 4: 713 encoder passes of 0.411 TFLOP and 49 of the image tower of 0.324
+TFLOP (counted by torch on one 384 x 256 frame of the published shapes), 1.45 CPU hours (extrapolated from one frame).
+The released trainer spends 16 TFLOP on them in every sample: its 13 000 updates of 24 clips are 5.0 EFLOP, the cache of
+1 533 scenes 0.47.
+"""
+
+import logging
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import msgspec
+import torch
+from torch import Tensor
+
+from gcd_model import ModelConfig
+from gcd_model.engines.cpu import arrange
+from gcd_model.geometry import driving_trajectory
+from gcd_model.image_encoder import ImageEncoder, clip_pixels
+from gcd_model.loading import random_weights, weights_path
+from gcd_model.vae import Encoder, Posterior
+from gcd_model.weights.card import precision
+from gcd_model.weights.load import load_weights
+from gcd_train.data.cache import (
+    CacheIdentity,
+    CacheIndex,
+    ClipPlan,
+    Moments,
+    SceneShard,
+    encoder_parts,
+    encoders_digest,
+    log_variance_codes,
+)
+from gcd_train.data.dataset4d import Dataset4D
+from gcd_train.data.latents import fault, read_index, write_index, write_shard
+from gcd_train.data.paths import Draw
+from gcd_train.data.pictures import PictureOptions, pictures_of, trained_picture
+from gcd_train.data.sample import Bytes, to_network
+from gcd_train.draws import Draws
+from gcd_train.errors import DataError, RecipeError, RunError
+from gcd_train.losses import PARALLEL_DOMAIN_WEIGHTS, class_emphasis
+from gcd_train.map_items import map_items
+
+_log = logging.getLogger(__name__)
+_MARGIN_BYTES = 64 * 2**20
+
+
+class EncoderChoice(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """weights: a path, package:NAME or random:FAMILY. device: auto, cpu or cuda[:N]. dtype: the networks' precision.
+
+    family: where the file does not tell. batch: pictures a call; it does not change the result.
+    """
+
+    weights: str
+    family: str | None = None
+    device: str = "auto"
+    dtype: str = "float32"
+    batch: int = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Encoders:
+    """Encoders on their device. digest: names their weights, whatever checkpoint they came in."""
+
+    config: ModelConfig
+    target: Encoder
+    condition: Encoder
+    image: ImageEncoder | None
+    digest: str
+    choice: EncoderChoice
+    device: torch.device
+
+    def posterior(self, frames: Tensor) -> Posterior:
+        """Target latents of frames [N, 3, H, W] in [-1, 1], not scaled: float32 moments on the CPU."""
+        parts = [self.target(rows) for rows in self._batches(frames)]
+        mean, log_variance = (torch.cat([getattr(p, name) for p in parts]) for name in ("mean", "log_variance"))
+        return Posterior(mean.float().cpu(), log_variance.float().cpu())
+
+    def condition_mean(self, frames: Tensor) -> Tensor:
+        """Condition latents [N, C, h, w] of frames with their noise, not scaled; float32 on the CPU."""
+        return torch.cat([self.condition(rows).mean for rows in self._batches(frames)]).float().cpu()
+
+    def tokens(self, frames: Tensor) -> Tensor | None:
+        """Image tokens [N, D] of clean frames; None for a model without an image tower."""
+        tower = self.image
+        if tower is None:
+            return None
+        size = tower.config.image_size
+        rows = [tower(clip_pixels(rows.float(), size).to(rows.dtype)) for rows in self._batches(frames)]
+        return torch.cat(rows).float().cpu()
+
+    def _batches(self, frames: Tensor) -> tuple[Tensor, ...]:
+        return frames.to(self.device, precision(self.choice.dtype)).split(self.choice.batch)
+
+
+@lru_cache(maxsize=1)
+def load_encoders(choice: EncoderChoice) -> Encoders:
+    """Load, freeze and place the encoders; a process does it once.
+
+    Raises: CheckpointError, OptionError as `load_weights`; RecipeError where the device is not there.
+    """
+    kind, _, name = choice.weights.partition(":")
+    loaded = (
+        random_weights(name) if kind == "random" else load_weights(weights_path(choice.weights), family=choice.family)
+    )
+    networks, there = loaded.diffusion, torch.cuda.is_available()
+    if choice.device.startswith("cuda") and not there:
+        raise RecipeError(f"device {choice.device} was asked for and this machine has no CUDA device; use auto or cpu")
+    device = torch.device(("cuda" if there else "cpu") if choice.device == "auto" else choice.device)
+    digest = encoders_digest(networks)
+    for module in encoder_parts(networks).values():
+        module.to(device, precision(choice.dtype)).requires_grad_(False).eval()
+        if device.type == "cpu":
+            arrange(module)
+    return Encoders(
+        config=networks.config,
+        target=networks.target_encoder,
+        condition=networks.condition_encoder,
+        image=networks.image_encoder,
+        digest=digest,
+        choice=choice,
+        device=device,
+    )
+
+
+class DrivingPictures:
+    """The fixed driving path through a set in ParallelDomain-4D's layout, at the size the model takes.
+
+    Source: the forward camera's own picture, cropped and resized. Targets: from the point clouds of all cameras, or
+    exactly, see `PictureOptions`. clip_frames: T, which sets where on the path the positions
+    lie. origin: names the set and how its pictures are made, wherever it lies.
+    Source: Generative Camera Dolly, ParallelDomain-4D, as released.
+    """
+
+    def __init__(self, data: Dataset4D, clip_frames: int, options: PictureOptions) -> None:
+        self.data, self.semantic, self._options = data, options.modality == "classes", options
+        self.scenes, self.fps = data.scenes, data.fps
+        kind = "classes" if self.semantic else "colour"
+        self.origin = f"parallel-domain-4d, {kind}, {'exact' if options.exact else 'points'}"
+        path = driving_trajectory(frames=clip_frames, move_time=clip_frames - 1)
+        self._source_from_target, self._pictures = path.source_from_target.numpy(), pictures_of(data, options)
+
+    def frames(self, scene: str, /) -> int:
+        """Time steps of a scene. Raises FileFault."""
+        return self.data.frames(scene)
+
+    def moment(self, scene: str, time: int, positions: Sequence[int], /) -> tuple[Bytes, Bytes]:
+        """Source [H, W, 3] and targets [P, H, W, 3] of a frame, whose files are read once. Raises FileFault."""
+        world_from_source = self.data.pose(scene, self.data.source_camera, time)
+        draw = Draw(
+            frame_numbers=(time,) * len(positions),
+            fps=self.data.fps,
+            reversed=False,
+            world_from_source=world_from_source,
+            world_from_target=world_from_source @ self._source_from_target[list(positions)],
+            start=None,
+            deltas=None,
+        )
+        made = self._pictures.make(scene, draw)
+        if not self._options.exact:
+            return made.source[0], made.target
+        view = self.data.views(scene, time, [self.data.source_camera])[0]
+        return trained_picture(view.rgb, *self._options.size), made.target
+
+
+def encode_scene(
+    encoders: Encoders, pictures: DrivingPictures, identity: CacheIdentity, scene: str
+) -> tuple[dict[str, Tensor], dict[int, str]]:
+    """The tensors of a scene's shard: everything its clips need; and why frames that cannot be had are left out.
+
+    Raises: DataError if no frame can be had, or the encoders give what float16 does not hold.
+    """
+    frames = pictures.frames(scene)
+    positions: dict[int, list[int]] = defaultdict(list)
+    for moment, position in identity.plan.pairs(frames, range(frames)):
+        positions[moment].append(position)
+    if not positions:
+        raise DataError(f"{scene}: {frames} frames are too few for a clip; generate or download it whole")
+    rows: dict[str, list[Tensor]] = defaultdict(list)
+    times: list[int] = []
+    missing: dict[int, str] = {}
+    for moment, wanted in sorted(positions.items()):
+        try:
+            source, targets = pictures.moment(scene, moment, wanted)
+        except DataError as error:
+            missing[moment] = str(error)
+            continue
+        if {source.shape[:2], targets.shape[1:3]} != {(identity.height, identity.width)}:
+            wants = f"{identity.height} x {identity.width}"
+            raise DataError(f"{scene}: pictures must be {wants} for these weights, got {targets.shape}")
+        for name, values in encode_moment(encoders, identity, source, targets, f"{scene}/{moment}").items():
+            rows[name].append(values)
+        times.append(moment)
+    if not times:
+        raise DataError(f"{scene}: none of {len(positions)} frames can be read, first: {next(iter(missing.values()))}")
+    tensors = {name: torch.cat(parts).contiguous() for name, parts in rows.items()}
+    for name, values in tensors.items():
+        if not bool(values.isfinite().all()):
+            raise DataError(f"{scene}: {name} does not fit float16; give --dtype float32, or look at the weights")
+    pairs = [(moment, position) for moment in times for position in positions[moment]]
+    made = {"times": torch.tensor(times, dtype=torch.int16), "pairs": torch.tensor(pairs, dtype=torch.int16)}
+    return tensors | made, missing
+
+
+@torch.no_grad()
+def encode_moment(
+    encoders: Encoders, identity: CacheIdentity, source_picture: Bytes, target_pictures: Bytes, name: str
+) -> dict[str, Tensor]:
+    """The rows of one frame: source [1, ...], targets [P, ...]. name: of the frame, what its noise follows from."""
+    source, targets = to_network(source_picture[None]), to_network(target_pictures)
+    draws = Draws(identity.seed, f"latent cache/{name}", 0, torch.device("cpu"))
+    noise = draws.normal(identity.copies, *source.shape[1:])
+    posterior = encoders.posterior(targets)
+    rows = {
+        "source": encoders.condition_mean(source + identity.augmentation * noise)[None].half(),
+        "target_mean": posterior.mean.half(),
+    }
+    if identity.moments == "both":
+        rows["target_log_variance"] = log_variance_codes(posterior.log_variance)
+    tokens = encoders.tokens(source)
+    if tokens is not None:
+        rows["tokens"] = tokens.half()
+    if identity.emphasis:
+        size = (posterior.mean.shape[-2], posterior.mean.shape[-1])
+        rows["emphasis"] = class_emphasis(targets, PARALLEL_DOMAIN_WEIGHTS, size).half()
+    return rows
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CacheJob:
+    """One scene's work, as a worker gets it."""
+
+    folder: Path
+    pictures: DrivingPictures
+    choice: EncoderChoice
+    identity: CacheIdentity
+
+    def __call__(self, scene: str) -> SceneShard:
+        """Encode a scene and write its shard. Raises TrainError."""
+        encoders = load_encoders(self.choice)
+        if encoders.digest != self.identity.encoders:
+            raise RunError(
+                f"{self.choice.weights} holds encoders {encoders.digest} on this machine, {self.identity.encoders} "
+                "where the run was started; copy the same file there"
+            )
+        started = time.perf_counter()
+        tensors, missing = encode_scene(encoders, self.pictures, self.identity, scene)
+        return SceneShard(
+            **write_shard(self.folder, scene, tensors),
+            frames=self.pictures.frames(scene),
+            times=tuple(tensors["times"].tolist()),
+            missing={str(moment): reason for moment, reason in missing.items()},
+            seconds=round(time.perf_counter() - started, 3),
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CacheProgress:
+    """A scene is done, or failed. entry: None if it failed. error: why. done, failed, total: scenes so far."""
+
+    scene: str
+    entry: SceneShard | None
+    error: str | None
+    done: int
+    failed: int
+    total: int
+
+
+def identity_of(
+    encoders: Encoders,
+    pictures: DrivingPictures,
+    plan: ClipPlan,
+    *,
+    copies: int = 4,
+    moments: Moments = "both",
+    seed: int = 0,
+) -> CacheIdentity:
+    """What a cache made now would say of itself; its pixel noise is as strong as the checkpoint is sampled with."""
+    config = encoders.config
+    return CacheIdentity(
+        encoders=encoders.digest,
+        dtype=encoders.choice.dtype,
+        pictures=pictures.origin,
+        fps=pictures.fps,
+        plan=plan,
+        copies=copies,
+        augmentation=config.sampling.augmentation,
+        moments=moments,
+        seed=seed,
+        height=config.height,
+        width=config.width,
+        scale=config.vae.scale,
+        emphasis=pictures.semantic,
+    )
+
+
+def cache_scenes(
+    job: CacheJob,
+    scenes: Sequence[str],
+    *,
+    workers: int = 1,
+    ray_address: str | None = None,
+    free_bytes: Callable[[], int] | None = None,
+) -> Iterator[CacheProgress]:
+    """Make the shards that are missing or damaged; each scene ends in the index or is reported with its error.
+
+    The caller holds `only_writer`. free_bytes: room on the disk, asked after each scene.
+    Raises: RunError if the folder holds another cache, cannot be written, or is too small for what is to come.
+    """
+    index = _begun(job)
+    todo = [scene for scene in scenes if scene not in index.scenes]
+    done, failed = len(scenes) - len(todo), 0
+    for outcome in map_items(job, todo, workers=workers, ray_address=ray_address):
+        scene, entry = outcome.item, outcome.value
+        if entry is None:
+            failed += 1
+        else:
+            done += 1
+            index = msgspec.structs.replace(index, scenes=dict(sorted({**index.scenes, scene: entry}.items())))
+            write_index(job.folder, index)
+        yield CacheProgress(scene=scene, entry=entry, error=outcome.error, done=done, failed=failed, total=len(scenes))
+        left = len(scenes) - done - failed
+        if free_bytes is None or not index.scenes or not left:
+            continue
+        needed, free = left * max(each.bytes for each in index.scenes.values()) + _MARGIN_BYTES, free_bytes()
+        if free < needed:
+            raise RunError(
+                f"{job.folder}: {left} more scenes need up to {needed / 1e9:.2f} GB, the disk has {free / 1e9:.2f} GB; "
+                "make room or take fewer --copies, then run the same line again"
+            )
+
+
+def _begun(job: CacheJob) -> CacheIndex:
+    """The index without damaged scenes. Raises RunError, naming what differs, for a cache that was made otherwise."""
+    index = read_index(job.folder, CacheIndex) or CacheIndex(identity=job.identity)
+    there, wanted = (msgspec.structs.asdict(identity) for identity in (index.identity, job.identity))
+    differs = [f"{name} {there[name]!r}, now {wanted[name]!r}" for name in there if there[name] != wanted[name]]
+    if differs:
+        raise RunError(f"{job.folder} was cached with {'; '.join(differs)}: choose another --out, or delete the folder")
+    faults = {scene: fault(job.folder, entry) for scene, entry in index.scenes.items()}
+    for reason in filter(None, faults.values()):
+        _log.warning("made anew: %s", reason)
+    whole = {scene: entry for scene, entry in index.scenes.items() if faults[scene] is None}
+    index = msgspec.structs.replace(index, scenes=whole)
+    write_index(job.folder, index)
+    return index

@@ -1,0 +1,288 @@
+"""Folders of what encoders made of clips or scenes: shards that appear whole, and an index that names them.
+
+index.json      how everything was made and, of every shard, size, SHA-256 and arrays; replaced as a whole
+*.safetensors   a shard
+
+Of the clips of a run, as the U-Net needs them, a shard holds some that follow each other (a scene's: see `cache`):
+
+source      float16 [N, F, T, C, h, w]      clean condition latents, plain and (F = 2) mirrored
+target      float16 [N, F, T, C, h, w]      target latents, as the U-Net works on them
+motion      float32 [N]                     the number that says how far the camera goes
+control     float32 [N, F, T, K]            camera features, where the model is steered
+emphasis    float16 [N, T, 1, h, w]         how much more a class counts, see `class_emphasis`
+"""
+
+import fcntl
+import hashlib
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self, TypeAlias, TypeVar
+
+import msgspec
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load, load_file, save
+from torch import Tensor
+
+from gcd_model.errors import FileError
+from gcd_model.small_files import read_json
+from gcd_train.errors import DataError, RunError
+from gcd_train.files import write_whole
+
+FORMAT = 2
+_INDEX, _MOST_INDEX = "index.json", 1 << 26
+
+
+class Shard(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One file. file: in the folder. arrays: shape by name."""
+
+    file: str
+    sha256: str
+    bytes: int
+    arrays: dict[str, tuple[int, ...]]
+
+
+class Index(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What `index.json` says. format: of index and shards."""
+
+    format: int = FORMAT
+
+
+Kind = TypeVar("Kind", bound=Index)
+
+
+def read_index(folder: Path, kind: type[Kind]) -> Kind | None:
+    """The index of a folder, None where there is none yet. Raises RunError if it cannot be read."""
+    path = folder / _INDEX
+    if not path.exists():
+        return None
+    try:
+        index = read_json(path, kind, _MOST_INDEX)
+    except FileError as error:
+        raise RunError(f"{path} {error}; delete {folder} and encode again") from error
+    if index.format != FORMAT:
+        raise RunError(f"{path} has format {index.format}, this version reads {FORMAT}; delete {folder}, encode again")
+    return index
+
+
+def write_index(folder: Path, index: Index) -> None:
+    """Replace the index; a reader sees the old one or the new one. Raises RunError if it cannot be written."""
+    write_whole(folder / _INDEX, msgspec.json.format(msgspec.json.encode(index)), lasting=True)
+
+
+def write_shard(folder: Path, name: str, tensors: dict[str, Tensor]) -> dict[str, Any]:
+    """Write a shard; returns the fields of its `Shard`. Raises RunError if it cannot be written."""
+    content, file = save(tensors), f"{name}.safetensors"
+    write_whole(folder / file, content, lasting=True)
+    arrays = {name: tuple(values.shape) for name, values in sorted(tensors.items())}
+    return {"file": file, "sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content), "arrays": arrays}
+
+
+def fault(folder: Path, shard: Shard) -> str | None:
+    """What is wrong with a shard: missing, cut, changed; None if it is as it was written."""
+    path = folder / shard.file
+    try:
+        if not path.is_file() or path.stat().st_size != shard.bytes:
+            return f"{path} is missing or not of the {shard.bytes} bytes that were written"
+        content = path.read_bytes()
+    except OSError as error:
+        return f"{path}: {error.strerror}"
+    same = hashlib.sha256(content).hexdigest() == shard.sha256
+    return None if same else f"{path} is damaged: its SHA-256 is not the one it was written with"
+
+
+def read_shard(folder: Path, shard: Shard) -> dict[str, Tensor]:
+    """The arrays of a shard, in memory. Raises DataError if it is missing or not as it was written."""
+    wrong = fault(folder, shard)
+    try:
+        if wrong is None:
+            return load((folder / shard.file).read_bytes())
+    except (OSError, SafetensorError) as error:
+        wrong = f"{folder / shard.file} cannot be read ({error})"
+    raise DataError(f"{wrong}; run the same `gcd-train cache` again, it makes this scene anew")
+
+
+def map_shard(folder: Path, shard: Shard) -> dict[str, Tensor]:
+    """The arrays of a shard, mapped: read where they are used. Raises RunError if it is missing or cut."""
+    path = folder / shard.file
+    try:
+        if not path.is_file() or path.stat().st_size != shard.bytes:
+            raise RunError(f"{path} is missing or not of the {shard.bytes} bytes that were written; delete {folder}")
+        return load_file(path)
+    except (OSError, SafetensorError) as error:
+        raise RunError(f"{path} cannot be read ({error}); delete {folder} and encode the clips again") from error
+
+
+@contextmanager
+def only_writer(folder: Path) -> Generator[None]:
+    """Hold a folder for one run. Raises RunError if another run has it; a killed one lets go by itself."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / ".lock").open("a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise RunError(f"another run is writing to {folder}; wait for it, or stop it") from error
+        for leftover in folder.glob(".*.partial"):
+            leftover.unlink(missing_ok=True)
+        yield
+
+
+class LatentsMeta(Index, frozen=True, kw_only=True):
+    """The index of a folder of latents.
+
+    identity: the autoencoder and the options it was made with. seeds: of the N clips there are to be; `shards` hold
+    them in this order. frames: T. flips: F. sensitivity, when all are there: what a unit change of each latent channel
+    does to the decoded picture, one on average.
+    """
+
+    identity: str
+    seeds: tuple[int, ...]
+    frames: int
+    flips: int
+    shards: tuple[Shard, ...] = ()
+    sensitivity: tuple[float, ...] = ()
+
+    @property
+    def clips(self) -> int:
+        """N."""
+        return len(self.seeds)
+
+    @property
+    def done(self) -> int:
+        """Clips that are there."""
+        return sum(shard.arrays["motion"][0] for shard in self.shards)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class LatentRows:
+    """Some frames. Each row is one frame, mirrored or not.
+
+    source, target: float32 [N, C, h, w]. motion: float32 [N]. control: float32 [N, K], None where nothing is steered.
+    emphasis: float32 [N, 1, h, w] or None.
+    """
+
+    source: Tensor
+    target: Tensor
+    motion: Tensor
+    control: Tensor | None
+    emphasis: Tensor | None
+
+
+class LatentClips:
+    """An opened folder of latents."""
+
+    def __init__(self, meta: LatentsMeta, shards: Sequence[dict[str, Tensor]]) -> None:
+        self.meta, self._shards = meta, tuple(shards)
+        self._ends = torch.tensor([len(shard["motion"]) for shard in shards]).cumsum(0)
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """Map the arrays. Raises RunError if the folder is unfinished or damaged."""
+        meta = read_index(folder, LatentsMeta)
+        if meta is None or not meta.sensitivity:
+            raise RunError(f"{folder} holds no finished latents; run `gcd-train train ... --stage latents`")
+        return cls(meta, [map_shard(folder, shard) for shard in meta.shards])
+
+    def resident(self, device: torch.device) -> Self:
+        """The same, held in the device's memory."""
+        names = self._shards[0]
+        return type(self)(self.meta, [{name: torch.cat([s[name] for s in self._shards]).to(device) for name in names}])
+
+    def rows(self, clips: Tensor, frames: Tensor, mirrored: Tensor, device: torch.device) -> LatentRows:
+        """The frames (clips[i], frames[i]), mirrored where the flag says so; all int64 or bool [N] on the CPU."""
+
+        def at(name: str, *index: Tensor) -> Tensor | None:
+            if name not in self._shards[0]:
+                return None
+
+            def rows(part: int, numbers: Tensor, which: Tensor) -> tuple[Tensor]:
+                values = self._shards[part][name]
+                return (values[tuple(each.to(values.device) for each in (numbers, *(i[which] for i in index)))],)
+
+            return _gathered(self._ends, clips, rows)[0].to(device)
+
+        side = mirrored.long()
+        source, target, motion = at("source", side, frames), at("target", side, frames), at("motion")
+        assert source is not None
+        assert target is not None
+        assert motion is not None
+        emphasis = at("emphasis", frames)
+        if emphasis is not None:
+            flip = mirrored.to(device).view(-1, *[1] * (emphasis.ndim - 1))
+            emphasis = torch.where(flip, emphasis.flip(-1), emphasis).float()
+        return LatentRows(
+            source=source.float(),
+            target=target.float(),
+            motion=motion,
+            control=at("control", side, frames),
+            emphasis=emphasis,
+        )
+
+    def names(self, clips: Tensor) -> tuple[str, ...]:
+        """What the clips are called in messages: their seeds."""
+        return tuple(f"clip {self.meta.seeds[number]}" for number in clips.tolist())
+
+
+class LatentVideos:
+    """Both sides of all pairs of some folders of latents; see `sample.VideoClips` for what they stand for.
+
+    scale: what the U-Net works on is this times what the condition encoder gives; see gcd_model.config.VAEConfig.
+    Both sides must have been encoded alike: by one autoencoder, without augmentation, targets as their mean.
+    """
+
+    def __init__(self, parts: Sequence[LatentClips], scale: float) -> None:
+        self._parts, self._scale = tuple(parts), scale
+        metas = [part.meta for part in parts]
+        self._ends = torch.tensor([2 * meta.clips for meta in metas]).cumsum(0)
+        sensitivities = zip(*(meta.sensitivity for meta in metas), strict=True)
+        self.meta = msgspec.structs.replace(
+            metas[0],
+            seeds=tuple(seed for meta in metas for seed in meta.seeds for _ in range(2)),
+            sensitivity=tuple(sum(row) / len(metas) for row in sensitivities),
+        )
+
+    def rows(self, clips: Tensor, frames: Tensor, mirrored: Tensor, device: torch.device) -> LatentRows:
+        """The frames (clips[i], frames[i]) and, as their source, the first frame of the same video; see `LatentClips`.
+
+        clips: int64 [N], video 2n is the source's side of pair n, 2n + 1 the target's.
+        """
+
+        def rows(part: int, videos: Tensor, which: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            latents, flip = self._parts[part], mirrored[which]
+            now = latents.rows(videos // 2, frames[which], flip, device)
+            first = latents.rows(videos // 2, torch.zeros_like(videos), flip, device)
+            of_target = (videos % 2).bool().to(device)[:, None, None, None]
+            source = torch.where(of_target, first.target / self._scale, first.source)
+            return source, torch.where(of_target, now.target, now.source * self._scale), now.motion
+
+        source, target, motion = _gathered(self._ends, clips, rows)
+        return LatentRows(source=source, target=target, motion=motion, control=None, emphasis=None)
+
+    def names(self, clips: Tensor) -> tuple[str, ...]:
+        """What the videos are called in messages: the seed of their pair, and its side."""
+        numbers = clips.tolist()
+        return tuple(f"clip {self.meta.seeds[n]}, its {'target' if n % 2 else 'source'}" for n in numbers)
+
+
+EncodedClips: TypeAlias = LatentClips | LatentVideos
+"""Clips as the U-Net learns from them."""
+
+
+def _gathered(
+    ends: Tensor, clips: Tensor, rows: Callable[[int, Tensor, Tensor], tuple[Tensor, ...]]
+) -> tuple[Tensor, ...]:
+    """Rows of clips that lie in several parts, in the order of `clips`.
+
+    ends: behind the last clip of each part. rows: of a part, by the clips' numbers in it and their places in `clips`.
+    """
+    part_of = torch.bucketize(clips, ends, right=True)
+    parts: list[int] = part_of.unique().tolist()
+    places = [(part_of == part).nonzero()[:, 0] for part in parts]
+    firsts = [int(ends[part - 1]) if part else 0 for part in parts]
+    made = [rows(part, clips[at] - first, at) for part, first, at in zip(parts, firsts, places, strict=True)]
+    if len(made) == 1:
+        return made[0]
+    order = torch.cat(places).argsort()
+    return tuple(torch.cat(each)[order.to(each[0].device)] for each in zip(*made, strict=True))

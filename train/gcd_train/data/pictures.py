@@ -1,0 +1,301 @@
+"""The pictures of a drawn sample, made while training instead of kept: from points, or exactly from our own geometry.
+
+As published, from the points of all cameras: on the sphere both source and target; in driving the source is the forward
+camera's own picture. Exactly: only scenes made by `gcd-train generate` keep their geometry; there are no holes, no
+blur, and hardly a byte to read.
+"""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gcd_model.geometry import Intrinsics, center_crop_box
+from gcd_train.data.dataset4d import VOID, Dataset4D, Ontology
+from gcd_train.data.files import FileFault, Recent
+from gcd_train.data.paths import Draw
+from gcd_train.data.sample import Bytes, SceneView
+from gcd_train.errors import DataError, RenderError
+from gcd_train.layouts.manifest import GEOMETRY, MANIFEST, read_manifest
+from gcd_train.pointcloud import SplatOptions, depth_visibility, published_picture, render_lens, splat, visibility
+
+if TYPE_CHECKING:
+    from gcd_train.scenes.frozen import FrozenScene
+    from gcd_train.scenes.renderer import Renderer, Rendering
+
+Number = TypeVar("Number", bound=np.generic)
+Doubles = NDArray[np.float64]
+Modality = Literal["rgb", "classes"]
+
+SAME_POSE = 5e-3
+"""Largest difference between the entries of two poses at which a dataset's own camera stands for a drawn one."""
+_SOURCE, _TARGET = "source", "target"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DrawnPictures:
+    """A sample's pictures, as in `Sample`. world_from_source: f64 [4, 4], where the source camera really stood."""
+
+    source: Bytes
+    target: Bytes
+    target_classes: Bytes | None
+    visible: NDArray[np.bool_] | None
+    world_from_source: Doubles
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PictureOptions:
+    """What is made of a draw.
+
+    size: width and height, pixels. modality: the target in colour, or painted by class. class_ids: also the target's
+    classes. visible: also what of the target the source camera saw. exact: from the geometry our own scenes keep,
+    instead of from points. published: points as released, with its approximations; open Kubric-4D with `published` too
+    then. device: where points are drawn.
+    """
+
+    size: tuple[int, int] = (384, 256)
+    modality: Modality = "rgb"
+    class_ids: bool = False
+    visible: bool = False
+    exact: bool = False
+    published: bool = False
+    device: str | None = None
+
+
+class SplatPictures:
+    """Draws points. Raises DataError where classes are asked of a set without."""
+
+    def __init__(self, dataset: Dataset4D, options: PictureOptions) -> None:
+        self._ontology = _ontology_of(dataset, options)
+        self._dataset, self._options, (self._width, self._height) = dataset, options, options.size
+        self._points = SplatOptions(published=options.published)
+
+    def make(self, scene: str, draw: Draw) -> DrawnPictures:
+        """The pictures. Raises DataError, FileFault: a file is missing, damaged or does not fit."""
+        lens, read = self._dataset.lens(scene), Recent(partial(self._dataset.views, scene), 1)
+        place = list(self._dataset.cameras).index(self._dataset.source_camera)
+        world_from_source, frames = draw.world_from_source, list[tuple[Bytes, ...]]()
+        classes, masks = list[Bytes](), list[NDArray[np.bool_]]()
+        for number, world_from_target in zip(draw.frame_numbers, draw.world_from_target, strict=True):
+            views = read(number)
+            own, seen = views[place], None
+            if draw.start is None:
+                world_from_source, seen = own.world_from_camera, own
+                source = trained_picture(own.rgb, self._width, self._height)
+            else:
+                source = self._picture(views, world_from_source, lens)
+                if self._options.visible:
+                    same = np.abs(own.world_from_camera - world_from_source).max() < SAME_POSE
+                    seen = own if same else self._seen(views, world_from_source, lens)
+            values = None
+            if self._ontology is not None and self._options.modality == "classes":
+                values = [self._ontology.encode(ids) for ids in self._ids(views)]
+            frames.append((source, self._picture(views, world_from_target, lens, values)))
+            if self._options.class_ids:
+                classes.append(self._target_ids(views, world_from_target, lens))
+            if self._options.visible and seen is not None:
+                across, along = self._options.size
+                masks.append(
+                    visibility(seen, world_from_target, lens, width=across, height=along, options=self._points)
+                )
+        return DrawnPictures(
+            source=np.stack([source for source, _ in frames]),
+            target=np.stack([target for _, target in frames]),
+            target_classes=np.stack(classes) if classes else None,
+            visible=np.stack(masks) if masks else None,
+            world_from_source=world_from_source,
+        )
+
+    def _target_ids(self, views: Sequence[SceneView], world_from_target: Doubles, lens: Intrinsics) -> Bytes:
+        """The class of the point that shows most in each pixel, `VOID` where none does: colours of edges are mixed, and
+        read back as a third class."""
+        smaller = render_lens(lens, self._width, self._height)
+        labels, device = self._ids(views), self._options.device
+        drawn = splat(views, world_from_target, smaller, labels=labels, options=self._points, device=device)
+        assert drawn.labels is not None
+        return drawn.labels.masked_fill(~drawn.covered, VOID).byte().cpu().numpy()
+
+    def _ids(self, views: Sequence[SceneView]) -> list[Bytes]:
+        """Class ids of the views; of several in one colour, which pictures cannot tell apart, the lowest."""
+        assert self._ontology is not None
+        classes = [view.classes for view in views if view.classes is not None]
+        if len(classes) < len(views):
+            raise DataError("classes were asked for, but the scene lacks its layer semantic_segmentation_2d")
+        return [self._ontology.merge(ids) for ids in classes]
+
+    def _picture(
+        self,
+        views: Sequence[SceneView],
+        world_from_camera: Doubles,
+        lens: Intrinsics,
+        values: Sequence[Bytes] | None = None,
+    ) -> Bytes:
+        return published_picture(
+            views,
+            world_from_camera,
+            lens,
+            width=self._width,
+            height=self._height,
+            values=values,
+            options=self._points,
+            device=self._options.device,
+        )
+
+    def _seen(self, views: Sequence[SceneView], world_from_source: Doubles, lens: Intrinsics) -> SceneView:
+        """What a camera at a drawn source pose would have seen, with depth, from the points of all."""
+        smaller = render_lens(lens, self._width, self._height)
+        drawn = splat(views, world_from_source, smaller, options=self._points, device=self._options.device)
+        rgb = (drawn.colour * 255).round().byte().cpu().numpy()
+        return _view(rgb, drawn.depth.cpu().numpy(), world_from_source, smaller)
+
+
+class ExactPictures:
+    """Draws geometry; options `published` and `device` mean nothing here.
+
+    A renderer is made when the first sample is, in the process that makes it. Raises RenderError without the extra
+    `scenes`, DataError where classes are asked of a set without.
+    """
+
+    def __init__(self, dataset: Dataset4D, options: PictureOptions) -> None:
+        self._ontology = _ontology_of(dataset, options)
+        self._dataset, self._options, (self._width, self._height) = dataset, options, options.size
+        self._renderer: tuple[int, Renderer] | None = None
+        _renderer_kind()  # what is not installed is said now, not sample by sample
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_renderer": None}  # an OpenGL context cannot go to another process
+
+    def make(self, scene: str, draw: Draw) -> DrawnPictures:
+        """See SplatPictures. Raises RenderError without a headless OpenGL."""
+        from gcd_train.scenes.driving.ontology import class_ids as published_ids
+
+        folder, numbers = self._dataset.folder(scene), list(draw.frame_numbers)
+        lens = render_lens(self._dataset.lens(scene), self._width, self._height)
+        renderer, still = self._own_renderer(), _frames_of(folder, numbers, lens)
+        geometry_from_world = _geometry_from_world(folder, numbers)
+        cameras = {
+            _SOURCE: geometry_from_world @ draw.world_from_source,
+            _TARGET: geometry_from_world @ draw.world_from_target,
+        }
+        drawn: dict[str, list[Rendering]] = {name: [] for name in cameras}
+        for _, name, rendering in renderer.views(still, cameras):
+            drawn[name].append(rendering)
+        target, ids = np.stack([each.rgb for each in drawn[_TARGET]]), None
+        if self._ontology is not None:
+            ids = self._ontology.merge(np.stack([published_ids(each.classes) for each in drawn[_TARGET]]))
+            target = self._ontology.encode(ids) if self._options.modality == "classes" else target
+        return DrawnPictures(
+            source=np.stack([each.rgb for each in drawn[_SOURCE]]),
+            target=target,
+            target_classes=ids if self._options.class_ids else None,
+            visible=_visibility(drawn, cameras, lens) if self._options.visible else None,
+            world_from_source=draw.world_from_source,
+        )
+
+    def _own_renderer(self) -> "Renderer":
+        """Of this process: an OpenGL context does not survive a fork."""
+        if self._renderer is None or self._renderer[0] != os.getpid():
+            self._renderer = os.getpid(), _renderer_kind()(self._width, self._height)
+        return self._renderer[1]
+
+
+def pictures_of(dataset: Dataset4D, options: PictureOptions) -> SplatPictures | ExactPictures:
+    """What makes a set's pictures. Raises DataError where classes are asked of a set without."""
+    return (ExactPictures if options.exact else SplatPictures)(dataset, options)
+
+
+def trained_picture(rgb: Bytes, width: int, height: int) -> Bytes:
+    """A camera's picture at the trained size: centre crop to its shape, then bilinear resize, as published."""
+    left, top, across, along = center_crop_box(rgb.shape[1], rgb.shape[0], width / height)
+    cropped = rgb[top : top + along, left : left + across]
+    if (across, along) == (width, height):
+        return np.ascontiguousarray(cropped)
+    return cv2.resize(cropped, (width, height), interpolation=cv2.INTER_LINEAR).astype(np.uint8, copy=False)
+
+
+def trained_lens(lens: Intrinsics, width: int, height: int) -> Intrinsics:
+    """The lens of `trained_picture`'s result, for a picture of this lens."""
+    return lens.cropped(*center_crop_box(lens.width, lens.height, width / height)).resized(width, height)
+
+
+def seen_through(picture: Bytes, own: Intrinsics, lens: Intrinsics, size: tuple[int, int]) -> Bytes:
+    """A camera's picture as if taken through another lens, cropped about its middle and resized: u8 [H, W, 3].
+
+    own: of the picture. lens: the other one; what it shows beyond the picture is black. size: width and height.
+    """
+    wide, high = size
+    if lens != own:
+        middle = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # OpenCV counts from a pixel's middle
+        to_lens = (lens.matrix @ own.matrix.inverse()).numpy()
+        warp = np.linalg.inv(middle) @ to_lens @ middle
+        picture = cv2.warpPerspective(picture, warp, (lens.width, lens.height)).astype(np.uint8, copy=False)
+    left, top, across, along = center_crop_box(lens.width, lens.height, wide / high)
+    kept = picture[top : top + along, left : left + across]
+    how = cv2.INTER_AREA if across >= wide else cv2.INTER_LINEAR
+    return cv2.resize(kept, size, interpolation=how).astype(np.uint8, copy=False)
+
+
+def narrower(one: Intrinsics, other: Intrinsics) -> Intrinsics:
+    """Of two lenses the one that shows less, which is within what the other shows."""
+    return max(one, other, key=lambda lens: lens.fx / lens.width)
+
+
+def _ontology_of(dataset: Dataset4D, options: PictureOptions) -> Ontology | None:
+    """The classes that the options need. Raises DataError for a set that has none."""
+    if options.modality == "rgb" and not options.class_ids:
+        return None
+    if dataset.ontology is None:
+        raise DataError("classes were asked of a data set that has none: Kubric-4D has instances only")
+    return dataset.ontology
+
+
+def _renderer_kind() -> "type[Renderer]":
+    try:
+        from gcd_train.scenes.renderer import Renderer
+    except ImportError as error:
+        raise RenderError(f"exact targets are drawn and need pip install 'gcd-node[scenes]' ({error})") from error
+    return Renderer
+
+
+def _view(rgb: Bytes, depth: NDArray[np.float32], world_from_camera: Doubles, lens: Intrinsics) -> SceneView:
+    return SceneView(rgb=rgb, depth=depth, classes=None, instances=None, world_from_camera=world_from_camera, lens=lens)
+
+
+def _frames_of(folder: Path, numbers: Sequence[int], lens: Intrinsics) -> "FrozenScene":
+    """The scene at these times only, for a camera with this lens."""
+    from gcd_train.scenes.frozen import FrozenScene
+
+    frozen = FrozenScene.load(folder / GEOMETRY)
+    if max(numbers) >= frozen.frames:
+        raise FileFault(folder / GEOMETRY, f"tells of {frozen.frames} frames, wanted frame {max(numbers)}")
+    return replace(frozen, poses=frozen.poses[numbers], focus=frozen.focus[numbers], hfov_deg=lens.hfov_deg)
+
+
+def _geometry_from_world(folder: Path, numbers: Sequence[int]) -> Doubles:
+    """f64 [T, 4, 4]: from the frame that poses are given in (the vehicle's, in driving) to that of the geometry."""
+    known = read_manifest(folder).world_from_vehicle
+    if known is None:
+        return np.broadcast_to(np.eye(4), (len(numbers), 4, 4))
+    poses = np.array(known, np.float64)
+    if max(numbers) >= len(poses):
+        raise FileFault(folder / MANIFEST, f"tells where the vehicle is in {len(poses)} frames, not {max(numbers) + 1}")
+    return poses[list(numbers)]
+
+
+def _visibility(
+    drawn: dict[str, list["Rendering"]], cameras: dict[str, Doubles], lens: Intrinsics
+) -> NDArray[np.bool_]:
+    """Where the source saw the very surface of the target."""
+    masks = [
+        depth_visibility(_view(source.rgb, source.depth, at, lens), target.depth, aimed, lens)
+        for source, target, at, aimed in zip(
+            drawn[_SOURCE], drawn[_TARGET], cameras[_SOURCE], cameras[_TARGET], strict=True
+        )
+    ]
+    return np.stack(masks)

@@ -1,0 +1,208 @@
+"""Which scenes are for training, validation and test, by number, split file or list; which clips are evaluated."""
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from filecmp import cmp
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+
+from gcd_model.errors import FileError, PoseError
+from gcd_model.geometry import Spherical
+from gcd_model.small_files import read_json, read_small
+from gcd_train.data.files import Skips
+from gcd_train.errors import DataError
+from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
+
+Part = Literal["train", "val", "test"]
+
+MOST_BYTES = 1 << 24
+"""Of a control list."""
+_KUBRIC_RANGES: dict[Part, range] = {"train": range(2800), "val": range(2800, 2900), "test": range(2900, 3000)}
+_NAMED = 5  # scenes in a message
+_LIST_MARK = re.compile(r"\binvalid\b", re.IGNORECASE)
+
+
+class SplitFile(msgspec.Struct, frozen=True, kw_only=True):
+    """ParallelDomain-4D's split. Others' file: counts and seed that stand in it are not needed."""
+
+    train: tuple[str, ...]
+    val: tuple[str, ...]
+    test: tuple[str, ...]
+
+
+def kubric_split(scenes: Iterable[str], part: Part) -> tuple[str, ...]:
+    """The scenes of one part of Kubric-4D, by number: 0-2799 train, 2800-2899 val, 2900-2999 test."""
+    wanted = _KUBRIC_RANGES[part]
+    return tuple(scene for scene in scenes if kubric4d_names.scene_number(scene) in wanted)
+
+
+def read_split(path: Path, part: Part) -> tuple[str, ...]:
+    """The scenes of one part of a ParallelDomain-4D split file, in its order.
+
+    Raises: DataError if it cannot be read, or a scene is in two parts.
+    """
+    try:
+        split = read_json(path, SplitFile)
+    except FileError as error:
+        raise DataError(f"{path} is no split file with lists train, val and test: it {error}") from error
+    scenes = [Path(name).name for name in (*split.train, *split.val, *split.test)]
+    if len(set(scenes)) < len(scenes):
+        twice = sorted({name for name in scenes if scenes.count(name) > 1})
+        raise DataError(f"{path} has {len(twice)} scenes in more than one part, first: {twice[0]}")
+    return tuple(Path(name).name for name in getattr(split, part))
+
+
+def read_scene_list(path: Path, skips: Skips) -> tuple[str, ...]:
+    """A list of scenes, one path a line, of which only the last component counts.
+
+    Blank lines and comments (from # on) do not count. A line whose comment says "invalid", also one that is a comment
+    altogether, as in the published lists, is a scene that is left out, and so is what is no scene name or stands there
+    twice; each is counted in `skips`.
+
+    Raises: DataError if the file cannot be read or no scene is left.
+    """
+    try:
+        lines = read_small(path).splitlines()
+    except FileError as error:
+        raise DataError(f"{path} is no list of scenes: it {error}") from error
+    scenes: list[str] = []
+    for number, line in enumerate(lines, 1):
+        name, reason = _entry(line)
+        if name and not reason and name in scenes:
+            reason = "stands there twice"
+        if reason:
+            skips.add(name, path, f"line {number}: {reason}")
+        elif name:
+            scenes.append(name)
+    if not scenes:
+        raise DataError(f"{path} lists no scene; it wants one path like data/scene_000048 a line")
+    return tuple(scenes)
+
+
+def present(wanted: Sequence[str], available: Sequence[str], skips: Skips, origin: Path | str) -> tuple[str, ...]:
+    """Those of the wanted scenes that there are; the others are counted in `skips` as told by `origin`."""
+    known = set(available)
+    for scene in wanted:
+        if scene not in known:
+            skips.add(scene, str(origin), "names a scene that is not in the data folder")
+    return tuple(scene for scene in wanted if scene in known)
+
+
+def require_apart(learned: Mapping[str, Path | str], held_out: Mapping[str, Path | str]) -> None:
+    """The one check that nothing is measured on what was learned from: it would say nothing about other scenes.
+
+    Scenes or episodes by name, with their world or file: of one name they are the same where the worlds are, or the
+    files, byte by byte. Raises DataError naming those that are in both parts.
+    """
+    shared = [name for name in held_out if name in learned and _is_same(learned[name], held_out[name])]
+    if shared:
+        named = ", ".join(sorted(shared)[:_NAMED]) + ", ..." * (len(shared) > _NAMED)
+        raise DataError(
+            f"training and held-out data share {len(shared)} scenes or episodes, {named}; hold out others, or leave "
+            "out --valid where a part of --data can be held out"
+        )
+
+
+def _is_same(one: Path | str, other: Path | str) -> bool:
+    if isinstance(one, Path) and isinstance(other, Path):
+        return one.is_file() and other.is_file() and cmp(one, other, shallow=False)
+    return one == other
+
+
+def _entry(line: str) -> tuple[str, str]:
+    """Scene name (or "") of a line, and why it is left out (or "")."""
+    line = line.strip()
+    if line.startswith("#") and not _LIST_MARK.search(line):
+        return "", ""
+    place, _, comment = line.lstrip("# \t").partition("#")
+    name = Path(place.strip()).name
+    if line.startswith("#") and not _is_scene(name):
+        return "", ""  # prose that happens to say "invalid"
+    if name and _LIST_MARK.search(comment):
+        return name, "is marked invalid"
+    if line.startswith("#"):
+        return "", ""
+    if name and not _is_scene(name):
+        return name, "is no scene name"
+    return name, ""
+
+
+def _is_scene(name: str) -> bool:
+    numbers = kubric4d_names.scene_number(name), parallel_domain4d_names.scene_number(name)
+    return any(number is not None for number in numbers)
+
+
+class _Entry(msgspec.Struct, frozen=True):
+    """Others' file: what else stands in it only informs."""
+
+    frame_start: Annotated[int, msgspec.Meta(ge=0)]
+    frame_skip: Annotated[int, msgspec.Meta(ge=1)]
+    fps: float | None = None
+    spherical_start: tuple[float, float, float] | None = None
+    spherical_end: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Control:
+    """One evaluation sample. name: as in the file, `sample_00`. frame_start: first frame number. frame_skip: stride.
+
+    start, goal: where the camera is at first and in the end; None in driving, whose path is fixed.
+    """
+
+    name: str
+    frame_start: int
+    frame_skip: int
+    start: Spherical | None = None
+    goal: Spherical | None = None
+
+    def frame_numbers(self, clip: int) -> tuple[int, ...]:
+        """Of a clip of so many frames."""
+        return tuple(self.frame_start + self.frame_skip * step for step in range(clip))
+
+    def fps(self, scene_fps: float) -> float:
+        """Frames per second of the clip as the network is told it, rounded as published."""
+        return float(round(scene_fps / self.frame_skip))
+
+
+Controls = Mapping[str, tuple[Control, ...]]
+"""By scene name, in the order of the file."""
+
+
+def read_controls(path: Path) -> Controls:
+    """Controls of either data set: {scene: {sample: {frame_start, frame_skip, ...}}}.
+
+    Kubric-4D's also have `spherical_start` and `spherical_end`, azimuth and elevation in degrees and radius in metres.
+    Scenes that do not exist may be listed.
+
+    Raises: DataError if the file cannot be read or is none, naming scene and sample where the fault has one.
+    """
+    try:
+        listed = read_json(path, dict[str, dict[str, _Entry]], MOST_BYTES)
+    except FileError as error:
+        raise DataError(f"{path} {error}; a control list has scenes with samples with frame_start") from error
+    if not listed:
+        raise DataError(f"{path} lists no scene")
+    return {
+        Path(scene).name: tuple(_control(path, scene, name, entry) for name, entry in sorted(samples.items()))
+        for scene, samples in listed.items()
+    }
+
+
+def _control(path: Path, scene: str, name: str, entry: _Entry) -> Control:
+    if (entry.spherical_start is None) != (entry.spherical_end is None):
+        raise DataError(f"{path}: {scene}, {name} has only one of spherical_start and spherical_end; give both")
+    try:
+        start, goal = _camera(entry.spherical_start), _camera(entry.spherical_end)
+    except PoseError as error:
+        raise DataError(f"{path}: {scene}, {name} asks for a camera that cannot be: {error}") from error
+    return Control(name=name, frame_start=entry.frame_start, frame_skip=entry.frame_skip, start=start, goal=goal)
+
+
+def _camera(numbers: tuple[float, float, float] | None) -> Spherical | None:
+    if numbers is None:
+        return None
+    azimuth_deg, elevation_deg, radius_m = numbers
+    return Spherical(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, radius_m=radius_m)

@@ -1,1 +1,0 @@
-"""Clips as the trainer and the evaluation read them."""
