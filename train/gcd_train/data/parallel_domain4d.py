@@ -92,8 +92,9 @@ class ParallelDomain4D(Dataset4D):
         classes: bool = True,
         instances: bool = False,
         ontology: Ontology | None = None,
+        source_camera: str = names.FORWARD,
     ) -> None:
-        super().__init__(root, scenes, cameras, names.FORWARD)
+        super().__init__(root, scenes, cameras, source_camera)
         if self.source_camera not in self.cameras:
             raise DataError(f"the source camera {self.source_camera} is none of {', '.join(self.cameras)}")
         self._classes, self._instances, self.ontology = classes, instances, ontology
@@ -107,6 +108,7 @@ class ParallelDomain4D(Dataset4D):
         cameras: Sequence[str] = names.CAMERAS,
         classes: bool = True,
         instances: bool = False,
+        source_camera: str = names.FORWARD,
     ) -> Self:
         """Every scene of a folder, by number, with the ontology of the first that has a readable one.
 
@@ -116,7 +118,15 @@ class ParallelDomain4D(Dataset4D):
         ontology = _first_ontology(Path(root), found) if classes else None
         if ontology is not None and ontology.duplicates:
             _LOG.warning("%s: classes of one colour are merged in decoding: %s", root, "; ".join(ontology.merged_names))
-        return cls(Path(root), found, cameras=cameras, classes=classes, instances=instances, ontology=ontology)
+        return cls(
+            Path(root),
+            found,
+            cameras=cameras,
+            classes=classes,
+            instances=instances,
+            ontology=ontology,
+            source_camera=source_camera,
+        )
 
     def frames(self, scene: str) -> int:
         """Time steps, up to the last picture of the source camera; some may be missing. Raises FileFault."""
