@@ -113,36 +113,15 @@ def _require_written(path: Path, done: bool) -> None:
 
 def read_npy(path: Path, wanted: str) -> NDArray[Any]:
     """The array of a .npy file, never a pickle. wanted: what it should hold, for the message. Raises SourceError."""
-    loaded = _loaded(path, wanted)
-    if isinstance(loaded, dict):
-        raise SourceError(f"{path} is an archive of arrays; give {wanted}")
-    return loaded
-
-
-def read_npz(path: Path, wanted: str) -> dict[str, NDArray[Any]]:
-    """All arrays of an .npz file by name, never a pickle. Raises SourceError."""
-    loaded = _loaded(path, wanted)
-    if not isinstance(loaded, dict):
-        raise SourceError(f"{path} is a single array; give {wanted}")
-    return loaded
-
-
-def _loaded(path: Path, wanted: str) -> NDArray[Any] | dict[str, NDArray[Any]]:
     try:
         if path.exists() and not path.is_file():
             raise ValueError("it is no regular file")
-        size = path.stat().st_size
         if zipfile.is_zipfile(path):
-            with zipfile.ZipFile(path) as archive:
-                size = sum(entry.file_size for entry in archive.infolist())
-        if size > _MOST_BYTES:
+            raise ValueError("it is an archive of arrays")
+        if path.stat().st_size > _MOST_BYTES:
             raise ValueError(f"it holds more than {_MOST_BYTES} bytes")
-        loaded = np.load(path, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            return loaded
-        with loaded:
-            return dict(loaded)
-    except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
+        return np.load(path, allow_pickle=False)
+    except Exception as error:  # numpy raises many kinds for a damaged file
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error).split("\n")[0]
         raise SourceError(f"cannot read {path}: {reason or type(error).__name__}; give {wanted}") from error
 

@@ -25,7 +25,6 @@ from gcd_node.frame import Image
 from gcd_node.image_io import (
     legend,
     read_npy,
-    read_npz,
     side_by_side,
     spread,
     strip,
@@ -331,20 +330,6 @@ def plan(
     if trajectory not in times:
         raise UsageError(f"--trajectory is gradual or direct, got {trajectory!r}")
     return traits.plan_view(delta, source=sphere, move_time=times[trajectory], mount=mount)
-
-
-def read_noise(path: Path) -> tuple[torch.Tensor | None, torch.Tensor | None]:
-    """Unit-variance noise from an .npz file: `initial` [T, C, h, w] and `augmentation` [T, 3, H, W], either may be
-    missing. Raises SourceError."""
-    arrays = read_npz(path, "an .npz file with `initial` and `augmentation`")
-    unknown = sorted(set(arrays) - {"initial", "augmentation"})
-    if unknown or not arrays:
-        raise SourceError(f"{path} must hold `initial` and `augmentation`, got {unknown or 'nothing'}")
-    for name, array in arrays.items():
-        if array.dtype.kind != "f" or array.ndim != 4 or not np.isfinite(array).all():
-            raise SourceError(f"`{name}` in {path} must be finite floats with 4 axes, got {array.dtype} {array.shape}")
-    tensors = {name: torch.from_numpy(array.astype(np.float32)) for name, array in arrays.items()}
-    return tensors.get("initial"), tensors.get("augmentation")
 
 
 def write_view(out: Path, source: OfflineClip, view: View, classes: Sequence[ClassRecord]) -> list[Path]:

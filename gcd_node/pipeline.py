@@ -33,15 +33,14 @@ _KEPT_EPOCHS = 8  # windows of a former epoch may still be in work
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Summary:
-    """What an activation came to. fps: of a window. window_s: from one window to the next. dropped: windows never
-    rendered. frames: read. rejected: what spoilt windows, and how many."""
+    """What an activation came to. fps: of a window. dropped: windows never rendered. frames: read. rejected: what
+    spoilt windows, and how many."""
 
     counts: WorkCounts = field(default_factory=WorkCounts)
     fps: float = 0.0
     dropped: int = 0
     frames: int = 0
     rejected: dict[str, int] = field(default_factory=dict[str, int])
-    window_s: float = 0.0
 
 
 class Stream:
@@ -206,7 +205,6 @@ class Stream:
             dropped=self._newest.dropped,
             frames=self._builder.pushed,
             rejected={str(reason): count for reason, count in self._builder.reasons.items()},
-            window_s=self._window_s,
         )
 
     # WatchListener: called in the reader thread.

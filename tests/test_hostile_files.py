@@ -553,13 +553,7 @@ for about, write_array in ARRAYS.items():
         more = ["--weights", "random:kubric90", "--out", "out", "--poses", "poses.npy"]
         return ["gcd-node", "synthesize", FILM, *more], "poses.npy"
 
-    def noisy(here: Path, write: Callable[[Path], object] = write_array) -> tuple[list[str], str]:
-        write(here / "noise.npz")
-        more = ["--weights", "random:kubric90", "--out", "out", "--azimuth-deg", "5", "--noise", "noise.npz"]
-        return ["gcd-node", "synthesize", FILM, *more], "noise.npz"
-
     add(f"poses: {about}", posed)
-    add(f"noise: {about}", noisy)
 
 
 def png(width: int, height: int, rows: int = 0) -> bytes:

@@ -28,7 +28,7 @@ from gcd_node.cli.weights import FamilyOption, HeadWidth, ImageHeads
 from gcd_node.errors import SourceError, UsageError
 from gcd_node.image_io import write_npz
 from gcd_node.messages import ontology
-from gcd_node.offline import ClipRequest, OfflineClip, plan, read_clip, read_noise, write_view
+from gcd_node.offline import ClipRequest, OfflineClip, plan, read_clip, write_view
 from gcd_node.preprocess import require_usable
 from gcd_node.sources import SourcePose
 
@@ -99,7 +99,6 @@ Seed = Annotated[int, _sampling(help="Of all random draws.")]
 Samples = Annotated[int, _sampling(help="Draws of the view; with several, a picture shows where they differ.")]
 MotionBucket = Annotated[float | None, _sampling(help="The motion number; else by the formula.")]
 CondAug = Annotated[float | None, _sampling(help="Strength of the noise on the conditioning frames; else the model's.")]
-Noise = Annotated[Path | None, _sampling(help=".npz with `initial` and `augmentation` instead of draws.")]
 Save = Annotated[Path | None, _sampling(help=".npz to write `latents` and `frames` to.")]
 
 AdapterFile = Annotated[Path | None, _model("--adapter", help="Low-rank adapter trained on these weights.")]
@@ -149,7 +148,6 @@ def synthesize(
     samples: Samples = 1,
     motion_bucket: MotionBucket = None,
     cond_aug: CondAug = None,
-    noise: Noise = None,
     save: Save = None,
     family: FamilyOption = None,
     device: Device = "auto",
@@ -166,10 +164,9 @@ def synthesize(
     pose = _pose(source_elevation_deg, source_radius, (mount_height, mount_forward, mount_left, mount_tilt))
     path = partial(plan, poses=poses, trajectory=trajectory, move_time=move_time, source=pose)
     path = partial(path, change=(azimuth_deg, elevation_deg, radius))
-    first, second = (None, None) if noise is None else read_noise(noise)
     options = RenderOptions(steps=steps, solver=solver, guidance=guidance, quality=quality, samples=samples, seed=seed)
-    options = replace(options, guidance_interval=guidance_interval, motion_bucket=motion_bucket, initial_noise=first)
-    augmentation = Augmentation(strength=cond_aug, seed=seed, noise=second)
+    options = replace(options, guidance_interval=guidance_interval, motion_bucket=motion_bucket)
+    augmentation = Augmentation(strength=cond_aug, seed=seed)
     load = partial(load_synthesizer, weights, adapter=adapter, family=family, device=device, dtype=dtype, engine=engine)
     load = partial(load, head_width=head_width, image_heads=image_heads, providers=provider or ())
     _run(input_path, out, save, clip, pose, load, path, options, augmentation)

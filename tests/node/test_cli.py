@@ -102,22 +102,6 @@ def test_what_nobody_stated_of_the_camera_is_said(
     assert "is taken to stand" not in capsys.readouterr().out
 
 
-def test_injected_noise_replaces_every_random_draw(clip: Path, tmp_path: Path) -> None:
-    rng = np.random.default_rng(1)
-    np.savez(
-        tmp_path / "n.npz",
-        initial=rng.standard_normal((14, 4, 16, 24), np.float32),
-        augmentation=rng.standard_normal((14, 3, *SIZE), np.float32),
-    )
-    results = []
-    for seed in ("1", "2"):
-        saved = tmp_path / f"{seed}.npz"
-        options = [*KUBRIC, "--noise", tmp_path / "n.npz", "--seed", seed, "--save", saved]
-        assert run_app([str(a) for a in synthesize(clip, tmp_path / "out", *options)]) == 0
-        results.append(np.load(saved)["latents"])
-    assert np.array_equal(*results)
-
-
 def test_several_samples_come_with_a_picture_of_where_they_differ(clip: Path, tmp_path: Path) -> None:
     arguments = synthesize(clip, tmp_path / "out", *KUBRIC, "--samples", "2")
     assert run_app([str(a) for a in arguments]) == 0
@@ -148,7 +132,6 @@ def test_poses_near_the_sphere_are_taken(clip: Path, tmp_path: Path) -> None:
         ([*KUBRIC, "--trajectory", "direct", "--move-time", "3"], 64, "give one"),
         ([*KUBRIC, "--guidance", "nan", "1.5"], 64, "finite"),
         ([*KUBRIC, "--poses", "none.npy"], 66, "none.npy"),
-        ([*KUBRIC, "--noise", "none.npz"], 66, "none.npz"),
         ([*KUBRIC, "--height", "64", "--width", "64"], 64, "own size"),
         ([*KUBRIC, "--device", "abacus"], 64, "abacus"),
         (["--weights", "package:none"], 65, "none"),

@@ -121,9 +121,7 @@ def test_what_a_killed_run_left_is_removed(source: Path, tmp_path: Path) -> None
     assert [path.name for path in tmp_path.iterdir()] == ["scn00003"]
 
 
-@pytest.mark.parametrize(
-    ("folder", "words"), [("nowhere", "cannot be read"), ("kubric/scn00003", "holds no scene")]
-)
+@pytest.mark.parametrize(("folder", "words"), [("nowhere", "cannot be read"), ("kubric/scn00003", "holds no scene")])
 def test_folders_without_scenes_are_refused(source: Path, tmp_path: Path, folder: str, words: str) -> None:
     result = CliRunner().invoke(app, ["data", "compact", str(source / folder), str(tmp_path)])
     assert (result.exit_code, words in " ".join(result.output.split())) == (66, True), result.output
