@@ -1,7 +1,6 @@
 """A whole drive through the grown driving world: the rig, and what holds at every time step, before it is drawn."""
 
 from functools import cache
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,18 +9,16 @@ from headless import needs_egl
 from numpy.typing import NDArray
 
 from gcd_model.geometry import driving_trajectory
-from gcd_train.errors import DataError
 from gcd_train.scenes.description import Part, Scene
 from gcd_train.scenes.driving import FPS, ONTOLOGY, class_ids, driving_drive, vehicle_from_camera
+from gcd_train.scenes.driving.classes import Label
 from gcd_train.scenes.driving.fleet import STYLES, Lamps, grown_bus
 from gcd_train.scenes.driving.flow import Crowd, random_drive
 from gcd_train.scenes.driving.grown import GrownWorld, grown_world
 from gcd_train.scenes.driving.roadside import Place, Plot
 from gcd_train.scenes.driving.street import random_street
 from gcd_train.scenes.driving.weather import WEATHERS, random_weather
-from gcd_train.scenes.labels import Label
 from gcd_train.scenes.renderer import Renderer
-from gcd_train.scenes.world_sheet import Look, write_world_sheet
 
 SEEDS = (1, 6, 11)
 FRAMES = 50
@@ -233,25 +230,6 @@ def test_the_forward_camera_sees_the_road_and_the_top_down_one_its_own_car() -> 
     assert {Label.ROAD, Label.SKY} <= set(np.unique(views["yaw-0"][0].classes).tolist())
     assert {Label.ROAD, Label.OWN_CAR} <= set(np.unique(views["camera0"][0].classes).tolist())
     assert all(view[0].depth.max() > 5.0 for view in views.values())
-
-
-@needs_egl
-def test_a_sheet_shows_a_row_for_every_scene(tmp_path: Path) -> None:
-    palette = (np.arange(768) % 32 * 8 + 4).astype(np.uint8).reshape(256, 3)  # colours the sheet keeps as they are
-    out = tmp_path / "docs" / "sheet.png"
-    looks = (Look(camera="yaw-0", step=0), Look(camera="camera0", step=0, shown="classes"))
-    write_world_sheet(out, _short_drive, (3, 0), looks, width=48, height=36, palette=palette)
-    picture = cv2.imread(str(out))
-    assert picture is not None
-    assert picture.shape == (75, 99, 3)
-    shown = {tuple(row) for row in picture[:36, 51:, ::-1].reshape(-1, 3).tolist()}
-    assert shown <= {tuple(row) for row in palette.tolist()}
-    with pytest.raises(DataError, match="no camera 'yaw-9'"):
-        write_world_sheet(out, _short_drive, (3,), (Look(camera="yaw-9", step=0),), width=48, height=36)
-
-
-def _short_drive(seed: int) -> Scene:
-    return driving_drive(seed, frames=1)
 
 
 def _inside(parts: list[Part], points: NDArray[np.float64]) -> NDArray[np.bool_]:

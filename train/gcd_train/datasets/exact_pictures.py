@@ -22,7 +22,7 @@ from gcd_train.datasets.trajectories import Draw
 from gcd_train.layouts.manifest import GEOMETRY, MANIFEST, read_manifest
 from gcd_train.pointcloud import depth_visibility, render_lens
 from gcd_train.scene_view import SceneView
-from gcd_train.scenes.driving.ontology import class_ids as published_ids
+from gcd_train.scenes.driving.classes import class_ids as published_ids
 from gcd_train.scenes.frozen import FrozenScene
 from gcd_train.scenes.renderer import Renderer, Rendering
 

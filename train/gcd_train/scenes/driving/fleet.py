@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gcd_train.scenes.description import Colour, Part, Pattern, Point
+from gcd_train.scenes.driving.classes import Label
 from gcd_train.scenes.driving.vehicles import OWN_PAINT, Assembly, varied
-from gcd_train.scenes.labels import Label
 
 _GLASS: Colour = (0.07, 0.09, 0.12)
 TYRE: Colour = (0.055, 0.055, 0.06)

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from gcd_train.scenes.description import Floats
 from gcd_train.scenes.driving import fleet, riders
+from gcd_train.scenes.driving.classes import Label
 from gcd_train.scenes.driving.fleet import Lamps
 from gcd_train.scenes.driving.footprint import Footprints, holds_a_point, touches
 from gcd_train.scenes.driving.ground import PAVEMENT_M, stop_line_m, zebra_m
 from gcd_train.scenes.driving.road import Crossing, Road
 from gcd_train.scenes.driving.street import Street
 from gcd_train.scenes.driving.vehicles import Assembly
-from gcd_train.scenes.labels import Label
 
 FPS = 10.0
 _BEGIN_M, _END_M = -90.0, 240.0

@@ -3,8 +3,8 @@
 import numpy as np
 
 from gcd_train.scenes.description import Colour, Part, Pattern, Point
+from gcd_train.scenes.driving.classes import Label
 from gcd_train.scenes.driving.surroundings import foliage, leaf_colour, tone
-from gcd_train.scenes.labels import Label
 
 _LAMP_LIGHT: Colour = (1.0, 0.86, 0.62)
 _UNLIT: Colour = (0.72, 0.72, 0.68)

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_train.scenes.description import Colour, Floats, Pattern, Sheet
+from gcd_train.scenes.driving.classes import Label
 from gcd_train.scenes.driving.ribbon import Span, fan, free_spans, patches, quads, ribbon
 from gcd_train.scenes.driving.road import Crossing, Road
 from gcd_train.scenes.driving.street import Street
-from gcd_train.scenes.labels import Label
 
 ROAD_M, PATCH_M, MARK_M, PAVEMENT_M = 0.0, 0.004, 0.014, 0.12
 _GROUND_M = -0.06

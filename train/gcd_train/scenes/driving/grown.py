@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from gcd_model.geometry import driving_trajectory
 from gcd_train.scenes.description import Floats, Part, Point, Sheet, upright
 from gcd_train.scenes.driving import night
+from gcd_train.scenes.driving.classes import Label
 from gcd_train.scenes.driving.flow import Crowd, Drive, RoadUser, fill, random_drive
 from gcd_train.scenes.driving.ground import ground_sheets
 from gcd_train.scenes.driving.rig import on_vehicle, rigid, vehicle_from_camera
@@ -16,7 +17,6 @@ from gcd_train.scenes.driving.street import Street, random_street
 from gcd_train.scenes.driving.surroundings import DISTRICTS
 from gcd_train.scenes.driving.vehicles import sky_dome
 from gcd_train.scenes.driving.weather import Weather, random_weather
-from gcd_train.scenes.labels import Label
 
 EGO_BODY = 1
 _EDITION = 2

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from gcd_train.scenes.description import Colour, Part, Pattern, Point, Sheet
+from gcd_train.scenes.driving.classes import Label
 from gcd_train.scenes.driving.ground import PATCH_M
 from gcd_train.scenes.driving.ribbon import fan
 from gcd_train.scenes.driving.roadside import Place
-from gcd_train.scenes.labels import Label
 
 _WARM: tuple[Colour, ...] = ((0.95, 0.78, 0.45), (0.9, 0.7, 0.36), (0.85, 0.86, 0.8), (0.95, 0.85, 0.6))
 _MOST_WINDOWS = 6

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from gcd_model.geometry import CameraMount, driving_trajectory
 from gcd_train.errors import DataError
 from gcd_train.scenes.description import Colour, Floats, Light, Part, Scene, upright
+from gcd_train.scenes.driving.classes import coarse
 from gcd_train.scenes.driving.grown import EGO_BODY, grown_world
 from gcd_train.scenes.driving.rig import rigid
 from gcd_train.scenes.driving.road import Road, random_road, road_sheets
 from gcd_train.scenes.driving.surroundings import DISTRICTS, surroundings
 from gcd_train.scenes.driving.traffic import Traffic, random_traffic
 from gcd_train.scenes.driving.vehicles import sky_dome
-from gcd_train.scenes.labels import coarse
 
 HFOV_DEG = 85.0
 _FOCUS_AHEAD_M = 28.0

@@ -3,9 +3,9 @@
 import numpy as np
 
 from gcd_train.scenes.description import Colour, Part, Point
+from gcd_train.scenes.driving.classes import Label
 from gcd_train.scenes.driving.fleet import DARK, HEADLIGHT, TAIL, TYRE, Lamps, block, random_paint
 from gcd_train.scenes.driving.vehicles import Assembly, varied
-from gcd_train.scenes.labels import Label
 
 _SKIN: tuple[Colour, ...] = ((0.86, 0.68, 0.57), (0.72, 0.54, 0.44), (0.52, 0.36, 0.26), (0.34, 0.23, 0.17))
 _CLOTHES: tuple[Colour, ...] = (

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_train.scenes.description import Colour, Floats, Pattern, Sheet
-from gcd_train.scenes.labels import Label
+from gcd_train.scenes.driving.classes import Label
 
 _STEP_M = 2.0
 _START_M, _END_M = -70.0, 230.0

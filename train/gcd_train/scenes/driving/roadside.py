@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from gcd_train.scenes.description import Colour, Part, Pattern
 from gcd_train.scenes.driving import furniture
+from gcd_train.scenes.driving.classes import Label
 from gcd_train.scenes.driving.footprint import Footprints, footprint_of, holds_a_point, touches
 from gcd_train.scenes.driving.road import Road
 from gcd_train.scenes.driving.street import Street
 from gcd_train.scenes.driving.surroundings import District, building, bush, sagitta, tone, tree
-from gcd_train.scenes.labels import Label
 
 CAMERA_ROOM_M = 0.6
 _BEGIN_M, _END_M = -120.0, 290.0

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gcd_train.scenes.description import Colour, Part, Pattern, Point
+from gcd_train.scenes.driving.classes import Label
 from gcd_train.scenes.driving.road import Road
-from gcd_train.scenes.labels import Label
 
 _BEGIN_M, _END_M = -55.0, 190.0
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gcd_train.scenes.description import Colour, Part, Pattern, Point
-from gcd_train.scenes.labels import Label
+from gcd_train.scenes.driving.classes import Label
 
 _GLASS: Colour = (0.08, 0.1, 0.13)
 _TYRE: Colour = (0.06, 0.06, 0.065)
