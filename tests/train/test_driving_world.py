@@ -11,8 +11,8 @@ from gcd_model.geometry import CameraMount
 from gcd_train.errors import DataError
 from gcd_train.scenes.driving import driving_scene
 from gcd_train.scenes.driving.classes import Label, coarse
-from gcd_train.scenes.driving.road import random_road
-from gcd_train.scenes.driving.traffic import Mover, random_traffic
+from gcd_train.scenes.driving.first_edition import random_road
+from gcd_train.scenes.driving.first_traffic import Mover, random_traffic
 from gcd_train.scenes.frozen import vertices_of
 
 RECORDED = (
