@@ -118,7 +118,8 @@ def _ground(road: Road, random: np.random.Generator) -> list[Sheet]:
     ]
     for side, kerb in road.sides:
         edge = side * kerb
-        strip = _along(road, *sorted((edge, edge + side * road.pavement_m)), _PAVEMENT_M, free_only=True)
+        outer = edge + side * road.pavement_m
+        strip = _along(road, min(edge, outer), max(edge, outer), _PAVEMENT_M, free_only=True)
         stones = _along(road, edge - 0.09, edge + 0.09, _PAVEMENT_M + 0.01, free_only=True)
         sheets += [flat(strip, paving, Label.PAVEMENT, Pattern.TILES), flat(stones, (0.72, 0.72, 0.7), Label.PAVEMENT)]
     for crossing in road.crossings:
@@ -136,7 +137,7 @@ def _ground(road: Road, random: np.random.Generator) -> list[Sheet]:
 
 def _along(road: Road, right: float, left: float, z: float, *, free_only: bool = False) -> Floats:
     """A strip along the road; with `free_only` it stops at the junctions."""
-    s = _START_M + STEP_M * np.arange(len(road.headings))
+    s = _START_M + STEP_M * np.arange(len(road.headings), dtype=np.float64)
     low, high = (np.append(road.places(s, y)[:, :2], np.full((len(s), 1), z), 1) for y in (right, left))
     kept = np.array([not free_only or road.is_free(float(m)) for m in s[:-1] + STEP_M / 2])
     return quads(low[:-1][kept], low[1:][kept], high[1:][kept], high[:-1][kept])

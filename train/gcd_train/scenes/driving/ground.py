@@ -34,9 +34,8 @@ def ground_sheets(street: Street, wetness: float, paved: bool, random: np.random
     if wetness > 0:
         sheets.append(flat(_puddles(street.main, random), (0.07, 0.075, 0.08), Label.ROAD, wetness=1.0))
     stone = [piece for road in street.roads for piece in _beside(road, 0.0, road.pavement_m, PAVEMENT_M)]
-    stone += [
-        fan(np.append(at, PAVEMENT_M), _rim(at, *axes, _CORNER_M, PAVEMENT_M)) for at, *axes in _quadrants(street)
-    ]
+    for middle, first, second in _quadrants(street):
+        stone.append(fan(np.append(middle, PAVEMENT_M), _rim(middle, first, second, _CORNER_M, PAVEMENT_M)))
     sheets.append(flat(np.concatenate(stone), paving, Label.PAVEMENT, Pattern.TILES, wetness))
     sheets.append(flat(_kerbs(street), (0.62, 0.62, 0.6), Label.KERB, wetness=wetness))
     return [*sheets, *_marks(street, wetness, random)]
@@ -78,11 +77,14 @@ def _asphalt(street: Street) -> Floats:
 
 def _beside(road: Road, near_m: float, far_m: float, near_z: float, far_z: float | None = None) -> Iterator[Floats]:
     """Strips on both sides, between two distances from the kerb, that stop before the junctions' corners."""
-    heights = near_z, near_z if far_z is None else far_z
+    far_z = near_z if far_z is None else far_z
     spans = road.free_spans(_CORNER_M)
     for side, kerb in road.sides:
         near, far = side * (kerb + near_m), side * (kerb + far_m)
-        yield ribbon(road, near, far, heights, spans) if side > 0 else ribbon(road, far, near, heights[::-1], spans)
+        if side > 0:
+            yield ribbon(road, near, far, (near_z, far_z), spans)
+        else:
+            yield ribbon(road, far, near, (far_z, near_z), spans)
 
 
 def _kerbs(street: Street) -> Floats:
@@ -91,9 +93,9 @@ def _kerbs(street: Street) -> Floats:
     for road in street.roads:
         pieces += _beside(road, _KERB_SLOPE_M, _KERB_WIDE_M, top)
         pieces += _beside(road, 0.0, _KERB_SLOPE_M, ROAD_M, top)
-    for at, *axes in _quadrants(street):
+    for middle, first, second in _quadrants(street):
         low, edge, inner = (
-            _rim(at, *axes, _CORNER_M - away, z)
+            _rim(middle, first, second, _CORNER_M - away, z)
             for away, z in ((0.0, ROAD_M), (_KERB_SLOPE_M, top), (_KERB_WIDE_M, top))
         )
         pieces += [quads(low[:-1], low[1:], edge[1:], edge[:-1]), quads(edge[:-1], edge[1:], inner[1:], inner[:-1])]
