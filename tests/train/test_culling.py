@@ -8,9 +8,8 @@ from headless import needs_egl
 from numpy.typing import NDArray
 from stage_world import LIGHT
 
-from gcd_train.scenes.compile import Vertices, runs_of, vertices_of
-from gcd_train.scenes.culling import Groups, grouped
 from gcd_train.scenes.description import STREET, Part, Pattern, Scene, Sheet, upright
+from gcd_train.scenes.frozen import Groups, Vertices, grouped, runs_of, vertices_of
 from gcd_train.scenes.renderer import Renderer, Rendering, clip_from_camera, sunlight_from_world
 
 SUN_TO = (0.6, 0.0, 0.8)

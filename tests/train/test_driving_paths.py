@@ -14,9 +14,8 @@ from gcd_train.errors import DataError
 from gcd_train.evaluation.clips import cameras_of
 from gcd_train.model_setup import family_of, model_config
 from gcd_train.recipe import Recipe, load_recipe
-from gcd_train.scenes.driving.pair_scene import driving_scene
-from gcd_train.scenes.pair_world import CameraWay, PairForm, World, agree, driving_world, read_world
-from gcd_train.scenes.worlds import WorldOptions
+from gcd_train.scenes.driving import driving_scene
+from gcd_train.scenes.pair_world import CameraWay, PairForm, World, WorldOptions, agree, driving_world, read_world
 
 FORM = PairForm(width=48, height=32, frames=3, oversample=1)
 

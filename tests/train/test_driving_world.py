@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from gcd_model.config import DRIVING_CLASSES
 from gcd_model.geometry import CameraMount
 from gcd_train.errors import DataError
-from gcd_train.scenes.compile import vertices_of
 from gcd_train.scenes.driving import driving_scene
-from gcd_train.scenes.driving.road import random_road
-from gcd_train.scenes.driving.traffic import Mover, random_traffic
-from gcd_train.scenes.labels import Label, coarse
+from gcd_train.scenes.driving.classes import Label, coarse
+from gcd_train.scenes.driving.first_edition import random_road
+from gcd_train.scenes.driving.first_traffic import Mover, random_traffic
+from gcd_train.scenes.frozen import vertices_of
 
 RECORDED = (
     (0, 27812, "6960525f2ffb0f58",

@@ -3,7 +3,6 @@
 import math
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,7 +18,6 @@ from gcd_train.scenes.drop.physics import Tracks, UnsoundSceneError
 from gcd_train.scenes.drop.things import KINDS, bounds, outline, random_thing
 from gcd_train.scenes.primitives import CONVEX, shape
 from gcd_train.scenes.renderer import Renderer
-from gcd_train.scenes.world_sheet import Look, write_world_sheet
 
 FRAMES = 18
 SEEDS = (2, 7)
@@ -310,22 +308,6 @@ def test_every_pixel_is_a_thing_the_floor_or_the_dome_at_its_true_depth(scene: S
             assert np.linalg.norm(points[view.instances == instance] - middle, axis=-1).max() < reach + 0.02
             seen.add(int(instance))
     assert len(seen) >= len(scene.objects) - 1  # a small one may hide among others
-
-
-@needs_egl
-def test_a_sheet_shows_each_look_of_each_seed(tmp_path: Path, scene: Scene) -> None:
-    looks = [Look(camera="view4", step=0), Look(camera="view0", step=3, shown="depth")]
-    looks.append(Look(camera="view0", step=3, shown="instances"))
-    write_world_sheet(tmp_path / "sheet.png", lambda _: scene, [0, 1], looks, width=48, height=32)
-    sheet = cv2.imread(str(tmp_path / "sheet.png"))
-    assert sheet is not None
-    assert sheet.shape == (2 * 32 + 3, 3 * 48 + 6, 3)
-    np.testing.assert_array_equal(sheet[:32], sheet[35:])
-    depth, instances = sheet[:32, 51:99], sheet[:32, 102:]
-    assert (depth[..., 0] == depth[..., 2]).all()
-    assert len(np.unique(instances.reshape(-1, 3), axis=0)) > 2
-    with pytest.raises(DataError, match="cannot be written"):
-        write_world_sheet(tmp_path / "sheet.nothing", lambda _: scene, [0], looks, width=48, height=32)
 
 
 def test_the_stage_is_drawn_with_an_extent_of_its_own(scene: Scene) -> None:

@@ -34,7 +34,7 @@ from gcd_train.layouts.parallel_domain4d import ParallelDomain4DWriter, calibrat
 from gcd_train.layouts.scene_files import SceneFiles
 from gcd_train.scenes.description import rotations
 from gcd_train.scenes.driving import ONTOLOGY
-from gcd_train.scenes.labels import Label
+from gcd_train.scenes.driving.classes import Label
 from gcd_train.scenes.renderer import Rendering
 
 LENS = Intrinsics.from_hfov(HFOV_DEG, 48, 32)

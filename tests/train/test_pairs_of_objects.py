@@ -22,11 +22,19 @@ from gcd_train.data.splits import require_apart
 from gcd_train.errors import DataError, RecipeError, RenderError
 from gcd_train.scenes.description import Scene, SceneObject
 from gcd_train.scenes.drop import HFOV_DEG
-from gcd_train.scenes.pair_scenes import orbit_draw
-from gcd_train.scenes.pair_world import STAGE_HFOV_DEG, PairForm, World, agree, driving_world, orbit_world, read_world
+from gcd_train.scenes.pair_world import (
+    STAGE_HFOV_DEG,
+    PairForm,
+    World,
+    WorldOptions,
+    agree,
+    driving_world,
+    orbit_world,
+    read_world,
+)
+from gcd_train.scenes.pair_writer import orbit_draw, write_shard
 from gcd_train.scenes.renderer import Renderer
-from gcd_train.scenes.worlds import SCENE_WORLDS, WorldOptions, scene_world
-from gcd_train.scenes.writer import write_shard
+from gcd_train.scenes.worlds import SCENE_WORLDS, scene_world
 
 
 def stage(seed: int, frames: int) -> Scene:

@@ -11,9 +11,8 @@ from stage_world import LIGHT
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.errors import DataError, RenderError
-from gcd_train.scenes.compile import indexed, runs_of, vertices_of
 from gcd_train.scenes.description import DOMES, ORBIT, STREET, Extent, Part, Pattern, Scene, Sheet, upright
-from gcd_train.scenes.frozen import FrozenScene, freeze
+from gcd_train.scenes.frozen import FrozenScene, freeze, indexed, runs_of, vertices_of
 from gcd_train.scenes.primitives import CONVEX, SHAPES, shape
 from gcd_train.scenes.renderer import Renderer, Rendering
 

@@ -9,8 +9,7 @@ import pytest
 from headless import needs_egl
 
 from gcd_train.errors import RenderError
-from gcd_train.scenes.compile import vertices_of
-from gcd_train.scenes.frozen import freeze
+from gcd_train.scenes.frozen import freeze, vertices_of
 from gcd_train.scenes.renderer import Renderer
 from gcd_train.scenes.tabletop import CLASS_NAMES, Episode, TabletopClass, tabletop_episode, tabletop_scene
 from gcd_train.scenes.tabletop.arm import random_arm

@@ -17,11 +17,9 @@ from gcd_train.layouts.scene_run import SceneRun, generate_scenes
 from gcd_train.layouts.scene_sheet import write_scene_sheet
 from gcd_train.layouts.scene_writer import SceneFormat
 from gcd_train.live.draws import LIVE_SCENES, LiveWorld, TargetPath, worlds_of
-from gcd_train.scenes.contact_sheet import write_contact_sheet
-from gcd_train.scenes.film import write_film
-from gcd_train.scenes.pair_world import CameraWay, PairForm, World, driving_world, orbit_world
-from gcd_train.scenes.worlds import SCENE_WORLDS, SceneWorld, WorldOptions
-from gcd_train.scenes.writer import generate
+from gcd_train.scenes.pair_world import CameraWay, PairForm, World, WorldOptions, driving_world, orbit_world
+from gcd_train.scenes.pair_writer import generate, write_contact_sheet
+from gcd_train.scenes.worlds import SCENE_WORLDS, SceneWorld
 
 app = typer.Typer(no_args_is_help=True, help="Make training data with a procedural world (extra `scenes`).")
 
@@ -74,7 +72,7 @@ def drop(
     with errors_shown():
         world, place = SCENE_WORLDS["drop"], _one_folder(folder, out)
         if _wants_pairs(pairs, clips, scenes, compact):
-            form = PairForm.of(width, height, frames, oversample, clips_per_shard)
+            form = _pair_form(width, height, frames, oversample, clips_per_shard)
             made = orbit_world(world, form, clips_per_scene=clips_per_scene)
             _make_pairs(place, made, made.seeds_of(first_seed, clips or 100), workers, ray, contact_sheet)
             return
@@ -108,7 +106,7 @@ def tabletop(
     with errors_shown():
         world, place = SCENE_WORLDS["tabletop"], _one_folder(folder, out)
         if _wants_pairs(pairs, clips, scenes, compact):
-            form = PairForm.of(width, height, frames, oversample, clips_per_shard)
+            form = _pair_form(width, height, frames, oversample, clips_per_shard)
             made = orbit_world(world, form, clips_per_scene=clips_per_scene)
             _make_pairs(place, made, made.seeds_of(first_seed, clips or 100), workers, ray, contact_sheet)
             return
@@ -149,7 +147,7 @@ def driving(
         mount = WorldOptions(height_m=mount_height, tilt_deg=mount_tilt)
         told = pairs or mount != WorldOptions() or edition != 1 or path != "gradual"
         if _wants_pairs(told, clips, scenes, compact):
-            form = PairForm.of(width, height, frames, oversample, clips_per_shard)
+            form = _pair_form(width, height, frames, oversample, clips_per_shard)
             world = driving_world(form, mount, edition, path)
             _make_pairs(place, world, world.seeds_of(first_seed, clips or 100), workers, ray, contact_sheet)
             return
@@ -188,20 +186,6 @@ def live(
             console.print(f"{each}: {there} of {len(seeds)} scenes")
 
 
-@app.command()
-def film(
-    out: Annotated[Path, typer.Option(help="An .mp4 file.")],
-    seed: Annotated[int, typer.Option(min=0, help="Scene; those from 2000000 on are in no data set.")] = 2_000_021,
-    world: Annotated[str, typer.Option(help="driving (10 Hz), drop or tabletop (12 Hz).")] = "driving",
-    frames: Annotated[int, typer.Option(min=2, help="Time steps.")] = 42,
-    width: Annotated[int, typer.Option(min=16, help="Pixels.")] = 432,
-    height: Annotated[int, typer.Option(min=16, help="Pixels.")] = 288,
-) -> None:
-    """One longer scene as a video, seen from its source camera; the packaged videos were made so."""
-    with errors_shown():
-        write_film(out, seed, world=world, frames=frames, width=width, height=height)
-
-
 def _wants_pairs(pairs: bool, clips: int | None, scenes: int | None, compact: bool) -> bool:
     wanted = pairs or clips is not None
     if wanted and (scenes is not None or compact):
@@ -230,6 +214,19 @@ def _form(
         frames=frames or world.frames,
         oversample=oversample,
         compact=compact,
+    )
+
+
+def _pair_form(
+    width: int | None, height: int | None, frames: int | None, oversample: int, clips_per_shard: int
+) -> PairForm:
+    usual = PairForm()
+    return PairForm(
+        width=width or usual.width,
+        height=height or usual.height,
+        frames=frames or usual.frames,
+        oversample=oversample,
+        clips_per_shard=clips_per_shard,
     )
 
 
@@ -267,8 +264,8 @@ def _make_pairs(
 ) -> None:
     _stop_as_by_ctrl_c()
     with progress_bar("clips", len(seeds), keep=True) as show:
-        for progress in generate(out, world, seeds, workers or os.cpu_count() or 1, ray):
-            show(progress.done)
+        for done in generate(out, world, seeds, workers or os.cpu_count() or 1, ray):
+            show(done)
     if sheet is not None:
         write_contact_sheet(out, sheet)
 

@@ -173,7 +173,7 @@ class ExactPictures:
 
     def make(self, scene: str, draw: Draw) -> DrawnPictures:
         """See SplatPictures. Raises RenderError without a headless OpenGL."""
-        from gcd_train.scenes.driving.ontology import class_ids as published_ids
+        from gcd_train.scenes.driving.classes import class_ids as published_ids
 
         folder, numbers = self._dataset.folder(scene), list(draw.frame_numbers)
         lens = render_lens(self._dataset.lens(scene), self._width, self._height)

@@ -1,29 +1,71 @@
-"""A scene ready to draw, and as a file: triangles and where their bodies are, so that any camera can look at it later.
+"""A scene ready to draw: its triangles, where their bodies are, and which of them a view can leave out.
 
-A scene folder keeps one, and a target view can be drawn exactly along any path, without simulating anything again.
+A scene folder keeps one as a file, so that a target view can be drawn exactly along any path, without simulating
+anything again.
 """
 
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import groupby, pairwise
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from gcd_model.small_files import decode_json
 from gcd_train.data.files import read_npz
 from gcd_train.errors import DataError
-from gcd_train.scenes.compile import VERTEX, Vertices, vertices_of
-from gcd_train.scenes.description import STREET, Extent, Floats, Light, Scene
+from gcd_train.scenes.description import (
+    DOMES,
+    STATIC,
+    STREET,
+    Colour,
+    Extent,
+    Floats,
+    Light,
+    Part,
+    Pattern,
+    Scene,
+    Sheet,
+    rotations,
+    upright,
+)
+from gcd_train.scenes.primitives import shape
+
+VERTEX = np.dtype(
+    [
+        ("position", "3f4"),
+        ("normal", "3f4"),
+        ("colour", "4u1"),  # and gloss
+        ("accent", "4u1"),  # and grain, on a scale of 0..1 from 0.02 m to 5.12 m, even in its logarithm
+        ("tags", "4u1"),  # class, instance, body, pattern
+    ]
+)
+Vertices = NDArray[np.void]
 
 _FORMAT = 2
+_CELL_M = 16.0
+"""Side of the squares on the ground by which what stands still is parted."""
+_SLACK_M = 0.01
+"""Added to every sphere: OpenGL places corners with 24 bits, here they are placed with 53."""
+
+
+class _Facts(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    format: int
+    hfov_deg: float
+    light: Light
+    extent: Extent
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class FrozenScene:
     """What the renderer needs.
 
-    vertices: [N] of `compile.VERTEX`, three in a row are a triangle, in their bodies' frames. The rest as in `Scene`.
+    vertices: [N] of `VERTEX`, three in a row are a triangle, in their bodies' frames. The rest as in `Scene`.
     """
 
     vertices: Vertices
@@ -41,9 +83,9 @@ class FrozenScene:
     def save(self, file: BinaryIO) -> None:
         """Write it as a compressed npz."""
         facts = _Facts(format=_FORMAT, hfov_deg=self.hfov_deg, light=self.light, extent=self.extent)
-        told = np.frombuffer(msgspec.json.encode(facts), np.uint8)
+        encoded = np.frombuffer(msgspec.json.encode(facts), np.uint8)
         raw = self.vertices.view(np.uint8).reshape(-1, VERTEX.itemsize)
-        np.savez_compressed(file, vertices=raw, poses=self.poses, focus=self.focus, facts=told)
+        np.savez_compressed(file, vertices=raw, poses=self.poses, focus=self.focus, facts=encoded)
 
     @classmethod
     def load(cls, path: Path) -> Self:
@@ -65,13 +107,6 @@ class FrozenScene:
             raise DataError(f"{path} is no drawable scene ({error}); generate the scene again") from error
 
 
-class _Facts(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    format: int
-    hfov_deg: float
-    light: Light
-    extent: Extent
-
-
 def freeze(scene: Scene) -> FrozenScene:
     """A scene's triangles and motion, without its cameras."""
     return FrozenScene(
@@ -82,3 +117,161 @@ def freeze(scene: Scene) -> FrozenScene:
         light=scene.light,
         extent=scene.extent,
     )
+
+
+def vertices_of(scene: Scene) -> Vertices:
+    """All triangles of a scene, in their bodies' frames: structured [N], three in a row are a triangle.
+
+    What is painted alike stands together, near things first and what moves among the nearest; then the ground, and the
+    sky last, so that few hidden pixels are shaded.
+    """
+    ordered = sorted(scene.parts, key=attrgetter("shape"))
+    groups = [_of_parts(name, list(parts)) for name, parts in groupby(ordered, key=attrgetter("shape"))]
+    parts = np.concatenate([np.empty(0, VERTEX), *groups]).reshape(-1, 3)
+    is_sky = np.isin(parts["tags"][:, 0, 3], (Pattern.SKY, *DOMES))
+    standing = parts[~is_sky]
+    place, tags = standing["position"][:, 0], standing["tags"][:, 0]
+    away = np.where(tags[:, 2] > 0, 0.0, np.hypot(place[:, 0], place[:, 1]))
+    standing = standing[np.lexsort((away, _paint(tags[:, 3], standing["colour"][:, 0, 3])))]
+    lying = [_of_sheet(sheet).reshape(-1, 3) for sheet in reversed(scene.sheets)]
+    return np.concatenate([standing, *lying, parts[is_sky]]).reshape(-1)
+
+
+def _paint(pattern: NDArray[np.uint8], gloss: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """What decides on a triangle's program: its pattern, and whether it shines (windows always do)."""
+    return pattern.astype(np.int64) * 2 + ((gloss > 0) | (pattern == Pattern.WINDOWS))
+
+
+def _of_parts(name: str, parts: list[Part]) -> Vertices:
+    corners, normals = (array.reshape(-1, 3) for array in shape(name))  # [V, 3]
+    size = np.array([part.size for part in parts], np.float32)[:, None]
+    centre = np.array([part.centre for part in parts], np.float32)[:, None]
+    yaw = np.array([part.yaw for part in parts])
+    about_z = upright(np.stack([0 * yaw, 0 * yaw, 0 * yaw, yaw], -1))[..., :3]
+    turn = about_z @ rotations(np.array([part.turn for part in parts]))
+    turn = np.swapaxes(turn, -1, -2).astype(np.float32)  # multiplied from the right
+    outward = normals / size
+    outward /= np.linalg.norm(outward, axis=-1, keepdims=True)
+    made = np.empty((len(parts), len(corners)), VERTEX)
+    made["position"] = (corners * size) @ turn + centre
+    made["normal"] = outward @ turn
+    made["colour"] = np.array([_bytes(part.colour, part.gloss) for part in parts], np.uint8)[:, None]
+    made["accent"] = np.array([_bytes(part.accent, _grain(part)) for part in parts], np.uint8)[:, None]
+    made["tags"] = np.array([(p.label, p.instance, p.body, p.pattern) for p in parts], np.uint8)[:, None]
+    return made.reshape(-1)
+
+
+def _of_sheet(sheet: Sheet) -> Vertices:
+    made = np.empty(sheet.corners.shape[0] * 3, VERTEX)
+    made["position"] = sheet.corners.reshape(-1, 3)
+    made["normal"] = (0.0, 0.0, 1.0)
+    made["colour"] = _bytes(sheet.colour, sheet.gloss)
+    made["accent"] = _bytes(sheet.accent, _grain(sheet))
+    made["tags"] = (sheet.label, 0, 0, sheet.pattern)
+    return made
+
+
+def _bytes(colour: Colour, fourth: float) -> tuple[int, ...]:
+    return tuple(round(255 * min(max(channel, 0.0), 1.0)) for channel in (*colour, fourth))
+
+
+def _grain(surface: Part | Sheet) -> float:
+    return math.log2(max(surface.grain_m, 0.02) / 0.02) / 8
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Run:
+    """Vertices that are painted alike and follow each other: drawn by one program."""
+
+    first: int
+    count: int
+    pattern: Pattern
+    glossy: bool
+
+
+def runs_of(vertices: Vertices) -> list[Run]:
+    """How to draw vertices in their order, triangles that are painted alike together."""
+    pattern = vertices["tags"][::3, 3]
+    paint = _paint(pattern, vertices["colour"][::3, 3])
+    starts = [0, *(np.flatnonzero(np.diff(paint)) + 1).tolist(), len(paint)]
+    return [
+        Run(first=3 * a, count=3 * (b - a), pattern=Pattern(int(pattern[a])), glossy=bool(paint[a] & 1))
+        for a, b in pairwise(starts)
+        if b > a
+    ]
+
+
+def indexed(vertices: Vertices) -> tuple[Vertices, NDArray[np.int32]]:
+    """Each vertex once, in the order of their first use, and which of them the triangles take: neighbours share."""
+    first, rank = _ranked(vertices)
+    return vertices[first], rank.astype(np.int32)
+
+
+def _ranked(rows: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows that differ, numbered as they first come: where each first stands, and the number of every row."""
+    raw = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.itemsize * math.prod(rows.shape[1:]))))
+    _, first, which = np.unique(raw, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return first[order], rank[which.reshape(-1)]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Groups:
+    """Triangles that follow each other, are painted alike, ride on one body and stand near each other.
+
+    A camera on a street sees a quarter of a scene, the shadow map about half. What is left out lies outside of the
+    picture: the pictures are the same to the pixel.
+
+    ends: [G + 1] int, group g has the vertices ends[g] to ends[g + 1]. body: [G] int. centre: [G, 3], metres in the
+    body's frame, and radius: [G], metres, of a sphere that holds the group.
+    """
+
+    ends: NDArray[np.int64]
+    body: NDArray[np.int64]
+    centre: NDArray[np.float64]
+    radius: NDArray[np.float64]
+
+    def placed(self, poses: Floats) -> NDArray[np.float64]:
+        """Where the spheres are when the bodies are at `poses` [B, 3, 4] (world_from_body): [G, 3], metres."""
+        rows = poses[self.body].astype(np.float64)
+        return (rows[..., :3] @ self.centre[..., None])[..., 0] + rows[..., 3]
+
+    def within(self, clip_from_world: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which groups reach into the picture of a projection [4, 4], at `places` as `placed` gives them: bool [G]."""
+        last = clip_from_world[3]
+        planes = np.concatenate([last + clip_from_world[:3], last - clip_from_world[:3]])  # each >= 0 within [6, 4]
+        planes /= np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
+        inside = places @ planes[:, :3].T + planes[:, 3]  # metres from each side of the picture [G, 6]
+        return (inside >= -self.radius[:, None]).all(1)
+
+    def stretches(self, shown: NDArray[np.bool_], first: int, count: int) -> Iterator[tuple[int, int]]:
+        """Of `count` vertices from `first`, whole groups, those `shown` [G]: first vertex and number of each piece."""
+        start, stop = np.searchsorted(self.ends, (first, first + count))
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], shown[start:stop], [False]])))
+        at = self.ends[start + edges].tolist()
+        for begin, end in zip(at[::2], at[1::2], strict=True):
+            yield begin, end - begin
+
+
+def grouped(vertices: Vertices, runs: Sequence[Run]) -> tuple[Vertices, Groups]:
+    """Vertices with those of a group beside each other, within the runs that they are drawn in, and the groups.
+
+    vertices: [N], runs: as `runs_of` gives them. Groups stand in the order of their first triangle.
+    """
+    triangles = vertices.reshape(-1, 3)
+    body = triangles["tags"][:, 0, 2].astype(np.int64)
+    cell = np.floor(triangles["position"][:, 0, :2] / _CELL_M).astype(np.int64) * (body == STATIC)[:, None]
+    run = np.repeat(np.arange(len(runs)), [each.count // 3 for each in runs])
+    first, group = _ranked(np.stack([run, body, cell[:, 0], cell[:, 1]], 1))
+    together = triangles[np.argsort(group, kind="stable")]
+    counts = 3 * np.bincount(group, minlength=len(first))
+    ends = np.concatenate([[0], np.cumsum(counts)])
+    corners, centre, radius = together["position"].reshape(-1, 3).astype(np.float64), np.empty((0, 3)), np.empty(0)
+    if len(first):
+        starts = ends[:-1]
+        centre = (np.minimum.reduceat(corners, starts) + np.maximum.reduceat(corners, starts)) / 2
+        away = np.linalg.norm(corners - np.repeat(centre, counts, axis=0), axis=1)
+        radius = np.maximum.reduceat(away, starts) + _SLACK_M
+    return together.reshape(-1), Groups(ends=ends, body=body[first], centre=centre, radius=radius)

@@ -16,16 +16,23 @@ from gcd_train.errors import DataError, RecipeError
 from gcd_train.files import write_whole
 from gcd_train.scenes.driving import FPS as DRIVING_FPS
 from gcd_train.scenes.driving import HFOV_DEG as DRIVING_HFOV_DEG
-from gcd_train.scenes.worlds import SceneWorld, WorldOptions
+from gcd_train.scenes.worlds import SceneWorld
 
 DEPTH_UNIT_M = 1 / 256
 """Depth is stored in these, as 16 bit."""
 STAGE_HFOV_DEG = math.degrees(2 * math.atan(0.5))
 """Kubric-4D's lens, as the worlds on its stage have it."""
 
-Numbers = tuple[float, float, float]
+Numbers: TypeAlias = tuple[float, float, float]
 CameraWay: TypeAlias = Literal["gradual", "direct"]
 """How the target camera reaches its goal: over the whole clip, or it stands there from the first frame on."""
+
+
+class WorldOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where the source camera really sits, for studies of a wrong mount. height_m, tilt_deg: see CameraMount."""
+
+    height_m: float = CameraMount().height_m
+    tilt_deg: float = CameraMount().tilt_deg
 
 
 class Orbit(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -92,20 +99,6 @@ class PairForm:
     frames: int = 14
     oversample: int = 2
     clips_per_shard: int = 8
-
-    @classmethod
-    def of(
-        cls, width: int | None, height: int | None, frames: int | None, oversample: int, clips_per_shard: int
-    ) -> "PairForm":
-        """None: as usual."""
-        usual = cls()
-        return cls(
-            width=width or usual.width,
-            height=height or usual.height,
-            frames=frames or usual.frames,
-            oversample=oversample,
-            clips_per_shard=clips_per_shard,
-        )
 
 
 def driving_world(form: PairForm, mount: WorldOptions, edition: int = 1, path: CameraWay = "gradual") -> World:

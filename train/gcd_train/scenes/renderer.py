@@ -16,10 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_train.errors import RenderError
-from gcd_train.scenes.compile import VERTEX, Run, indexed, runs_of
-from gcd_train.scenes.culling import Groups, grouped
 from gcd_train.scenes.description import Extent, Floats, Light, Scene
-from gcd_train.scenes.frozen import FrozenScene, freeze
+from gcd_train.scenes.frozen import VERTEX, FrozenScene, Groups, Run, freeze, grouped, indexed, runs_of
 from gcd_train.scenes.shaders import SHADELESS, SHADOW_FRAGMENT, SHADOW_VERTEX, fragment
 from gcd_train.scenes.shaders import VERTEX as VERTEX_SHADER
 

@@ -4,11 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_model.geometry import CameraMount
 from gcd_train.errors import RecipeError
 from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
 from gcd_train.scenes.description import Scene
@@ -17,16 +15,9 @@ from gcd_train.scenes.driving import ONTOLOGY, OntologyItem, driving_drive, vehi
 Layout = Literal["kubric4d", "parallel_domain4d"]
 
 
-class WorldOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where the source camera really sits, for studies of a wrong mount. height_m, tilt_deg: see CameraMount."""
-
-    height_m: float = CameraMount().height_m
-    tilt_deg: float = CameraMount().tilt_deg
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SceneWorld:
-    """A world of whole scenes, seen by all cameras of a published data set.
+    """A world of whole scenes, seen by all cameras of a published data set, by default Kubric-4D's.
 
     make: the scene of a seed with so many frames; nothing else decides what is drawn. edition: rises whenever `make`
     draws another scene for the same seed. frames, fps, width, height: as published. classes, vehicle_from_camera: of
@@ -34,13 +25,13 @@ class SceneWorld:
     """
 
     name: str
-    layout: Layout
     make: Callable[[int, int], Scene]
-    edition: int
-    frames: int
-    fps: float
-    width: int
-    height: int
+    edition: int = 1
+    layout: Layout = "kubric4d"
+    frames: int = kubric4d_names.FRAMES
+    fps: float = kubric4d_names.FPS
+    width: int = kubric4d_names.WIDTH
+    height: int = kubric4d_names.HEIGHT
     classes: tuple[OntologyItem, ...] = ()
     vehicle_from_camera: Callable[[], dict[str, NDArray[np.float64]]] | None = None
 
@@ -62,32 +53,14 @@ def _tabletop(seed: int, frames: int) -> Scene:
     return tabletop_scene(seed, frames=frames)
 
 
-def _drive(seed: int, frames: int) -> Scene:
-    return driving_drive(seed, frames=frames)
-
-
-def _on_a_stage(name: str, make: Callable[[int, int], Scene], edition: int) -> SceneWorld:
-    """A world with Kubric-4D's cameras and layout."""
-    return SceneWorld(
-        name=name,
-        layout="kubric4d",
-        make=make,
-        edition=edition,
-        frames=kubric4d_names.FRAMES,
-        fps=kubric4d_names.FPS,
-        width=kubric4d_names.WIDTH,
-        height=kubric4d_names.HEIGHT,
-    )
-
-
 SCENE_WORLDS: dict[str, SceneWorld] = {
-    "drop": _on_a_stage("drop", _drop, edition=1),
-    "tabletop": _on_a_stage("tabletop", _tabletop, edition=1),
+    "drop": SceneWorld(name="drop", make=_drop),
+    "tabletop": SceneWorld(name="tabletop", make=_tabletop),
     "driving": SceneWorld(
         name="driving",
-        layout="parallel_domain4d",
-        make=_drive,
+        make=lambda seed, frames: driving_drive(seed, frames=frames),
         edition=2,  # the first is that of the pairs
+        layout="parallel_domain4d",
         frames=parallel_domain4d_names.FRAMES,
         fps=parallel_domain4d_names.FPS,
         width=parallel_domain4d_names.WIDTH,
@@ -96,7 +69,6 @@ SCENE_WORLDS: dict[str, SceneWorld] = {
         vehicle_from_camera=vehicle_from_camera,
     ),
 }
-"""Worlds of whole scenes."""
 
 
 def scene_world(name: str) -> SceneWorld:

@@ -1,10 +1,8 @@
 """The driving world: streets with traffic, seen from a vehicle; as pairs of clips and as whole drives."""
 
-from gcd_train.scenes.driving.drive import driving_drive
+from gcd_train.scenes.driving.classes import ONTOLOGY, OntologyItem, class_ids
 from gcd_train.scenes.driving.flow import FPS
-from gcd_train.scenes.driving.ontology import ONTOLOGY, OntologyItem, class_ids
-from gcd_train.scenes.driving.pair_scene import HFOV_DEG, driving_scene
-from gcd_train.scenes.driving.rig import vehicle_from_camera
+from gcd_train.scenes.driving.world import HFOV_DEG, driving_drive, driving_scene, vehicle_from_camera
 
 __all__ = [
     "FPS",

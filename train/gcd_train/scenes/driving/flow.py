@@ -7,17 +7,14 @@ kept before.
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gcd_train.scenes.description import Floats
-from gcd_train.scenes.driving import fleet, riders
-from gcd_train.scenes.driving.fleet import Lamps
-from gcd_train.scenes.driving.footprint import Footprints, holds_a_point, touches
+from gcd_train.scenes.driving import vehicles
+from gcd_train.scenes.driving.classes import Label
 from gcd_train.scenes.driving.ground import PAVEMENT_M, stop_line_m, zebra_m
-from gcd_train.scenes.driving.road import Crossing, Road
-from gcd_train.scenes.driving.street import Street
-from gcd_train.scenes.driving.vehicles import Assembly
-from gcd_train.scenes.labels import Label
+from gcd_train.scenes.driving.roads import Crossing, Doubles, Road, Street
+from gcd_train.scenes.driving.roadside import Footprints, holds_a_point, touches
+from gcd_train.scenes.driving.vehicles import Assembly, Lamps
 
 FPS = 10.0
 _BEGIN_M, _END_M = -90.0, 240.0
@@ -38,11 +35,6 @@ class RoadUser:
     def moves(self) -> bool:
         """Whether it ever leaves its place."""
         return bool(np.ptp(self.rows, axis=0).max() > 1e-6)
-
-    @property
-    def footprints(self) -> Footprints:
-        """[T, 5]."""
-        return footprints(self.rows, self.assembly)
 
 
 def footprints(rows: Floats, assembly: Assembly) -> Footprints:
@@ -89,14 +81,14 @@ def _waiting_place(crossing: Crossing) -> float:
     return crossing.at_m - stop_line_m(crossing) - 1.8
 
 
-def travelled(speed: float, gain: float, frames: int) -> NDArray[np.float64]:
+def travelled(speed: float, gain: float, frames: int) -> Doubles:
     """Metres [T] at a speed in m/s that changes evenly; nobody goes backwards or beyond 16 m/s."""
     seconds = np.arange(frames) / FPS
     pace = np.clip(speed + gain * seconds, 0.0, 16.0)
     return np.concatenate([[0.0], np.cumsum((pace[1:] + pace[:-1]) / 2 / FPS)])[:frames]
 
 
-def _along(road: Road, s: NDArray[np.float64], lateral: float, reverse: bool = False) -> Floats:
+def _along(road: Road, s: Doubles, lateral: float, reverse: bool = False) -> Floats:
     places = road.places(s, lateral)
     yaw = places[:, 2] + (np.pi if reverse else 0.0)
     return np.stack([places[:, 0], places[:, 1], np.zeros(len(s)), yaw], -1).astype(np.float32)
@@ -109,7 +101,7 @@ class Crowd:
     street: Street
     drive: Drive
     obstacles: Footprints
-    cameras: NDArray[np.float64]
+    cameras: Doubles
     camera_room_m: float
     users: list[RoadUser] = field(default_factory=list[RoadUser])
     _ground: list[Footprints] = field(default_factory=list[Footprints])
@@ -141,7 +133,7 @@ class Crowd:
 
 def fill(crowd: Crowd, lamps: bool, random: np.random.Generator) -> None:
     """The ego first, then lanes, side roads, parked vehicles, cyclists and people."""
-    crowd.add(fleet.grown_own_car(), crowd.drive.rows)
+    crowd.add(vehicles.grown_own_car(), crowd.drive.rows)
     density = float(random.uniform(0.25, 1.1))
     for index in range(-crowd.street.main.lanes_left, crowd.street.main.lanes_right):
         _lane(crowd, index, density, lamps, random)
@@ -160,12 +152,12 @@ def fill(crowd: Crowd, lamps: bool, random: np.random.Generator) -> None:
 def _vehicle(random: np.random.Generator, lamps: Lamps, near: bool) -> Assembly:
     draw = float(random.random())
     if draw < 0.08:
-        return fleet.grown_truck(random, lamps, near)
+        return vehicles.grown_truck(random, lamps, near)
     if draw < 0.13:
-        return fleet.grown_bus(random, lamps, near)
+        return vehicles.grown_bus(random, lamps, near)
     if draw < 0.17:
-        return riders.grown_motorcyclist(random, lamps)
-    return fleet.grown_car(random, lamps, near)
+        return vehicles.grown_motorcyclist(random, lamps)
+    return vehicles.grown_car(random, lamps, near)
 
 
 def _lane(crowd: Crowd, index: int, density: float, lamps: bool, random: np.random.Generator) -> None:
@@ -217,7 +209,7 @@ def _parked(crowd: Crowd, road: Road, random: np.random.Generator) -> None:
         while strip > 0 and s < min(170.0, road.end_m):
             near = crowd.is_near(road.at(s)[:2])
             wide = random.random() < 0.05
-            made = fleet.grown_truck(random, Lamps(), near) if wide else fleet.grown_car(random, Lamps(), near)
+            made = vehicles.grown_truck(random, Lamps(), near) if wide else vehicles.grown_car(random, Lamps(), near)
             s += made.length + float(random.uniform(0.7, 1.5))
             middle = s - made.length / 2
             if random.random() < fullness and road.is_free(middle, 7.5 + made.length / 2):
@@ -228,14 +220,14 @@ def _parked(crowd: Crowd, road: Road, random: np.random.Generator) -> None:
 def _left_two_wheelers(crowd: Crowd, random: np.random.Generator) -> None:
     """Bicycles and motorcycles left on the pavement, side by side, square to the kerb."""
     frames, road = len(crowd.drive.rows), crowd.street.main
-    for side, kerb in ((-1.0, road.right_m), (1.0, road.left_m)):
+    for side, kerb in road.sides:
         for _ in range(int(random.integers(0, 4))):
             s, heavy = float(random.uniform(-45, 70)), random.random() < 0.3
             for number in range(int(random.integers(1, 5))):
                 rows = _along(road, np.full(frames, s + number * (1.1 if heavy else 0.8)), side * (kerb + 1.25))
                 rows[:, 2:] += [PAVEMENT_M, np.pi / 2]
                 if road.is_free(s, 8.0):
-                    crowd.add(riders.left_motorcycle(random) if heavy else riders.left_bicycle(random), rows)
+                    crowd.add(vehicles.left_motorcycle(random) if heavy else vehicles.left_bicycle(random), rows)
 
 
 def _cyclists(crowd: Crowd, random: np.random.Generator) -> None:
@@ -248,13 +240,13 @@ def _cyclists(crowd: Crowd, random: np.random.Generator) -> None:
             covered = travelled(float(random.uniform(2.5, 6.0)), 0.0, frames)
             start = float(random.uniform(-15, 70))
             rows = _along(road, start - side * covered, side * (edge - 0.42), side > 0)
-            crowd.add(riders.grown_cyclist(random), rows)
+            crowd.add(vehicles.grown_cyclist(random), rows)
 
 
 def _walkers(crowd: Crowd, random: np.random.Generator) -> None:
     frames, spacing = len(crowd.drive.rows), float(random.uniform(7, 45))
     for road in crowd.street.roads:
-        for side, kerb in ((-1.0, road.right_m), (1.0, road.left_m)):
+        for side, kerb in road.sides:
             s = max(-40.0, road.start_m)
             while s < min(120.0, road.end_m):
                 s += float(random.exponential(spacing)) + 0.7
@@ -266,7 +258,7 @@ def _walkers(crowd: Crowd, random: np.random.Generator) -> None:
                 if all(road.is_free(float(at), 2.5) for at in (path[0], path[-1])):
                     rows = _along(road, path, lateral, way < 0)
                     rows[:, 2] = PAVEMENT_M
-                    crowd.add(riders.grown_person(random, not stands), rows)
+                    crowd.add(vehicles.grown_person(random, not stands), rows)
 
 
 def _crossing_people(crowd: Crowd, random: np.random.Generator) -> None:
@@ -282,4 +274,4 @@ def _crossing_people(crowd: Crowd, random: np.random.Generator) -> None:
                 across = (start if way > 0 else -start) + way * travelled(float(random.uniform(0.9, 1.7)), 0.0, frames)
                 rows = np.stack([x - across * np.sin(heading), y + across * np.cos(heading),
                                  np.zeros(frames), np.full(frames, heading + way * np.pi / 2)], -1)  # fmt: skip
-                crowd.add(riders.grown_person(random, walks=True), rows.astype(np.float32))
+                crowd.add(vehicles.grown_person(random, walks=True), rows.astype(np.float32))

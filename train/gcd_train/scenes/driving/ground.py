@@ -3,19 +3,15 @@
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gcd_train.scenes.description import Colour, Floats, Pattern, Sheet
-from gcd_train.scenes.driving.ribbon import Span, fan, free_spans, patches, quads, ribbon
-from gcd_train.scenes.driving.road import Crossing, Road
-from gcd_train.scenes.driving.street import Street
-from gcd_train.scenes.labels import Label
+from gcd_train.scenes.driving.classes import Label
+from gcd_train.scenes.driving.roads import Crossing, Doubles, Road, Street, fan, patches, quads, ribbon
 
 ROAD_M, PATCH_M, MARK_M, PAVEMENT_M = 0.0, 0.004, 0.014, 0.12
-_GROUND_M = -0.06
 _KERB_WIDE_M, _KERB_SLOPE_M = 0.16, 0.05
-_CORNER_M = 2.2
-_MARKED: Span = (-70.0, 190.0)
+_CORNER_M, _COURT_M = 2.2, PAVEMENT_M - 0.03
+_MARKED_M = -70.0, 190.0
 
 
 def ground_sheets(street: Street, wetness: float, paved: bool, random: np.random.Generator) -> list[Sheet]:
@@ -27,18 +23,21 @@ def ground_sheets(street: Street, wetness: float, paved: bool, random: np.random
     asphalt: Colour = (tone, tone * random.uniform(0.97, 1.02), tone * random.uniform(0.98, 1.07))
     grey = random.uniform(0.45, 0.66)
     paving: Colour = (grey, grey * random.uniform(0.92, 1.0), grey * random.uniform(0.84, 1.0))
-    roads = street.roads
-    sheets = [_terrain(street, wetness, random)]
+    grass: Colour = (random.uniform(0.24, 0.4), random.uniform(0.38, 0.48), random.uniform(0.16, 0.26))
+    dry: Colour = (random.uniform(0.5, 0.62), random.uniform(0.46, 0.54), random.uniform(0.32, 0.4))
+    sheets = [terrain(800.0, 200.0, grass if random.random() < 0.75 else dry, 0.3 * wetness)]
     if paved:
-        court = np.concatenate([_courts(road) for road in roads])
-        sheets.append(_sheet(court, _times(paving, 0.86), Label.PAVEMENT, Pattern.SPECKLE, wetness))
-    sheets.append(_sheet(_asphalt(street), asphalt, Label.ROAD, Pattern.SPECKLE, wetness))
-    sheets.append(_sheet(_repairs(street.main, random), _times(asphalt, 0.8), Label.ROAD, Pattern.SPECKLE, wetness))
+        court = [piece for road in street.roads for piece in _beside(road, 1.0, road.pavement_m + 16.0, _COURT_M)]
+        sheets.append(flat(np.concatenate(court), _times(paving, 0.86), Label.PAVEMENT, Pattern.SPECKLE, wetness))
+    sheets.append(flat(_asphalt(street), asphalt, Label.ROAD, Pattern.SPECKLE, wetness))
+    sheets.append(flat(_repairs(street.main, random), _times(asphalt, 0.8), Label.ROAD, Pattern.SPECKLE, wetness))
     if wetness > 0:
-        sheets.append(_sheet(_puddles(street.main, random), (0.07, 0.075, 0.08), Label.ROAD, gloss=1.0))
-    stone = np.concatenate([_pavements(street), _corners(street, 0.0, PAVEMENT_M)])
-    sheets.append(_sheet(stone, paving, Label.PAVEMENT, Pattern.TILES, wetness))
-    sheets.append(_sheet(_kerbs(street), (0.62, 0.62, 0.6), Label.KERB, gloss=wetness))
+        sheets.append(flat(_puddles(street.main, random), (0.07, 0.075, 0.08), Label.ROAD, wetness=1.0))
+    stone = [piece for road in street.roads for piece in _beside(road, 0.0, road.pavement_m, PAVEMENT_M)]
+    for middle, first, second in _quadrants(street):
+        stone.append(fan(np.append(middle, PAVEMENT_M), _rim(middle, first, second, _CORNER_M, PAVEMENT_M)))
+    sheets.append(flat(np.concatenate(stone), paving, Label.PAVEMENT, Pattern.TILES, wetness))
+    sheets.append(flat(_kerbs(street), (0.62, 0.62, 0.6), Label.KERB, wetness=wetness))
     return [*sheets, *_marks(street, wetness, random)]
 
 
@@ -47,115 +46,77 @@ def _times(colour: Colour, factor: float) -> Colour:
     return r, g, b
 
 
-def _sheet(
-    corners: Floats, colour: Colour, label: Label, pattern: Pattern = Pattern.PLAIN, gloss: float = 0.0
+def flat(
+    corners: Floats, colour: Colour, label: Label, pattern: Pattern = Pattern.PLAIN, wetness: float = 0.0
 ) -> Sheet:
-    """Triangles turned so that they face up; what is wet is darker."""
+    """Triangles turned so that they face up; what is wet is darker, and shines."""
     edges = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     upward = np.where((edges[:, 2] < 0)[:, None, None], corners[:, ::-1], corners).astype(np.float32)
-    dark = _times(colour, 1 - 0.35 * gloss) if label != Label.LANE_MARKING else colour
-    return Sheet(corners=upward, colour=dark, label=label, pattern=pattern, gloss=gloss)
+    dark = _times(colour, 1 - 0.35 * wetness) if label != Label.LANE_MARKING else colour
+    return Sheet(corners=upward, colour=dark, label=label, pattern=pattern, gloss=wetness)
 
 
-def _terrain(street: Street, wetness: float, random: np.random.Generator) -> Sheet:
-    grass: Colour = (random.uniform(0.24, 0.4), random.uniform(0.38, 0.48), random.uniform(0.16, 0.26))
-    dry: Colour = (random.uniform(0.5, 0.62), random.uniform(0.46, 0.54), random.uniform(0.32, 0.4))
-    colour = grass if random.random() < 0.75 else dry
-    x, y = np.meshgrid(np.arange(-800.0, 800.0, 200.0), np.arange(-800.0, 800.0, 200.0))
-    low = np.stack([x.reshape(-1), y.reshape(-1), np.full(x.size, _GROUND_M)], -1)
-    corners = quads(low, *(low + np.array([a, b, 0.0]) for a, b in ((200.0, 0.0), (200.0, 200.0), (0.0, 200.0))))
-    return _sheet(corners, colour, Label.TERRAIN, Pattern.SPECKLE, 0.3 * wetness)
+def terrain(half_m: float, cell_m: float, colour: Colour, wetness: float = 0.0) -> Sheet:
+    """A square of cells just below all roads; split, so that interpolation stays exact far away."""
+    x, y = np.meshgrid(np.arange(-half_m, half_m, cell_m), np.arange(-half_m, half_m, cell_m))
+    low = np.stack([x.reshape(-1), y.reshape(-1), np.full(x.size, -0.06)], -1)
+    corners = quads(low, *(low + np.array([a, b, 0.0]) for a, b in ((cell_m, 0.0), (cell_m, cell_m), (0.0, cell_m))))
+    return flat(corners, colour, Label.TERRAIN, Pattern.SPECKLE, wetness)
 
 
 def _asphalt(street: Street) -> Floats:
+    """The lanes, and what lies under and before the rounded corners."""
     pieces = [ribbon(road, -road.right_m, road.left_m, ROAD_M) for road in street.roads]
-    return np.concatenate([*pieces, _corners(street, ROAD_M, None)])
-
-
-def _sides(road: Road) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Direction of each side and where its kerb is: right, left."""
-    return (-1.0, road.right_m), (1.0, road.left_m)
-
-
-def _pavements(street: Street) -> Floats:
-    pieces = [
-        ribbon(road, *_ordered(side * kerb, side * (kerb + road.pavement_m)), PAVEMENT_M, free_spans(road, _CORNER_M))
-        for road in street.roads
-        for side, kerb in _sides(road)
-    ]
+    reach = _CORNER_M * 1.05
+    for middle, first, second in _quadrants(street):
+        square = [middle, middle + first * reach, middle + (first + second) * reach, middle + second * reach]
+        a, b, c, d = (np.append(corner, ROAD_M)[None] for corner in square)
+        pieces.append(quads(a, b, c, d))
     return np.concatenate(pieces)
 
 
-def _courts(road: Road) -> Floats:
-    spans = free_spans(road, _CORNER_M)
-    pieces = [
-        ribbon(road, *_ordered(side * (kerb + 1.0), side * (kerb + road.pavement_m + 16.0)), PAVEMENT_M - 0.03, spans)
-        for side, kerb in _sides(road)
-    ]
-    return np.concatenate(pieces)
-
-
-def _ordered(a: float, b: float) -> tuple[float, float]:
-    return min(a, b), max(a, b)
+def _beside(road: Road, near_m: float, far_m: float, near_z: float, far_z: float | None = None) -> Iterator[Floats]:
+    """Strips on both sides, between two distances from the kerb, that stop before the junctions' corners."""
+    far_z = near_z if far_z is None else far_z
+    spans = road.free_spans(_CORNER_M)
+    for side, kerb in road.sides:
+        near, far = side * (kerb + near_m), side * (kerb + far_m)
+        if side > 0:
+            yield ribbon(road, near, far, (near_z, far_z), spans)
+        else:
+            yield ribbon(road, far, near, (far_z, near_z), spans)
 
 
 def _kerbs(street: Street) -> Floats:
     """The kerb stones' tops, and their faces towards the road."""
-    pieces: list[Floats] = []
+    top, pieces = PAVEMENT_M + 0.008, [np.zeros((0, 3, 3), np.float32)]
     for road in street.roads:
-        spans = free_spans(road, _CORNER_M)
-        for side, kerb in _sides(road):
-            inner, edge, outer = side * kerb, side * (kerb + _KERB_SLOPE_M), side * (kerb + _KERB_WIDE_M)
-            top = PAVEMENT_M + 0.008
-            pieces.append(ribbon(road, *_ordered(edge, outer), top, spans))
-            heights = (top, ROAD_M) if side < 0 else (ROAD_M, top)
-            pieces.append(ribbon(road, *_ordered(inner, edge), heights, spans))
-    return np.concatenate([*pieces, *_kerb_corners(street)])
+        pieces += _beside(road, _KERB_SLOPE_M, _KERB_WIDE_M, top)
+        pieces += _beside(road, 0.0, _KERB_SLOPE_M, ROAD_M, top)
+    for middle, first, second in _quadrants(street):
+        low, edge, inner = (
+            _rim(middle, first, second, _CORNER_M - away, z)
+            for away, z in ((0.0, ROAD_M), (_KERB_SLOPE_M, top), (_KERB_WIDE_M, top))
+        )
+        pieces += [quads(low[:-1], low[1:], edge[1:], edge[:-1]), quads(edge[:-1], edge[1:], inner[1:], inner[:-1])]
+    return np.concatenate(pieces)
 
 
-def _quadrants(street: Street) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]]:
+def _quadrants(street: Street) -> Iterator[tuple[Doubles, Doubles, Doubles]]:
     """Of every corner of a junction: its middle of rounding [2] and the axes [2] from there to the two roads."""
     for crossing in street.main.crossings:
         x, y, heading = street.main.at(crossing.at_m)
         ahead, left = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
         for along in (-1.0, 1.0):
-            for side, kerb in _sides(street.main):
+            for side, kerb in street.main.sides:
                 middle = np.array([x, y]) + along * ahead * (crossing.half_m + _CORNER_M)
                 yield middle + side * left * (kerb + _CORNER_M), -along * ahead, -side * left
 
 
-def _rim(
-    middle: NDArray[np.float64], first: NDArray[np.float64], second: NDArray[np.float64], radius: float, z: float
-) -> NDArray[np.float64]:
+def _rim(middle: Doubles, first: Doubles, second: Doubles, radius: float, z: float) -> Doubles:
     turn = np.linspace(0, np.pi / 2, 6)[:, None]
     rim = middle + radius * (np.cos(turn) * first + np.sin(turn) * second)
     return np.append(rim, np.full((6, 1), z), 1)
-
-
-def _corners(street: Street, road_z: float, pavement_z: float | None) -> Floats:
-    """The rounded corners: as stone where a height is given for it, else the asphalt under and before them."""
-    pieces: list[Floats] = [np.zeros((0, 3, 3), np.float32)]
-    for middle, first, second in _quadrants(street):
-        if pavement_z is not None:
-            rim = _rim(middle, first, second, _CORNER_M, pavement_z)
-            pieces.append(fan(np.append(middle, pavement_z), rim))
-        else:
-            reach = _CORNER_M * 1.05
-            square = [middle, middle + first * reach, middle + (first + second) * reach, middle + second * reach]
-            a, b, c, d = (np.append(corner, road_z)[None] for corner in square)
-            pieces.append(quads(a, b, c, d))
-    return np.concatenate(pieces)
-
-
-def _kerb_corners(street: Street) -> list[Floats]:
-    pieces: list[Floats] = []
-    for middle, first, second in _quadrants(street):
-        top = PAVEMENT_M + 0.008
-        low = _rim(middle, first, second, _CORNER_M, ROAD_M)
-        edge = _rim(middle, first, second, _CORNER_M - _KERB_SLOPE_M, top)
-        inner = _rim(middle, first, second, _CORNER_M - _KERB_WIDE_M, top)
-        pieces += [quads(low[:-1], low[1:], edge[1:], edge[:-1]), quads(edge[:-1], edge[1:], inner[1:], inner[:-1])]
-    return pieces
 
 
 def _repairs(road: Road, random: np.random.Generator) -> Floats:
@@ -185,22 +146,19 @@ def _marks(street: Street, wetness: float, random: np.random.Generator) -> list[
     width = float(random.uniform(0.12, 0.18))
     dash = (float(random.uniform(2.5, 4.5)), float(random.uniform(4.0, 8.0)))
     edged, solid = random.random() < 0.6, random.random() < 0.5
-    lanes, centre, zebras, stops = [], [], [], []
+    none = [np.zeros((0, 3, 3), np.float32)]
+    lanes, centre, zebras, stops = [*none], [*none], [*none], [*none]
     for road in street.roads:
-        lanes.append(_lane_lines(road, width, dash, edged))
+        lanes += _lane_lines(road, width, dash, edged)
         centre.append(_dashes(road, 0.0, width, None if solid else dash))
-        for crossing in road.crossings:
-            zebras.append(patches(road, _zebra(road, crossing), MARK_M))
-            stops.append(patches(road, _stop_lines(road, crossing), MARK_M))
-    pairs = ((lanes, paint, Label.LANE_MARKING), (centre, middle, Label.LANE_MARKING),
+        zebras += [patches(road, _zebra(road, crossing), MARK_M) for crossing in road.crossings]
+        stops += [patches(road, _stop_lines(road, crossing), MARK_M) for crossing in road.crossings]
+    kinds = ((lanes, paint, Label.LANE_MARKING), (centre, middle, Label.LANE_MARKING),
              (zebras, paint, Label.CROSSWALK), (stops, paint, Label.STOP_LINE))  # fmt: skip
-    none = np.zeros((0, 3, 3), np.float32)
-    return [
-        _sheet(np.concatenate([none, *shapes]), colour, label, gloss=0.5 * wetness) for shapes, colour, label in pairs
-    ]
+    return [flat(np.concatenate(shapes), colour, label, wetness=0.5 * wetness) for shapes, colour, label in kinds]
 
 
-def _lane_lines(road: Road, width: float, dash: tuple[float, float], edged: bool) -> Floats:
+def _lane_lines(road: Road, width: float, dash: tuple[float, float], edged: bool) -> list[Floats]:
     """Between lanes of one direction, at the outer edges, and around the parking places."""
     inner = [-i * road.lane_m for i in range(-road.lanes_left + 1, road.lanes_right) if i != 0]
     pieces = [_dashes(road, lateral, width, dash) for lateral in inner]
@@ -210,12 +168,12 @@ def _lane_lines(road: Road, width: float, dash: tuple[float, float], edged: bool
             pieces.append(_dashes(road, lateral, 0.1, (1.0, 4.6)))
         elif edged:
             pieces.append(_dashes(road, lateral - np.sign(lateral) * 0.25, width, None))
-    return np.concatenate([np.zeros((0, 3, 3), np.float32), *pieces])
+    return pieces
 
 
 def _dashes(road: Road, lateral: float, width: float, dash: tuple[float, float] | None) -> Floats:
-    begin, end = max(_MARKED[0], road.start_m), min(_MARKED[1], road.end_m)
-    spans = free_spans(road, _CORNER_M + 5.6, begin, end)
+    begin, end = max(_MARKED_M[0], road.start_m), min(_MARKED_M[1], road.end_m)
+    spans = road.free_spans(_CORNER_M + 5.6, begin, end)
     right, left = lateral - width / 2, lateral + width / 2
     if dash is None:
         return ribbon(road, right, left, MARK_M, spans)
@@ -233,16 +191,14 @@ def zebra_m(crossing: Crossing) -> tuple[float, float]:
     return crossing.half_m + _CORNER_M + 0.4, crossing.half_m + _CORNER_M + 3.2
 
 
-def _zebra(road: Road, crossing: Crossing) -> NDArray[np.float64]:
-    if not crossing.zebra:
-        return np.zeros((0, 4))
+def _zebra(road: Road, crossing: Crossing) -> Doubles:
     stripes = np.arange(-road.right_m + 0.5, road.left_m - 0.6, 1.0)
     near, far = zebra_m(crossing)
     ends = ((crossing.at_m - far, crossing.at_m - near), (crossing.at_m + near, crossing.at_m + far))
-    return np.array([(*end, y, y + 0.5) for end in ends for y in stripes])
+    return np.array([(*end, y, y + 0.5) for end in ends for y in stripes if crossing.zebra])
 
 
-def _stop_lines(road: Road, crossing: Crossing) -> NDArray[np.float64]:
+def _stop_lines(road: Road, crossing: Crossing) -> Doubles:
     away = stop_line_m(crossing) - 0.9
     right, left = -road.lanes_right * road.lane_m, road.lanes_left * road.lane_m
     at = crossing.at_m

@@ -1,5 +1,7 @@
 """What stands beside the streets of a grown driving world: nothing on a road, nothing in another thing, and nothing
 where a camera passes.
+
+A footprint is [..., 5]: x and y of its centre, yaw in radians, half its length along the yaw and half its width.
 """
 
 from collections.abc import Callable, Sequence
@@ -8,27 +10,79 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_train.scenes.description import Colour, Part, Pattern
-from gcd_train.scenes.driving import furniture
-from gcd_train.scenes.driving.footprint import Footprints, footprint_of, holds_a_point, touches
-from gcd_train.scenes.driving.road import Road
-from gcd_train.scenes.driving.street import Street
-from gcd_train.scenes.driving.surroundings import District, building, bush, sagitta, tone, tree
-from gcd_train.scenes.labels import Label
+from gcd_train.scenes.description import Colour, Part
+from gcd_train.scenes.driving import things
+from gcd_train.scenes.driving.roads import Doubles, Road, Street
+from gcd_train.scenes.driving.things import District, tone
 
 CAMERA_ROOM_M = 0.6
 _BEGIN_M, _END_M = -120.0, 290.0
 _NEAR_M, _PLANTED_M = 38.0, 175.0
 _CLEAR_M = 3.2
-_BOARDS: tuple[Colour, ...] = (
-    (0.6, 0.1, 0.1),
-    (0.1, 0.25, 0.5),
-    (0.15, 0.4, 0.2),
-    (0.2, 0.2, 0.2),
-    (0.8, 0.6, 0.15),
-)
 
+Footprints = Doubles
 Parts = Sequence[Part]
+
+
+def overlap(first: Footprints, second: Footprints, gap_m: float = 0.0) -> NDArray[np.bool_]:
+    """Whether rectangles come closer than a gap (along one of their axes), [...]; sizes broadcast.
+
+    Two convex shapes are apart if and only if an edge's normal separates them.
+    """
+    apart = second[..., :2] - first[..., :2]
+    touching = np.ones(np.broadcast_shapes(first.shape[:-1], second.shape[:-1]), bool)
+    for yaw in (first[..., 2], first[..., 2] + np.pi / 2, second[..., 2], second[..., 2] + np.pi / 2):
+        distance = np.abs(apart[..., 0] * np.cos(yaw) + apart[..., 1] * np.sin(yaw))
+        touching &= distance < _reach(first, yaw) + _reach(second, yaw) + gap_m
+    return touching
+
+
+def touches(first: Footprints, second: Footprints, gap_m: float = 0.0) -> bool:
+    """Whether any two rectangles of a pair overlap; sizes broadcast. Only those near each other are looked at."""
+    away = first[..., :2] - second[..., :2]
+    radius = np.hypot(first[..., 3], first[..., 4]) + np.hypot(second[..., 3], second[..., 4]) + 2 * gap_m
+    near = away[..., 0] ** 2 + away[..., 1] ** 2 < radius**2
+    if not near.any():
+        return False
+    shape = (*near.shape, 5)
+    return bool(overlap(np.broadcast_to(first, shape)[near], np.broadcast_to(second, shape)[near], gap_m).any())
+
+
+def _reach(box: Footprints, yaw: Doubles) -> Doubles:
+    """Half the length of a rectangle's shadow on an axis."""
+    turn = yaw - box[..., 2]
+    return np.abs(np.cos(turn)) * box[..., 3] + np.abs(np.sin(turn)) * box[..., 4]
+
+
+def footprint_of(parts: Sequence[Part]) -> Footprints:
+    """A rectangle along the first part's yaw that holds all parts, [5]."""
+    yaw = parts[0].yaw
+    ahead, left = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+    centres = np.array([part.centre[:2] for part in parts])
+    turn = np.array([part.yaw for part in parts]) - yaw
+    cos, sin, half = np.abs(np.cos(turn)), np.abs(np.sin(turn)), np.abs([part.size[:2] for part in parts]) / 2
+    halves = np.stack([cos * half[:, 0] + sin * half[:, 1], sin * half[:, 0] + cos * half[:, 1]], -1)
+    along, aside = centres @ ahead, centres @ left
+    low = np.array([(along - halves[:, 0]).min(), (aside - halves[:, 1]).min()])
+    high = np.array([(along + halves[:, 0]).max(), (aside + halves[:, 1]).max()])
+    middle = (low + high) / 2
+    x, y = ahead * middle[0] + left * middle[1]
+    return np.array([x, y, yaw, (high[0] - low[0]) / 2, (high[1] - low[1]) / 2])
+
+
+def holds_a_point(parts: Sequence[Part], points: Doubles, margin_m: float) -> bool:
+    """Whether a point [N, 3] lies within a margin of a part's bounding box; the parts stand upright."""
+    hub = np.array(parts[0].centre)
+    radius = max(float(np.linalg.norm(part.centre - hub) + np.linalg.norm(part.size) / 2) for part in parts)
+    points = points[((points - hub) ** 2).sum(-1) < (radius + 2 * margin_m) ** 2]
+    for part in parts if len(points) else ():
+        away = points - part.centre
+        cos, sin = np.cos(part.yaw), np.sin(part.yaw)
+        local = np.stack([away[:, 0] * cos + away[:, 1] * sin, away[:, 1] * cos - away[:, 0] * sin, away[:, 2]], -1)
+        reach = np.abs(part.size) / 2 + margin_m
+        if bool((np.abs(local) < reach).all(-1).any()):
+            return True
+    return False
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -40,10 +94,13 @@ class Place:
     side: float
     away: float
 
+    def moved(self, s: float, more_m: float) -> "Place":
+        """On the same side at another `s`, so much further from the road."""
+        return replace(self, s=s, away=self.away + more_m)
+
     def put(self, parts: Parts, turn: float = 0.0) -> tuple[Part, ...]:
         """An assembly stood there, its x along the road."""
-        x, y, heading = self.road.at(self.s, self.side * self.away)
-        return tuple(part.placed(x, y, 0.0, heading + turn) for part in parts)
+        return self.road.put(parts, self.s, self.side * self.away, turn)
 
 
 @dataclass(kw_only=True, slots=True)
@@ -67,9 +124,14 @@ class Plot:
         x, y, _ = place.road.at(place.s, place.side * place.away)
         return bool(np.hypot(self.cameras[:, 0] - x, self.cameras[:, 1] - y).min() < _NEAR_M)
 
-    def put(self, parts: tuple[Part, ...], *, on_pavement: bool = False, gap_m: float = 0.3) -> bool:
-        """Add a thing if there is room for it; what stands on a pavement may not stand on the lanes either."""
-        ground = footprint_of(parts)
+    def put(
+        self, parts: tuple[Part, ...], *, on_pavement: bool = False, on_foot: bool = False, gap_m: float = 0.3
+    ) -> bool:
+        """Add a thing if there is room for it; what stands on a pavement may not stand on the lanes either.
+
+        on_foot: only its first part needs ground.
+        """
+        ground = footprint_of(parts[:1] if on_foot else parts)
         roads = self._lanes if on_pavement else self._roads
         if touches(ground, roads, 0.05) or (self._taken and touches(ground, np.array(self._taken), gap_m)):
             return False
@@ -100,29 +162,14 @@ def furnish(plot: Plot, district: District, paved: bool, lit: bool, green: bool,
     """
     grey = tone(random, (0.33, 0.35, 0.36), 0.3)
     _signals(plot, green, grey, random)
-    for road in plot.street.roads:
-        for side, kerb in ((-1.0, road.right_m), (1.0, road.left_m)):
-            _lamps(plot, Place(road=road, s=0.0, side=side, away=kerb + 0.5), grey, lit, random)
-    for road in plot.street.roads:
-        for side, kerb in ((-1.0, road.right_m), (1.0, road.left_m)):
-            _houses(plot, Place(road=road, s=0.0, side=side, away=kerb), district, paved, lit, random)
-    for road in plot.street.roads:
-        for side, kerb in ((-1.0, road.right_m), (1.0, road.left_m)):
-            at = Place(road=road, s=0.0, side=side, away=kerb)
-            _furniture(plot, at, lit, grey, random)
-            _greenery(plot, at, district, paved, random)
-
-
-def _at(place: Place, s: float, more_m: float) -> Place:
-    return Place(road=place.road, s=s, side=place.side, away=place.away + more_m)
-
-
-def _begin(road: Road) -> float:
-    return max(_BEGIN_M, road.start_m)
-
-
-def _end(road: Road) -> float:
-    return min(_END_M, road.end_m)
+    sides = [Place(road=road, s=0.0, side=side, away=kerb) for road in plot.street.roads for side, kerb in road.sides]
+    for side in sides:
+        _lamps(plot, side.moved(0.0, 0.5), grey, lit, random)
+    for side in sides:
+        _houses(plot, side, district, paved, lit, random)
+    for side in sides:
+        _furniture(plot, side, lit, grey, random)
+        _greenery(plot, side, district, paved, random)
 
 
 def _signals(plot: Plot, green: bool, grey: Colour, random: np.random.Generator) -> None:
@@ -130,86 +177,59 @@ def _signals(plot: Plot, green: bool, grey: Colour, random: np.random.Generator)
         return
     for number, road in enumerate(plot.street.roads):
         for crossing in road.crossings:
-            for side, kerb in ((-1.0, road.right_m), (1.0, road.left_m)):
+            for side, kerb in road.sides:
                 at = crossing.at_m + side * (crossing.half_m + _CLEAR_M + 3.2)
                 place = Place(road=road, s=at, side=side, away=kerb + 0.6)
-                shown = furniture.signal(green if number == 0 else not green, grey)
+                shown = things.signal(green if number == 0 else not green, grey)
                 plot.put(place.put(shown, 0.0 if side < 0 else np.pi), on_pavement=True)
 
 
 def _lamps(plot: Plot, place: Place, grey: Colour, lit: bool, random: np.random.Generator) -> None:
+    road = place.road
     every, height = float(random.uniform(22, 38)), float(random.uniform(5.8, 8.5))
-    for s in np.arange(_begin(place.road) + float(random.uniform(0, every)), min(_end(place.road), 190.0), every):
-        at = _at(place, float(s), 0.0)
-        if place.road.is_free(at.s, _CLEAR_M + 1.0):
-            parts = at.put(furniture.street_lamp(height, place.side, grey, lit))
-            ground = parts[:1]  # its arm reaches over the road
-            if not holds_a_point(parts, plot.cameras, CAMERA_ROOM_M) and plot.put(ground, on_pavement=True):
-                plot.things[-1] = parts
+    first = max(_BEGIN_M, road.start_m) + float(random.uniform(0, every))
+    for s in np.arange(first, min(road.end_m, 190.0), every):
+        at = place.moved(float(s), 0.0)
+        if road.is_free(at.s, _CLEAR_M + 1.0):
+            lamp = at.put(things.street_lamp(height, place.side, grey, lit))
+            if plot.put(lamp, on_pavement=True, on_foot=True):  # its arm reaches over the road
                 plot.lamps.append(at)
 
 
 def _houses(plot: Plot, place: Place, district: District, paved: bool, lit: bool, random: np.random.Generator) -> None:
     road = place.road
     edge = road.pavement_m + road.verge_m * (0.0 if paved else 1.0) + 0.8
-    s = _begin(road) + float(random.uniform(0, 10))
-    while s < _end(road):
+    s = max(_BEGIN_M, road.start_m) + float(random.uniform(0, 10))
+    while s < min(_END_M, road.end_m):
         width, depth = float(random.uniform(*district.width_m)), float(random.uniform(9, 17))
         if random.random() < district.built:
-            back = float(random.uniform(*district.setback_m)) + sagitta(road, s + width / 2, width)
-            at = _at(place, s + width / 2, edge + back + depth / 2)
-            house = building(width, depth, district, random)
-            house += _eaves(house)
+            back = float(random.uniform(*district.setback_m)) + things.sagitta(road, s + width / 2, width)
+            at = place.moved(s + width / 2, edge + back + depth / 2)
+            house = things.building(width, depth, district, random)
+            roof = house[1]
+            if roof.shape == "gable":  # closed from below
+                below = (0.0, 0.0, roof.centre[2] - roof.size[2] / 2 - 0.05)
+                size = (roof.size[0], roof.size[1], 0.1)
+                house.append(replace(roof, shape="box", centre=below, size=size, colour=(0.7, 0.68, 0.64)))
             if paved and plot.shows_details(at):
-                house += _shop(width, depth, place.side, lit, random)
+                house += things.shop(width, -place.side * depth / 2, lit, random)
             plot.put(at.put(house))
         s += width + float(random.uniform(*district.gap_m))
-
-
-def _eaves(house: Parts) -> list[Part]:
-    """What closes a gabled roof from below."""
-    roof = house[1]
-    if roof.shape != "gable":
-        return []
-    x, y, z = roof.centre
-    length, depth, height = roof.size
-    below = (x, y, z - height / 2 - 0.05)
-    return [replace(roof, shape="box", centre=below, size=(length, depth, 0.1), colour=(0.7, 0.68, 0.64))]
-
-
-def _shop(width: float, depth: float, side: float, lit: bool, random: np.random.Generator) -> list[Part]:
-    """A shop window and its sign along the ground floor."""
-    if random.random() < 0.35:
-        return []
-    front, wide = -side * depth / 2, width * float(random.uniform(0.5, 0.92))
-    board = tone(random, _BOARDS[int(random.integers(len(_BOARDS)))], 0.2)
-    shines = lit and random.random() < 0.6
-    window = Part(
-        shape="box",
-        centre=(0, front, 1.45),
-        size=(wide, 0.16, 2.1),
-        colour=(0.95, 0.8, 0.55) if shines else (0.1, 0.12, 0.14),
-        gloss=0.7,
-        label=Label.BUILDING,
-        pattern=Pattern.LIT if shines else Pattern.PLAIN,
-    )
-    above = Part(shape="box", centre=(0, front, 2.85), size=(wide + 0.3, 0.4, 0.5), colour=board, label=Label.BUILDING)
-    return [window, above]
 
 
 def _furniture(plot: Plot, place: Place, lit: bool, grey: Colour, random: np.random.Generator) -> None:
     road, room = place.road, place.road.pavement_m
     makers: tuple[tuple[Callable[[], list[Part]], float, float], ...] = (
-        (lambda: furniture.sign(random, grey), 0.45, 0.45),
-        (lambda: furniture.planter(random), 0.2, 1.1),
-        (lambda: furniture.shelter(random, lit), 0.2, 1.3),
-        (lambda: furniture.kiosk(random, lit), 0.15, 1.6),
+        (lambda: things.sign(random, grey), 0.45, 0.45),
+        (lambda: things.planter(random), 0.2, 1.1),
+        (lambda: things.shelter(random, lit), 0.2, 1.3),
+        (lambda: things.kiosk(random, lit), 0.15, 1.6),
     )
-    s = _begin(road) + float(random.uniform(0, 20))
-    while s < min(150.0, _end(road)):
+    s = max(_BEGIN_M, road.start_m) + float(random.uniform(0, 20))
+    while s < min(150.0, road.end_m):
         make, _, away = makers[int(random.choice(4, p=[share for _, share, _ in makers]))]
         if road.is_free(s, _CLEAR_M + 4.0) and room > away + 0.9:
-            plot.put(_at(place, s, away).put(make(), 0.0 if place.side < 0 else np.pi), on_pavement=True)
+            plot.put(place.moved(s, away).put(make(), 0.0 if place.side < 0 else np.pi), on_pavement=True)
         s += float(random.uniform(12, 45))
 
 
@@ -219,33 +239,27 @@ def _greenery(plot: Plot, place: Place, district: District, paved: bool, random:
     bare, firs = random.random() < 0.12, 0.0 if paved else float(random.choice([0.0, 0.1, 0.4]))
     in_row = road.pavement_m - 0.7 if paved else road.pavement_m + max(0.5 * road.verge_m, 0.6)
     every = district.trees_every_m * (1.0 if paved else 0.8)
-    s = max(-_PLANTED_M, _begin(road)) + float(random.uniform(0, every))
-    while s < min(_PLANTED_M, _end(road)) and not bare:
+    s = max(_BEGIN_M, road.start_m) + float(random.uniform(0, every))
+    while s < min(_PLANTED_M, road.end_m) and not bare:
         draw = float(random.random())
-        made = bush(random) if draw < 0.12 else furniture.conifer(random) if draw < 0.12 + firs else tree(random)
-        at = _at(place, s, in_row + float(random.uniform(0, 0.5)))
+        kind = things.bush if draw < 0.12 else things.conifer if draw < 0.12 + firs else things.tree
+        made = kind(random)
+        at = place.moved(s, in_row + float(random.uniform(0, 0.5)))
         if road.is_free(s, _CLEAR_M + 3.0):
-            _plant(plot, at, made)
+            shown = made if plot.shows_details(at) or len(made) < 3 else made[:2]  # far away one crown is enough
+            plot.put(at.put(shown), on_pavement=True, on_foot=True)
         s += every * float(random.uniform(0.5, 1.6))
     if not paved:
         _borders(plot, place, random)
 
 
-def _plant(plot: Plot, at: Place, made: list[Part]) -> None:
-    """Only the stem needs ground; far away one crown is enough."""
-    shown = made if plot.shows_details(at) or len(made) < 3 else made[:2]
-    parts = at.put(shown)
-    if not holds_a_point(parts, plot.cameras, CAMERA_ROOM_M) and plot.put(parts[:1], on_pavement=True):
-        plot.things[-1] = parts
-
-
 def _borders(plot: Plot, place: Place, random: np.random.Generator) -> None:
     road = place.road
     edge = road.pavement_m + road.verge_m + 0.5
-    s = _begin(road)
-    while s < min(150.0, _end(road)):
+    s = max(_BEGIN_M, road.start_m)
+    while s < min(150.0, road.end_m):
         length = float(random.uniform(5, 14))
-        make = furniture.hedge if random.random() < 0.6 else furniture.fence
+        make = things.hedge if random.random() < 0.6 else things.fence
         if random.random() < 0.6 and road.is_free(s + length / 2, length / 2 + _CLEAR_M):
-            plot.put(_at(place, s + length / 2, edge).put(make(random, length)), gap_m=0.1)
+            plot.put(place.moved(s + length / 2, edge).put(make(random, length)), gap_m=0.1)
         s += length + float(random.uniform(1.5, 8))

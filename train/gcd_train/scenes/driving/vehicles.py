@@ -1,30 +1,39 @@
-"""Vehicles, people and cyclists as assemblies of parts: x ahead, y left, z up, on the ground at the origin."""
+"""Who drives, rides and walks in a grown driving world: x ahead, y left, z up, on the ground at the origin.
 
-from dataclasses import dataclass
+`near` asks for what only a close look shows.
+"""
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gcd_train.scenes.description import Colour, Part, Pattern, Point
-from gcd_train.scenes.labels import Label
+from gcd_train.scenes.description import Colour, Part, Point
+from gcd_train.scenes.driving.classes import Label
+from gcd_train.scenes.driving.things import block, picked
 
-_GLASS: Colour = (0.08, 0.1, 0.13)
-_TYRE: Colour = (0.06, 0.06, 0.065)
-_PAINTS: tuple[Colour, ...] = (
-    (0.92, 0.92, 0.92),
-    (0.75, 0.76, 0.78),
-    (0.45, 0.46, 0.48),
-    (0.1, 0.1, 0.11),
-    (0.08, 0.14, 0.35),
-    (0.65, 0.08, 0.07),
-    (0.2, 0.35, 0.6),
-    (0.55, 0.5, 0.42),
-    (0.1, 0.3, 0.18),
-    (0.85, 0.6, 0.1),
-    (0.4, 0.12, 0.1),
-    (0.35, 0.5, 0.5),
-)
 OWN_PAINT: Colour = (0.16, 0.24, 0.36)
 """The ego car's livery never changes: its own camera cannot see it, so nothing could tell another one."""
+_OWN_BACK_M = 0.56
+_GLASS: Colour = (0.07, 0.09, 0.12)
+_TYRE: Colour = (0.055, 0.055, 0.06)
+_DARK: Colour = (0.1, 0.1, 0.11)
+_RIM: Colour = (0.62, 0.63, 0.65)
+_HEADLIGHT: Colour = (0.93, 0.93, 0.88)
+_TAIL: Colour = (0.55, 0.03, 0.03)
+_PAINTS: tuple[tuple[Colour, float], ...] = (
+    ((0.93, 0.93, 0.92), 0.2), ((0.72, 0.73, 0.75), 0.16), ((0.42, 0.43, 0.45), 0.15), ((0.07, 0.07, 0.08), 0.16),
+    ((0.07, 0.13, 0.36), 0.08), ((0.62, 0.06, 0.06), 0.08), ((0.18, 0.34, 0.6), 0.05), ((0.52, 0.46, 0.38), 0.04),
+    ((0.08, 0.27, 0.17), 0.03), ((0.86, 0.6, 0.08), 0.02), ((0.38, 0.1, 0.09), 0.02), ((0.33, 0.5, 0.5), 0.01),
+)  # fmt: skip
+_LIVERIES: tuple[Colour, ...] = (
+    (0.75, 0.1, 0.08), (0.9, 0.75, 0.1), (0.1, 0.3, 0.6), (0.85, 0.86, 0.88), (0.1, 0.45, 0.3),
+)  # fmt: skip
+_SKIN: tuple[Colour, ...] = ((0.86, 0.68, 0.57), (0.72, 0.54, 0.44), (0.52, 0.36, 0.26), (0.34, 0.23, 0.17))
+_CLOTHES: tuple[Colour, ...] = (
+    (0.12, 0.14, 0.2), (0.2, 0.25, 0.4), (0.6, 0.1, 0.12), (0.75, 0.72, 0.66), (0.25, 0.3, 0.24), (0.85, 0.55, 0.12),
+    (0.1, 0.1, 0.1), (0.5, 0.5, 0.52), (0.3, 0.45, 0.6), (0.55, 0.4, 0.3), (0.7, 0.4, 0.5), (0.9, 0.88, 0.85),
+)  # fmt: skip
+_HAIR: tuple[Colour, ...] = ((0.1, 0.08, 0.07), (0.3, 0.2, 0.12), (0.55, 0.52, 0.5))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -37,37 +46,61 @@ class Assembly:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class _Body:
-    """Proportions of a car. Metres; cabin: (start, end) as shares of the length from the rear."""
+class Lamps:
+    """lit: headlights and tail lights shine. brakes: the tail lights shine brightly."""
+
+    lit: bool = False
+    brakes: bool = False
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Style:
+    """Proportions, metres. cabin: (rear end, front end) at the belt, shares of the length from the rear.
+
+    glass: the shape of the cabin. bed: the pick-up's open load begins at the rear and ends at the cabin.
+    wheel: radius. closed: share of the length, from the rear, that has no windows.
+    """
 
     length: float
     width: float
     height: float
     belt: float
     cabin: tuple[float, float]
+    glass: str = "taper"
+    wheel: float = 0.33
+    bed: bool = False
+    closed: float = 0.0
 
 
-_CARS = (
-    _Body(length=4.5, width=1.8, height=1.45, belt=0.88, cabin=(0.08, 0.72)),  # saloon
-    _Body(length=3.9, width=1.72, height=1.5, belt=0.92, cabin=(0.0, 0.7)),  # small car
-    _Body(length=4.7, width=1.9, height=1.72, belt=1.05, cabin=(0.0, 0.72)),  # off-road
-    _Body(length=4.6, width=1.82, height=1.48, belt=0.9, cabin=(0.0, 0.7)),  # estate
-    _Body(length=5.0, width=1.95, height=2.0, belt=1.1, cabin=(0.0, 0.85)),  # van
-    _Body(length=5.3, width=1.95, height=1.85, belt=1.05, cabin=(0.38, 0.72)),  # pick-up
-)
+_CARS: tuple[tuple[_Style, float], ...] = (
+    (_Style(length=4.6, width=1.82, height=1.45, belt=0.92, cabin=(0.12, 0.72), glass="cabin"), 0.24),  # saloon
+    (_Style(length=4.0, width=1.75, height=1.49, belt=0.93, cabin=(0.01, 0.73)), 0.2),  # hatchback
+    (_Style(length=3.55, width=1.66, height=1.53, belt=0.95, cabin=(0.0, 0.8)), 0.08),  # city car
+    (_Style(length=4.75, width=1.84, height=1.48, belt=0.93, cabin=(0.0, 0.7)), 0.11),  # estate
+    (_Style(length=4.7, width=1.92, height=1.74, belt=1.08, cabin=(0.0, 0.72), wheel=0.38), 0.17),  # off-road
+    (_Style(length=4.85, width=1.92, height=1.8, belt=1.05, cabin=(0.0, 0.84)), 0.07),  # people carrier
+    (_Style(length=5.4, width=2.0, height=2.3, belt=1.18, cabin=(0.0, 0.86), closed=0.62), 0.08),  # van
+    (_Style(length=5.35, width=1.95, height=1.82, belt=1.08, cabin=(0.36, 0.74), glass="cabin", wheel=0.39, bed=True),
+     0.05),  # pick-up
+)  # fmt: skip
 
 
-def random_car(random: np.random.Generator) -> Assembly:
-    """One of several body styles in one of many paints."""
-    body = _CARS[int(random.choice(len(_CARS), p=[0.3, 0.2, 0.18, 0.12, 0.12, 0.08]))]
-    paint = _PAINTS[int(random.integers(len(_PAINTS)))]
-    return _car(body, varied(paint, random), Label.CAR)
+def grown_car(random: np.random.Generator, lamps: Lamps, near: bool) -> Assembly:
+    """One of eight body styles in one of many paints."""
+    style = _CARS[int(random.choice(len(_CARS), p=[share for _, share in _CARS]))][0]
+    return _car(style, random_paint(random), lamps, near)
 
 
-def own_car() -> Assembly:
-    """The ego car; its nose ends just behind the forward camera, which therefore never sees it."""
-    car = _car(_CARS[1], OWN_PAINT, Label.OWN_CAR)
-    return Assembly(parts=tuple(p.placed(-0.45, 0.0, 0.0, 0.0) for p in car.parts), length=car.length, width=car.width)
+def grown_own_car() -> Assembly:
+    """The ego car, always the same; its nose ends just behind the forward camera, which therefore never sees it."""
+    car = _car(_CARS[1][0], OWN_PAINT, Lamps(), near=True)
+    parts = tuple(replace(part.placed(-_OWN_BACK_M, 0.0, 0.0, 0.0), label=Label.OWN_CAR) for part in car.parts)
+    return Assembly(parts=parts, length=car.length + 2 * _OWN_BACK_M, width=car.width)
+
+
+def random_paint(random: np.random.Generator) -> Colour:
+    """A vehicle's colour, as often as it is seen."""
+    return varied(_PAINTS[int(random.choice(len(_PAINTS), p=[share for _, share in _PAINTS]))][0], random)
 
 
 def varied(colour: Colour, random: np.random.Generator) -> Colour:
@@ -76,120 +109,201 @@ def varied(colour: Colour, random: np.random.Generator) -> Colour:
     return r, g, b
 
 
-def _car(body: _Body, paint: Colour, label: Label) -> Assembly:
-    length, width = body.length, body.width
-    start, end = (share * length - length / 2 for share in body.cabin)
-    cabin_x, cabin_m, cabin_z = (start + end) / 2, end - start, (body.belt + body.height) / 2
-    roof_m = cabin_m * 0.66
-
-    def part(shape: str, at: Point, size: Point, colour: Colour, gloss: float = 0.5) -> Part:
-        return Part(shape=shape, centre=at, size=size, colour=colour, gloss=gloss, label=label)
-
-    low = 0.28
+def _car(style: _Style, paint: Colour, lamps: Lamps, near: bool) -> Assembly:
+    length, width, label = style.length, style.width, Label.CAR
+    sill = 0.6 * style.belt
+    shoulder = (length * 0.985, width, style.belt - sill)
     parts = [
-        part("box", (0, 0, (low + body.belt) / 2), (length, width, body.belt - low), paint),
-        part("cabin", (cabin_x, 0, cabin_z), (cabin_m, width * 0.94, body.height - body.belt), _GLASS, 0.8),
-        part("box", (cabin_x - 0.04 * cabin_m, 0, body.height), (roof_m, width * 0.7, 0.06), paint),
-        part("box", (length / 2, 0, 0.45), (0.08, width * 0.9, 0.24), (0.12, 0.12, 0.13), 0.1),
-        part("box", (-length / 2, 0, 0.45), (0.08, width * 0.9, 0.24), (0.12, 0.12, 0.13), 0.1),
+        block((0, 0, (0.2 + sill) / 2), (length, width, sill - 0.2), paint, label, gloss=0.35),
+        block((0, 0, (sill + style.belt) / 2), shoulder, paint, label, gloss=0.35, shape="nose"),
+        *_cabin(style, paint),
+        *_lights(length, width, 0.68 * style.belt, lamps, label, near),
+        *_wheels((-0.3 * length, 0.31 * length), width, style.wheel, label, near),
+    ]  # fmt: skip
+    if near:
+        parts += _fittings(style, paint)
+    return Assembly(parts=tuple(parts), length=length + 0.1, width=width + 0.1)
+
+
+def _cabin(style: _Style, paint: Colour) -> list[Part]:
+    length, width = style.length, style.width
+    start, end = (share * length - length / 2 for share in style.cabin)
+    middle, long, high = (start + end) / 2, end - start, style.height - style.belt
+    z, label = (style.belt + style.height) / 2, Label.CAR
+    roof = (long * (0.72 if style.glass == "taper" else 0.62), width * 0.76, 0.05)
+    lean = -0.04 * long if style.glass == "cabin" else 0.0
+    parts = [
+        block((middle, 0, z), (long, width * 0.95, high), _GLASS, label, gloss=0.45, shape=style.glass),
+        block((middle + lean, 0, style.height), roof, paint, label, gloss=0.35),
     ]
-    for y in (-width * 0.36, width * 0.36):
-        parts.append(part("box", (length / 2, y, 0.7), (0.1, 0.34, 0.14), (0.9, 0.9, 0.82), 0.6))
-        parts.append(part("box", (-length / 2, y, 0.74), (0.1, 0.32, 0.15), (0.6, 0.03, 0.03), 0.6))
-    return Assembly(parts=(*parts, *_wheels(length * 0.31, width, 0.33, label)), length=length, width=width)
+    if style.closed:  # a van's load room has no windows
+        room = style.closed * length
+        size = (room, width * 0.97, high + 0.02)
+        parts.append(block((start + room / 2, 0, z), size, paint, label, gloss=0.4))
+    if style.bed:
+        load = start + length / 2 - 0.15
+        parts.append(block((start - load / 2, 0, style.belt - 0.02), (load, width * 0.82, 0.05), _DARK, label))
+    return parts
 
 
-def _wheels(axle: float, width: float, radius: float, label: Label) -> list[Part]:
-    size = (2 * radius, 0.24, 2 * radius)
+def _lights(length: float, width: float, z: float, lamps: Lamps, label: Label, near: bool) -> list[Part]:
+    """Two in front, two behind; far away only those that shine."""
+    if not (near or lamps.lit or lamps.brakes):
+        return []
+    tail: Colour = (0.95, 0.05, 0.04) if lamps.brakes else (0.5, 0.02, 0.02) if lamps.lit else _TAIL
+    red = lamps.lit or lamps.brakes
+    parts: list[Part] = []
+    for y in (-width * 0.37, width * 0.37):
+        parts.append(block((length / 2, y, z), (0.07, 0.34, 0.14), _HEADLIGHT, label, gloss=0.6, lit=lamps.lit))
+        parts.append(block((-length / 2, y, z + 0.06), (0.07, 0.3, 0.17), tail, label, gloss=0.6, lit=red))
+    return parts
+
+
+def _fittings(style: _Style, paint: Colour) -> list[Part]:
+    """Grille, bumpers, plates and mirrors."""
+    front, width, label = style.length / 2, style.width, Label.CAR
+    mirror = style.cabin[1] * style.length - front - 0.3
     return [
-        Part(shape="wheel", centre=(x, y, radius), size=size, colour=_TYRE, label=label)
-        for x in (-axle, axle)
-        for y in (-width / 2 + 0.1, width / 2 - 0.1)
+        block((front + 0.01, 0, 0.62 * style.belt), (0.05, width * 0.42, 0.16), _DARK, label),
+        block((front, 0, 0.3), (0.1, width * 0.96, 0.2), _DARK, label),
+        block((-front, 0, 0.3), (0.1, width * 0.96, 0.2), _DARK, label),
+        block((-front - 0.02, 0, 0.6 * style.belt), (0.05, 0.5, 0.11), (0.85, 0.85, 0.8), label),
+        block((mirror, 0, style.belt + 0.1), (0.12, width + 0.08, 0.12), paint, label, gloss=0.35),
     ]
 
 
-def random_truck(random: np.random.Generator) -> Assembly:
-    """A box truck, a lorry with trailer, or a bus."""
-    kind = random.choice(["box", "lorry", "bus"], p=[0.5, 0.2, 0.3])
-    paint = varied(_PAINTS[int(random.integers(len(_PAINTS)))], random)
-    if kind == "bus":
-        return _bus(paint, float(random.uniform(9, 12)))
-    length = float(random.uniform(6, 8.5) if kind == "box" else random.uniform(11, 13.5))
-    white = float(random.uniform(0.6, 0.95))
-    cargo = (white, white, white) if random.random() < 0.6 else varied(paint, random)
-    return _lorry(paint, cargo, length, float(random.uniform(2.7, 3.6)))
+def _wheels(axles: tuple[float, ...], width: float, radius: float, label: Label, near: bool) -> list[Part]:
+    """Round wheels with rims, or far away one dark block an axle."""
+    if not near:
+        return [block((x, 0, radius), (1.7 * radius, width + 0.02, 1.9 * radius), _TYRE, label) for x in axles]
+    parts: list[Part] = []
+    for x in axles:
+        for y in (-width / 2 + 0.1, width / 2 - 0.1):
+            parts.append(block((x, y, radius), (2 * radius, 0.23, 2 * radius), _TYRE, label, shape="wheel"))
+        parts.append(block((x, 0, radius), (radius, width + 0.06, radius), _RIM, label, gloss=0.35, shape="wheel"))
+    return parts
 
 
-def _lorry(paint: Colour, cargo: Colour, length: float, height: float) -> Assembly:
-    def part(shape: str, at: Point, size: Point, colour: Colour, gloss: float = 0.3) -> Part:
-        return Part(shape=shape, centre=at, size=size, colour=colour, gloss=gloss, label=Label.TRUCK)
-
-    front, box_m = length / 2, length - 2.3
+def grown_truck(random: np.random.Generator, lamps: Lamps, near: bool) -> Assembly:
+    """A box truck, a tipper or a lorry with a long trailer."""
+    kind = str(random.choice(["box", "tipper", "trailer"], p=[0.55, 0.2, 0.25]))
+    length = float(random.uniform(11, 13.5) if kind == "trailer" else random.uniform(6, 8.5))
+    height = 2.5 if kind == "tipper" else float(random.uniform(2.8, 3.6))
+    white = float(random.uniform(0.6, 0.92))
+    cargo: Colour = (white, white, white) if random.random() < 0.55 else random_paint(random)
+    front, load, label = length / 2, length - 2.35, Label.TRUCK
+    paint = random_paint(random)
     parts = [
-        part("box", (front - 0.95, 0, 1.35), (1.9, 2.3, 1.9), paint),
-        part("box", (front - 0.02, 0, 1.85), (0.1, 2.1, 0.75), _GLASS, 0.8),
-        part("box", (-front + box_m / 2, 0, (height + 0.9) / 2), (box_m, 2.45, height - 0.9), cargo),
-        part("box", (0, 0, 0.7), (length * 0.96, 1.0, 0.4), (0.1, 0.1, 0.1)),
-        part("box", (-front, 0, 0.75), (0.1, 2.2, 0.2), (0.5, 0.05, 0.05)),
+        block((front - 1.0, 0, 1.4), (2.0, 2.35, 2.0), paint, label, gloss=0.4, shape="nose"),
+        block((front - 0.09, 0, 1.85), (0.12, 2.05, 0.72), _GLASS, label, gloss=0.45),
+        block((-front + load / 2, 0, (height + 1.0) / 2), (load, 2.46, height - 1.0), cargo, label, gloss=0.2),
+        block((0, 0, 0.75), (length * 0.97, 1.1, 0.4), _DARK, label),
+        *_lights(length, 2.35, 0.78, lamps, label, near),
+        *_wheels((front - 1.2, -front + 1.3, -front + 2.5), 2.42, 0.5, label, near),
     ]
-    axles = (front - 1.2, -front + 1.4, -front + 2.6)
-    wheels = [
-        Part(shape="wheel", centre=(x, y, 0.5), size=(1.0, 0.4, 1.0), colour=_TYRE, label=Label.TRUCK)
-        for x in axles
-        for y in (-1.0, 1.0)
-    ]
-    return Assembly(parts=(*parts, *wheels), length=length, width=2.45)
+    if kind == "tipper":
+        heap: Colour = (0.45, 0.37, 0.28)
+        parts.append(block((-front + load / 2, 0, height + 0.1), (load * 0.85, 2.1, 0.5), heap, label, shape="taper"))
+    elif near:
+        parts.append(block((-front - 0.01, 0, (height + 1.0) / 2), (0.04, 0.05, height - 1.2), _DARK, label))
+        stripe = random_paint(random)
+        parts.append(block((-front + load / 2, 0, 1.35), (load * 0.9, 2.49, 0.35), stripe, label))
+    return Assembly(parts=tuple(parts), length=length + 0.1, width=2.52)
 
 
-def _bus(paint: Colour, length: float) -> Assembly:
-    def part(at: Point, size: Point, colour: Colour, gloss: float = 0.4) -> Part:
-        return Part(shape="box", centre=at, size=size, colour=colour, gloss=gloss, label=Label.TRUCK)
-
+def grown_bus(random: np.random.Generator, lamps: Lamps, near: bool) -> Assembly:
+    """A city bus or a coach."""
+    length, label = float(random.uniform(9.5, 12.2)), Label.BUS
+    paint = varied(picked(random, _LIVERIES), random)
+    band: Colour = (0.9, 0.9, 0.88)
     parts = [
-        part((0, 0, 0.95), (length, 2.5, 1.3), paint),
-        part((0, 0, 2.05), (length * 0.995, 2.46, 0.95), _GLASS, 0.8),
-        part((0, 0, 2.75), (length, 2.5, 0.5), paint),
+        block((0, 0, 0.95), (length, 2.5, 1.25), paint, label, gloss=0.4),
+        block((0, 0, 2.02), (length * 0.995, 2.46, 0.9), _GLASS, label, gloss=0.45),
+        block((0, 0, 2.72), (length, 2.5, 0.5), band if random.random() < 0.5 else paint, label, gloss=0.4),
+        block((-1.0, 0, 3.05), (length * 0.5, 1.6, 0.22), _DARK, label),
+        *_lights(length, 2.5, 0.75, lamps, label, near),
+        *_wheels((-0.28 * length, 0.31 * length), 2.46, 0.49, label, near),
     ]
-    return Assembly(parts=(*parts, *_wheels(length * 0.3, 2.5, 0.48, Label.TRUCK)), length=length, width=2.5)
+    if near:
+        posts = np.linspace(-0.46, 0.46, 7) * length
+        parts += [block((float(x), 0, 2.02), (0.1, 2.5, 0.9), paint, label) for x in posts]
+        parts.append(block((length / 2, 0, 2.7), (0.05, 1.5, 0.28), (0.95, 0.62, 0.1), label, lit=True))
+    return Assembly(parts=tuple(parts), length=length + 0.1, width=2.55)
 
 
-def random_person(random: np.random.Generator) -> Assembly:
-    """A standing or walking person."""
-    height = float(random.uniform(1.55, 1.9))
-    coat, legs = (varied(_PAINTS[int(random.integers(len(_PAINTS)))], random) for _ in range(2))
-    return Assembly(
-        parts=_figure(height, coat, legs, Label.PERSON, stride=float(random.uniform(0, 0.28))), length=0.5, width=0.5
-    )
+def _cloth(random: np.random.Generator) -> Colour:
+    return varied(picked(random, _CLOTHES), random)
 
 
-def _figure(
-    height: float, coat: Colour, legs: Colour, label: Label, *, stride: float, lift: float = 0.0
-) -> tuple[Part, ...]:
-    def part(shape: str, at: Point, size: Point, colour: Colour) -> Part:
-        return Part(shape=shape, centre=(at[0], at[1], at[2] + lift), size=size, colour=colour, label=label)
-
-    hip = height * 0.48
-    return (
-        part("box", (stride, 0.1, hip / 2), (0.17, 0.15, hip), legs),
-        part("box", (-stride, -0.1, hip / 2), (0.17, 0.15, hip), legs),
-        part("taper", (0, 0, hip + height * 0.18), (0.28, 0.46, height * 0.36), coat),
-        part("ball", (0, 0, height - 0.13), (0.23, 0.22, 0.27), (0.72, 0.54, 0.44)),
-    )
+def grown_person(random: np.random.Generator, walks: bool) -> Assembly:
+    """A grown-up or a child, walking or standing; some carry a bag."""
+    height = float(random.uniform(1.52, 1.92) if random.random() < 0.88 else random.uniform(1.0, 1.35))
+    stride = float(random.uniform(0.12, 0.24)) * height / 1.7 if walks else 0.0
+    parts = _figure(random, height, Label.PERSON, stride)
+    if random.random() < 0.3:
+        parts.append(block((0.0, 0.3 * height / 1.7, 0.42 * height), (0.32, 0.12, 0.3), _cloth(random), Label.PERSON))
+    return Assembly(parts=tuple(parts), length=0.6, width=0.62)
 
 
-def random_cyclist(random: np.random.Generator) -> Assembly:
+def _figure(random: np.random.Generator, height: float, label: Label, stride: float, lift: float = 0.0) -> list[Part]:
+    k = height / 1.7
+    hip, coat, legs = 0.48 * height, _cloth(random), _cloth(random)
+    skin, hair = picked(random, _SKIN), varied(picked(random, _HAIR), random)
+
+    def limb(at: Point, size: Point, colour: Colour, shape: str = "box") -> Part:
+        return block((at[0], at[1], at[2] + lift), size, colour, label, shape=shape)
+
+    return [
+        limb((stride, 0.09 * k, hip / 2), (0.16 * k, 0.14 * k, hip), legs),
+        limb((-stride, -0.09 * k, hip / 2), (0.16 * k, 0.14 * k, hip), legs),
+        limb((0, 0, hip + 0.17 * height), (0.26 * k, 0.42 * k, 0.36 * height), coat, "nose"),
+        limb((0.7 * stride, -0.25 * k, hip + 0.14 * height), (0.11 * k, 0.1 * k, 0.34 * height), coat),
+        limb((-0.7 * stride, 0.25 * k, hip + 0.14 * height), (0.11 * k, 0.1 * k, 0.34 * height), coat),
+        limb((0.01, 0, height - 0.13 * k), (0.2 * k, 0.18 * k, 0.25 * k), skin, "taper"),
+        limb((-0.02, 0, height - 0.03 * k), (0.2 * k, 0.2 * k, 0.1 * k), hair),
+    ]
+
+
+def grown_cyclist(random: np.random.Generator) -> Assembly:
     """A person on a bicycle."""
-    coat, legs = (varied(_PAINTS[int(random.integers(len(_PAINTS)))], random) for _ in range(2))
-    wheels = [
-        Part(shape="wheel", centre=(x, 0, 0.34), size=(0.68, 0.06, 0.68), colour=_TYRE, label=Label.CYCLIST)
-        for x in (-0.52, 0.52)
+    parts = (*_two_wheels(_cloth(random), 0.34, 0.05, Label.CYCLIST), *_figure(random, 1.25, Label.CYCLIST, 0.1, 0.45))
+    return Assembly(parts=parts, length=1.85, width=0.65)
+
+
+def grown_motorcyclist(random: np.random.Generator, lamps: Lamps) -> Assembly:
+    """A person on a motorcycle, with a helmet."""
+    label = Label.MOTORCYCLIST
+    helmet = block((0.02, 0, 1.62), (0.28, 0.26, 0.28), random_paint(random), label, gloss=0.6, shape="ball")
+    parts = (*_motorcycle(random_paint(random), lamps, label), *_figure(random, 1.25, label, 0.1, 0.45), helmet)
+    return Assembly(parts=parts, length=2.15, width=0.8)
+
+
+def _two_wheels(paint: Colour, radius: float, wide: float, label: Label) -> list[Part]:
+    reach = 0.53 if wide < 0.1 else 0.7
+    return [
+        *(block((x, 0, radius), (2 * radius, wide, 2 * radius), _TYRE, label, shape="wheel") for x in (-reach, reach)),
+        block((0, 0, 0.6), (0.95, 0.06, 0.1), paint, label),
+        block((reach - 0.1, 0, 0.95), (0.05, 0.5, 0.05), _DARK, label),
     ]
-    frame = Part(shape="box", centre=(0, 0, 0.62), size=(0.95, 0.06, 0.12), colour=coat, label=Label.CYCLIST)
-    rider = _figure(1.25, coat, legs, Label.CYCLIST, stride=0.1, lift=0.5)
-    return Assembly(parts=(*wheels, frame, *rider), length=1.8, width=0.6)
 
 
-def sky_dome() -> Part:
-    """A dome far away; the shader paints it. Its inside must face the camera, hence the negative size."""
-    size = (-1600.0, 1600.0, 1600.0)
-    return Part(shape="ball", centre=(0, 0, 0), size=size, colour=(0.5, 0.6, 0.8), label=Label.SKY, pattern=Pattern.SKY)
+def left_bicycle(random: np.random.Generator) -> Assembly:
+    """A bicycle nobody sits on."""
+    saddle = block((-0.25, 0, 0.88), (0.25, 0.14, 0.07), _DARK, Label.BICYCLE)
+    parts = (*_two_wheels(_cloth(random), 0.34, 0.05, Label.BICYCLE), saddle)
+    return Assembly(parts=parts, length=1.8, width=0.55)
+
+
+def left_motorcycle(random: np.random.Generator) -> Assembly:
+    """A motorcycle nobody sits on."""
+    return Assembly(parts=_motorcycle(random_paint(random), Lamps(), Label.MOTORCYCLE), length=2.1, width=0.6)
+
+
+def _motorcycle(paint: Colour, lamps: Lamps, label: Label) -> tuple[Part, ...]:
+    return (
+        *_two_wheels(paint, 0.31, 0.16, label),
+        block((0.1, 0, 0.68), (0.75, 0.3, 0.34), paint, label, gloss=0.35, shape="taper"),
+        block((-0.45, 0, 0.8), (0.7, 0.28, 0.12), _DARK, label),
+        block((0.74, 0, 0.86), (0.08, 0.2, 0.18), _HEADLIGHT, label, gloss=0.6, lit=lamps.lit),
+        block((-0.86, 0, 0.78), (0.06, 0.16, 0.08), _TAIL, label, lit=lamps.lit or lamps.brakes),
+    )

@@ -1,0 +1,123 @@
+"""The driving world's classes: our ids, what the packaged model's class head calls them, and ParallelDomain-4D's."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Label(IntEnum):
+    """What a pixel shows.
+
+    The first thirteen are the ontology of the class head (`gcd_model.DRIVING_CLASSES`), in its order; the others tell
+    apart what that one calls alike.
+    """
+
+    SKY = 0
+    ROAD = 1
+    LANE_MARKING = 2
+    PAVEMENT = 3
+    TERRAIN = 4
+    BUILDING = 5
+    VEGETATION = 6
+    POLE = 7
+    CAR = 8
+    TRUCK = 9
+    CYCLIST = 10
+    PERSON = 11
+    OWN_CAR = 12
+    BUS = 13
+    MOTORCYCLIST = 14
+    BICYCLE = 15
+    MOTORCYCLE = 16
+    TRAFFIC_LIGHT = 17
+    TRAFFIC_SIGN = 18
+    CROSSWALK = 19
+    STOP_LINE = 20
+    KERB = 21
+    FENCE = 22
+    STREET_FURNITURE = 23
+
+
+_COARSE: dict[int, Label] = {
+    Label.BUS: Label.TRUCK,
+    Label.MOTORCYCLIST: Label.CYCLIST,
+    Label.BICYCLE: Label.CYCLIST,
+    Label.MOTORCYCLE: Label.CYCLIST,
+    Label.TRAFFIC_LIGHT: Label.POLE,
+    Label.TRAFFIC_SIGN: Label.POLE,
+    Label.CROSSWALK: Label.LANE_MARKING,
+    Label.STOP_LINE: Label.LANE_MARKING,
+    Label.KERB: Label.PAVEMENT,
+    Label.FENCE: Label.BUILDING,
+    Label.STREET_FURNITURE: Label.POLE,
+}
+
+
+def coarse(label: int) -> int:
+    """What the packaged model's class head calls a label; the thirteen that it knows stay."""
+    return _COARSE.get(label, label)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class OntologyItem:
+    """A class of ParallelDomain-4D. id: 0..254. name: as the data set spells it. colour: 8-bit RGB. label: our id."""
+
+    id: int
+    name: str
+    colour: tuple[int, int, int]
+    label: Label
+
+    @property
+    def is_thing(self) -> bool:
+        """Whether its instances are counted: road users are."""
+        return self.label in _ROAD_USERS
+
+
+_ROAD_USERS = {
+    *(Label.BICYCLE, Label.BUS, Label.CAR, Label.CYCLIST, Label.MOTORCYCLE, Label.MOTORCYCLIST, Label.OWN_CAR),
+    *(Label.PERSON, Label.TRUCK),
+}
+
+
+_ITEMS: tuple[tuple[int, str, tuple[int, int, int], Label], ...] = (
+    (1, "Bicycle", (119, 11, 32), Label.BICYCLE),
+    (2, "Bicyclist", (64, 64, 64), Label.CYCLIST),
+    (3, "Building", (156, 110, 84), Label.BUILDING),
+    (4, "Bus", (0, 60, 100), Label.BUS),
+    (5, "Car", (0, 0, 142), Label.CAR),
+    (8, "CrossWalk", (255, 216, 128), Label.CROSSWALK),
+    (9, "Fence", (196, 92, 44), Label.FENCE),
+    (11, "LaneMarking", (246, 240, 196), Label.LANE_MARKING),
+    (12, "LimitLine", (204, 255, 255), Label.STOP_LINE),
+    (13, "Motorcycle", (0, 0, 230), Label.MOTORCYCLE),
+    (14, "Motorcyclist", (128, 128, 128), Label.MOTORCYCLIST),
+    (16, "OtherFixedStructure", (92, 20, 140), Label.STREET_FURNITURE),
+    (20, "OwnCar(EgoCar)", (128, 230, 128), Label.OWN_CAR),
+    (22, "Pedestrian", (220, 20, 60), Label.PERSON),
+    (24, "Road", (92, 88, 104), Label.ROAD),
+    (26, "RoadBoundary(Curb)", (170, 84, 170), Label.KERB),
+    (28, "SideWalk", (214, 140, 190), Label.PAVEMENT),
+    (29, "Sky", (122, 176, 230), Label.SKY),
+    (31, "Terrain", (150, 196, 104), Label.TERRAIN),
+    (33, "TrafficLight", (255, 112, 0), Label.TRAFFIC_LIGHT),
+    (34, "TrafficSign", (255, 255, 0), Label.TRAFFIC_SIGN),
+    (36, "Truck", (0, 0, 70), Label.TRUCK),
+    (37, "Vegetation", (36, 112, 62), Label.VEGETATION),
+    (38, "VerticalPole", (170, 170, 20), Label.POLE),
+)
+ONTOLOGY = tuple(OntologyItem(id=id_, name=name, colour=colour, label=label) for id_, name, colour, label in _ITEMS)
+"""In the order of their ids; each label has exactly one.
+
+Ids and names are those of the public ParallelDomain SDK. The colours of people and vehicles are the ones by which the
+paper's training finds these classes; all others are ours.
+"""
+
+
+def class_ids(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The data set's class ids of a map of our labels, [...] to [...]."""
+    table = np.zeros(256, np.uint8)
+    for item in ONTOLOGY:
+        table[item.label] = item.id
+    return table[labels]

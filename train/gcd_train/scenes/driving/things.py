@@ -1,0 +1,257 @@
+"""What stands beside roads: houses, trees, lamps, signals, shelters, hedges; x along the road, y to its left, z up."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gcd_train.scenes.description import Colour, Part, Pattern, Point
+from gcd_train.scenes.driving.classes import Label
+from gcd_train.scenes.driving.roads import Road
+
+Pair = tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class District:
+    """The character of a neighbourhood: buildings' floors, width and distance, gaps, share of trees."""
+
+    floors: tuple[int, int]
+    width_m: Pair
+    setback_m: Pair
+    gap_m: Pair
+    built: float
+    trees_every_m: float
+    gabled: float
+
+
+DISTRICTS = {
+    "city": District(
+        floors=(3, 12), width_m=(10, 28), setback_m=(0, 2), gap_m=(0, 2), built=0.95, trees_every_m=22, gabled=0.1
+    ),
+    "suburb": District(
+        floors=(1, 3), width_m=(7, 13), setback_m=(3, 9), gap_m=(3, 12), built=0.85, trees_every_m=11, gabled=0.8
+    ),
+    "business": District(
+        floors=(1, 5), width_m=(18, 45), setback_m=(4, 16), gap_m=(4, 20), built=0.8, trees_every_m=18, gabled=0.05
+    ),
+    "green": District(
+        floors=(1, 3), width_m=(8, 16), setback_m=(6, 20), gap_m=(10, 50), built=0.35, trees_every_m=7, gabled=0.6
+    ),
+}
+_WALLS: tuple[Colour, ...] = (
+    (0.72, 0.68, 0.6), (0.6, 0.36, 0.28), (0.78, 0.76, 0.72), (0.5, 0.5, 0.53), (0.66, 0.55, 0.42), (0.42, 0.28, 0.24),
+    (0.82, 0.78, 0.62), (0.48, 0.56, 0.62), (0.36, 0.38, 0.42), (0.7, 0.6, 0.62), (0.58, 0.62, 0.5), (0.86, 0.85, 0.82),
+)  # fmt: skip
+_BOARDS: tuple[Colour, ...] = (
+    (0.6, 0.1, 0.1), (0.1, 0.25, 0.5), (0.15, 0.4, 0.2), (0.2, 0.2, 0.2), (0.8, 0.6, 0.15),
+)  # fmt: skip
+
+
+def random_district(random: np.random.Generator) -> str:
+    """One of `DISTRICTS`."""
+    return str(random.choice(list(DISTRICTS), p=[0.4, 0.3, 0.18, 0.12]))
+
+
+def block(
+    at: Point,
+    size: Point,
+    colour: Colour,
+    label: Label,
+    *,
+    shape: str = "box",
+    gloss: float = 0.0,
+    pattern: Pattern = Pattern.PLAIN,
+    lit: bool = False,
+    yaw: float = 0.0,
+) -> Part:
+    """One piece of a thing, a vehicle or a person. lit: it shines."""
+    painted = Pattern.LIT if lit else pattern
+    return Part(shape=shape, centre=at, size=size, colour=colour, label=label, gloss=gloss, pattern=painted, yaw=yaw)
+
+
+def picked(random: np.random.Generator, colours: tuple[Colour, ...]) -> Colour:
+    """Any of them, equally often."""
+    return colours[int(random.integers(len(colours)))]
+
+
+def tone(random: np.random.Generator, colour: Colour, spread: float = 0.15) -> Colour:
+    """A colour a little lighter or darker, and a little off."""
+    shade = random.uniform(1 - spread, 1 + spread)
+    r, g, b = (float(np.clip(c * shade * random.uniform(0.95, 1.05), 0.02, 0.97)) for c in colour)
+    return r, g, b
+
+
+def sky_dome() -> Part:
+    """A dome far away; the shader paints it. Its inside must face the camera, hence the negative size."""
+    size = (-1600.0, 1600.0, 1600.0)
+    return block((0, 0, 0), size, (0.5, 0.6, 0.8), Label.SKY, shape="ball", pattern=Pattern.SKY)
+
+
+def sagitta(road: Road, s: float, width: float) -> float:
+    """How far a straight front must stand back from a curved road."""
+    turn = abs(road.at(s + width / 2)[2] - road.at(s - width / 2)[2])
+    return width * turn / 4 + 0.3
+
+
+def building(width: float, depth: float, district: District, random: np.random.Generator) -> list[Part]:
+    """One house: its body with windows, then its roof; along x by its width."""
+    wall, label = tone(random, picked(random, _WALLS)), Label.BUILDING
+    height = float(random.integers(district.floors[0], district.floors[1] + 1)) * 3.1 + 0.8
+    body = block((0, 0, height / 2), (width, depth, height), wall, label, pattern=Pattern.WINDOWS)
+    dark = tone(random, (0.36, 0.25, 0.22) if random.random() < 0.5 else (0.3, 0.31, 0.33))
+    if random.random() < district.gabled:
+        size = (width * 1.06, depth * 1.08, depth * float(random.uniform(0.3, 0.5)))
+        roof = block((0, 0, height + size[2] / 2), size, dark, label, shape="gable", pattern=Pattern.BRICK)
+        return [body, roof]
+    along = float(random.uniform(-0.2, 0.2)) * width
+    return [
+        body,
+        block((0, 0, height + 0.2), (width * 1.02, depth * 1.02, 0.4), dark, label),
+        block((along, 0, height + 1.2), (3.5, 3.0, 2.0), tone(random, (0.55, 0.55, 0.56)), label),
+    ]
+
+
+def shop(width: float, front: float, lit: bool, random: np.random.Generator) -> list[Part]:
+    """A shop window and its sign along the ground floor, or none; front: the house's, across the road."""
+    if random.random() < 0.35:
+        return []
+    wide, label = width * float(random.uniform(0.5, 0.92)), Label.BUILDING
+    board = tone(random, picked(random, _BOARDS), 0.2)
+    shines = lit and random.random() < 0.6
+    glass: Colour = (0.95, 0.8, 0.55) if shines else (0.1, 0.12, 0.14)
+    return [
+        block((0, front, 1.45), (wide, 0.16, 2.1), glass, label, gloss=0.7, lit=shines),
+        block((0, front, 2.85), (wide + 0.3, 0.4, 0.5), board, label),
+    ]
+
+
+def leaf_colour(random: np.random.Generator) -> Colour:
+    """Mostly green."""
+    return tone(random, (0.26, 0.4, 0.16) if random.random() < 0.85 else (0.5, 0.42, 0.15), 0.25)
+
+
+def foliage(at: Point, size: Point, colour: Colour, shape: str = "ball", yaw: float = 0.0) -> Part:
+    """One body of leaves."""
+    return block(at, size, colour, Label.VEGETATION, shape=shape, pattern=Pattern.LEAVES, yaw=yaw)
+
+
+def tree(random: np.random.Generator) -> list[Part]:
+    """A stem with two or three crowns."""
+    height, spread = float(random.uniform(4.5, 10)), float(random.uniform(2.4, 5.0))
+    leaf, stem = leaf_colour(random), height * float(random.uniform(0.3, 0.42))
+    size = (0.3, 0.3, stem + 0.6)
+    parts = [block((0, 0, stem / 2 + 0.3), size, (0.3, 0.22, 0.16), Label.VEGETATION, shape="post")]
+    for _ in range(int(random.integers(2, 4))):
+        x, y = (float(random.uniform(-0.22, 0.22)) * spread for _ in range(2))
+        crown = (height - stem) * float(random.uniform(0.75, 1.0))
+        size = (spread * float(random.uniform(0.7, 1)), spread * float(random.uniform(0.7, 1)), crown)
+        z = stem + crown / 2 + float(random.uniform(-0.2, 0.6))
+        parts.append(foliage((x, y, z), size, tone(random, leaf, 0.1)))
+    return parts
+
+
+def bush(random: np.random.Generator) -> list[Part]:
+    """One low crown."""
+    size = (float(random.uniform(1.2, 3.5)), float(random.uniform(0.9, 1.5)), float(random.uniform(0.8, 1.7)))
+    return [foliage((0, 0, size[2] * 0.35), size, leaf_colour(random))]
+
+
+def conifer(random: np.random.Generator) -> list[Part]:
+    """A fir."""
+    high, wide = float(random.uniform(6, 12)), float(random.uniform(2.4, 3.6))
+    green = tone(random, (0.14, 0.28, 0.16), 0.2)
+    parts = [block((0, 0, 0.7), (0.3, 0.3, 1.4), (0.28, 0.2, 0.14), Label.VEGETATION)]
+    for tier, (low, share, tall) in enumerate(((0.1, 1.0, 0.55), (0.32, 0.78, 0.45), (0.55, 0.5, 0.45))):
+        size = (wide * share, wide * share, high * tall)
+        parts.append(foliage((0, 0, high * (low + tall / 2)), size, green, "cone", 0.5 * tier))
+    return parts
+
+
+def hedge(random: np.random.Generator, length: float) -> list[Part]:
+    """A clipped hedge along the road."""
+    high = float(random.uniform(0.9, 1.9))
+    size = (length, 0.8, high)
+    return [foliage((0, 0, high / 2 - 0.05), size, leaf_colour(random), "taper" if high < 1.2 else "box")]
+
+
+def fence(random: np.random.Generator, length: float) -> list[Part]:
+    """Boards between posts, or a wall."""
+    colour = tone(random, picked(random, ((0.5, 0.36, 0.24), (0.75, 0.75, 0.72), (0.35, 0.37, 0.38))), 0.2)
+    high = float(random.uniform(0.9, 1.8))
+    ends = np.arange(-length / 2, length / 2 + 0.01, length / 3)
+    return [
+        block((0, 0, high / 2 + 0.06), (length, 0.07, high - 0.12), colour, Label.FENCE),
+        *(block((float(x), 0, high / 2), (0.1, 0.1, high), colour, Label.FENCE) for x in ends),
+    ]
+
+
+def street_lamp(height: float, side: float, grey: Colour, lit: bool) -> list[Part]:
+    """A post on one side of the road (-1: right), its arm over the road."""
+    reach, glass = 1.8, (1.0, 0.86, 0.62) if lit else (0.72, 0.72, 0.68)
+    return [
+        block((0, 0, height / 2), (0.16, 0.16, height), grey, Label.POLE, shape="post"),
+        block((0, -side * reach / 2, height), (0.1, reach, 0.1), grey, Label.POLE),
+        block((0, -side * reach, height - 0.07), (0.3, 0.7, 0.14), glass, Label.POLE, lit=lit),
+    ]
+
+
+def signal(green: bool, grey: Colour) -> list[Part]:
+    """A traffic light that shows its face against x."""
+    lamps: tuple[tuple[float, Colour, bool], ...] = (
+        (3.55, (0.9, 0.06, 0.04), not green),
+        (3.3, (0.9, 0.6, 0.05), False),
+        (3.05, (0.06, 0.85, 0.35), green),
+    )
+    parts = [
+        block((0, 0, 1.7), (0.13, 0.13, 3.4), grey, Label.POLE, shape="post"),
+        block((0, 0, 3.3), (0.3, 0.34, 0.9), (0.06, 0.06, 0.06), Label.TRAFFIC_LIGHT),
+    ]
+    for z, (r, g, b), on in lamps:
+        shown = (r, g, b) if on else (r * 0.2, g * 0.2, b * 0.2)
+        parts.append(block((-0.16, 0, z), (0.05, 0.2, 0.2), shown, Label.TRAFFIC_LIGHT, lit=on))
+    return parts
+
+
+def sign(random: np.random.Generator, grey: Colour) -> list[Part]:
+    """A traffic sign that shows its face against x."""
+    face = picked(random, ((0.8, 0.05, 0.06), (0.05, 0.2, 0.65), (0.92, 0.78, 0.08)))
+    size, high = float(random.uniform(0.5, 0.75)), float(random.uniform(2.1, 2.6))
+    return [
+        block((0, 0, high / 2), (0.08, 0.08, high), grey, Label.POLE, shape="post"),
+        block((-0.05, 0, high), (0.03, size, size), face, Label.TRAFFIC_SIGN),
+        block((-0.07, 0, high), (0.02, size * 0.62, size * 0.62), (0.92, 0.92, 0.9), Label.TRAFFIC_SIGN),
+    ]
+
+
+def shelter(random: np.random.Generator, lit: bool) -> list[Part]:
+    """A bus stop's shelter with a poster; it hides who waits behind it."""
+    poster, label = tone(random, (0.75, 0.45, 0.3), 0.3), Label.STREET_FURNITURE
+    return [
+        block((0, 0.0, 2.35), (4.0, 1.5, 0.1), (0.25, 0.27, 0.28), label),
+        block((0, 0.7, 1.25), (3.9, 0.06, 1.9), (0.35, 0.42, 0.45), label),
+        block((-1.9, 0.0, 1.25), (0.12, 1.3, 2.0), poster, label, lit=lit),
+        block((1.9, 0.65, 1.2), (0.08, 0.08, 2.3), (0.2, 0.2, 0.2), label),
+        block((0.2, 0.4, 0.5), (2.2, 0.35, 0.08), (0.5, 0.36, 0.22), label),
+    ]
+
+
+def kiosk(random: np.random.Generator, lit: bool) -> list[Part]:
+    """A round advertising column or a small stall."""
+    label = Label.STREET_FURNITURE
+    colour = tone(random, picked(random, ((0.6, 0.55, 0.45), (0.3, 0.45, 0.5), (0.7, 0.3, 0.25))), 0.2)
+    if random.random() < 0.5:
+        return [
+            block((0, 0, 1.4), (1.2, 1.2, 2.8), colour, label, shape="post", lit=lit),
+            block((0, 0, 2.95), (1.4, 1.4, 0.3), (0.2, 0.25, 0.22), label, shape="post"),
+        ]
+    return [
+        block((0, 0, 1.2), (2.6, 1.6, 2.4), colour, label),
+        block((0, 0, 2.5), (3.2, 2.1, 0.14), tone(random, (0.8, 0.8, 0.78)), label),
+    ]
+
+
+def planter(random: np.random.Generator) -> list[Part]:
+    """A tub with a small bush."""
+    grey = tone(random, (0.55, 0.53, 0.5))
+    tub = block((0, 0, 0.35), (1.3, 1.0, 0.7), grey, Label.STREET_FURNITURE, shape="taper")
+    return [tub, foliage((0, 0, 0.95), (1.1, 0.9, 0.9), leaf_colour(random))]

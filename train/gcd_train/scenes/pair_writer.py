@@ -1,0 +1,249 @@
+"""Pairs of clips: drawn, and stored in shards that appear whole, written by several processes, resumable.
+
+The source camera stands or drives as the world has it, the target goes its path. A data folder holds `world.json` (what
+it is) and `shard-<first seed>-<clips>.zip` files. In a shard every clip has `<seed>/scene.json` and one PNG per camera
+and kind, all frames one below the other: colour as RGB, depth as 16 bit in 1/256 metre (0: sky), instances and, where
+the world has an ontology, classes as 8 bit.
+"""
+
+import json
+import os
+import re
+import time
+import zipfile
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from gcd_model.geometry import CameraMount
+from gcd_train.data.pairs import PairedClips
+from gcd_train.data.paths import Draw, FrameSampling, OrbitSampling
+from gcd_train.errors import DataError, RenderError
+from gcd_train.files import write_whole
+from gcd_train.look.clip import instance_colour
+from gcd_train.map_items import map_items, one_thread_each
+from gcd_train.scenes.description import Scene, rotations
+from gcd_train.scenes.driving import driving_scene
+from gcd_train.scenes.frozen import freeze
+from gcd_train.scenes.pair_world import DEPTH_UNIT_M, Orbit, World, agree
+from gcd_train.scenes.renderer import Renderer, Rendering
+from gcd_train.scenes.worlds import scene_world
+
+_ABANDONED_S = 3600.0  # no shard takes so long
+_ATTEMPTS = 100
+_CLEAR_M = 1.0
+"""A camera stays this far from the sphere about any thing; nearer, one thing would fill the picture."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DrawnClip:
+    """facts: of the scene. cameras: "source" and "target", world_from_camera [T, 4, 4]. orbit: None in driving."""
+
+    seed: int
+    facts: dict[str, float | str]
+    hfov_deg: float
+    cameras: dict[str, NDArray[np.float64]]
+    views: dict[str, list[Rendering]]
+    orbit: Orbit | None = None
+
+
+def generate(out: Path, world: World, seeds: range, workers: int, ray_address: str | None = None) -> Iterator[int]:
+    """Make the clips of `seeds`: yields how many there are by now. Finished shards of an earlier run are kept.
+
+    workers, ray_address: see `map_items`.
+    Raises:
+        DataError: the folder holds another kind of data.
+        RenderError: nothing can be drawn on this machine. RunError: anything else that ends a shard.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    agree(out, world)
+    missing = _missing_shards(out, seeds, world.clips_per_shard)
+    done = len(seeds) - sum(map(len, missing))
+    yield done
+    one_thread_each()
+    write = partial(write_shard, out.resolve(), world)
+    for outcome in map_items(write, missing, workers=workers, ray_address=ray_address):
+        outcome.unwrap()  # the first that fails ends the run
+        done += len(outcome.item)
+        yield done
+
+
+def _missing_shards(out: Path, seeds: range, size: int) -> list[range]:
+    """Runs of at most `size` seeds of which no finished shard has any; what killed workers left is removed."""
+    there: set[int] = set()
+    for path in out.glob("shard-*.zip"):
+        named = re.fullmatch(r"shard-(\d+)-(\d+)", path.stem)
+        if named is None:
+            raise DataError(f"{path} is no shard of this program; take it out of the folder")
+        first, count = (int(number) for number in named.groups())
+        there.update(range(first, first + count))
+    for leftover in out.glob("shard-*.partial"):
+        if time.time() - leftover.stat().st_mtime > _ABANDONED_S:
+            leftover.unlink()
+    shards: list[range] = []
+    for seed in seeds:
+        if seed in there:
+            continue
+        if shards and shards[-1].stop == seed and len(shards[-1]) < size:
+            shards[-1] = range(shards[-1].start, seed + 1)
+        else:
+            shards.append(range(seed, seed + 1))
+    return shards
+
+
+def shard_path(out: Path, seeds: range) -> Path:
+    """Where the clips of these seeds lie: the name tells the first and how many."""
+    return out / f"shard-{seeds[0]:08d}-{len(seeds)}.zip"
+
+
+def write_shard(out: Path, world: World, seeds: range) -> None:
+    """Render and store a run of clips; the file appears under its name once it is complete."""
+    path = shard_path(out, seeds)
+    unfinished = path.with_suffix(f".{os.getpid()}.partial")
+    try:
+        with (
+            Renderer(world.width, world.height, oversample=world.oversample) as renderer,
+            zipfile.ZipFile(unfinished, "w", zipfile.ZIP_STORED) as archive,
+        ):
+            for clip in drawn_clips(renderer, world, seeds):
+                _store(archive, clip)
+        unfinished.replace(path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def _store(archive: zipfile.ZipFile, clip: DrawnClip) -> None:
+    name = f"{clip.seed:08d}"
+    poses = {camera: np.round(poses, 6).tolist() for camera, poses in clip.cameras.items()}
+    scene: dict[str, Any] = {"facts": {**clip.facts, "hfov_deg": clip.hfov_deg}, "world_from_camera": poses}
+    if clip.orbit is not None:
+        scene["orbit"] = msgspec.to_builtins(clip.orbit)
+    archive.writestr(f"{name}/scene.json", json.dumps(scene))
+    for camera, frames in clip.views.items():
+        depth = np.concatenate([frame.depth for frame in frames])
+        strips: dict[str, NDArray[Any]] = {
+            "rgb": np.concatenate([frame.rgb for frame in frames])[..., ::-1],
+            "depth": np.rint(depth / DEPTH_UNIT_M).clip(0, 65535).astype(np.uint16),
+            "instances": np.concatenate([frame.instances for frame in frames]),
+        }
+        if clip.orbit is None:
+            strips["classes"] = np.concatenate([frame.classes for frame in frames])
+        for kind, strip in strips.items():
+            _, data = cv2.imencode(".png", strip, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+            archive.writestr(f"{name}/{camera}.{kind}.png", data.tobytes())
+
+
+def drawn_clips(renderer: Renderer, world: World, seeds: Sequence[int]) -> Iterator[DrawnClip]:
+    """Clips by number, each scene simulated once for those of its clips that follow each other.
+
+    Raises:
+        RenderError: a scene cannot be simulated or drawn, or leaves no room for a camera.
+    """
+    for scene_seed, group in groupby(seeds, key=world.scene_of):
+        if world.camera == "fixed":
+            yield from (_fixed(renderer, world, seed) for seed in group)
+        else:
+            yield from _orbits(renderer, world, scene_seed, list(group))
+
+
+def _fixed(renderer: Renderer, world: World, seed: int) -> DrawnClip:
+    mount = CameraMount(height_m=world.options.height_m, tilt_deg=world.options.tilt_deg)
+    scene = driving_scene(seed, frames=world.frames, mount=mount, edition=world.edition, move_time=world.move_time)
+    return DrawnClip(
+        seed=seed, facts=scene.facts, hfov_deg=scene.hfov_deg, cameras=scene.cameras, views=renderer.render(scene)
+    )
+
+
+def _orbits(renderer: Renderer, world: World, scene_seed: int, seeds: list[int]) -> Iterator[DrawnClip]:
+    """All clips of a scene in one pass: their time steps follow each other, so it is sent to the renderer once."""
+    published = scene_world(world.name)
+    scene = published.make(scene_seed, published.frames)
+    draws = [orbit_draw(scene, world, seed) for seed in seeds]
+    numbers = np.concatenate([draw.frame_numbers for draw in draws])
+    cameras = {
+        "source": np.concatenate([np.tile(draw.world_from_source, (world.frames, 1, 1)) for draw in draws]),
+        "target": np.concatenate([draw.world_from_target for draw in draws]),
+    }
+    cut = replace(freeze(scene), poses=scene.poses[numbers], focus=scene.focus[numbers], hfov_deg=world.hfov_deg)
+    views: dict[str, list[Rendering]] = {name: [] for name in cameras}
+    for step, name, view in renderer.views(cut, cameras):
+        views[name].append(view)
+        clip, frame = divmod(step, world.frames)
+        if name == "target" and frame == world.frames - 1:
+            steps = slice(clip * world.frames, (clip + 1) * world.frames)
+            yield DrawnClip(
+                seed=seeds[clip],
+                facts=scene.facts,
+                hfov_deg=world.hfov_deg,
+                cameras={name: poses[steps] for name, poses in cameras.items()},
+                views=views,
+                orbit=_orbit(draws[clip]),
+            )
+            views = {name: [] for name in cameras}
+
+
+def orbit_draw(scene: Scene, world: World, seed: int) -> Draw:
+    """Time steps and camera path of a clip: the first one drawn that leaves the cameras clear of all things.
+
+    Raises: RenderError if things are in the way wherever the cameras stand.
+    """
+    sampling = OrbitSampling(frames=FrameSampling(clip=world.frames, strides=(world.stride,)))
+    scene_seed, clip = divmod(seed, world.clips_per_scene)
+    salt = zlib.crc32(world.name.encode())  # else all worlds would be seen along the same paths
+    for attempt in range(_ATTEMPTS):
+        random = np.random.default_rng([scene_seed, clip, attempt, salt])
+        draw = sampling.draw(random, scene.frames, world.fps * world.stride)
+        if _clear(scene, draw):
+            return draw
+    raise RenderError(f"{world.name} scene {scene_seed}: no path leaves the cameras clear of all things; skip it")
+
+
+def _clear(scene: Scene, draw: Draw) -> bool:
+    steps = list(draw.frame_numbers)
+    eyes = np.stack([np.tile(draw.world_from_source[:3, 3], (len(steps), 1)), draw.world_from_target[:, :3, 3]])
+    for thing in scene.objects:
+        middle = thing.positions[steps] + rotations(thing.quaternions[steps]) @ np.array(thing.middle)
+        reach = np.linalg.norm(thing.size) / 2 + _CLEAR_M
+        if bool((np.linalg.norm(eyes - middle, axis=-1) < reach).any()):
+            return False
+    return True
+
+
+def _orbit(draw: Draw) -> Orbit:
+    assert draw.start is not None
+    assert draw.deltas is not None
+    azimuth_deg, elevation_deg, radius_m = draw.deltas[-1].tolist()
+    return Orbit(
+        start=(draw.start.azimuth_deg, draw.start.elevation_deg, draw.start.radius_m),
+        change=(azimuth_deg, elevation_deg, radius_m),
+        frame_numbers=draw.frame_numbers,
+    )
+
+
+def write_contact_sheet(folder: Path, out: Path, clips: int = 8) -> None:
+    """Source, target on its way and at its end, depth and classes of the first clips, one row a clip, as PNG.
+
+    Instances stand for the classes where the world has none.
+    """
+    data = PairedClips.open(folder, limit=clips)
+    colours = [kind.colour for kind in data.classes] or [instance_colour(number) for number in range(256)]
+    rows: list[NDArray[np.uint8]] = []
+    for clip in (data[number] for number in range(len(data))):
+        last = len(clip.target) - 1
+        far = clip.target_depth[last]
+        near = np.where(far > 0, 1 / np.maximum(far, 4.0), 0.0)
+        depth = np.repeat((near * 4 * 255).astype(np.uint8)[..., None], 3, -1)
+        labels = (clip.target_classes if data.classes else clip.target_instances)[last]
+        views = [clip.source[0], clip.source[last], *(clip.target[min(time, last)] for time in (0, 7, 13))]
+        rows.append(np.concatenate([*views, depth, np.array(colours, np.uint8)[labels]], axis=1))
+    _, picture = cv2.imencode(".png", np.concatenate(rows)[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    write_whole(out, picture.tobytes())
