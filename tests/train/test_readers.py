@@ -30,7 +30,7 @@ from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
 from gcd_train.datasets.picture_files import bytes_read, read_depth, read_ids, read_palette_indices
 from gcd_train.datasets.skips import FileFault
 from gcd_train.errors import DataError
-from gcd_train.layouts.depth_code import encode_depth
+from gcd_train.layouts.encodings import STAGE_DEPTH
 
 VIEWS = tuple(f"view{number}" for number in range(4))
 CAMERAS = tuple(DRIVING_POSES)
@@ -158,7 +158,7 @@ def test_compact_files_are_read_where_the_published_ones_are_not(driving: Path) 
     colour.with_suffix(".png").unlink()
     depth.with_suffix(".npz").unlink()
     assert cv2.imwrite(str(colour.with_suffix(".webp")), drawn.rgb[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 90])
-    assert cv2.imwrite(str(depth.with_suffix(".png")), encode_depth(drawn.depth))
+    assert cv2.imwrite(str(depth.with_suffix(".png")), STAGE_DEPTH.encode(drawn.depth))
     view = open_driving(driving.parent).views("scene_000004", 0, ["yaw-0"])[0]
     np.testing.assert_allclose(view.depth, drawn.depth, rtol=6e-4)
     assert np.abs(view.rgb.astype(int) - drawn.rgb).mean() < 15
@@ -407,7 +407,7 @@ def test_a_folder_without_scenes_is_refused(tmp_path: Path, kind: type[Kubric4D 
 
 def test_depth_codes_are_read_back_within_their_step(tmp_path: Path) -> None:
     metres = np.geomspace(0.06, 29_000.0, 600, dtype=np.float32).reshape(20, 30)
-    assert cv2.imwrite(str(tmp_path / "depth.png"), encode_depth(metres))
+    assert cv2.imwrite(str(tmp_path / "depth.png"), STAGE_DEPTH.encode(metres))
     np.testing.assert_allclose(read_depth(tmp_path / "depth.png"), metres, rtol=6e-4)
 
 

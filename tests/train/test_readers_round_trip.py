@@ -16,7 +16,7 @@ from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
 from gcd_train.datasets.trajectories import DRIVING, MAX90, generator
 from gcd_train.datasets.view_pairs import ViewPairs
 from gcd_train.errors import DataError
-from gcd_train.layouts.depth_code import SKY_M
+from gcd_train.layouts.encodings import SKY_M
 from gcd_train.layouts.scene_writer import SceneFormat, write_scene
 from gcd_train.scenes.driving import class_ids, driving_drive
 from gcd_train.scenes.frozen import freeze

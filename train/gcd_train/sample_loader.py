@@ -16,7 +16,7 @@ from gcd_train.datasets.dataset4d import PairSample
 from gcd_train.datasets.skips import Skips
 from gcd_train.datasets.view_pairs import PairBatch, collate
 from gcd_train.errors import RunError, TrainError
-from gcd_train.map_items import one_thread_each
+from gcd_train.parallel import one_thread_each
 from gcd_train.recipe import LoaderRecipe
 
 

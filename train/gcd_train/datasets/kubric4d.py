@@ -1,7 +1,7 @@
 """Reader of Kubric-4D, as published and downloaded or as `gcd-train generate` writes it.
 
 Sixteen cameras stand still around a scene; depth is stored as distance to the camera's centre, in compact scenes along
-the optical axis. There are instances but no classes. Folders and names: `gcd_train.layouts.kubric4d_names`.
+the optical axis. There are instances but no classes. Folders and names: `gcd_train.layouts.kubric4d`.
 """
 
 from collections import OrderedDict
@@ -29,7 +29,7 @@ from gcd_train.datasets.picture_files import (
 from gcd_train.datasets.rotations import pose_from_quaternion
 from gcd_train.datasets.skips import FileFault
 from gcd_train.errors import DataError
-from gcd_train.layouts import kubric4d_names as names
+from gcd_train.layouts import kubric4d as names
 from gcd_train.pointcloud import planar_from_distance
 from gcd_train.scene_view import SceneView
 

@@ -1,7 +1,7 @@
 """Reader of ParallelDomain-4D, as published and downloaded or as `gcd-train generate` writes it.
 
 Cameras ride on a vehicle; poses are given in the vehicle's frame (x ahead, y left, z up), which the views call their
-world. Depth is stored along the optical axis. Folders and names: `gcd_train.layouts.parallel_domain4d_names`.
+world. Depth is stored along the optical axis. Folders and names: `gcd_train.layouts.parallel_domain4d`.
 """
 
 import logging
@@ -20,7 +20,7 @@ from gcd_train.datasets.ontology import Ontology, read_ontology
 from gcd_train.datasets.picture_files import one_of, read_colour, read_depth, read_ids, require_size
 from gcd_train.datasets.skips import FileFault
 from gcd_train.errors import DataError
-from gcd_train.layouts import parallel_domain4d_names as names
+from gcd_train.layouts import parallel_domain4d as names
 from gcd_train.scene_view import SceneView
 
 Bytes = NDArray[np.uint8]

@@ -12,7 +12,7 @@ from gcd_model.errors import FileError
 from gcd_model.small_files import read_json, read_small
 from gcd_train.datasets.skips import Skips
 from gcd_train.errors import DataError
-from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
+from gcd_train.layouts import kubric4d, parallel_domain4d
 
 Part = Literal["train", "val", "test"]
 
@@ -43,7 +43,7 @@ def kubric_split(scenes: Iterable[str], part: Part) -> tuple[str, ...]:
     Raises: DataError for another part.
     """
     wanted = _KUBRIC_RANGES[_require_part(part)]
-    return tuple(scene for scene in scenes if kubric4d_names.scene_number(scene) in wanted)
+    return tuple(scene for scene in scenes if kubric4d.scene_number(scene) in wanted)
 
 
 def read_split(path: Path, part: Part) -> tuple[str, ...]:
@@ -139,7 +139,7 @@ def _entry(line: str) -> tuple[str, str]:
 
 def _is_scene(name: str) -> bool:
     numbers: tuple[Callable[[str], int | None], ...] = (
-        kubric4d_names.scene_number,
-        parallel_domain4d_names.scene_number,
+        kubric4d.scene_number,
+        parallel_domain4d.scene_number,
     )
     return any(number(name) is not None for number in numbers)

@@ -27,7 +27,7 @@ from gcd_train.latent_cache.index import (
 from gcd_train.latent_cache.pictures import PathPictures
 from gcd_train.latent_cache.plan import ClipPlan
 from gcd_train.latent_cache.shard import encode_scene
-from gcd_train.map_items import map_items
+from gcd_train.parallel import map_items
 
 _log = logging.getLogger(__name__)
 _MARGIN_BYTES = 64 * 2**20

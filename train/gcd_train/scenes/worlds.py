@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gcd_model.geometry import CameraMount
 from gcd_train.errors import RecipeError
-from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
+from gcd_train.layouts import kubric4d, parallel_domain4d
 from gcd_train.scenes.description import Scene
 from gcd_train.scenes.driving import ONTOLOGY, OntologyItem, driving_drive, vehicle_from_camera
 
@@ -46,7 +46,7 @@ class SceneWorld:
 
     def scene_name(self, seed: int) -> str:
         """The folder in which the scene of a seed lies: its number is the seed."""
-        names = kubric4d_names if self.layout == "kubric4d" else parallel_domain4d_names
+        names = kubric4d if self.layout == "kubric4d" else parallel_domain4d
         return names.scene_name(seed)
 
 
@@ -73,10 +73,10 @@ def _on_a_stage(name: str, make: Callable[[int, int], Scene], edition: int) -> S
         layout="kubric4d",
         make=make,
         edition=edition,
-        frames=kubric4d_names.FRAMES,
-        fps=kubric4d_names.FPS,
-        width=kubric4d_names.WIDTH,
-        height=kubric4d_names.HEIGHT,
+        frames=kubric4d.FRAMES,
+        fps=kubric4d.FPS,
+        width=kubric4d.WIDTH,
+        height=kubric4d.HEIGHT,
     )
 
 
@@ -88,10 +88,10 @@ SCENE_WORLDS: dict[str, SceneWorld] = {
         layout="parallel_domain4d",
         make=_drive,
         edition=2,  # the first is that of the pairs
-        frames=parallel_domain4d_names.FRAMES,
-        fps=parallel_domain4d_names.FPS,
-        width=parallel_domain4d_names.WIDTH,
-        height=parallel_domain4d_names.HEIGHT,
+        frames=parallel_domain4d.FRAMES,
+        fps=parallel_domain4d.FPS,
+        width=parallel_domain4d.WIDTH,
+        height=parallel_domain4d.HEIGHT,
         classes=ONTOLOGY,
         vehicle_from_camera=vehicle_from_camera,
     ),

@@ -21,7 +21,7 @@ import msgspec
 import numpy as np
 
 from gcd_train.errors import DataError
-from gcd_train.map_items import map_items, one_thread_each
+from gcd_train.parallel import map_items, one_thread_each
 from gcd_train.scenes.pair_scenes import DrawnClip, drawn_clips
 from gcd_train.scenes.pair_world import DEPTH_UNIT_M, World, agree
 from gcd_train.scenes.renderer import Renderer, Rendering
