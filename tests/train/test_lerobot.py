@@ -19,7 +19,7 @@ from gcd_train.cli.main import app
 from gcd_train.data_kinds import DataPlaces, RunData, open_data
 from gcd_train.datasets.skips import FileFault
 from gcd_train.errors import DataError, RecipeError, RunError
-from gcd_train.lerobot.cameras import CAMERA_FILE, CameraCalibration
+from gcd_train.lerobot.folder import CAMERA_FILE, CameraCalibration
 from gcd_train.lerobot.pairs import LeRobotOptions, LeRobotPairs
 from gcd_train.lerobot.tabletop_export import TabletopExport, export_tabletop
 from gcd_train.lerobot.writer import ExportOptions, LeRobotWriter, LoggedEpisode

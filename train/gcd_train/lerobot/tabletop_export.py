@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gcd_model.geometry import Intrinsics
 from gcd_train.errors import RecipeError, RunError
 from gcd_train.files import new_folder
-from gcd_train.lerobot.cameras import CameraCalibration
+from gcd_train.lerobot.folder import CameraCalibration
 from gcd_train.lerobot.writer import ExportOptions, LeRobotWriter, LoggedEpisode
 from gcd_train.scenes.drop import HFOV_DEG, orbit_cameras
 from gcd_train.scenes.frozen import freeze
