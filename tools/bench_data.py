@@ -22,7 +22,7 @@ from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import DRIVING, MAX90
 from gcd_train.data.views import ViewPairs
 from gcd_train.layouts.scene_writer import SceneFormat, write_scene
-from gcd_train.map_items import one_thread_each
+from gcd_train.parallel import one_thread_each
 from gcd_train.pointcloud import published_picture
 from gcd_train.scenes.worlds import SCENE_WORLDS
 
@@ -46,16 +46,21 @@ def main():
     with tempfile.TemporaryDirectory(prefix="gcd-bench-", dir=options.folder) as place:
         for name in options.world:
             world = SCENE_WORLDS[name]
-            warm = replace(SceneFormat.of(world, **EDITIONS["compact"]), frames=1)
+            warm = replace(published_form(world, **EDITIONS["compact"]), frames=1)
             write_scene(Path(place) / "unmeasured", world, warm, FIRST_SEED)
             for edition in EDITIONS:
                 measure(Path(place) / f"{name}-{edition}", name, edition, options)
 
 
+def published_form(world, **edition):
+    """As the world's published data set."""
+    return SceneFormat(width=world.width, height=world.height, frames=world.frames, **edition)
+
+
 def measure(place, name, edition, options):
     """All figures of a world in one edition."""
     world, (open_set, sampling) = SCENE_WORLDS[name], WORLDS[name]
-    form = SceneFormat.of(world, **EDITIONS[edition])
+    form = published_form(world, **EDITIONS[edition])
     form = replace(form, frames=options.frames or world.frames)
     made = [write_scene(place, world, form, FIRST_SEED + number) for number in range(options.scenes)]
     what = f"{name}, {edition}"

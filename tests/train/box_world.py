@@ -1,9 +1,12 @@
 """A world that is made in a millisecond: a red box that stands, a green one that slides and turns, ground, sky."""
 
+from pathlib import Path
+
 import numpy as np
 
 from gcd_model.geometry import sphere_poses
 from gcd_train.errors import DataError
+from gcd_train.layouts.manifest import SceneManifest, faults, read_manifest
 from gcd_train.scenes.description import Light, Part, Pattern, Scene, SceneObject, Sheet, upright
 from gcd_train.scenes.worlds import SceneWorld
 
@@ -63,6 +66,12 @@ def box_world(make: object = box_scene) -> SceneWorld:
         width=48,
         height=32,
     )
+
+
+def checked(scene: Path) -> SceneManifest:
+    """Of a scene folder that is as it was written."""
+    assert list(faults(scene)) == []
+    return read_manifest(scene)
 
 
 def _object(name: str, instance: int, body: int, size: tuple[float, float, float], path: np.ndarray) -> SceneObject:

@@ -13,9 +13,8 @@ from gcd_train.cli.main import app
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.errors import DataError
-from gcd_train.layouts import encodings
 from gcd_train.layouts.compact import Compaction
-from gcd_train.layouts.depth_code import encode_depth
+from gcd_train.layouts.encodings import DepthCode
 
 VIEWS = tuple(f"view{number}" for number in range(4))
 DRIVING = tuple(DRIVING_POSES)
@@ -105,10 +104,12 @@ def test_a_damaged_scene_is_one_line_and_the_next_line_packs_it(source: Path, tm
 
 
 def test_what_comes_out_otherwise_is_not_there(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def farther(metres: NDArray[np.float32]) -> NDArray[np.uint16]:
-        return encode_depth(metres * np.float32(1.01))
+    exact = DepthCode.encode
 
-    monkeypatch.setattr(encodings, "encode_depth", farther)
+    def farther(code: DepthCode, metres: NDArray[np.float32]) -> NDArray[np.uint16]:
+        return exact(code, metres * np.float32(1.01))
+
+    monkeypatch.setattr(DepthCode, "encode", farther)
     with pytest.raises(DataError, match="view0 at frame 0: its depth came out"):
         Compaction.of(source / "kubric", tmp_path, cameras=VIEWS)("scn00003")
     assert list(tmp_path.iterdir()) == []

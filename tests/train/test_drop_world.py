@@ -14,8 +14,8 @@ from gcd_train.errors import DataError, RenderError
 from gcd_train.scenes.description import ORBIT, Part, Scene, rotations
 from gcd_train.scenes.drop import FPS, HFOV_DEG, DropLabel, drop_scene, orbit_cameras, world
 from gcd_train.scenes.drop.looks import DOME_M
-from gcd_train.scenes.drop.physics import Tracks, UnsoundSceneError
 from gcd_train.scenes.drop.things import KINDS, bounds, outline, random_thing
+from gcd_train.scenes.drop.world import Tracks, UnsoundSceneError
 from gcd_train.scenes.primitives import CONVEX, shape
 from gcd_train.scenes.renderer import Renderer
 
@@ -197,7 +197,7 @@ def test_things_are_one_piece(name: str) -> None:
 
 
 def _materials(random: np.random.Generator) -> list:
-    from gcd_train.scenes.drop.materials import random_material
+    from gcd_train.scenes.drop.looks import random_material
 
     return [random_material(random, 1.0) for _ in range(2)]
 

@@ -20,7 +20,7 @@ from gcd_train.data.files import FileFault
 from gcd_train.data.open import DataPlaces, RunData, open_data
 from gcd_train.data.sample import Sample
 from gcd_train.errors import DataError, RunError
-from gcd_train.lerobot.cameras import CAMERA_FILE, CameraCalibration
+from gcd_train.lerobot.folder import CAMERA_FILE, CameraCalibration
 from gcd_train.lerobot.pairs import LeRobotOptions, LeRobotPairs
 from gcd_train.lerobot.tabletop_export import TabletopExport, export_tabletop
 from gcd_train.lerobot.writer import ExportOptions, LeRobotWriter, LoggedEpisode

@@ -10,7 +10,7 @@ import pytest
 from mapped_work import always_killed, killed_once, seat_after_a_death, square, unsendable
 
 from gcd_train.errors import DataError, RunError
-from gcd_train.map_items import Outcome, map_items
+from gcd_train.parallel import Outcome, map_items
 
 HERE = Path(__file__).parent
 
@@ -83,7 +83,7 @@ def test_leaving_early_stops_the_workers_in_an_orderly_way(tmp_path: Path) -> No
         "import signal, sys; sys.path.insert(0, sys.argv[1])\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # background jobs of a shell ignore it
         "from mapped_work import wait_for_ever\n"
-        "from gcd_train.map_items import map_items\n"
+        "from gcd_train.parallel import map_items\n"
         "if __name__ == '__main__':\n"
         "    list(map_items(wait_for_ever, [sys.argv[2]] * 3, workers=2))\n"
     )
@@ -103,7 +103,7 @@ def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
         "import signal, sys; sys.path.insert(0, sys.argv[1])\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # background jobs of a shell ignore it
         "from mapped_work import mark_and_square\n"
-        "from gcd_train.map_items import map_items\n"
+        "from gcd_train.parallel import map_items\n"
         "if __name__ == '__main__':\n"
         "    list(map_items(mark_and_square, [(sys.argv[2], n) for n in range(10_000)], workers=2))\n"
     )

@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 from mapped_work import mark_and_square, square
 
-from gcd_train import map_on_ray
+from gcd_train import parallel
 from gcd_train.errors import RunError
-from gcd_train.map_items import map_items
+from gcd_train.parallel import map_items
 
 
 class FakeRay:
@@ -78,7 +78,7 @@ class FakeRay:
 @pytest.fixture
 def fake(monkeypatch: pytest.MonkeyPatch) -> FakeRay:
     fake = FakeRay(lost={5})
-    monkeypatch.setattr(map_on_ray, "_import_ray", lambda: fake)
+    monkeypatch.setattr(parallel, "_import_ray", lambda: fake)
     return fake
 
 
@@ -167,11 +167,9 @@ class TestTwoNodes:
     def test_scenes_are_whole_when_a_node_is_killed(self, cluster: Any, tmp_path: Path) -> None:
         """Two nodes write scenes into one folder; one is killed after the first scene."""
         pytest.importorskip("moderngl", reason="needs the extra `scenes`")
-        from box_world import box_world
+        from box_world import box_world, checked
 
-        from gcd_train.layouts.manifest import verify
-        from gcd_train.layouts.scene_run import generate_scenes
-        from gcd_train.layouts.scene_writer import SceneFormat
+        from gcd_train.layouts.scene_writer import SceneFormat, generate_scenes
 
         second = cluster.add_node(num_cpus=2, object_store_memory=80 * 2**20)
         cluster.wait_for_nodes()
@@ -186,7 +184,7 @@ class TestTwoNodes:
         assert (last.written + last.there, last.failures) == (10, {})
         names = sorted(path.name for path in root.iterdir() if not path.name.startswith("."))
         assert names == [f"scn{number:05d}" for number in range(10)]
-        assert [verify(root / name).seed for name in names] == list(range(10))
+        assert [checked(root / name).seed for name in names] == list(range(10))
 
 
 def _kill(node: Any) -> None:

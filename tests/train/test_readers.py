@@ -27,7 +27,7 @@ from gcd_train.data.files import FileFault, read_ids, read_palette_indices
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.errors import DataError
-from gcd_train.layouts.depth_code import encode_depth
+from gcd_train.layouts.encodings import STAGE_DEPTH
 
 VIEWS = tuple(f"view{number}" for number in range(4))
 CAMERAS = tuple(DRIVING_POSES)
@@ -127,7 +127,7 @@ def test_compact_files_are_read_where_the_published_ones_are_not(driving: Path) 
     colour.with_suffix(".png").unlink()
     depth.with_suffix(".npz").unlink()
     assert cv2.imwrite(str(colour.with_suffix(".webp")), drawn.rgb[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 90])
-    assert cv2.imwrite(str(depth.with_suffix(".png")), encode_depth(drawn.depth))
+    assert cv2.imwrite(str(depth.with_suffix(".png")), STAGE_DEPTH.encode(drawn.depth))
     view = open_driving(driving.parent).views("scene_000004", 0, ["yaw-0"])[0]
     np.testing.assert_allclose(view.depth, drawn.depth, rtol=6e-4)
     assert np.abs(view.rgb.astype(int) - drawn.rgb).mean() < 15

@@ -16,7 +16,7 @@ from gcd_train.data.paths import DRIVING, MAX90, FrameSampling, generator
 from gcd_train.data.pictures import PictureOptions
 from gcd_train.data.views import ViewPairs
 from gcd_train.errors import DataError
-from gcd_train.layouts.depth_code import SKY_M
+from gcd_train.layouts.encodings import SKY_M
 from gcd_train.layouts.scene_writer import SceneFormat, write_scene
 from gcd_train.scenes.driving import class_ids, driving_drive
 from gcd_train.scenes.frozen import freeze

@@ -44,7 +44,7 @@ def compact(
     """
     from gcd_train.layouts.compact import Compaction
     from gcd_train.layouts.scene_folder import remove_leftovers
-    from gcd_train.map_items import map_items, one_thread_each
+    from gcd_train.parallel import map_items, one_thread_each
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that no worker is left behind
     say = Console(stderr=True, highlight=False)

@@ -13,9 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from gcd_train.cli.errors import errors_shown
 from gcd_train.cli.progress_bar import progress_bar
 from gcd_train.errors import RecipeError
-from gcd_train.layouts.scene_run import SceneRun, generate_scenes
-from gcd_train.layouts.scene_sheet import write_scene_sheet
-from gcd_train.layouts.scene_writer import SceneFormat
+from gcd_train.layouts.scene_writer import SceneFormat, SceneRun, generate_scenes, write_scene_sheet
 from gcd_train.live.draws import LIVE_SCENES, LiveWorld, TargetPath, worlds_of
 from gcd_train.scenes.pair_world import CameraWay, PairForm, World, WorldOptions, driving_world, orbit_world
 from gcd_train.scenes.pair_writer import generate, write_contact_sheet

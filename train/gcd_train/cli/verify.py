@@ -10,8 +10,8 @@ from gcd_model import printable
 from gcd_train.cli.errors import errors_shown
 from gcd_train.cli.progress_bar import progress_bar
 from gcd_train.errors import DataError
-from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
-from gcd_train.layouts.manifest import MANIFEST, faults, read_manifest
+from gcd_train.layouts import kubric4d, parallel_domain4d
+from gcd_train.layouts.manifest import MANIFEST, faults
 
 Scenes: TypeAlias = Annotated[list[Path], typer.Argument(help="Scene folders, or folders full of them.")]
 
@@ -45,12 +45,12 @@ def _scenes_of(place: Path) -> list[Path]:
 
 
 def _is_scene_name(name: str) -> bool:
-    return kubric4d_names.scene_number(name) is not None or parallel_domain4d_names.scene_number(name) is not None
+    return kubric4d.scene_number(name) is not None or parallel_domain4d.scene_number(name) is not None
 
 
 def _faults_of(scene: Path) -> list[str]:
     try:
-        return list(faults(scene, read_manifest(scene)))
+        return list(faults(scene))
     except DataError as error:
         return [str(error)]
 

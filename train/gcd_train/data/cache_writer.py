@@ -44,7 +44,7 @@ from gcd_train.data.sample import Bytes, to_network
 from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.losses import PARALLEL_DOMAIN_WEIGHTS, class_emphasis
-from gcd_train.map_items import map_items
+from gcd_train.parallel import map_items
 
 _log = logging.getLogger(__name__)
 _MARGIN_BYTES = 64 * 2**20

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_train.errors import DataError
-from gcd_train.layouts.depth_code import FAR_M, stored_depth
+from gcd_train.layouts.encodings import FAR_M, stored_depth
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
@@ -193,7 +193,7 @@ def read_colour(path: Path) -> Bytes:
 
 
 def read_depth(path: Path, key: str = "data") -> Floats:
-    """Metres, f32 [H, W], of a float TIFF, an npz with array `key`, or a PNG of ours (`depth_code`).
+    """Metres, f32 [H, W], of a float TIFF, an npz with array `key`, or a PNG of ours (`DepthCode`).
 
     0 is kept as "nothing known"; beyond 30 000 m is cut there, as published.
     Raises: FileFault if it is damaged, or holds NaN, negative numbers, or nothing that is known or within those.

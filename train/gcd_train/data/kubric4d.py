@@ -1,7 +1,7 @@
 """Reader of Kubric-4D, as published and downloaded or as `gcd-train generate` writes it.
 
 Sixteen cameras stand still around a scene; depth is stored as distance to the camera's centre, in compact scenes along
-the optical axis. There are instances but no classes. Folders and names: `gcd_train.layouts.kubric4d_names`.
+the optical axis. There are instances but no classes. Folders and names: `gcd_train.layouts.kubric4d`.
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ from gcd_train.data.files import (
 )
 from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError
-from gcd_train.layouts import kubric4d_names as names
+from gcd_train.layouts import kubric4d as names
 from gcd_train.pointcloud import planar_from_distance
 
 _PLANAR = f".{names.COMPACT_SUFFIXES['depth']}"

@@ -21,7 +21,7 @@ from gcd_train.data.splits import Part, kubric_split, present, read_split, requi
 from gcd_train.data.videos import FilmedPairs, filmed_scenes
 from gcd_train.data.views import ViewPairs
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
+from gcd_train.layouts import kubric4d, parallel_domain4d
 from gcd_train.layouts.manifest import MANIFEST, read_manifest
 from gcd_train.lerobot.pairs import LeRobotOptions, LeRobotPairs
 from gcd_train.model_setup import digest_of
@@ -179,11 +179,11 @@ class _Opening:
         )
 
     def _kubric(self, root: Path) -> Kubric4D:
-        cameras = self._data.cameras or kubric4d_names.CAMERAS
+        cameras = self._data.cameras or kubric4d.CAMERAS
         return Kubric4D.open(root, cameras=cameras, published=self._data.published)
 
     def _driving(self, root: Path) -> ParallelDomain4D:
-        cameras = self._data.cameras or parallel_domain4d_names.CAMERAS
+        cameras = self._data.cameras or parallel_domain4d.CAMERAS
         return ParallelDomain4D.open(root, cameras=cameras, classes=self._data.modality == "semantic")
 
     def _parts(self, whole: Set) -> tuple[Set, Set]:

@@ -1,7 +1,7 @@
 """Reader of ParallelDomain-4D, as published and downloaded or as `gcd-train generate` writes it.
 
 Cameras ride on a vehicle; poses are given in the vehicle's frame (x ahead, y left, z up), which the views call their
-world. Depth is stored along the optical axis. Folders and names: `gcd_train.layouts.parallel_domain4d_names`.
+world. Depth is stored along the optical axis. Folders and names: `gcd_train.layouts.parallel_domain4d`.
 """
 
 import logging
@@ -32,7 +32,7 @@ from gcd_train.data.files import (
 )
 from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError
-from gcd_train.layouts import parallel_domain4d_names as names
+from gcd_train.layouts import parallel_domain4d as names
 
 _LOG = logging.getLogger(__name__)
 _U8, _U16 = 255, 65535

@@ -14,7 +14,7 @@ from gcd_model.geometry import Spherical
 from gcd_model.small_files import read_json, read_small
 from gcd_train.data.files import Skips
 from gcd_train.errors import DataError
-from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
+from gcd_train.layouts import kubric4d, parallel_domain4d
 
 Part = Literal["train", "val", "test"]
 
@@ -36,7 +36,7 @@ class SplitFile(msgspec.Struct, frozen=True, kw_only=True):
 def kubric_split(scenes: Iterable[str], part: Part) -> tuple[str, ...]:
     """The scenes of one part of Kubric-4D, by number: 0-2799 train, 2800-2899 val, 2900-2999 test."""
     wanted = _KUBRIC_RANGES[part]
-    return tuple(scene for scene in scenes if kubric4d_names.scene_number(scene) in wanted)
+    return tuple(scene for scene in scenes if kubric4d.scene_number(scene) in wanted)
 
 
 def read_split(path: Path, part: Part) -> tuple[str, ...]:
@@ -131,7 +131,7 @@ def _entry(line: str) -> tuple[str, str]:
 
 
 def _is_scene(name: str) -> bool:
-    numbers = kubric4d_names.scene_number(name), parallel_domain4d_names.scene_number(name)
+    numbers = kubric4d.scene_number(name), parallel_domain4d.scene_number(name)
     return any(number is not None for number in numbers)
 
 

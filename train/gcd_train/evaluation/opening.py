@@ -40,7 +40,7 @@ from gcd_train.evaluation.protocol import (
     usual_clips,
 )
 from gcd_train.evaluation.scene_clips import SceneSet
-from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
+from gcd_train.layouts import kubric4d, parallel_domain4d
 from gcd_train.layouts.manifest import MANIFEST, read_manifest
 
 
@@ -161,7 +161,7 @@ def _world(scene: Path) -> str:
     """As its manifest says; a scene without one was published, and counts as its layout."""
     if (scene / MANIFEST).is_file():
         return read_manifest(scene).world
-    return "kubric4d" if kubric4d_names.scene_number(scene.name) is not None else "parallel_domain4d"
+    return "kubric4d" if kubric4d.scene_number(scene.name) is not None else "parallel_domain4d"
 
 
 def _note_missing(split: PublicSplit, there: set[int], notes: Skips) -> None:
@@ -223,9 +223,9 @@ def data_kind(folders: Sequence[Path]) -> DataKind:
         names = [path.name for path in folders[0].iterdir()]
     except OSError as error:
         raise DataError(f"{folders[0]} cannot be read ({error}); give a folder with pairs or with scenes") from error
-    if any(kubric4d_names.scene_number(name) is not None for name in names):
+    if any(kubric4d.scene_number(name) is not None for name in names):
         found: DataKind = "kubric4d"
-    elif any(parallel_domain4d_names.scene_number(name) is not None for name in names):
+    elif any(parallel_domain4d.scene_number(name) is not None for name in names):
         found = "parallel_domain4d"
     else:
         return "pairs"
@@ -313,7 +313,7 @@ def _declared(mount: CameraMount | None, clips: PairedClips) -> CameraMount | No
 
 
 def _dataset(folder: Path, cuts: SceneCuts, *, orbits: bool) -> Kubric4D | ParallelDomain4D:
-    names = kubric4d_names.CAMERAS if orbits else parallel_domain4d_names.CAMERAS
+    names = kubric4d.CAMERAS if orbits else parallel_domain4d.CAMERAS
     if not orbits:
         return ParallelDomain4D.open(folder, cameras=cuts.cameras or names, classes=cuts.semantic)
     if cuts.semantic:

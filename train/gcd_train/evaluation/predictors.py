@@ -13,7 +13,7 @@ from torch import Tensor
 from gcd_model.geometry import CameraMount, Intrinsics, Trajectory, driving_trajectory, to_pose
 from gcd_train.data.sample import Bytes, ClipSource, SceneView
 from gcd_train.errors import DataError
-from gcd_train.pointcloud.unproject import tangents
+from gcd_train.pointcloud.project import tangents
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -19,7 +19,7 @@ from gcd_train.data.files import Skips
 from gcd_train.data.paths import FrameSampling, OrbitSampling, generator
 from gcd_train.data.splits import Control, Controls
 from gcd_train.errors import DataError
-from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
+from gcd_train.layouts import kubric4d, parallel_domain4d
 
 ProtocolName: TypeAlias = Literal["paper", "release"]
 
@@ -162,8 +162,8 @@ def released_controls(scenes: Sequence[str], *, orbit: bool) -> Controls:
 
 def scene_number(scene: str) -> int:
     """By the name of its folder, in either layout. Raises DataError for another name."""
-    number = kubric4d_names.scene_number(scene)
-    number = parallel_domain4d_names.scene_number(scene) if number is None else number
+    number = kubric4d.scene_number(scene)
+    number = parallel_domain4d.scene_number(scene) if number is None else number
     if number is None:
         raise DataError(f"{scene} is no scene's name; wanted scn00042 or scene_000042")
     return number

@@ -17,7 +17,7 @@ from gcd_train.evaluation.measure import predicted_and_measured
 from gcd_train.evaluation.predictors import Prediction, Predictor
 from gcd_train.evaluation.statistics import FIRST_MEASURED
 from gcd_train.evaluation.store import ClipRecord, RunKeeper
-from gcd_train.map_items import Outcome, map_items, one_thread_each
+from gcd_train.parallel import Outcome, map_items, one_thread_each
 
 GIVE_UP_AFTER = 5
 """Clips in a row of which nothing could be measured, after which a run stops: something is wrong with all of them."""

@@ -13,8 +13,8 @@ from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.layouts import encodings, kubric4d_names, parallel_domain4d_names
-from gcd_train.layouts.depth_code import FAR_M, NEAR_M
+from gcd_train.layouts import encodings, kubric4d, parallel_domain4d
+from gcd_train.layouts.encodings import FAR_M, NEAR_M
 from gcd_train.layouts.manifest import GEOMETRY, MANIFEST, read_manifest
 from gcd_train.layouts.scene_files import SceneFiles
 from gcd_train.layouts.scene_folder import new_scene
@@ -58,8 +58,8 @@ class Compaction:
             names = [path.name for path in source.iterdir()]
         except OSError as error:
             raise DataError(f"{source} cannot be read ({error}); give the folder that holds the scenes") from error
-        orbits = any(kubric4d_names.scene_number(name) is not None for name in names)
-        usual = kubric4d_names.CAMERAS if orbits else parallel_domain4d_names.CAMERAS
+        orbits = any(kubric4d.scene_number(name) is not None for name in names)
+        usual = kubric4d.CAMERAS if orbits else parallel_domain4d.CAMERAS
         return cls(source=source, out=out, orbits=orbits, cameras=cameras or usual, gaps=gaps)
 
     @property
@@ -101,7 +101,7 @@ class Compaction:
     @property
     def _ahead(self) -> str:
         """The camera that tells how many frames there are."""
-        forward = parallel_domain4d_names.FORWARD
+        forward = parallel_domain4d.FORWARD
         return forward if forward in self.cameras else self.cameras[0]
 
     def _reader(self, root: Path, scene: str) -> Kubric4D | ParallelDomain4D:
@@ -113,7 +113,7 @@ class Compaction:
         """Files of a scene that are no pictures."""
         folder = self.source / scene
         if self.orbits:
-            yield from (kubric4d_names.metadata_path(folder, _number(camera)) for camera in self.cameras)
+            yield from (kubric4d.metadata_path(folder, _number(camera)) for camera in self.cameras)
         yield from (path for name in _JSON_FOLDERS for path in sorted((folder / name).glob("*.json")))
         if (folder / MANIFEST).exists():
             yield folder / GEOMETRY
@@ -144,8 +144,8 @@ class Compaction:
     def _orbit_view(
         self, source: Path, out: Path, view: SceneView, time: int, camera: str
     ) -> Iterator[tuple[Path, bytes]]:
-        def place(folder: Path, layer: kubric4d_names.Layer, *, compact: bool = False) -> Path:
-            return kubric4d_names.frame_path(folder, _number(camera), layer, time, compact=compact)
+        def place(folder: Path, layer: kubric4d.Layer, *, compact: bool = False) -> Path:
+            return kubric4d.frame_path(folder, _number(camera), layer, time, compact=compact)
 
         _require_published(place(source, "rgba"))
         yield place(out, "rgba", compact=True), encodings.webp(view.rgb, quality=_KUBRIC_WEBP)
@@ -156,8 +156,8 @@ class Compaction:
     def _street_view(
         self, source: Path, out: Path, view: SceneView, time: int, camera: str
     ) -> Iterator[tuple[Path, bytes]]:
-        def place(folder: Path, layer: parallel_domain4d_names.Layer, *, compact: bool = False) -> Path:
-            return parallel_domain4d_names.frame_path(folder, camera, layer, time, compact=compact)
+        def place(folder: Path, layer: parallel_domain4d.Layer, *, compact: bool = False) -> Path:
+            return parallel_domain4d.frame_path(folder, camera, layer, time, compact=compact)
 
         _require_published(place(source, "rgb"))
         yield place(out, "rgb", compact=True), encodings.webp(view.rgb, quality=_STREET_WEBP)

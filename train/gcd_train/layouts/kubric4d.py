@@ -1,25 +1,78 @@
-"""Writes scenes as Kubric-4D has them: see `kubric4d_names` for the files, `kubric4d_metadata` for the JSON."""
+"""Kubric-4D scene folders: where things lie, and what writes them.
 
-from typing import Any
+    scn00042/
+        scn00042_p0_v3.json                 metadata of view 3 (0..15)
+        frames_p0_v3/rgba_00007.png         colour with alpha, 8 bit            compact: .webp, no alpha
+        frames_p0_v3/depth_00007.tiff       float32, distance to the camera     compact: .png, 16 bit, depth along the
+                                                                                axis (!), see STAGE_DEPTH
+        frames_p0_v3/segmentation_00007.png palette, instance number            compact: the same
+
+Along the axis, flat ground is equally far all along a row of pixels, which halves the size of a compact scene.
+Source: the Kubric-4D data set of Van Hoorick et al. 2024, as downloaded.
+"""
+
+import itertools
+import math
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.errors import DataError
-from gcd_train.layouts import encodings, kubric4d_names
-from gcd_train.layouts.camera_facts import ray_lengths
-from gcd_train.layouts.depth_code import with_sky
-from gcd_train.layouts.instance_tracks import InstanceTracks
-from gcd_train.layouts.kubric4d_metadata import view_metadata
-from gcd_train.layouts.kubric4d_names import Layer
-from gcd_train.layouts.scene_files import SceneFiles
-from gcd_train.scenes.description import Floats, Scene
-from gcd_train.scenes.renderer import Rendering
+from gcd_train.layouts import encodings
+from gcd_train.layouts.encodings import Doubles, Floats, quaternions, with_sky
+from gcd_train.layouts.manifest import SceneFiles
+from gcd_train.scenes.description import Scene, SceneObject, rotations
 
-_PALETTE = encodings.instance_palette()
-_IDS = 256
+if TYPE_CHECKING:
+    from gcd_train.scenes.renderer import Rendering
+
+Layer = Literal["rgba", "depth", "segmentation"]
+Json = dict[str, Any]
+
+VIEWS = 16
+FRAMES = 60
+FPS = 24.0
+WIDTH, HEIGHT = 576, 384
+SUFFIXES: dict[Layer, str] = {"rgba": "png", "depth": "tiff", "segmentation": "png"}
+COMPACT_SUFFIXES: dict[Layer, str] = {"rgba": "webp", "depth": "png", "segmentation": "png"}
+CAMERAS = tuple(f"view{view}" for view in range(VIEWS))
+"""What our worlds call the published views, by their number."""
+STEP_RATE_HZ = 480
+"""Of the physics of both worlds in this layout."""
+
+_IDS, _BITS = 256, 64
 _WEBP_QUALITY = 85
+_GRAVITY_M_S2, _SENSOR_MM = 9.81, 32.0
+_DIGITS = 5  # decimals of metres and shares: hundredths of a millimetre
+_PALETTE = encodings.instance_palette()
+_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])  # axes x right, y up, looking along -z
+
+
+def scene_name(number: int) -> str:
+    """Folder of a scene, `scn00042`."""
+    return f"scn{number:05d}"
+
+
+def scene_number(name: str) -> int | None:
+    """The number in a folder's name, None if it is no scene of this layout."""
+    named = re.fullmatch(r"scn(\d{5,})", name)
+    return None if named is None else int(named[1])
+
+
+def metadata_path(scene: Path, view: int) -> Path:
+    """JSON of one view of a scene folder, `scn00042/scn00042_p0_v3.json`."""
+    return scene / f"{scene.name}_p0_v{view}.json"
+
+
+def frame_path(scene: Path, view: int, layer: Layer, time: int, *, compact: bool = False) -> Path:
+    """One picture of a layer at frame number `time`, `scn00042/frames_p0_v3/rgba_00007.png`."""
+    suffix = (COMPACT_SUFFIXES if compact else SUFFIXES)[layer]
+    return scene / f"frames_p0_v{view}" / f"{layer}_{time:05d}.{suffix}"
 
 
 class Kubric4DWriter:
@@ -32,14 +85,14 @@ class Kubric4DWriter:
 
     def __init__(self, files: SceneFiles, scene: Scene, lens: Intrinsics, *, seed: int, fps: float, compact: bool):
         self._files, self._scene, self._lens, self._compact = files, scene, lens, compact
-        self._facts = {"seed": seed, "fps": fps}
+        self._seed, self._fps = seed, fps
         self._views = {name: view for view, name in enumerate(scene.cameras)}
         self._tracks = [InstanceTracks(scene.frames) for _ in self._views]
         self._objects = tuple(sorted(scene.objects, key=lambda thing: thing.instance))
         self._ids = segment_ids(tuple(thing.instance for thing in self._objects))
         self._rays = ray_lengths(lens)
 
-    def add(self, time: int, camera: str, drawn: Rendering) -> None:
+    def add(self, time: int, camera: str, drawn: "Rendering") -> None:
         """Write colour, distance and segmentation of one view."""
         view = self._views[camera]
         ids = self._ids[drawn.instances]
@@ -50,31 +103,30 @@ class Kubric4DWriter:
             self._write(view, "depth", time, encodings.depth_png(with_sky(drawn.depth)))
         else:
             self._write(view, "rgba", time, encodings.rgba_png(drawn.rgb))
-            self._write(view, "depth", time, encodings.float_tiff(distance_of(drawn.depth, self._rays)))
+            self._write(view, "depth", time, encodings.float_tiff(with_sky(drawn.depth * self._rays)))
 
     def finish(self) -> None:
         """Write the metadata of every view; view 0 alone has the collisions, of which our worlds tell none."""
         for camera, view in self._views.items():
-            told = view_metadata(self._scene, camera, self._objects, self._tracks[view], self._lens, self._facts)
+            poses = self._scene.cameras[camera]
+            told = view_metadata(self._scene, poses, self._objects, self._tracks[view], self._lens, self._fps)
+            told["random_seed"] = self._seed
             if view == 0:
                 told["collisions"] = []
             if self._compact:  # half of the file, and it follows from size, positions and quaternions
-                told["instances"] = [without_boxes(instance) for instance in told["instances"]]
-            self._files.write(kubric4d_names.metadata_path(self._files.folder, view), msgspec.json.encode(told))
+                for instance in told["instances"]:
+                    del instance["bboxes_3d"]
+            self._files.write(metadata_path(self._files.folder, view), msgspec.json.encode(told))
 
     def _write(self, view: int, layer: Layer, time: int, data: bytes) -> None:
-        path = kubric4d_names.frame_path(self._files.folder, view, layer, time, compact=self._compact)
-        self._files.write(path, data)
+        self._files.write(frame_path(self._files.folder, view, layer, time, compact=self._compact), data)
 
 
-def without_boxes(instance: dict[str, Any]) -> dict[str, Any]:
-    """An instance's metadata without its boxes in the world."""
-    return {name: value for name, value in instance.items() if name != "bboxes_3d"}
-
-
-def distance_of(depth: Floats, rays: Floats) -> Floats:
-    """Depth along the axis, 0 for the sky, as distance to the camera centre. rays: see `ray_lengths`. All [H, W]."""
-    return with_sky(depth * rays)
+def ray_lengths(lens: Intrinsics) -> Floats:
+    """[H, W]: distance to the camera centre over depth along the axis, for the middle of every pixel."""
+    x = (np.arange(lens.width) + 0.5 - lens.cx) / lens.fx
+    y = (np.arange(lens.height) + 0.5 - lens.cy) / lens.fy
+    return np.sqrt(1 + x[None] ** 2 + y[:, None] ** 2).astype(np.float32)
 
 
 def segment_ids(instances: tuple[int, ...]) -> encodings.Bytes:
@@ -89,3 +141,122 @@ def segment_ids(instances: tuple[int, ...]) -> encodings.Bytes:
     table = np.zeros(_IDS, np.uint8)
     table[[*instances, *others]] = np.arange(1, _IDS)
     return table
+
+
+class InstanceTracks:
+    """What one camera saw of every instance: pixel counts [T, 256] and boxes [T, 256, 4].
+
+    A box is its first row, first column, and the row and column after its last, in pixels, all 0 where the instance is
+    not seen.
+    """
+
+    def __init__(self, frames: int) -> None:
+        self.pixels = np.zeros((frames, _IDS), np.int64)
+        self.boxes = np.zeros((frames, _IDS, 4), np.int64)
+
+    def add(self, time: int, ids: NDArray[np.uint8]) -> None:
+        """One picture [H, W]."""
+        counts = np.bincount(ids.reshape(-1), minlength=_IDS)
+        self.pixels[time] = counts
+        for first in range(0, int(np.flatnonzero(counts)[-1]) + 1, _BITS):  # one bit an id: a row is seen at once
+            bit_of = np.zeros(_IDS, np.uint64)
+            bit_of[first : first + _BITS] = np.uint64(1) << np.arange(_BITS, dtype=np.uint64)
+            bits = bit_of[ids]
+            top, bottom = _span(np.bitwise_or.reduce(bits, axis=1))
+            left, right = _span(np.bitwise_or.reduce(bits, axis=0))
+            self.boxes[time, first : first + _BITS] = np.stack([top, left, bottom, right], -1)
+        self.boxes[time][counts == 0] = 0
+
+
+def _span(occupied: NDArray[np.uint64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First place with each bit, and one after the last, [64]."""
+    there = (occupied[:, None] >> np.arange(_BITS, dtype=np.uint64)) & np.uint64(1)
+    return there.argmax(0), len(there) - there[::-1].argmax(0)
+
+
+def view_metadata(
+    scene: Scene, poses: Doubles, objects: tuple[SceneObject, ...], tracks: InstanceTracks, lens: Intrinsics, fps: float
+) -> Json:
+    """Everything the published file tells of one view, but for the seed.
+
+    poses: of its camera, [T, 4, 4]. objects: number k has the id k + 1 in the segmentation and in `tracks`.
+    """
+    instances = [_instance(thing, k + 1, tracks, poses, lens) for k, thing in enumerate(objects)]
+    background = scene.facts.get("surroundings", "procedural")
+    return {
+        "scene": {
+            "resolution": [lens.width, lens.height],
+            "frame_rate": fps,
+            "step_rate": STEP_RATE_HZ,
+            "gravity": [0.0, 0.0, -_GRAVITY_M_S2 / float(scene.facts.get("metres_a_unit", 1.0))],
+            "num_frames": scene.frames,
+            "background": background,
+            "num_instances": len(objects),
+            "num_valo_instances": int((tracks.pixels[:, 1 : len(objects) + 1].sum(0) > 0).sum()),
+        },
+        "camera": camera_metadata(poses, lens),
+        "instances": instances,
+        "dome": {"asset_id": background},
+    }
+
+
+def camera_metadata(poses: Doubles, lens: Intrinsics) -> Json:
+    """Of a camera with poses [T, 4, 4]: angles in radians, Blender's axes, K for pictures of size 1 x 1.
+
+    With Blender's axes a point in front has a negative z: K turns it over, [[fx, 0, -cx], [0, -fy, -cy], [0, 0, -1]].
+    R is the pose of the first frame, world from camera.
+    """
+    placed = poses @ _BLENDER
+    fx, fy = lens.fx / lens.width, lens.fy / lens.height
+    cx, cy = lens.cx / lens.width, lens.cy / lens.height
+    return {
+        "focal_length": _SENSOR_MM * fx,
+        "sensor_width": _SENSOR_MM,
+        "field_of_view": 2 * math.atan(lens.width / 2 / lens.fx),
+        "positions": placed[:, :3, 3].tolist(),
+        "quaternions": quaternions(placed[:, :3, :3]).tolist(),
+        "K": [[fx, 0.0, -cx], [0.0, -fy, -cy], [0.0, 0.0, -1.0]],
+        "R": placed[0].tolist(),
+    }
+
+
+def _instance(thing: SceneObject, number: int, tracks: InstanceTracks, poses: Doubles, lens: Intrinsics) -> Json:
+    shown = np.flatnonzero(tracks.pixels[:, number])
+    scale = np.array([lens.height, lens.width, lens.height, lens.width])
+    box = np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * thing.size + thing.middle  # [8, 3]
+    corners = np.einsum("tij,kj->tki", rotations(thing.quaternions), box) + thing.positions[:, None]
+    return {
+        "asset_id": thing.name,
+        "label": thing.label,
+        "dynamic": thing.dynamic,
+        "size": _rounded(np.asarray(thing.size)),
+        "middle": _rounded(np.asarray(thing.middle)),
+        "mass": thing.mass_kg,
+        "friction": thing.friction,
+        "restitution": thing.restitution,
+        "positions": _rounded(thing.positions),
+        "quaternions": _rounded(thing.quaternions),
+        "velocities": _rounded(thing.velocities),
+        "angular_velocities": _rounded(thing.angular_velocities),
+        "image_positions": _rounded(project(thing.positions, poses, lens)),
+        "bboxes_3d": _rounded(corners),
+        "visibility": tracks.pixels[:, number].tolist(),
+        "bboxes": _rounded(tracks.boxes[shown, number] / scale),
+        "bbox_frames": shown.tolist(),
+    }
+
+
+def project(points: Doubles, world_from_camera: Doubles, lens: Intrinsics) -> Doubles:
+    """Where a camera with poses [T, 4, 4] sees world points [T, 3]: shares of width and height, [T, 2].
+
+    Points behind it get odd places.
+    """
+    camera_from_world = np.linalg.inv(world_from_camera)
+    local = np.einsum("tij,tj->ti", camera_from_world[:, :3, :3], points) + camera_from_world[:, :3, 3]
+    depth = np.where(np.abs(local[:, 2]) < 1e-9, 1e-9, local[:, 2])
+    x, y = lens.fx * local[:, 0] / depth + lens.cx, lens.fy * local[:, 1] / depth + lens.cy
+    return np.stack([x / lens.width, y / lens.height], -1)
+
+
+def _rounded(numbers: Doubles) -> Any:
+    return np.round(numbers, _DIGITS).tolist()

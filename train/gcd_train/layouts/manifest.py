@@ -46,7 +46,26 @@ class SceneManifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     files: dict[str, str]
     world_from_vehicle: tuple[Matrix, ...] | None = None
     facts: dict[str, float | str] = {}
-    format: int = 1
+    format: Literal[1] = 1
+
+
+class SceneFiles:
+    """Writes into one scene folder and keeps the SHA-256 of every file for its manifest."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.checksums: dict[str, str] = {}
+        self.size = 0
+
+    def write(self, path: Path, data: bytes) -> None:
+        """One file; its folder is made when needed. Raises OSError, which names it, for one if the disk is full."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            path.write_bytes(data)
+        except OSError as error:  # a full disk does not say for which file
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        self.checksums[path.relative_to(self.folder).as_posix()] = hashlib.sha256(data).hexdigest()
+        self.size += len(data)
 
 
 def package_version() -> str:
@@ -68,20 +87,12 @@ def read_manifest(scene: Path) -> SceneManifest:
         raise DataError(f"{path} {error}; delete the scene and generate it again") from error
 
 
-def verify(scene: Path) -> SceneManifest:
-    """Compare every file of a scene folder with its checksum; what other programs added is no fault.
+def faults(scene: Path) -> Iterator[str]:
+    """One line for every file of a scene folder that is missing, cannot be read, or is not as it was written.
 
-    Raises: DataError naming the first missing or changed file.
+    Files that other programs added are no fault. Raises: DataError as `read_manifest`.
     """
-    manifest = read_manifest(scene)
-    for fault in faults(scene, manifest):
-        raise DataError(f"{fault}; delete the scene and generate it again")
-    return manifest
-
-
-def faults(scene: Path, manifest: SceneManifest) -> Iterator[str]:
-    """One line for every file of a scene folder that is missing, cannot be read, or is not as it was written."""
-    for name, wanted in manifest.files.items():
+    for name, wanted in read_manifest(scene).files.items():
         try:
             if (scene / name).exists() and not (scene / name).is_file():
                 yield f"{scene / name} is no regular file"

@@ -1,25 +1,90 @@
-"""Writes scenes as ParallelDomain-4D has them: see `parallel_domain4d_names` for the files.
+"""ParallelDomain-4D scene folders: where things lie, and what writes them.
 
-Poses are told in the vehicle's frame (x ahead, y left, z up), where all 19 cameras stand still.
+    scene_000042/
+        rgb/yaw-0/000000000000000075.png                        colour, 8 bit           compact: .webp
+        depth/yaw-0/000000000000000075.npz                      array `data`, float32,  compact: .png, 16 bit, see
+                                                                metres along the axis   STREET_DEPTH
+        semantic_segmentation_2d/yaw-0/000000000000000075.png   class id =              compact: the same colours, as
+                                                                R + 256 G + 65536 B     a palette PNG
+        instance_segmentation_2d/yaw-0/000000000000000075.png   instance id, alike
+        calibration/*.json, ontology/*.json
+
+Files are named by ten times the frame number plus five (frame 7: 75). Poses are told in the vehicle's frame (x ahead,
+y left, z up), where all 19 cameras stand still. Source: the ParallelDomain-4D data set of Van Hoorick et al. 2024, as
+downloaded.
 """
 
+import re
 from collections.abc import Mapping, Sequence
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 import numpy as np
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.layouts import encodings
-from gcd_train.layouts.camera_facts import Doubles, quaternions
-from gcd_train.layouts.depth_code import with_sky
-from gcd_train.layouts.parallel_domain4d_names import Layer, calibration_folder, frame_path, ontology_folder
-from gcd_train.layouts.scene_files import SceneFiles
-from gcd_train.scenes.driving import OntologyItem
-from gcd_train.scenes.renderer import Rendering
+from gcd_train.layouts.encodings import Doubles, quaternions, with_sky
+from gcd_train.layouts.manifest import SceneFiles
 
+if TYPE_CHECKING:
+    from gcd_train.scenes.driving import OntologyItem
+    from gcd_train.scenes.renderer import Rendering
+
+Layer = Literal["rgb", "depth", "semantic_segmentation_2d", "instance_segmentation_2d"]
+
+FRAMES = 50
+FPS = 10.0
+WIDTH, HEIGHT = 640, 480
+CAMERAS = (*sorted(f"camera{number}" for number in range(16)), "yaw-0", "yaw-60", "yaw-neg-60")
+"""The 19 cameras in the published order: 16 around the scene by name, then the vehicle's own."""
+FORWARD = "yaw-0"
+"""The camera that looks ahead: the source of every clip."""
+DEPTH_KEY = "data"
+"""Name of the array in a depth npz."""
+_SUFFIXES = {"rgb": "png", "depth": "npz"}
+_COMPACT_SUFFIXES = {"rgb": "webp", "depth": "png"}
 _VOID_ID = 255
 _WEBP_QUALITY = 80
+
+
+def scene_name(number: int) -> str:
+    """Folder of a scene, `scene_000042`."""
+    return f"scene_{number:06d}"
+
+
+def scene_number(name: str) -> int | None:
+    """The number in a folder's name, None if it is no scene of this layout."""
+    named = re.fullmatch(r"scene_(\d{6,})", name)
+    return None if named is None else int(named[1])
+
+
+def frame_stem(time: int) -> str:
+    """File name without suffix of frame number `time`."""
+    return f"{10 * time + 5:018d}"
+
+
+def frame_time(stem: str) -> int | None:
+    """Inverse of `frame_stem`; None if the file is no frame of this layout."""
+    if not re.fullmatch(r"\d{18}", stem) or int(stem) % 10 != 5:
+        return None
+    return int(stem) // 10
+
+
+def frame_path(scene: Path, camera: str, layer: Layer, time: int, *, compact: bool = False) -> Path:
+    """One picture of a layer at frame number `time`, `scene_000042/rgb/yaw-0/000000000000000075.png`."""
+    suffix = (_COMPACT_SUFFIXES if compact else _SUFFIXES).get(layer, "png")
+    return scene / layer / camera / f"{frame_stem(time)}.{suffix}"
+
+
+def calibration_folder(scene: Path) -> Path:
+    """Holds one JSON with the cameras (its name is not fixed)."""
+    return scene / "calibration"
+
+
+def ontology_folder(scene: Path) -> Path:
+    """Holds one JSON with the classes (its name is not fixed)."""
+    return scene / "ontology"
 
 
 class ParallelDomain4DWriter:
@@ -33,7 +98,7 @@ class ParallelDomain4DWriter:
         files: SceneFiles,
         lens: Intrinsics,
         vehicle_from_camera: Mapping[str, Doubles],
-        classes: Sequence[OntologyItem],
+        classes: "Sequence[OntologyItem]",
         *,
         compact: bool,
     ) -> None:
@@ -43,7 +108,7 @@ class ParallelDomain4DWriter:
         self._class_ids = np.full(256, _VOID_ID, np.uint8)
         self._class_ids[[item.label for item in classes]] = [item.id for item in classes]
 
-    def add(self, time: int, camera: str, drawn: Rendering) -> None:
+    def add(self, time: int, camera: str, drawn: "Rendering") -> None:
         """Write colour, depth, classes and instances of one view."""
         depth = with_sky(drawn.depth)
         id_png = encodings.packed_id_png if self._compact else encodings.id_png
@@ -52,7 +117,7 @@ class ParallelDomain4DWriter:
             self._write(camera, "depth", time, encodings.street_depth_png(depth))
         else:
             self._write(camera, "rgb", time, encodings.rgb_png(drawn.rgb))
-            self._write(camera, "depth", time, encodings.float_npz(depth))
+            self._write(camera, "depth", time, encodings.float_npz(depth, DEPTH_KEY))
         self._write(camera, "semantic_segmentation_2d", time, id_png(self._class_ids[drawn.classes]))
         self._write(camera, "instance_segmentation_2d", time, id_png(drawn.instances))
 
@@ -70,28 +135,28 @@ def calibration(vehicle_from_camera: Mapping[str, Doubles], lens: Intrinsics) ->
     """Parallel lists of names, intrinsics in pixels and extrinsics: where each camera sits on the vehicle."""
     inside = {"fx": lens.fx, "fy": lens.fy, "cx": lens.cx, "cy": lens.cy, "skew": 0.0, "fov": 0.0, "fisheye": 0}
     inside |= {f"k{number}": 0.0 for number in range(1, 7)} | {"p1": 0.0, "p2": 0.0}
-    return {
-        "names": list(vehicle_from_camera),
-        "intrinsics": [inside] * len(vehicle_from_camera),
-        "extrinsics": [_extrinsics(pose) for pose in vehicle_from_camera.values()],
-    }
+    extrinsics = [
+        {
+            "rotation": dict(zip(("qw", "qx", "qy", "qz"), quaternions(pose[:3, :3]).tolist(), strict=True)),
+            "translation": dict(zip("xyz", pose[:3, 3].tolist(), strict=True)),
+        }
+        for pose in vehicle_from_camera.values()
+    ]
+    return {"names": list(vehicle_from_camera), "intrinsics": [inside] * len(extrinsics), "extrinsics": extrinsics}
 
 
-def ontology(classes: Sequence[OntologyItem]) -> dict[str, Any]:
+def ontology(classes: "Sequence[OntologyItem]") -> dict[str, Any]:
     """Names and colours by id, and 255 for what has no class."""
-    items = [_item(kind.id, kind.name, kind.colour, kind.is_thing) for kind in classes]
-    return {"items": [*items, _item(_VOID_ID, "Void", (0, 0, 0), is_thing=False)]}
-
-
-def _item(number: int, name: str, colour: tuple[int, int, int], is_thing: bool) -> dict[str, Any]:
-    red, green, blue = colour
-    shade = {"r": red, "g": green, "b": blue}
-    return {"id": number, "name": name, "color": shade, "isthing": is_thing, "supercategory": ""}
-
-
-def _extrinsics(pose: Doubles) -> dict[str, dict[str, float]]:
-    turn = quaternions(pose[:3, :3]).tolist()
+    rows = [(kind.id, kind.name, kind.colour, kind.is_thing) for kind in classes]
     return {
-        "rotation": dict(zip(("qw", "qx", "qy", "qz"), turn, strict=True)),
-        "translation": dict(zip("xyz", pose[:3, 3].tolist(), strict=True)),
+        "items": [
+            {
+                "id": number,
+                "name": name,
+                "color": dict(zip("rgb", colour, strict=True)),
+                "isthing": is_thing,
+                "supercategory": "",
+            }
+            for number, name, colour, is_thing in [*rows, (_VOID_ID, "Void", (0, 0, 0), False)]
+        ]
     }

@@ -1,27 +1,45 @@
-"""Makes one scene of a world and writes it whole: pictures, metadata, geometry, manifest."""
+"""Makes scenes of a world and writes them whole: pictures, metadata, geometry, manifest; and a picture of them."""
 
 import io
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
+import cv2
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from gcd_model.geometry import Intrinsics
-from gcd_train.errors import DataError, RecipeError
+from gcd_model.small_files import read_json
+from gcd_train.data.files import read_npz
+from gcd_train.errors import DataError, RecipeError, TrainError
+from gcd_train.files import new_folder, remove_leftovers, write_whole
+from gcd_train.layouts import kubric4d, parallel_domain4d
+from gcd_train.layouts.encodings import stored_depth
 from gcd_train.layouts.kubric4d import Kubric4DWriter
-from gcd_train.layouts.manifest import GEOMETRY, MANIFEST, Matrix, SceneManifest, package_version, read_manifest
+from gcd_train.layouts.manifest import (
+    GEOMETRY,
+    MANIFEST,
+    Matrix,
+    SceneFiles,
+    SceneManifest,
+    package_version,
+    read_manifest,
+)
 from gcd_train.layouts.parallel_domain4d import ParallelDomain4DWriter
-from gcd_train.layouts.scene_files import SceneFiles
-from gcd_train.layouts.scene_folder import new_scene
+from gcd_train.parallel import Outcome, map_items, one_thread_each
 from gcd_train.scenes.description import Scene
-from gcd_train.scenes.frozen import FrozenScene, freeze
-from gcd_train.scenes.renderer import Renderer, Rendering, require_drawing
+from gcd_train.scenes.frozen import freeze
+from gcd_train.scenes.renderer import Renderer, require_drawing
 from gcd_train.scenes.worlds import SceneWorld
 
-_FREE_TO_DIFFER = {"version", "files", "world_from_vehicle", "hfov_deg", "cameras", "facts"}
+GIVE_UP_AFTER = 5
+"""Failures in a row after which a run stops: the disk is full, or nothing can be drawn."""
+_SHEET_ROWS, _SHEET_WIDTH = 8, 320
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -38,11 +56,6 @@ class SceneFormat:
         if min(self.width, self.height, self.frames, self.oversample) < 1:
             raise RecipeError(f"sizes, frames and oversampling must be at least 1, got {self}")
 
-    @classmethod
-    def of(cls, world: SceneWorld, *, oversample: int = 2, compact: bool = False) -> "SceneFormat":
-        """As the world's published data set."""
-        return cls(width=world.width, height=world.height, frames=world.frames, oversample=oversample, compact=compact)
-
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SceneMade:
@@ -54,18 +67,6 @@ class SceneMade:
     cpu_s: float = 0.0
 
 
-class LayoutWriter(Protocol):
-    """Takes a scene's views in any order."""
-
-    def add(self, time: int, camera: str, drawn: Rendering) -> None:
-        """One view."""
-        ...
-
-    def finish(self) -> None:
-        """After the last view."""
-        ...
-
-
 def write_scene(root: Path, world: SceneWorld, form: SceneFormat, seed: int) -> SceneMade:
     """Draw and write the scene of a seed, unless it is there: the folder appears once everything is in it.
 
@@ -75,64 +76,66 @@ def write_scene(root: Path, world: SceneWorld, form: SceneFormat, seed: int) -> 
         OSError: the disk is full, or cannot be written.
     """
     place = root / world.scene_name(seed)
+    header = _header(world, form, seed)
     if place.exists():
-        _require_alike(place, world, form, seed)
+        _require_alike(place, header)
         return SceneMade(folder=place, made=False)
     started = time.process_time()
     require_drawing()  # before a simulation of many seconds
     scene = world.make(seed, form.frames)
-    with new_scene(root, place.name) as folder:
+    with new_folder(root, place.name) as folder:
         files = SceneFiles(folder)
-        manifest = _manifest(world, form, seed, scene)
+        lens = Intrinsics.from_hfov(scene.hfov_deg, form.width, form.height)
+        if world.vehicle_from_camera is None:
+            writer = Kubric4DWriter(files, scene, lens, seed=seed, fps=world.fps, compact=form.compact)
+        else:
+            rig = world.vehicle_from_camera()
+            writer = ParallelDomain4DWriter(files, lens, rig, world.classes, compact=form.compact)
         frozen = freeze(scene)
-        _write_views(_writer(files, world, form, seed, scene), scene, frozen, form)
-        files.write(folder / GEOMETRY, _geometry(frozen))
-        told = msgspec.structs.replace(manifest, files=dict(sorted(files.checksums.items())))
-        files.write(folder / MANIFEST, msgspec.json.format(msgspec.json.encode(told), indent=1))
+        with Renderer(form.width, form.height, oversample=form.oversample) as renderer:
+            for step, camera, drawn in renderer.views(frozen, scene.cameras):
+                writer.add(step, camera, drawn)
+        writer.finish()
+        geometry = io.BytesIO()
+        frozen.save(geometry)
+        files.write(folder / GEOMETRY, geometry.getvalue())
+        manifest = SceneManifest(
+            **header,
+            version=package_version(),
+            hfov_deg=scene.hfov_deg,
+            cameras=tuple(scene.cameras),
+            files=dict(sorted(files.checksums.items())),
+            world_from_vehicle=_vehicle_path(world, scene),
+            facts=scene.facts,
+        )
+        files.write(folder / MANIFEST, msgspec.json.format(msgspec.json.encode(manifest), indent=1))
     return SceneMade(folder=place, made=True, size=files.size, cpu_s=time.process_time() - started)
 
 
-def _write_views(writer: LayoutWriter, scene: Scene, frozen: FrozenScene, form: SceneFormat) -> None:
-    with Renderer(form.width, form.height, oversample=form.oversample) as renderer:
-        for step, camera, drawn in renderer.views(frozen, scene.cameras):
-            writer.add(step, camera, drawn)
-    writer.finish()
+def _header(world: SceneWorld, form: SceneFormat, seed: int) -> dict[str, Any]:
+    """What a manifest says of a scene before it is simulated."""
+    return {
+        "layout": world.layout,
+        "world": world.name,
+        "seed": seed,
+        "edition": world.edition,
+        "frames": form.frames,
+        "fps": world.fps,
+        "width": form.width,
+        "height": form.height,
+        "oversample": form.oversample,
+        "compact": form.compact,
+    }
 
 
-def _writer(
-    files: SceneFiles,
-    world: SceneWorld,
-    form: SceneFormat,
-    seed: int,
-    scene: Scene,
-) -> LayoutWriter:
-    lens = Intrinsics.from_hfov(scene.hfov_deg, form.width, form.height)
-    if world.vehicle_from_camera is None:
-        return Kubric4DWriter(files, scene, lens, seed=seed, fps=world.fps, compact=form.compact)
-    rig = world.vehicle_from_camera()
-    return ParallelDomain4DWriter(files, lens, rig, world.classes, compact=form.compact)
-
-
-def _manifest(world: SceneWorld, form: SceneFormat, seed: int, scene: Scene | None) -> SceneManifest:
-    """Without the files. No scene: for comparing what does not depend on it."""
-    return SceneManifest(
-        layout=world.layout,
-        world=world.name,
-        seed=seed,
-        version=package_version(),
-        edition=world.edition,
-        frames=form.frames,
-        fps=world.fps,
-        width=form.width,
-        height=form.height,
-        oversample=form.oversample,
-        compact=form.compact,
-        hfov_deg=scene.hfov_deg if scene else 0.0,
-        cameras=tuple(scene.cameras) if scene else (),
-        files={},
-        world_from_vehicle=_vehicle_path(world, scene) if scene else None,
-        facts=scene.facts if scene else {},
-    )
+def _require_alike(place: Path, header: dict[str, Any]) -> None:
+    there = read_manifest(place)
+    for name, wanted in header.items():
+        came = getattr(there, name)
+        if came != wanted:
+            raise DataError(
+                f"{place} is there already with {name} {came}, wanted {wanted}; choose another folder or remove it"
+            )
 
 
 def _vehicle_path(world: SceneWorld, scene: Scene) -> tuple[Matrix, ...] | None:
@@ -142,17 +145,141 @@ def _vehicle_path(world: SceneWorld, scene: Scene) -> tuple[Matrix, ...] | None:
     return tuple(tuple(map(tuple, rows)) for rows in (scene.cameras[camera] @ np.linalg.inv(pose)).tolist())
 
 
-def _require_alike(place: Path, world: SceneWorld, form: SceneFormat, seed: int) -> None:
-    there, wanted = read_manifest(place), _manifest(world, form, seed, None)
-    for field in there.__struct_fields__:
-        came, needed = getattr(there, field), getattr(wanted, field)
-        if field not in _FREE_TO_DIFFER and came != needed:
-            raise DataError(
-                f"{place} is there already with {field} {came}, wanted {needed}; choose another folder or remove it"
-            )
+@dataclass(slots=True)
+class SceneRun:
+    """An account of a run so far. failures: seed -> error. gave_up: stopped before its end, see `GIVE_UP_AFTER`."""
+
+    written: int = 0
+    there: int = 0
+    size: int = 0
+    cpu_s: float = 0.0
+    failures: dict[int, str] = field(default_factory=dict[int, str])
+    exit_code: int = 0
+    in_a_row: int = 0
+
+    @property
+    def done(self) -> int:
+        """Scenes with an outcome."""
+        return self.written + self.there + len(self.failures)
+
+    @property
+    def gave_up(self) -> bool:
+        """Whether too many failed in a row."""
+        return self.in_a_row >= GIVE_UP_AFTER
+
+    def add(self, outcome: Outcome[int, SceneMade]) -> None:
+        """Count one scene."""
+        try:
+            made = outcome.unwrap()
+        except TrainError as error:
+            self.failures[outcome.item] = str(error)
+            self.exit_code = error.exit_code
+            self.in_a_row += 1
+            return
+        self.in_a_row = 0
+        self.written += made.made
+        self.there += not made.made
+        self.size += made.size
+        self.cpu_s += made.cpu_s
+
+    def lines(self) -> list[str]:
+        """What to tell at the end: a summary, and one line for each failure."""
+        size = f", {self.size / 1e6:.1f} MB, {self.cpu_s:.1f} CPU s" if self.written else ""
+        counts = f"{self.written} written{size}; {self.there} there already; {len(self.failures)} failed"
+        reasons = [f"  seed {seed}: {why}" for seed, why in self.failures.items()]
+        if self.gave_up:
+            reasons.append(f"  gave up after {GIVE_UP_AFTER} failures in a row; run the same line again to go on")
+        return [f"scenes: {counts}", *reasons]
 
 
-def _geometry(frozen: FrozenScene) -> bytes:
-    file: Any = io.BytesIO()
-    frozen.save(file)
-    return file.getvalue()
+def generate_scenes(
+    root: Path,
+    world: SceneWorld,
+    form: SceneFormat,
+    seeds: range,
+    *,
+    workers: int = 1,
+    ray_address: str | None = None,
+) -> Iterator[SceneRun]:
+    """Make the scenes of `seeds` in the folder `root`; gives the account after every scene, the same object each time.
+
+    Scenes that are there are kept, what a killed run left half done is removed. workers, ray_address: see `map_items`.
+    Raises: RunError as `map_items`.
+    """
+    root = root.resolve()
+    remove_leftovers(root)
+    one_thread_each()
+    run = SceneRun()
+    for outcome in map_items(partial(write_scene, root, world, form), seeds, workers=workers, ray_address=ray_address):
+        run.add(outcome)
+        yield run
+        if run.gave_up:
+            return
+
+
+def write_scene_sheet(scenes: Sequence[Path], out: Path) -> None:
+    """First, middle and last frame of one camera, two others, depth and labels, of the first 8 scenes, as PNG.
+
+    Raises:
+        DataError: none of the scenes is there, or a picture cannot be read.
+        RunError: the sheet cannot be written.
+    """
+    there = [scene for scene in scenes if (scene / MANIFEST).exists()][:_SHEET_ROWS]
+    if not there:
+        raise DataError(f"there is no finished scene to draw into {out.name}; look at the failures above")
+    rows = [np.concatenate([_small(picture) for picture in _row(scene)], axis=1) for scene in there]
+    _, data = cv2.imencode(".png", np.concatenate([row for row in rows if row.shape == rows[0].shape]))
+    write_whole(out, data.tobytes())
+
+
+def _row(scene: Path) -> Iterator[NDArray[np.uint8]]:
+    """BGR pictures, read back from the scene's files."""
+    manifest = read_manifest(scene)
+    last = manifest.frames - 1
+    on_stage = manifest.layout == "kubric4d"
+    names: Any = kubric4d if on_stage else parallel_domain4d
+    colour, ids = ("rgba", "segmentation") if on_stage else ("rgb", "semantic_segmentation_2d")
+    cameras = (4, 0, 9) if on_stage else (parallel_domain4d.FORWARD, "yaw-60", "camera0")
+    first, second, third = (n if isinstance(n, str) or n < len(manifest.cameras) else 0 for n in cameras)
+
+    def path(camera: int | str, layer: str, step: int) -> Path:
+        return names.frame_path(scene, camera, layer, step, compact=manifest.compact)
+
+    for camera, step in ((first, 0), (first, manifest.frames // 2), (first, last), (second, last), (third, last)):
+        yield _read(path(camera, colour, step), cv2.IMREAD_COLOR_BGR).astype(np.uint8)
+    metres = _metres(path(first, "depth", last))
+    near = np.float32(np.percentile(metres, 2))
+    yield np.repeat((255 * near / np.maximum(metres, near)).astype(np.uint8)[..., None], 3, -1)
+    labels = _read(path(first, ids, last), cv2.IMREAD_COLOR_BGR).astype(np.uint8)
+    yield labels if on_stage else _class_colours(scene)[labels[..., 2]]
+
+
+def _read(path: Path, flag: int) -> NDArray[np.generic]:
+    picture = cv2.imread(str(path), flag)
+    if picture is None:
+        raise DataError(f"{path} cannot be read; delete the scene and generate it again")
+    return picture
+
+
+def _metres(path: Path) -> NDArray[np.float32]:
+    if path.suffix == ".npz":
+        return read_npz(path)[parallel_domain4d.DEPTH_KEY].astype(np.float32)
+    stored = _read(path, cv2.IMREAD_UNCHANGED)
+    metres = stored_depth(stored) if path.suffix == ".png" else np.asarray(stored, np.float32)
+    if metres is None:
+        raise DataError(f"{path} holds no depth codes, but {stored.dtype} {list(stored.shape)}; remove the scene")
+    return metres
+
+
+def _class_colours(scene: Path) -> NDArray[np.uint8]:
+    """BGR by class id, [256, 3]."""
+    palette = np.zeros((256, 3), np.uint8)
+    for ontology in parallel_domain4d.ontology_folder(scene).glob("*.json"):
+        for item in read_json(ontology, dict[str, Any])["items"]:
+            palette[item["id"]] = [item["color"][channel] for channel in "bgr"]
+    return palette
+
+
+def _small(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    height = round(_SHEET_WIDTH * picture.shape[0] / picture.shape[1])
+    return np.asarray(cv2.resize(picture, (_SHEET_WIDTH, height), interpolation=cv2.INTER_AREA), np.uint8)

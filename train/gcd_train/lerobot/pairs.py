@@ -1,12 +1,13 @@
 """Pairs of calibrated cameras of LeRobot data sets: training with real robots, without the package lerobot.
 
 Both cameras filmed the same moments, so one is the source, the other the target, and the calibration says how they
-stand to each other. See `cameras` for what the calibration file holds.
+stand to each other. See `folder` for what the calibration file holds.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,10 +21,86 @@ from gcd_train.data.pictures import narrower, seen_through
 from gcd_train.data.sample import Sample
 from gcd_train.data.views import readable
 from gcd_train.errors import DataError
-from gcd_train.lerobot.cameras import CameraCalibration, read_cameras
-from gcd_train.lerobot.extra import load_arrow, load_av
-from gcd_train.lerobot.folder import EpisodePlace, LeRobotFolder, read_rows
-from gcd_train.lerobot.video import read_pictures
+from gcd_train.lerobot.folder import (
+    CameraCalibration,
+    EpisodePlace,
+    LeRobotFolder,
+    load_arrow,
+    load_av,
+    read_cameras,
+    read_rows,
+)
+
+_EARLY_S = 0.5
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class VideoClip:
+    """pictures: u8 [T, H, W, 3], RGB. bytes_read: of packets."""
+
+    pictures: NDArray[np.uint8]
+    bytes_read: int
+
+
+def read_pictures(path: Path, times_s: Sequence[float], tolerance_s: float) -> VideoClip:
+    """The picture nearest to each time.
+
+    Args:
+        times_s: rising, seconds in the file.
+        tolerance_s: a picture farther away in time is none.
+    Raises: FileFault: the video is missing, damaged, too short, or has no picture near enough. DataError: no PyAV.
+    """
+    av = load_av()
+    if not path.is_file():
+        raise FileFault(path, "is missing: download or export the data set again")
+    counted = _Counted()
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise FileFault(path, "holds no video")
+            shown = _pictures_since(container, times_s[0], counted)
+            chosen = list(_nearest(path, shown, times_s, tolerance_s))
+    except (av.FFmpegError, ValueError, IndexError) as error:
+        raise FileFault(path, f"is damaged ({error})") from error
+    return VideoClip(pictures=np.stack(chosen), bytes_read=counted.bytes)
+
+
+@dataclass(slots=True)
+class _Counted:
+    bytes: int = 0
+
+
+def _pictures_since(container: Any, first_s: float, counted: _Counted) -> Iterator[tuple[float, Any]]:
+    """Time and frame of every picture, from a little before `first_s`."""
+    stream = container.streams.video[0]
+    stream.thread_type = "NONE"  # loader workers share the cores
+    begin = max(0.0, first_s - _EARLY_S)
+    container.seek(int(begin / stream.time_base), stream=stream, backward=True)
+    for packet in container.demux(stream):
+        counted.bytes += packet.size
+        for frame in packet.decode():
+            if frame.pts is not None:
+                yield float(frame.pts * frame.time_base), frame
+
+
+def _nearest(
+    path: Path, shown: Iterator[tuple[float, Any]], times_s: Sequence[float], tolerance_s: float
+) -> Iterator[NDArray[np.uint8]]:
+    """One picture a wanted time; a picture may serve two."""
+    before: tuple[float, Any] | None = None
+    after = next(shown, None)
+    for wanted in times_s:
+        while after is not None and after[0] < wanted:
+            before, after = after, next(shown, None)
+        there = [pair for pair in (before, after) if pair is not None]
+        if not there:
+            raise FileFault(path, "holds no picture that can be decoded")
+        time, frame = there[0] if abs(there[0][0] - wanted) <= abs(there[-1][0] - wanted) else there[-1]
+        if abs(time - wanted) > tolerance_s:
+            end = f"it ends at {time:.3f} s" if after is None else f"the nearest is at {time:.3f} s"
+            raise FileFault(path, f"has no picture within {1000 * tolerance_s:.1f} ms of {wanted:.3f} s: {end}")
+        yield frame.to_ndarray(format="rgb24")
+
 
 __all__ = ["LeRobotOptions", "LeRobotPairs"]
 

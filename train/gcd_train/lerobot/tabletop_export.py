@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.errors import RecipeError, RunError
-from gcd_train.layouts.scene_folder import new_scene
-from gcd_train.lerobot.cameras import CameraCalibration
+from gcd_train.files import new_folder
+from gcd_train.lerobot.folder import CameraCalibration
 from gcd_train.lerobot.writer import ExportOptions, LeRobotWriter, LoggedEpisode
 from gcd_train.scenes.drop import HFOV_DEG, orbit_cameras
 from gcd_train.scenes.frozen import freeze
@@ -51,7 +51,7 @@ def export_tabletop(out: Path, export: TabletopExport) -> Iterator[int]:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise RunError(f"{out} is there already; choose another folder, or remove it")
     with (
-        new_scene(out.absolute().parent, out.name) as folder,
+        new_folder(out.absolute().parent, out.name) as folder,
         Renderer(export.width, export.height, oversample=export.oversample) as renderer,
         LeRobotWriter(folder, _calibrations(export, poses), _options(export)) as writer,
     ):

@@ -1,7 +1,7 @@
 """Episodes of a robot as a LeRobot data set (format v3.0), with the cameras' calibration beside it.
 
 Source: the LeRobotDataset v3.0 format as its documentation describes it: many episodes a file, `meta/episodes` says
-where each begins. The calibration is ours, see `cameras`.
+where each begins. The calibration is ours, see `folder`.
 """
 
 import json
@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_train.errors import DataError
-from gcd_train.lerobot.cameras import CameraCalibration, write_cameras
-from gcd_train.lerobot.extra import load_arrow, load_av
+from gcd_train.lerobot.folder import CameraCalibration, load_arrow, load_av, write_cameras
 
 
 @dataclass(slots=True)

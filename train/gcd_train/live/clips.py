@@ -28,7 +28,7 @@ from gcd_model.small_files import decode_json
 from gcd_train.errors import DataError, RenderError
 from gcd_train.files import whole
 from gcd_train.live.draws import FLOOR_Z_M, METRES_A_UNIT, LiveDraw, LiveWorld, Poses, TargetPath, live_scene
-from gcd_train.map_items import map_items, one_thread_each
+from gcd_train.parallel import map_items, one_thread_each
 from gcd_train.scenes.description import Scene
 from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.renderer import Renderer, Rendering

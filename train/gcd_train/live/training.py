@@ -31,7 +31,7 @@ from gcd_train.live.paint_training import HeldOutViews, PaintTask
 from gcd_train.live.recipe import LiveRecipe, LiveStage
 from gcd_train.live.target_views import ViewBatches
 from gcd_train.loop import Loop, LoopOptions, Task
-from gcd_train.map_items import map_items
+from gcd_train.parallel import map_items
 from gcd_train.recipe import ComputeRecipe
 from gcd_train.recipe.values import LiveStageName
 from gcd_train.run_folder import RunFolder

@@ -17,7 +17,7 @@ from gcd_train.data.pairs import PairedClip, PairedClips
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
+from gcd_train.layouts import kubric4d, parallel_domain4d
 from gcd_train.look.clip import SKY_M, Footage, LabelName, instance_colour, splatted
 from gcd_train.look.scene_clip import ShowOptions, dataset_clip
 from gcd_train.pointcloud import depth_visibility
@@ -124,21 +124,21 @@ def open_scene(path: Path, options: ShowOptions, clip_seed: int | None = None) -
         raise RecipeError("--clip names a clip of pair shards; choose one of a scene with --start, --stride and --seed")
     if not path.is_dir():
         raise DataError(f"{path} is no folder; give a scene such as scn00000 or scene_000000, or pair shards")
-    if kubric4d_names.scene_number(path.name) is not None:
+    if kubric4d.scene_number(path.name) is not None:
         # with the views that are there: to look at a scene not all are needed
-        every = enumerate(kubric4d_names.CAMERAS)
-        views = [camera for view, camera in every if kubric4d_names.metadata_path(path, view).exists()]
-        orbits = Kubric4D(path.parent, [path.name], cameras=views or kubric4d_names.CAMERAS, instances=True)
+        every = enumerate(kubric4d.CAMERAS)
+        views = [camera for view, camera in every if kubric4d.metadata_path(path, view).exists()]
+        orbits = Kubric4D(path.parent, [path.name], cameras=views or kubric4d.CAMERAS, instances=True)
         return dataset_clip(orbits, path.name, options)
-    if parallel_domain4d_names.scene_number(path.name) is not None:
-        cameras = [camera for camera in parallel_domain4d_names.CAMERAS if (path / "rgb" / camera).is_dir()]
+    if parallel_domain4d.scene_number(path.name) is not None:
+        cameras = [camera for camera in parallel_domain4d.CAMERAS if (path / "rgb" / camera).is_dir()]
         classes = (path / "semantic_segmentation_2d").is_dir()
         drives = ParallelDomain4D(
             path.parent,
             [path.name],
-            cameras=cameras or parallel_domain4d_names.CAMERAS,
+            cameras=cameras or parallel_domain4d.CAMERAS,
             classes=classes,
-            ontology=read_ontology(parallel_domain4d_names.ontology_folder(path)) if classes else None,
+            ontology=read_ontology(parallel_domain4d.ontology_folder(path)) if classes else None,
         )
         return dataset_clip(drives, path.name, options)
     raise DataError(_guess(path))
@@ -158,7 +158,7 @@ def _guess(path: Path) -> str:
     scenes = [
         name
         for name in inside
-        if kubric4d_names.scene_number(name) is not None or parallel_domain4d_names.scene_number(name) is not None
+        if kubric4d.scene_number(name) is not None or parallel_domain4d.scene_number(name) is not None
     ]
     if scenes:
         return f"{path} is a set of {len(scenes)} scenes; show one, such as {path / scenes[0]}"

@@ -26,7 +26,7 @@ from gcd_train.data.pictures import trained_picture
 from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError, RecipeError, RenderError
 from gcd_train.evaluation.scene_clips import nearest_resized
-from gcd_train.layouts import kubric4d_names
+from gcd_train.layouts import kubric4d
 from gcd_train.layouts.manifest import GEOMETRY, SceneManifest, read_manifest
 from gcd_train.look.clip import SKY_M, Bytes, Footage, LabelName, instance_colour, splatted
 from gcd_train.pointcloud import depth_visibility, published_picture, render_lens, visibility
@@ -272,7 +272,7 @@ class _Assets(msgspec.Struct, frozen=True):
 
 def _asset_names(folder: Path, camera: str) -> dict[int, str]:
     """What instances 1, 2, ... are called in the metadata of a Kubric-4D view; empty where it does not tell."""
-    path = kubric4d_names.metadata_path(folder, int(camera.removeprefix("view") or 0))
+    path = kubric4d.metadata_path(folder, int(camera.removeprefix("view") or 0))
     try:
         assets = read_json(path, _Assets, MOST_TEXT).instances
     except FileError:

@@ -1,6 +1,12 @@
-"""Depth pictures projected into another camera's picture."""
+"""From the pixels of depth cameras to points, and to the pixels of another camera.
 
+A pixel (u, v) at depth z falls at z (A (u, v, 1)) + b, with one matrix A and one vector b for the two cameras, so no
+points in the world are ever stored. Tiles of a picture that the other camera cannot see are left out before that.
+"""
+
+import math
 from dataclasses import dataclass
+from typing import Self, TypeVar
 
 import numpy as np
 import torch
@@ -9,9 +15,248 @@ from torch import Tensor
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.data.sample import SceneView
-from gcd_train.pointcloud.options import SplatOptions
-from gcd_train.pointcloud.pixel_map import Doubles, PixelMap
-from gcd_train.pointcloud.tiles import Tiles, contributing
+from gcd_train.errors import DataError, RecipeError
+
+Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
+Number = TypeVar("Number", bound=np.generic)
+
+_SIDE = 32  # pixels; larger tiles leave out less, smaller ones take longer to look at
+_MARGIN = 1.0  # pixels beyond each edge, against rounding
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SplatOptions:
+    """How points become a picture. The defaults weigh as published, on exact pinhole geometry.
+
+    radius: each point also shows in the pixels from -(radius // 2) to (radius + 1) // 2 about its own, both ways: 0 its
+        own alone, 1 also right, below and below right, 2 all eight neighbours. neighbour_share: of its weight there.
+    sharpness: k of the soft depth test, weight = exp(-k (2 d / d_max - 1)), d the depth, d_max the picture's largest.
+    far_from_m: where d_max reaches this, d is min(sqrt(depth), far_limit) and k is far_sharpness.
+    nearest_m: what is not beyond this in front of the target camera is left out. farthest_m: a source depth beyond this
+        is taken for unknown.
+    negligible: relative weight below which a point is left out before colours are gathered; 0 keeps all.
+    published: pixels are whole numbers without the half that leads to their middles, in the source as in the target,
+        and what lies up to a pixel beyond the left or upper edge falls on it. For comparing with the published clouds
+        only: it shifts pictures that differ in size by part of a pixel.
+    compact: forget points outside the picture at once, which on a GPU means to wait for it; None does so on the CPU
+        only.
+    Raises RecipeError for numbers that mean nothing.
+    Source: Generative Camera Dolly, point renderer as released.
+    """
+
+    radius: int = 1
+    neighbour_share: float = 0.02
+    sharpness: float = 512.0
+    far_from_m: float = 64.0
+    far_sharpness: float = 256.0
+    far_limit: float = 32.0
+    nearest_m: float = 0.1
+    farthest_m: float = 30_000.0
+    negligible: float = 4e-8
+    published: bool = False
+    compact: bool | None = None
+
+    def __post_init__(self) -> None:
+        if self.radius < 0:
+            raise RecipeError(f"a splat radius must be a whole number of pixels from 0 up, got {self.radius}")
+        if not 0.0 < self.neighbour_share <= 1.0:
+            raise RecipeError(f"a neighbour's share must lie above 0 and up to 1, got {self.neighbour_share:g}")
+        if not 0.0 <= self.negligible < 1.0:
+            raise RecipeError(f"a negligible weight must lie from 0 up and below 1, got {self.negligible:g}")
+        lengths = (self.sharpness, self.far_from_m, self.far_sharpness, self.far_limit, self.nearest_m, self.farthest_m)
+        if not all(math.isfinite(number) and number > 0.0 for number in lengths):
+            raise RecipeError(f"sharpness and distances of a splat must be positive and finite, got {self}")
+
+    @property
+    def pixel_centre(self) -> float:
+        """What leads from a pixel's number to where its ray goes, pixels."""
+        return 0.0 if self.published else 0.5
+
+    @property
+    def offsets(self) -> range:
+        """The pixels a point shows in, counted from its own, in either direction."""
+        return range(-(self.radius // 2), (self.radius + 1) // 2 + 1)
+
+
+def planar_from_distance(distance: Floats, lens: Intrinsics, *, published: bool = False) -> Floats:
+    """Depth along the optical axis from the distance to the camera's centre.
+
+        z = distance / |((u - cx) / fx, (v - cy) / fy, 1)|        through the middles of the pixels
+
+    Args:
+        distance: f32 [H, W], metres. lens: of the same picture, pixels.
+        published: as released: tangents of angles that are evenly spaced from edge to edge instead. Exact in the centre
+            and in the corners, up to 0.5 % off between (at 53 degrees).
+    Returns:
+        f32 [H, W], metres; whatever is not known stays as it is.
+    Raises:
+        DataError: the lens is another picture's.
+    Source: Generative Camera Dolly, Kubric-4D; Kubric's depth is the distance.
+    """
+    _require_size(distance, lens)
+    right, down = _tangents_of_even_angles(lens) if published else tangents(lens, 0.5)
+    lengths = np.sqrt(1.0 + right[None, :] ** 2 + down[:, None] ** 2)  # [H, W]
+    return distance / lengths.astype(np.float32)
+
+
+def unproject(view: SceneView, *, published: bool = False) -> Floats:
+    """The points a view sees.
+
+    Args:
+        view: with its depth. published: whole pixel numbers, without the half that leads to their middles.
+    Returns:
+        f32 [H, W, 3] in the world, metres; NaN where the depth is 0, not finite or absurd.
+    Raises:
+        DataError: depth and lens are of different sizes.
+    """
+    _require_size(view.depth, view.lens)
+    right, down = tangents(view.lens, 0.0 if published else 0.5)
+    known = np.where(is_known(view.depth, SplatOptions().farthest_m), view.depth, np.nan)
+    turn, position = view.world_from_camera[:3, :3], view.world_from_camera[:3, 3]
+    rays = turn[:, 0] * right[None, :, None] + turn[:, 1] * down[:, None, None] + turn[:, 2]  # [H, W, 3]
+    return (known[..., None] * rays + position).astype(np.float32)
+
+
+def is_known(depth: Floats, farthest_m: float) -> NDArray[np.bool_]:
+    """Where a depth is one: positive, a number, and not beyond what any scene has."""
+    return (depth > 0.0) & (depth <= farthest_m)
+
+
+def tangents(lens: Intrinsics, pixel_centre: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """How far the rays of all columns go to the right, [W], and of all rows down, [H], for 1 ahead."""
+    right = (np.arange(lens.width, dtype=np.float64) + pixel_centre - lens.cx) / lens.fx
+    down = (np.arange(lens.height, dtype=np.float64) + pixel_centre - lens.cy) / lens.fy
+    return right, down
+
+
+def _tangents_of_even_angles(lens: Intrinsics) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    across, along = math.radians(lens.hfov_deg) / 2, math.radians(lens.vfov_deg) / 2
+    right = np.linspace(-across, across, lens.width, dtype=np.float64)
+    down = np.linspace(-along, along, lens.height, dtype=np.float64)
+    return np.tan(right), np.tan(down)
+
+
+def _require_size(depth: Floats, lens: Intrinsics) -> None:
+    if depth.shape != (lens.height, lens.width):
+        raise DataError(
+            f"a depth picture must be of its lens's size, {lens.width} x {lens.height}, got {list(depth.shape)[::-1]}; "
+            "resize the lens with the picture"
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PixelMap:
+    """The map between two cameras.
+
+        (x, y, ahead) = z (across[u] + along[v]) + offset,    target pixel = (x / ahead + cx, y / ahead + cy)
+
+    across: [W, 3] and along: [H, 3], of the source's columns and rows. offset: [3], the source's camera itself.
+    float64; x and y are counted from the target's principal point, where float32 will be finest.
+    """
+
+    across: Doubles
+    along: Doubles
+    offset: Doubles
+
+    @classmethod
+    def between(
+        cls,
+        world_from_source: Doubles,
+        source: Intrinsics,
+        world_from_target: Doubles,
+        target: Intrinsics,
+        pixel_centre: float,
+    ) -> Self:
+        """From a camera with the lens `source` to one with the lens `target`; poses are [4, 4], metres."""
+        target_from_source = np.linalg.inv(world_from_target) @ world_from_source
+        pixels_from_source = np.diag([target.fx, target.fy, 1.0]) @ target_from_source[:3]
+        right, down = tangents(source, pixel_centre)
+        return cls(
+            across=right[:, None] * pixels_from_source[:, 0],
+            along=down[:, None] * pixels_from_source[:, 1] + pixels_from_source[:, 2],
+            offset=pixels_from_source[:, 3],
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Tiles:
+    """Some of the square tiles of a picture, by row and column of tiles: int64 [K] each."""
+
+    row: NDArray[np.intp]
+    column: NDArray[np.intp]
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+    def cut(self, picture: NDArray[Number]) -> NDArray[Number]:
+        """These tiles of a picture [H, W, ...], as [K, side, side, ...]; 0 beyond its edges."""
+        return _tiled(picture)[self.row, :, self.column]
+
+    def lines(self, pixels: PixelMap) -> tuple[Doubles, Doubles]:
+        """The map's columns and rows in these tiles: across [3, K, 1, side] and along [3, K, side, 1]."""
+        across, along = _tiled_line(pixels.across)[self.column], _tiled_line(pixels.along)[self.row]  # [K, side, 3]
+        return across.transpose(2, 0, 1)[:, :, None, :], along.transpose(2, 0, 1)[..., None]
+
+
+def contributing(depth: NDArray[np.float32], pixels: PixelMap, lens: Intrinsics, options: SplatOptions) -> Tiles:
+    """The tiles that may reach into the target's picture: all that do, and few that do not.
+
+    Where the two cameras' fields of view do not meet, there are none, and the depth is not even looked at.
+
+    depth: f32 [H, W] of the source, metres. pixels: from there to the target. lens: of the target.
+    """
+    frustum = _Frustum(pixels=pixels, lens=lens, options=options)
+    none, all_depths = np.zeros((1, 1)), np.full((1, 1), options.farthest_m)
+    if frustum.misses(pixels.across[None], pixels.along[None], none, all_depths).all():
+        return Tiles(row=np.zeros(0, np.intp), column=np.zeros(0, np.intp))
+    tiled = _tiled(depth)
+    # One axis after the other, the long one last: six times as fast as both at once.
+    low, high = tiled.min(axis=1).min(axis=-1), tiled.max(axis=1).max(axis=-1)
+    low, high = np.maximum(low, 0.0), np.minimum(high, options.farthest_m)
+    missed = frustum.misses(_tiled_line(pixels.across), _tiled_line(pixels.along), low, high)
+    row, column = np.nonzero(~(missed | (high <= 0.0)))
+    return Tiles(row=row, column=column)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Frustum:
+    """What the target camera sees."""
+
+    pixels: PixelMap
+    lens: Intrinsics
+    options: SplatOptions
+
+    def misses(
+        self, across: Doubles, along: Doubles, low: NDArray[np.floating], high: NDArray[np.floating]
+    ) -> NDArray[np.bool_]:
+        """Which tiles are wholly beyond one of its sides: bool [rows, columns].
+
+        across: [columns, side, 3], along: [rows, side, 3]; low, high: [rows, columns], the depths in each tile. A
+        tile's points lie between eight corners. Whatever is not a number is never beyond anything.
+        """
+        ray = along[:, None, [0, -1], None] + across[None, :, None, [0, -1]]  # [rows, columns, 2, 2, 3]
+        depths = np.stack([low, high], axis=-1)[..., None, None, None]  # [rows, columns, 2, 1, 1, 1]
+        with np.errstate(invalid="ignore"):  # of depths that are no numbers
+            x, y, ahead = np.moveaxis(depths * ray[:, :, None] + self.pixels.offset, -1, 0)  # [rows, columns, 2, 2, 2]
+        beyond = [ahead <= self.options.nearest_m]
+        for place, centre, size in ((x, self.lens.cx, self.lens.width), (y, self.lens.cy, self.lens.height)):
+            beyond += [place + (centre + 1.0 + _MARGIN) * ahead < 0.0, place + (centre - size - _MARGIN) * ahead > 0.0]
+        return np.any([side.all(axis=(2, 3, 4)) for side in beyond], axis=0)
+
+
+def _tiled(picture: NDArray[Number]) -> NDArray[Number]:
+    """[H, W, ...] as [rows, side, columns, side, ...], filled up with 0."""
+    height, width = picture.shape[:2]
+    rest = [(0, -height % _SIDE), (0, -width % _SIDE)] + [(0, 0)] * (picture.ndim - 2)
+    filled = np.pad(picture, rest) if rest[0][1] or rest[1][1] else picture
+    shape = (filled.shape[0] // _SIDE, _SIDE, filled.shape[1] // _SIDE, _SIDE, *picture.shape[2:])
+    return filled.reshape(shape)
+
+
+def _tiled_line(line: Doubles) -> Doubles:
+    """[N, 3] as [tiles, side, 3], the last one repeated."""
+    return np.pad(line, [(0, -len(line) % _SIDE), (0, 0)], mode="edge").reshape(-1, _SIDE, 3)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -1,4 +1,6 @@
-"""The picture a training sample shows: points drawn a little larger, holes filled, blurred, made smaller."""
+"""The picture a training sample shows: points drawn a little larger, holes filled, blurred, made smaller; and what of
+it the source camera saw too.
+"""
 
 from collections.abc import Sequence
 
@@ -10,13 +12,16 @@ from torch import Tensor
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.data.sample import SceneView
-from gcd_train.pointcloud.holes import fill_holes
-from gcd_train.pointcloud.options import SplatOptions
-from gcd_train.pointcloud.pixel_map import Doubles
+from gcd_train.errors import DataError
+from gcd_train.pointcloud.project import Doubles, Floats, PixelMap, SplatOptions
 from gcd_train.pointcloud.splat import Bytes, splat
 
 OVERSIZE = 1.09375
 """Drawn at 420 x 280 for 384 x 256."""
+_LEAST = 1e-7
+_BLACK = 1e-7
+_KERNEL, _SIGMA = 3, 0.75  # of visibility
+_NEAREST_M = 0.1  # in front of the source camera
 
 
 def render_lens(lens: Intrinsics, width: int, height: int) -> Intrinsics:
@@ -95,3 +100,117 @@ def published_picture(
     )
     half = 0.0 if options is not None and options.published else 0.5
     return (picture * 255 + half).clamp(0, 255).to(torch.uint8).cpu().numpy()
+
+
+def fill_holes(
+    colour: Tensor, covered: Tensor, *, kernel: int = 21, sigma: float = 5.25, blur_sigma: float = 0.6
+) -> Tensor:
+    """Holes take the weighted mean of what is around them; then the whole picture is blurred a little.
+
+        filled = G(colour * covered) / max(G(covered), 1e-7)        where not covered, G a Gaussian of `kernel` pixels
+
+    Holes with nothing covered within the kernel stay black. Pictures go on beyond their edges mirrored.
+
+    Args:
+        colour: float32 [H, W, C]. covered: bool [H, W].
+        kernel, sigma: of the filling, pixels; kernel is odd. blur_sigma: of the 3 x 3 blur over everything.
+    Returns:
+        [H, W, C].
+    Source: Generative Camera Dolly, point renderer as released; the mirrored edges are our reading.
+    """
+    held = covered[..., None].to(colour.dtype)
+    blurred = _blur(torch.cat([colour * held, held], dim=-1), kernel, sigma)
+    filled = torch.where(covered[..., None], colour, blurred[..., :-1] / blurred[..., -1:].clamp(min=_LEAST))
+    return _blur(filled, 3, blur_sigma)
+
+
+def _blur(picture: Tensor, kernel: int, sigma: float) -> Tensor:
+    """[H, W, C] through a Gaussian, one axis after the other."""
+    reach = kernel // 2
+    away = torch.arange(-reach, reach + 1, device=picture.device, dtype=picture.dtype)
+    weights = torch.softmax(-(away**2) / (2 * sigma**2), dim=0)
+    planes = F.pad(picture.permute(2, 0, 1)[:, None], (reach, reach, reach, reach), mode="reflect")  # [C, 1, H, W]
+    planes = F.conv2d(F.conv2d(planes, weights.view(1, 1, 1, -1)), weights.view(1, 1, -1, 1))
+    return planes[:, 0].permute(1, 2, 0)
+
+
+def visibility(
+    source: SceneView,
+    world_from_camera: Doubles,
+    lens: Intrinsics,
+    *,
+    width: int = 384,
+    height: int = 256,
+    options: SplatOptions | None = None,
+) -> NDArray[np.bool_]:
+    """Where the source view alone, drawn as another camera sees it, shows anything: the published rule.
+
+    Whether the target shows the same thing there is not asked, and what is black counts as hidden.
+
+    Args:
+        source: with depth. world_from_camera, lens, width, height, options: see published_tensor().
+    Returns:
+        bool [height, width]; the complement counts as occluded.
+    Source: Generative Camera Dolly, evaluation as released: holes are filled over 3 pixels, not 21.
+    """
+    shown = published_tensor(
+        [source],
+        world_from_camera,
+        lens,
+        width=width,
+        height=height,
+        options=options,
+        kernel=_KERNEL,
+        sigma=_SIGMA,
+    )
+    return (shown.sum(-1) > _BLACK).numpy()
+
+
+def depth_visibility(
+    source: SceneView, target_depth: Floats, world_from_camera: Doubles, lens: Intrinsics, *, tolerance: float = 0.02
+) -> NDArray[np.bool_]:
+    """Where the source camera saw the very surface that the target shows.
+
+    Each target pixel is looked up in the source's depth: at one of the four pixels around, or between them, where
+    inverse depth is interpolated, as planes have it.
+
+    Args:
+        source: with depth. target_depth: f32 [H, W], planar, metres, 0 where nothing is known.
+        world_from_camera, lens: of the target. tolerance: share of the depth by which the two may differ.
+    Returns:
+        bool [H, W]; False where either depth is not known.
+    Raises:
+        DataError: the target's depth and lens are of different sizes.
+    """
+    if target_depth.shape != (lens.height, lens.width):
+        raise DataError(
+            f"the target's depth must be {lens.width} x {lens.height} as its lens says, got {target_depth.shape[::-1]}"
+        )
+    pixels = PixelMap.between(world_from_camera, lens, source.world_from_camera, source.lens, 0.5)
+    rays = pixels.across[None] + pixels.along[:, None]  # [H, W, 3]
+    x, y, ahead = np.moveaxis(target_depth[..., None] * rays + pixels.offset, -1, 0)
+    met = (target_depth > 0.0) & (ahead > _NEAREST_M)
+    column = x / np.where(met, ahead, 1.0) + source.lens.cx
+    row = y / np.where(met, ahead, 1.0) + source.lens.cy
+    met &= (column >= 0) & (column < source.lens.width) & (row >= 0) & (row < source.lens.height)
+    agrees = np.zeros(met.shape, np.bool_)
+    agrees[met] = _agrees(source.depth, column[met], row[met], ahead[met], tolerance)
+    return agrees
+
+
+def _agrees(depth: Floats, column: Doubles, row: Doubles, wanted: Doubles, tolerance: float) -> NDArray[np.bool_]:
+    """[M]: whether a depth picture has the wanted depths at these places, counted from its corner."""
+    left, top = np.floor(column - 0.5).astype(np.intp), np.floor(row - 0.5).astype(np.intp)
+    right_share, lower_share = column - 0.5 - left, row - 0.5 - top
+    found = np.zeros(len(wanted), np.bool_)
+    inverse, weight = np.zeros(len(wanted)), np.zeros(len(wanted))
+    for right in (0, 1):
+        for lower in (0, 1):
+            at = np.clip(top + lower, 0, depth.shape[0] - 1), np.clip(left + right, 0, depth.shape[1] - 1)
+            near = depth[at].astype(np.float64)
+            share = np.abs(1 - right - right_share) * np.abs(1 - lower - lower_share) * (near > 0)
+            inverse += share / np.where(near > 0, near, 1.0)
+            weight += share
+            found |= np.abs(near - wanted) <= tolerance * wanted
+    between = weight / np.where(inverse > 0, inverse, 1.0)
+    return found | ((inverse > 0) & (np.abs(between - wanted) <= tolerance * wanted))

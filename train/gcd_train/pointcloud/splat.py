@@ -1,7 +1,9 @@
 """Point clouds of several depth cameras as another camera sees them, unprojected and drawn in one go, in float32.
 
 The published renderer needs float64, as its weights span hundreds of orders of magnitude. Only their ratios within a
-pixel count, so the nearest depth of each pixel is found first, and weights are taken relative to it.
+pixel count, so the nearest depth of each pixel is found first, and weights are taken relative to it. A point's weight
+in a neighbour is its own times a constant, so points are gathered at their own pixels and the neighbours are served
+from pictures: the cost does not depend on how many points there are.
 """
 
 import math
@@ -11,19 +13,19 @@ from typing import Self
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError
-from gcd_train.pointcloud.options import SplatOptions
-from gcd_train.pointcloud.pixel_map import Doubles
-from gcd_train.pointcloud.project import Hits, project, to_device, where_true
-from gcd_train.pointcloud.taps import Gathered, show
+from gcd_train.pointcloud.project import Doubles, Hits, SplatOptions, project, to_device, where_true
 
 Bytes = NDArray[np.uint8]
 Labels = NDArray[np.uint8] | NDArray[np.uint16]
+
+_FLOAT64_TRACE = 740.0  # a weight e^740 times smaller than the largest is the last that a float64 mean keeps
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -86,6 +88,24 @@ def splat(
         labels=None if labels is None else picture.picked[1].to(torch.int32),
         lit=picture.lit.permute(1, 2, 0),
     )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Gathered:
+    """What fell on each pixel, weights relative to the nearest point of that pixel.
+
+    nearest: [H, W], d of the nearest point, inf where nothing fell. rate: scalar; weights fall by e in d = 1 / rate.
+    weight: [H, W], sum of weights, 1 and more where something fell. colour: [C, H, W], sum of weights times values.
+    picked: [L, H, W], numbers of the nearest point itself: its depth, its labels. lit: [G, H, W], d of the
+    nearest point that is not black in three channels, inf where there is none; G is 0 where nobody asks.
+    """
+
+    nearest: Tensor
+    rate: Tensor
+    weight: Tensor
+    colour: Tensor
+    picked: Tensor
+    lit: Tensor
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -202,3 +222,52 @@ def _require_fitting(views: Sequence[SceneView], values: Sequence[Bytes], labels
         if shown.ndim != 3 or shown.dtype != np.uint8 or shown.shape[2] != values[0].shape[2]:
             raise DataError(f"values must be u8 [H, W, C] with the same C, got {shown.dtype} {list(shown.shape)}")
     return values[0].shape[2] if values else 3
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Shown:
+    """colour: [C, H, W], the mean of what shows. picked: [L, H, W], of the heaviest. covered: bool [H, W].
+
+    lit: bool [G, H, W], where float64 would have a trace of what is not black.
+    """
+
+    colour: Tensor
+    picked: Tensor
+    covered: Tensor
+    lit: Tensor
+
+
+def show(gathered: Gathered, options: SplatOptions) -> Shown:
+    """Every pixel as the weighted mean of what shows in it; 0 where nothing does."""
+    handicap = -math.log(options.neighbour_share) / gathered.rate  # what a neighbour's point seems to lie further back
+    offsets = [(down, right) for down in options.offsets for right in options.offsets]
+    moved = _Moved(gathered.nearest.shape, options)
+    seeming = [moved(gathered.nearest, at, torch.inf) + (handicap if at != (0, 0) else 0.0) for at in offsets]
+    front = torch.stack(seeming).amin(dim=0)  # [H, W]
+    covered = front < torch.inf
+    front = front.masked_fill(~covered, 0.0)
+    weight, colour = torch.zeros_like(front), torch.zeros_like(gathered.colour)
+    picked, lit = torch.zeros_like(gathered.picked), torch.full_like(gathered.lit, torch.inf)
+    for at, depth in zip(offsets, seeming, strict=True):
+        share = torch.exp((front - depth) * gathered.rate)  # 0 where nothing fell
+        weight += share * moved(gathered.weight, at, 0.0)
+        colour += share * moved(gathered.colour, at, 0.0)
+        picked = torch.where(depth == front, moved(gathered.picked, at, 0.0), picked)
+        lit = torch.minimum(lit, moved(gathered.lit, at, torch.inf) + (handicap if at != (0, 0) else 0.0))
+    trace = (lit - front) * gathered.rate <= _FLOAT64_TRACE
+    return Shown(colour=colour / weight.clamp(min=1e-30), picked=picked, covered=covered, lit=trace)
+
+
+class _Moved:
+    """Pictures [..., H, W] moved by whole pixels, with a constant where nothing comes from."""
+
+    def __init__(self, size: torch.Size, options: SplatOptions) -> None:
+        self._height, self._width = size
+        self._before, self._after = -options.offsets[0], options.offsets[-1]
+
+    def __call__(self, picture: Tensor, by: tuple[int, int], outside: float) -> Tensor:
+        down, right = by
+        edges = (self._after, self._before, self._after, self._before)
+        wide = F.pad(picture, edges, value=outside)
+        top, left = self._after - down, self._after - right
+        return wide[..., top : top + self._height, left : left + self._width]

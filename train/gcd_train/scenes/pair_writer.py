@@ -30,7 +30,7 @@ from gcd_train.data.paths import Draw, FrameSampling, OrbitSampling
 from gcd_train.errors import DataError, RenderError
 from gcd_train.files import write_whole
 from gcd_train.look.clip import instance_colour
-from gcd_train.map_items import map_items, one_thread_each
+from gcd_train.parallel import map_items, one_thread_each
 from gcd_train.scenes.description import Scene, rotations
 from gcd_train.scenes.driving import driving_scene
 from gcd_train.scenes.frozen import freeze

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_train.errors import RecipeError
-from gcd_train.layouts import kubric4d_names, parallel_domain4d_names
+from gcd_train.layouts import kubric4d, parallel_domain4d
 from gcd_train.scenes.description import Scene
 from gcd_train.scenes.driving import ONTOLOGY, OntologyItem, driving_drive, vehicle_from_camera
 
@@ -28,16 +28,16 @@ class SceneWorld:
     make: Callable[[int, int], Scene]
     edition: int = 1
     layout: Layout = "kubric4d"
-    frames: int = kubric4d_names.FRAMES
-    fps: float = kubric4d_names.FPS
-    width: int = kubric4d_names.WIDTH
-    height: int = kubric4d_names.HEIGHT
+    frames: int = kubric4d.FRAMES
+    fps: float = kubric4d.FPS
+    width: int = kubric4d.WIDTH
+    height: int = kubric4d.HEIGHT
     classes: tuple[OntologyItem, ...] = ()
     vehicle_from_camera: Callable[[], dict[str, NDArray[np.float64]]] | None = None
 
     def scene_name(self, seed: int) -> str:
         """The folder in which the scene of a seed lies: its number is the seed."""
-        names = kubric4d_names if self.layout == "kubric4d" else parallel_domain4d_names
+        names = kubric4d if self.layout == "kubric4d" else parallel_domain4d
         return names.scene_name(seed)
 
 
@@ -61,10 +61,10 @@ SCENE_WORLDS: dict[str, SceneWorld] = {
         make=lambda seed, frames: driving_drive(seed, frames=frames),
         edition=2,  # the first is that of the pairs
         layout="parallel_domain4d",
-        frames=parallel_domain4d_names.FRAMES,
-        fps=parallel_domain4d_names.FPS,
-        width=parallel_domain4d_names.WIDTH,
-        height=parallel_domain4d_names.HEIGHT,
+        frames=parallel_domain4d.FRAMES,
+        fps=parallel_domain4d.FPS,
+        width=parallel_domain4d.WIDTH,
+        height=parallel_domain4d.HEIGHT,
         classes=ONTOLOGY,
         vehicle_from_camera=vehicle_from_camera,
     ),

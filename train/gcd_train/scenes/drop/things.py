@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_train.scenes.description import Floats, Part, Point, Quaternion, rotations
-from gcd_train.scenes.drop.labels import DropLabel
-from gcd_train.scenes.drop.materials import Material, random_material, shaded
+from gcd_train.scenes.drop.looks import DropLabel, Material, random_material, shaded
 from gcd_train.scenes.primitives import shape
 
 _Random = np.random.Generator

@@ -7,12 +7,15 @@ was doing when it was killed is done again, and what raises is told in its outco
 import logging
 import os
 import signal
+import socket
+import threading
 import traceback
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -27,6 +30,9 @@ _LOG = logging.getLogger(__name__)
 _ONE_THREAD = ("LP_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 _STOP_S = 30.0
 _KINDS: dict[str, type[TrainError]] = {kind.__name__: kind for kind in (DataError, RecipeError, RenderError, RunError)}
+_TASKS_AT_ONCE = 2  # on Ray, for each that can be worked on: one is done, one waits
+_LOOK_AGAIN_S = 5.0
+_ANSWER_S = 10.0
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -74,22 +80,10 @@ def map_items(
         RunError: there is no such cluster, or the extra `cluster` is not installed.
     """
     if ray_address is not None:
-        from gcd_train.map_on_ray import map_on_ray  # it stands on this module
-
-        return map_on_ray(function, items, address=ray_address, retries=retries, gpus=gpus)
+        return _map_on_ray(function, iter(items), ray_address, retries, gpus)
     if workers == 1:
-        return (done(function, item) for item in items)
+        return (_outcome(function, item) for item in items)
     return _Pool(function, workers, retries, environments).run(iter(items))
-
-
-def done(function: Callable[[Item], Value], item: Item) -> Outcome[Item, Value]:
-    """Apply a function; an error becomes an outcome, only being stopped is none."""
-    try:
-        return Outcome(item=item, value=function(item))
-    except Exception as error:
-        if not isinstance(error, TrainError | OSError):
-            _LOG.exception("item %r", item)
-        return Outcome(item=item, error=_told(error), kind=type(error).__name__)
 
 
 def one_thread_each() -> None:
@@ -98,26 +92,31 @@ def one_thread_each() -> None:
         os.environ.setdefault(name, "1")
 
 
-def _told(error: Exception) -> str:
-    """One line; what nobody expected is told with its place."""
-    if isinstance(error, TrainError | OSError):
-        return str(error)
-    place = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{type(error).__name__}: {error} ({os.path.basename(place.filename)}, line {place.lineno})"
-
-
-@dataclass(slots=True, eq=False)
-class _Worker:
-    process: BaseProcess
-    pipe: Connection
-    seat: int
-    attempt: "_Attempt | None" = None
+def _outcome(function: Callable[[Item], Value], item: Item) -> Outcome[Item, Value]:
+    """Apply a function; an error becomes an outcome, only being stopped is none."""
+    try:
+        return Outcome(item=item, value=function(item))
+    except (TrainError, OSError) as error:
+        return Outcome(item=item, error=str(error), kind=type(error).__name__)
+    except Exception as error:  # a fault of ours: told with its place
+        _LOG.exception("item %r", item)
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        told = f"{type(error).__name__}: {error} ({os.path.basename(place.filename)}, line {place.lineno})"
+        return Outcome(item=item, error=told, kind=type(error).__name__)
 
 
 @dataclass(slots=True, eq=False)
 class _Attempt:
     item: Any
     killed: int = 0
+
+
+@dataclass(slots=True, eq=False)
+class _Worker:
+    process: BaseProcess
+    pipe: Connection
+    number: int
+    attempt: _Attempt | None = None
 
 
 class _Pool:
@@ -133,30 +132,29 @@ class _Pool:
 
     def run(self, items: Iterator[Any]) -> Generator[Outcome[Any, Any]]:
         try:
-            while self._feed(items):
-                ready = wait([worker.pipe for worker in self._workers if worker.attempt is not None])
-                for worker in [worker for worker in self._workers if worker.pipe in ready]:
+            while busy := self._feed(items):
+                ready = wait([worker.pipe for worker in busy])
+                for worker in [worker for worker in busy if worker.pipe in ready]:
                     outcome = self._collect(worker)
                     if outcome is not None:
                         yield outcome
         finally:
             self._stop()
 
-    def _feed(self, items: Iterator[Any]) -> bool:
-        """Give every idle worker an item, starting workers as needed. False once nothing is under way."""
-        while len([worker for worker in self._workers if worker.attempt is not None]) < self._size:
-            attempt = self._again.popleft() if self._again else _next_attempt(items)
+    def _feed(self, items: Iterator[Any]) -> list[_Worker]:
+        """Give every idle worker an item, starting workers as needed; those that have one."""
+        while len(busy := [worker for worker in self._workers if worker.attempt is not None]) < self._size:
+            attempt = self._again.popleft() if self._again else next(map(_Attempt, items), None)
             if attempt is None:
                 break
             idle = next((worker for worker in self._workers if worker.attempt is None), None) or self._start()
             idle.attempt = attempt
-            try:
+            with suppress(OSError):  # it was killed while idle: its pipe is closed, and reading will tell
                 idle.pipe.send(attempt.item)
-            except OSError:
-                continue  # it was killed while idle: its pipe is closed, and reading will tell
-        return any(worker.attempt is not None for worker in self._workers)
+        return busy
 
     def _collect(self, worker: _Worker) -> Outcome[Any, Any] | None:
+        """What a worker that is ready has made; None where it was killed and its item is put back."""
         attempt = worker.attempt
         assert attempt is not None, "only busy workers are waited for"
         try:
@@ -167,7 +165,6 @@ class _Pool:
         return Outcome(item=attempt.item, value=value, error=error, kind=kind)
 
     def _after_death(self, worker: _Worker, attempt: _Attempt) -> Outcome[Any, Any] | None:
-        """Put its item back, or give it up."""
         worker.process.join(_STOP_S)
         code = worker.process.exitcode
         self._workers.remove(worker)
@@ -183,12 +180,12 @@ class _Pool:
     def _start(self) -> _Worker:
         context = get_context("spawn")  # a fork would share OpenGL's and torch's state
         ours, theirs = context.Pipe()
-        seat = min(set(range(self._size)) - {worker.seat for worker in self._workers})
-        environment = dict(self._environments[seat % len(self._environments)])
+        number = min(set(range(self._size)) - {worker.number for worker in self._workers})
+        environment = dict(self._environments[number % len(self._environments)])
         process = context.Process(target=_serve, args=(theirs, environment), daemon=True)
         process.start()
         theirs.close()
-        worker = _Worker(process, ours, seat)
+        worker = _Worker(process, ours, number)
         self._workers.append(worker)
         with suppress(OSError):  # it is gone already: the item's turn will tell
             ours.send(self._function)
@@ -206,12 +203,6 @@ class _Pool:
                 worker.process.join()
 
 
-def _next_attempt(items: Iterator[Any]) -> _Attempt | None:
-    for item in items:
-        return _Attempt(item)
-    return None
-
-
 def _serve(pipe: Connection, environment: Mapping[str, str]) -> None:
     """A worker's life: the function first, then items until the pipe is closed."""
     os.environ.update(environment)
@@ -219,30 +210,94 @@ def _serve(pipe: Connection, environment: Mapping[str, str]) -> None:
     signal.signal(signal.SIGTERM, _leave)
     one_thread_each()
     with suppress(EOFError, OSError):  # the parent is done, or gone
-        function = _received(pipe)
+        try:
+            function = pipe.recv()
+        except (EOFError, OSError):
+            return
+        except Exception as error:
+            function = partial(_refuse, f"a worker cannot import its work ({type(error).__name__}: {error})")
         while True:
-            _send(pipe, done(function, pipe.recv()))
-
-
-def _received(pipe: Connection) -> Callable[[Any], Any]:
-    try:
-        return pipe.recv()
-    except (EOFError, OSError):
-        raise
-    except Exception as error:
-        return partial(_refuse, f"a worker cannot import its work ({type(error).__name__}: {error})")
+            outcome = _outcome(function, pipe.recv())
+            try:
+                pipe.send((outcome.value, outcome.error, outcome.kind))
+            except (TypeError, AttributeError, ValueError) as error:  # what pickle raises for what it cannot take
+                pipe.send((None, f"its result cannot be sent to the parent ({error})", type(error).__name__))
 
 
 def _refuse(why: str, item: object) -> None:
     raise RunError(why)
 
 
-def _send(pipe: Connection, outcome: Outcome[Any, Any]) -> None:
-    try:
-        pipe.send((outcome.value, outcome.error, outcome.kind))
-    except (TypeError, AttributeError, ValueError) as error:  # what pickle raises for what it cannot take
-        pipe.send((None, f"its result cannot be sent to the parent ({error})", type(error).__name__))
-
-
 def _leave(number: int, frame: object) -> None:
     raise SystemExit(0)
+
+
+def _map_on_ray(
+    function: Callable[[Any], Any], items: Iterator[Any], address: str, retries: int, gpus: float
+) -> Generator[Outcome[Any, Any]]:
+    """Twice as many items are out as the cluster can work on, whose nodes come and go.
+
+    Ray gives an item to another worker when its own is killed or its node lost. Stops a connection that it made.
+    """
+    ray = _import_ray()
+    ours = not ray.is_initialized()
+    if ours:
+        _connect(ray, address)
+    out: dict[Any, Any] = {}
+    try:
+        share = gpus if ray.cluster_resources().get("GPU", 0.0) else 0.0
+        task = ray.remote(_on_a_node).options(num_cpus=1, num_gpus=share, max_retries=retries)
+        shared = ray.put(function)
+        while True:
+            there = ray.cluster_resources()
+            at_once = min(there.get("CPU", 1.0), there.get("GPU", 0.0) / share if share else float("inf"))
+            wanted = max(_TASKS_AT_ONCE, int(_TASKS_AT_ONCE * at_once))
+            for item in islice(items, max(0, wanted - len(out))):
+                out[task.remote(shared, item)] = item
+            if not out:
+                return
+            ready, _ = ray.wait(list(out), num_returns=1, timeout=_LOOK_AGAIN_S)
+            for reference in ready:
+                yield _ray_outcome(ray, reference, out.pop(reference))
+    finally:
+        for reference in out:
+            ray.cancel(reference)
+        if ours:
+            ray.shutdown()
+
+
+def _import_ray() -> Any:
+    try:
+        import ray
+    except ImportError as error:
+        raise RunError("--ray needs the extra `cluster`: pip install 'gcd-node[cluster]'") from error
+    return ray
+
+
+def _connect(ray: Any, address: str) -> None:
+    """Raises RunError if no cluster answers."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    on_stop = signal.getsignal(signal.SIGTERM)  # Ray sets one of its own
+    try:
+        if host and port.isdecimal():  # Ray itself would try a wrong address for minutes
+            socket.create_connection((host, int(port)), _ANSWER_S).close()
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+    except (OSError, OverflowError, ValueError, RuntimeError, ray.exceptions.RayError) as error:
+        raise RunError(f"no Ray cluster answers at {address} ({error}); start one with `ray start --head`") from error
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, on_stop)
+
+
+def _on_a_node(function: Callable[[Any], Any], item: Any) -> tuple[Any, str | None, str | None]:
+    one_thread_each()
+    outcome = _outcome(function, item)
+    return outcome.value, outcome.error, outcome.kind
+
+
+def _ray_outcome(ray: Any, reference: Any, item: Any) -> Outcome[Any, Any]:
+    try:
+        value, error, kind = ray.get(reference)
+    except ray.exceptions.RayError as lost:
+        first = str(lost).strip().splitlines()[0]
+        return Outcome(item=item, error=f"its Ray worker was lost again and again ({first})", kind="WorkerLost")
+    return Outcome(item=item, value=value, error=error, kind=kind)
