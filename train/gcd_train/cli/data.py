@@ -42,8 +42,8 @@ def compact(
 
     A scene appears when all of it was read again and compared. Stopped at any point, the same line goes on.
     """
+    from gcd_train.files import remove_leftovers
     from gcd_train.layouts.compact import Compaction
-    from gcd_train.layouts.scene_folder import remove_leftovers
     from gcd_train.parallel import map_items, one_thread_each
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that no worker is left behind

@@ -13,11 +13,10 @@ from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError, RecipeError
+from gcd_train.files import new_folder
 from gcd_train.layouts import encodings, kubric4d, parallel_domain4d
 from gcd_train.layouts.encodings import FAR_M, NEAR_M
-from gcd_train.layouts.manifest import GEOMETRY, MANIFEST, read_manifest
-from gcd_train.layouts.scene_files import SceneFiles
-from gcd_train.layouts.scene_folder import new_scene
+from gcd_train.layouts.manifest import GEOMETRY, MANIFEST, SceneFiles, read_manifest
 
 _KUBRIC_WEBP, _STREET_WEBP = 85, 80
 _LEAST_PSNR_DB = 20.0  # what WebP of this quality is far above
@@ -84,7 +83,7 @@ class Compaction:
     def _packed(self, scene: str) -> Packed:
         reader, before = self._reader(self.source, scene), bytes_read()
         frames = reader.frames(scene)
-        with new_scene(self.out, scene) as folder:
+        with new_folder(self.out, scene) as folder:
             files = SceneFiles(folder)
             for path in self._facts(scene):
                 files.write(folder / path.relative_to(self.source / scene), path.read_bytes())
