@@ -43,6 +43,9 @@ class Denoiser(nn.Module):
         camera = None if self.camera is None or batch.camera is None else self.camera.proj(batch.camera)
         plan = self.unet.plan(levels.c_noise[None], batch.vector, camera, batch.tokens)
         scaled, image_mode = _column(levels.c_in) * noisy, batch.frames == 1
+        if torch.is_grad_enabled() and noisy.device.type == "cpu" and not self.unet.stem.weight.requires_grad:
+            # torch's group norm crashes on a CPU where channels-last pictures need no gradient and its weights do
+            scaled.requires_grad_()
         raw = self.unet(scaled, batch.condition, plan.step(0), image_mode=image_mode).float()
         return _column(levels.c_skip) * noisy + _column(levels.c_out) * raw
 
