@@ -83,7 +83,7 @@ def _import_what_commands_import() -> None:
     new_app(COMMANDS)
     for name in ("check", "cli.view_saver", "demo", "viewer.server"):
         import_module(f"gcd_node.{name}")
-    for name in ("distillation.recipe", "evaluation.run", "gallery", "reports.pages", "show.open_scene", "trainer"):
+    for name in ("training.distill_recipe", "training.run"):
         import_module(f"gcd_train.{name}")
 
 

@@ -15,11 +15,12 @@ from gcd_model.loading import random_weights
 from gcd_model.networks import random_networks
 from gcd_train.data_kinds import DataPlaces, RunData, open_data, sampling_of
 from gcd_train.datasets.trajectories import DrivingSampling, OrbitSampling
-from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.latent_cache import CacheJob, cache_scenes, only_writer
-from gcd_train.precision import Precision
-from gcd_train.recipe import DataRecipe, FramesRecipe, LossRecipe, OrbitRecipe, Recipe
+from gcd_train.recipe import LossRecipe, Recipe
+from gcd_train.recipe_data import DataRecipe, FramesRecipe, OrbitRecipe
+from gcd_train.training.draws import Draws
+from gcd_train.training.setup import Precision
 
 VIEWS = tuple(f"view{number}" for number in range(4))
 CONFIG = ModelConfig(frames=3, height=32, width=48)

@@ -12,11 +12,11 @@ from gcd_train.data_kinds import open_pairs
 from gcd_train.datasets.paired import PairedClips
 from gcd_train.errors import DataError
 from gcd_train.evaluation.clips import cameras_of
-from gcd_train.model_setup import model_config
-from gcd_train.recipe import load_recipe
+from gcd_train.recipe_files import load_recipe
 from gcd_train.scenes.driving.pair_scene import driving_scene
 from gcd_train.scenes.pair_world import CameraWay, PairForm, World, agree, driving_world, read_world
 from gcd_train.scenes.worlds import WorldOptions
+from gcd_train.training.setup import model_config
 
 FORM = PairForm(width=48, height=32, frames=3, oversample=1)
 

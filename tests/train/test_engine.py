@@ -16,21 +16,17 @@ from two_processes import FRAMES, LOG, UPDATES, AfterUpdates, Never, Noise, Task
 
 from gcd_model.networks import random_networks
 from gcd_model.unet import VideoUNet
-from gcd_train.draws import Draws
-from gcd_train.ema import Ema
-from gcd_train.engine import optimisers
-from gcd_train.engine.blocks import recompute_blocks, stages_of
-from gcd_train.engine.engine import Engine
-from gcd_train.engine.optimisers import build_optimiser, set_rate
-from gcd_train.engine.processes import ALONE, Processes, processes_of
-from gcd_train.engine.states import newest_weights
 from gcd_train.errors import Interrupted, RecipeError
-from gcd_train.loop import Loop, Progress, StepLoss
-from gcd_train.model_setup import model_config
-from gcd_train.precision import Precision
-from gcd_train.recipe import Budget, ComputeRecipe, EmaRecipe, OptimiserRecipe
-from gcd_train.run_folder import RunFolder
-from gcd_train.schedule import ParameterGroup
+from gcd_train.recipe import EmaRecipe, OptimiserRecipe
+from gcd_train.recipe_data import Budget, ComputeRecipe
+from gcd_train.training import optimiser as optimisers
+from gcd_train.training.checkpoint import newest_weights
+from gcd_train.training.distributed import ALONE, Engine, Processes, processes_of, recompute_blocks, stages_of
+from gcd_train.training.draws import Draws
+from gcd_train.training.loop import Loop, Progress, StepLoss
+from gcd_train.training.monitor import RunFolder
+from gcd_train.training.optimiser import Ema, ParameterGroup, build_optimiser, set_rate
+from gcd_train.training.setup import Precision, model_config
 
 RATE = OptimiserRecipe(rate=0.1, kind="adam")
 

@@ -20,7 +20,6 @@ from typer.testing import CliRunner
 from gcd_train.cli.main import app
 from gcd_train.datasets.clip_source import to_network
 from gcd_train.datasets.parallel_domain4d import ParallelDomain4D
-from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.latent_cache import (
     CachedLatents,
@@ -35,8 +34,9 @@ from gcd_train.latent_cache import (
 from gcd_train.latent_cache.batches import CachedBatches
 from gcd_train.latent_cache.driving import DrivingPictures
 from gcd_train.latent_cache.shard import log_variance_codes, log_variance_of
-from gcd_train.precision import Precision
 from gcd_train.recipe import LossRecipe
+from gcd_train.training.draws import Draws
+from gcd_train.training.setup import Precision
 
 CPU = torch.device("cpu")
 

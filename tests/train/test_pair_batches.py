@@ -25,14 +25,13 @@ from gcd_train.datasets.sample_clips import SampleClips
 from gcd_train.datasets.skips import Skips
 from gcd_train.datasets.trajectories import DrivingSampling, OrbitSampling
 from gcd_train.datasets.view_pairs import ViewPairs, collate
-from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.pair_batches import PairBatches, told_motion
-from gcd_train.precision import Precision
-from gcd_train.recipe import LoaderRecipe, UNetRecipe
-from gcd_train.recipe.optimiser import OptimiserRecipe
-from gcd_train.recipe.values import Budget
+from gcd_train.recipe import OptimiserRecipe, UNetRecipe
+from gcd_train.recipe_data import Budget, LoaderRecipe
 from gcd_train.sample_loader import LoadedBatch, SampleLoader, SampleOrder
+from gcd_train.training.draws import Draws
+from gcd_train.training.setup import Precision
 
 CPU = torch.device("cpu")
 PRECISION = Precision(CPU, half=False, channels_last=False)

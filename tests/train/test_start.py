@@ -15,14 +15,13 @@ from gcd_model.networks import Networks, empty_networks, random_networks
 from gcd_model.weights.card import Card
 from gcd_model.weights.load import save_weights
 from gcd_model.weights.save import gcd_state, write_published
-from gcd_train.draws import Draws
 from gcd_train.errors import RecipeError
-from gcd_train.model_setup import model_config
-from gcd_train.objective import Batch, Denoiser, denoiser_of, diffusion_loss  # noqa: F401
-from gcd_train.precision import Precision
-from gcd_train.recipe import LossRecipe, ModelRecipe, NoiseRecipe, load_recipe
-from gcd_train.start import fresh_networks, start_networks
-from gcd_train.trained_part import is_temporal, keep_trained_alone, let_train
+from gcd_train.recipe import LossRecipe, ModelRecipe, NoiseRecipe
+from gcd_train.recipe_files import load_recipe
+from gcd_train.training.draws import Draws
+from gcd_train.training.objective import Batch, Denoiser, diffusion_loss
+from gcd_train.training.setup import Precision, fresh_networks, model_config, start_networks
+from gcd_train.training.trainable import is_temporal, keep_trained_alone, let_train
 
 CPU = torch.device("cpu")
 SEED = 3

@@ -14,12 +14,13 @@ from torch.testing import assert_close
 
 from gcd_model.networks import Networks, random_networks
 from gcd_train.errors import TrainError
-from gcd_train.loop import Loop, LoopOptions, Progress, StepLoss
-from gcd_train.model_setup import model_config
-from gcd_train.recipe import Budget, LogRecipe, OptimiserRecipe
-from gcd_train.run_folder import RunFolder
-from gcd_train.schedule import ParameterGroup
-from gcd_train.stages.vae import normalise_latents, start_from_components
+from gcd_train.recipe import OptimiserRecipe
+from gcd_train.recipe_data import Budget, LogRecipe
+from gcd_train.training.loop import Loop, LoopOptions, Progress, StepLoss
+from gcd_train.training.monitor import RunFolder
+from gcd_train.training.optimiser import ParameterGroup
+from gcd_train.training.setup import model_config
+from gcd_train.training.vae import normalise_latents, start_from_components
 
 
 def networks() -> Networks:
@@ -106,7 +107,7 @@ def test_a_loss_that_is_no_number_stops_the_run_and_is_not_saved(tmp_path: Path)
     loop = Loop(Parabola(fails_at=3), RunFolder(tmp_path), options(Budget(updates=5), Clock()))
     with pytest.raises(TrainError, match="lower the learning rate"):
         loop.run()
-    assert not (tmp_path / "vae" / "state.pt").exists()
+    assert not (tmp_path / "vae" / "states").exists()
 
 
 class Distances:

@@ -7,7 +7,6 @@ from typing import TypeVar
 
 from gcd_model import Family, ModelConfig
 from gcd_model.networks import Networks
-from gcd_train.batches import BatchMaker, BatchSource
 from gcd_train.datasets.clip_frames import DRIVING_FRAMES, KUBRIC_FRAMES, FrameSampling
 from gcd_train.datasets.clip_source import PaintedClips
 from gcd_train.datasets.dataset4d import Dataset4D
@@ -26,12 +25,13 @@ from gcd_train.latent_cache import CachedLatents
 from gcd_train.latent_cache.batches import CachedBatches
 from gcd_train.layouts.manifest import MANIFEST, read_manifest
 from gcd_train.lerobot.pairs import LeRobotOptions, LeRobotPairs
-from gcd_train.model_setup import digest_of
 from gcd_train.pair_batches import PairBatches
-from gcd_train.precision import Precision
-from gcd_train.recipe import DataRecipe, Recipe
+from gcd_train.recipe import Recipe
+from gcd_train.recipe_data import DataRecipe
 from gcd_train.run_data import DataPlaces, RunData
 from gcd_train.sample_loader import Samples
+from gcd_train.training.objective import BatchMaker, BatchSource
+from gcd_train.training.setup import Precision, digest_of
 
 _FIXED_SEED = 0  # of the clips that are measured on: the same ones in every run
 Set = TypeVar("Set", Kubric4D, ParallelDomain4D)

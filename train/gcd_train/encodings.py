@@ -5,16 +5,15 @@ from pathlib import Path
 
 from gcd_model import Family, ModelConfig
 from gcd_model.networks import Networks, weights_digest
-from gcd_train.conditioner import Conditioner
 from gcd_train.datasets.clip_source import ClipSource
 from gcd_train.datasets.latents import EncodedClips, LatentClips, LatentVideos
 from gcd_train.errors import RunError
-from gcd_train.losses import COLOUR_WEIGHTS
-from gcd_train.model_setup import digest_of
-from gcd_train.precision import Precision
 from gcd_train.recipe import LatentsRecipe, Recipe
 from gcd_train.stages.latents import LatentsJob, encode_clips
 from gcd_train.stop import StopSignal
+from gcd_train.training.batches import Conditioner
+from gcd_train.training.losses import COLOUR_WEIGHTS
+from gcd_train.training.setup import Precision, digest_of
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

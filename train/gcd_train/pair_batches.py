@@ -10,13 +10,14 @@ from gcd_model.geometry import SphericalDelta, motion_bucket
 from gcd_model.networks import Networks
 from gcd_train.datasets.clip_source import to_network
 from gcd_train.datasets.view_pairs import PairBatch
-from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.objective import Batch, drop_streams
 from gcd_train.pixel_encoding import encode_frames
-from gcd_train.precision import Precision
-from gcd_train.recipe import LoaderRecipe, UNetRecipe
+from gcd_train.recipe import UNetRecipe
+from gcd_train.recipe_data import LoaderRecipe
 from gcd_train.sample_loader import LoadedBatch, SampleLoader, Samples
+from gcd_train.training.draws import Draws
+from gcd_train.training.objective import Batch, drop_streams
+from gcd_train.training.setup import Precision
 
 
 class PairBatches:

@@ -9,9 +9,9 @@ from torch import Tensor, nn
 
 from gcd_model.image_encoder import clip_pixels
 from gcd_model.networks import Networks
-from gcd_train.draws import Draws
-from gcd_train.losses import COLOUR_WEIGHTS, class_emphasis
 from gcd_train.recipe import UNetRecipe
+from gcd_train.training.draws import Draws
+from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
 
 Made = TypeVar("Made")
 

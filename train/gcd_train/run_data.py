@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from gcd_train.batches import BatchMaker
 from gcd_train.datasets.clip_source import ClipSource
+from gcd_train.training.objective import BatchMaker
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -17,7 +17,7 @@ from gcd_train.datasets.skips import Skips
 from gcd_train.datasets.view_pairs import PairBatch, collate
 from gcd_train.errors import RunError, TrainError
 from gcd_train.map_items import one_thread_each
-from gcd_train.recipe import LoaderRecipe
+from gcd_train.recipe_data import LoaderRecipe
 
 
 class Samples(Protocol):

@@ -9,14 +9,14 @@ from torch import Tensor
 from gcd_model import ModelConfig
 from gcd_model.conditioning import micro_conditioning
 from gcd_model.networks import Networks
-from gcd_train.draws import Draws
 from gcd_train.errors import RecipeError
 from gcd_train.latent_cache.encoders import encoders_digest
 from gcd_train.latent_cache.plan import PathKind
 from gcd_train.latent_cache.reader import CachedClip, CachedLatents
-from gcd_train.objective import Batch, drop_streams
-from gcd_train.precision import Precision
 from gcd_train.recipe import UNetRecipe
+from gcd_train.training.draws import Draws
+from gcd_train.training.objective import Batch, drop_streams
+from gcd_train.training.setup import Precision
 
 
 class CachedBatches:

@@ -13,11 +13,11 @@ from torch import Tensor
 from gcd_model.vae import Posterior
 from gcd_train.datasets.picture_files import read
 from gcd_train.datasets.skips import FileFault
-from gcd_train.draws import Draws
 from gcd_train.errors import DataError
 from gcd_train.latent_cache.index import CacheIndex, digest, read_index
 from gcd_train.latent_cache.plan import ClipPlace, PathKind
 from gcd_train.latent_cache.shard import log_variance_of
+from gcd_train.training.draws import Draws
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

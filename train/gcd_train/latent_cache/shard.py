@@ -16,12 +16,12 @@ import torch
 from torch import Tensor
 
 from gcd_train.datasets.clip_source import to_network
-from gcd_train.draws import Draws
 from gcd_train.errors import DataError
 from gcd_train.latent_cache.encoders import Encoders
 from gcd_train.latent_cache.index import CacheIdentity
 from gcd_train.latent_cache.pictures import MomentPictures, PathPictures
-from gcd_train.losses import PARALLEL_DOMAIN_WEIGHTS, class_emphasis
+from gcd_train.training.draws import Draws
+from gcd_train.training.losses import PARALLEL_DOMAIN_WEIGHTS, class_emphasis
 
 _LOWEST, _SPAN, _CODES = -30.0, 50.0, 255
 

@@ -17,16 +17,16 @@ from gcd_model.errors import FileError
 from gcd_model.geometry import Trajectory
 from gcd_model.networks import Networks
 from gcd_model.small_files import read_json
-from gcd_train.conditioner import Conditioner, mirrored_path
 from gcd_train.datasets.clip_source import ClipSource, numbers_of, to_network
 from gcd_train.datasets.latents import MOST_META, LatentsMeta
-from gcd_train.draws import Draws
 from gcd_train.errors import DataError, Interrupted, RunError
 from gcd_train.files import write_whole
-from gcd_train.losses import ClassWeight, class_emphasis
-from gcd_train.precision import Precision
 from gcd_train.recipe import LatentsRecipe
 from gcd_train.stop import StopSignal
+from gcd_train.training.batches import Conditioner, mirrored_path
+from gcd_train.training.draws import Draws
+from gcd_train.training.losses import ClassWeight, class_emphasis
+from gcd_train.training.setup import Precision
 
 _log = logging.getLogger(__name__)
 _SAVE_EVERY = 32  # clips
