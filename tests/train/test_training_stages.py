@@ -110,6 +110,13 @@ def test_a_loss_that_is_no_number_stops_the_run_and_is_not_saved(tmp_path: Path)
     assert not (tmp_path / "vae" / "states").exists()
 
 
+def test_a_run_measures_after_so_many_updates(tmp_path: Path) -> None:
+    log = LogRecipe(log_s=1000.0, save_s=1000.0, measure_s=1e-9, measure_every=2)
+    Loop(Parabola(), RunFolder(tmp_path), replace(options(Budget(updates=5), Clock()), log=log)).run()
+    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [line["updates"] for line in lines if line["kind"] == "measured"] == [2, 4, 5]
+
+
 class Distances:
     """A task whose parts pull one number to different places; keeps the gradient of each update."""
 

@@ -120,14 +120,14 @@ class TwiceTheBatch(Task):
         )  # fmt: skip
 
 
-def recipe_of() -> Recipe:
+def recipe_of(batch: int = 2) -> Recipe:
     recipe = tiny_recipe()
     loss = msgspec.structs.replace(recipe.unet.loss, sensitivity=False)
     # half the published rate: where a gradient is next to nothing, Adam makes a whole step of its rounding
     optimiser = msgspec.structs.replace(recipe.unet.optimiser, kind="adam", rate=1e-5)
     budget = Budget(updates=UPDATES)
     return tiny_recipe(
-        unet=msgspec.structs.replace(recipe.unet, batch=2, loss=loss, budget=budget, optimiser=optimiser)
+        unet=msgspec.structs.replace(recipe.unet, batch=batch, loss=loss, budget=budget, optimiser=optimiser)
     )
 
 
@@ -176,6 +176,7 @@ def alone(folder: Path) -> dict[str, dict[str, Tensor]]:
     return {
         "two batches": trained(folder / "two", Task(recipe), options(ALONE, Never(), LOG)),
         "twice the batch": trained(folder / "twice", TwiceTheBatch(recipe), once),
+        "three batches": trained(folder / "three", Task(recipe_of(3)), replace(options(ALONE, Never(), LOG), parts=3)),
         "start": Task(recipe).module.state_dict(),
     }
 
@@ -205,6 +206,12 @@ class Together:
             off = distance(weights, self.single["twice the batch"])
             found[f"{parallel} share of the way"] = off / distance(weights, self.single["start"])
         return found
+
+    def uneven(self) -> dict[str, object]:
+        """Three batches an update, of which one process computes two."""
+        chosen = replace(options(self.processes, Never(), LOG, parallel="ddp"), parts=3)
+        weights = trained(self.folder / "uneven", Task(recipe_of(3)), chosen)
+        return {"uneven": furthest(weights, self.single["three batches"])}
 
     def stopped_and_resumed(self, parallel: str) -> dict[str, object]:
         """Only the second process hears the signal; both stop, and go on to the bits of an undisturbed run."""
@@ -282,7 +289,7 @@ def main(folder: Path, what: Sequence[str]) -> None:
     with processes_of(ComputeRecipe(device="cpu", parallel="ddp", timeout_s=240.0)) as processes:
         single = processes.told(alone(folder / "alone") if processes.first else None)
         both = Together(folder, processes, single)
-        found = both.equal_one("ddp")
+        found = both.equal_one("ddp") | both.uneven()
         if "more" in what:
             found |= both.equal_one("fsdp")
             for parallel in ("ddp", "fsdp"):

@@ -31,7 +31,7 @@ class Budget(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return min(used, 1.0)
 
 
-Parallel: TypeAlias = Literal["none", "ddp", "fsdp"]
+Parallel: TypeAlias = Literal["ddp", "fsdp"]
 
 
 class ComputeRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -58,7 +58,7 @@ class ComputeRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     resident: bool = False
     weights: Literal["float32", "bfloat16"] = "float32"
     frozen: Literal["float32", "bfloat16"] = "float32"
-    parallel: Parallel = "none"
+    parallel: Parallel = "ddp"
     timeout_s: Positive = 1800.0
     checkpoint_activations: bool | Annotated[int, Meta(ge=1)] = False
     compile: bool = False
@@ -67,14 +67,16 @@ class ComputeRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 class LogRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How often a run speaks. log_s: a line of the log. save_s: the state. measure_s: metrics and sample pictures.
 
-    valid_clips: held-out clips to measure on. tensorboard: write losses, metrics and samples for TensorBoard, too.
+    measure_every: measure after so many updates instead. valid_clips: held-out clips to measure on, always the same.
+    tensorboard: write losses, metrics and samples for TensorBoard, too.
     keep: how many states are kept, the newest ones. keep_every: save after so many updates, too, and keep those states
-    for ever. save: "async" writes the states of several processes beside training; one process always waits.
+    for ever. save: "async" writes states beside training.
     """
 
     log_s: Positive = 15.0
     save_s: Positive = 120.0
     measure_s: Positive = 300.0
+    measure_every: Count | None = None
     valid_clips: Count = 4
     tensorboard: bool = False
     keep: Count = 3

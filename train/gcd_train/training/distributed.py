@@ -59,17 +59,15 @@ class Processes:
         """Whether `torchrun` started this process, be it as the only one."""
         return self.control is not None
 
-    def batches(self, parts: int) -> range:
-        """Which of an update's `parts` batches this process computes; every batch draws as it would in one process.
+    def batches(self, parts: int) -> list[tuple[int, float]]:
+        """Which of an update's `parts` batches this process computes, and how much each counts: 1, or 0.
 
-        Raises RecipeError if they cannot be shared equally.
+        Every batch draws as it would in one process. All processes compute equally many, as gradients are exchanged
+        together: where they do not divide the parts, some compute one that counts nothing.
         """
-        if parts % self.count:
-            raise RecipeError(
-                f"an update of {parts} batches cannot be shared by {self.count} processes: start a number of processes "
-                f"that divides {parts}, or give unet.batch and a smaller unet.clip_batch"
-            )
-        return range(self.rank, parts, self.count)
+        own = [(part, 1.0) for part in range(self.rank, parts, self.count)]
+        idle = (own[-1][0] if own else self.rank % parts, 0.0)
+        return own + [idle] * (-(-parts // self.count) - len(own))
 
     def agreed(self, now: float, seconds: float, stop: bool) -> tuple[float, float, bool]:
         """The first process's clock and training time, and whether any process was asked to stop.
@@ -148,16 +146,12 @@ def processes_of(compute: ComputeRecipe) -> Generator[Processes]:
     """The processes that torchrun started, connected, until the block is left; ALONE without torchrun.
 
     nccl carries the gradients on CUDA, one device a process; gloo on the CPU.
-    Raises RecipeError if there are several and the recipe does not say how they share the work, or too few devices.
+    Raises RecipeError if there are too few devices.
     """
     if "RANK" not in os.environ or "WORLD_SIZE" not in os.environ:
         yield ALONE
         return
     rank, count = int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
-    if count > 1 and compute.parallel == "none":
-        raise RecipeError(
-            f'torchrun started {count} processes, but compute.parallel is "none"; say "ddp" or "fsdp", or start one'
-        )
     with _device(compute) as backend:
         timeout = timedelta(seconds=compute.timeout_s)
         store, _, _ = next(rendezvous("env://", rank, count, timeout=timeout))
@@ -308,16 +302,12 @@ class Engine:
             compile_blocks(module)
         if compute.checkpoint_activations:
             recompute_blocks(module, int(compute.checkpoint_activations))
-        if not self.processes.several or compute.parallel == "none":
+        if not self.processes.several:
             return module
         if compute.parallel == "ddp":
             return replicated(module)
         share_out(module, self.processes)
         return module
-
-    def backward_of(self, network: nn.Module, part: int, parts: int) -> AbstractContextManager[object]:
-        """Context of the forward and backward pass of a batch of an update; the last one settles the gradients."""
-        return held_back(network, last=part + self.processes.count >= parts)
 
     def share_of_loss(self, parts: int) -> float:
         """What a batch's loss is multiplied with, so that an update's gradient is the mean over its `parts` batches."""

@@ -19,7 +19,7 @@ from gcd_train.recipe import EmaRecipe, OptimiserRecipe
 from gcd_train.recipe_data import AnyStageName, Budget, LogRecipe
 from gcd_train.stop import StopSignal
 from gcd_train.training.checkpoint import Mark, States, Trained
-from gcd_train.training.distributed import Engine, whole
+from gcd_train.training.distributed import Engine, held_back, whole
 from gcd_train.training.monitor import FiniteGuard, RunFolder
 from gcd_train.training.optimiser import Ema, ParameterGroup, build_optimiser, set_rate
 
@@ -91,7 +91,7 @@ class ShardedTask(SharedTask, Protocol):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class LoopOptions:
-    """How a stage runs. identity: see StageState. frames_per_clip: for the log. parts: batches
+    """How a stage runs. identity: see StateNote. frames_per_clip: for the log. parts: batches
     whose gradients make one update, shared by the engine's processes. clock: seconds, for tests."""
 
     stage: AnyStageName
@@ -175,10 +175,10 @@ class Loop:
                 self._save()
                 self._states.finish()
                 raise Interrupted(f"stopped at update {self._updates} of {options.stage}; run again to go on")
-            if now - measured >= options.log.measure_s:
+            if self._due(options.log.measure_every, now - measured >= options.log.measure_s):
                 self._measure()
                 measured = saved = self._agreed()[0]
-            elif now - saved >= options.log.save_s or self._kept_for_ever():
+            elif now - saved >= options.log.save_s or self._due(options.log.keep_every, False):
                 self._save()
                 saved = self._agreed()[0]
         self._measure()
@@ -195,9 +195,9 @@ class Loop:
         now, self._seconds, stop = self._processes.agreed(options.clock(), self._seconds, options.stop.is_set())
         return now, stop
 
-    def _kept_for_ever(self) -> bool:
-        every = self._options.log.keep_every
-        return every is not None and self._updates % every == 0
+    def _due(self, every: int | None, otherwise: bool) -> bool:
+        """Whether something that is done after every so many updates is; without their number, `otherwise`."""
+        return otherwise if every is None else self._updates % every == 0
 
     def _update(self) -> None:
         started, recipe = self._options.clock(), self._options.optimiser
@@ -205,10 +205,10 @@ class Loop:
         set_rate(self._optimiser, progress.updates, progress.share, recipe)
         self._optimiser.zero_grad(set_to_none=True)
         engine, parts = self._options.engine, self._options.parts
-        for part in self._mine:
-            with engine.backward_of(self._network, part, parts):
+        for turn, (part, share) in enumerate(self._mine, 1):
+            with held_back(self._network, last=turn == len(self._mine)):
                 loss = self._task.step_loss(replace(progress, part=part))
-                (loss.total * engine.share_of_loss(parts)).backward()
+                (loss.total * (share * engine.share_of_loss(parts))).backward()
             kept = {name: value.detach() for name, value in loss.parts.items()}
             self._guard.saw(progress.updates, "loss", loss.total, loss.ids)
             self._window.losses.append(StepLoss(loss.total.detach(), kept, loss.frames, loss.ids))
