@@ -218,6 +218,7 @@ def test_the_temporal_part_trains_on_a_cpu_with_channels_last() -> None:
     """In a process of its own, which torch's group norm would crash."""
     program = (
         "import torch; from test_start import *; from tiny_driving import smaller\n"
+        "from gcd_train.training.objective import denoiser_of\n"
         "networks = random_networks(smaller(4, 32, 64), seed=0); unet = networks.config.unet\n"
         "let_train(networks, ModelRecipe(weights='x', train='temporal'), SEED)\n"
         "denoiser = Precision(CPU, half=False, channels_last=True).placed(denoiser_of(networks))\n"
