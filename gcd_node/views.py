@@ -185,12 +185,16 @@ class EndOfStream:
         self._live, self._sink, self._context = live, sink, context
         self._open: dict[str, Set[str]] = {view_id: set() for view_id in live.config.view}
         """Views that have not ended, and on which of their topics something was sent."""
+        self._ended: dict[str, int] = {}
+        """The latest revision of each view that was taken out: what is still in work of it is not sent."""
         self._newest_goal: dict[str, tuple[int, int]] = {}
 
     def send(self, messages: Sequence[ViewMessage]) -> None:
         """What one view of one window came to; what is made of the view no more, such as deviations of a single sample,
-        ends. Left out: frames that an overlapping window has sent before."""
+        ends. Left out: frames that an overlapping window has sent before, and views that have ended."""
         header = messages[0].header
+        if header.view_rev <= self._ended.get(header.view_id, 0):
+            return
         for message in messages:
             if message.topic.endswith("/frm"):
                 moment = (message.header.src.epoch, message.header.src.seq[0])
@@ -207,7 +211,8 @@ class EndOfStream:
         """End views that were taken out."""
         there = self._live.config.view
         for view_id in [each for each in self._open if each not in there]:
-            self._end(view_id, self._live.revision(view_id), self._topics(view_id), last_window_id, delay_ms=0)
+            self._ended[view_id] = self._live.revision(view_id)
+            self._end(view_id, self._ended[view_id], self._topics(view_id), last_window_id, delay_ms=0)
         for view_id in there:  # that came meanwhile: they end, too, when they go
             self._open.setdefault(view_id, set())
 
