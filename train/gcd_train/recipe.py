@@ -97,7 +97,8 @@ class ModelRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     prediction: what the network says, left out as the base has it; "v" is the paper's. steps: of the sampler that
     ships, left out as the base has it.
     weights: a weight file to start from, of any layout; left out, everything starts at random. scratch: take the
-    autoencoder and the image tower from it alone; the U-Net and what steers it start at random. See gcd_train.training.setup.
+    autoencoder and the image tower from it alone; the U-Net and what steers it start at random. See
+    gcd_train.training.setup.
     train: what the U-Net stage trains: "all" of the U-Net and what steers it, as published; "temporal", of the U-Net
     only what works across frames; "lora", adapters as [model.lora] says. family: how it is used, see
     `gcd-train families`. frames, height, width: trained length and size in pixels, left out as the base has them.
