@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,25 +16,26 @@ from gcd_model.live.config import LiveConfig
 from gcd_train.errors import DataError
 from gcd_train.evaluation.metrics import gradient_map
 from gcd_train.live.clips import LiveClip
-from gcd_train.live.judge import Moments, frechet_distance, random_judge
-from gcd_train.live.measure import SetResult, differences, methods_of, open_networks, to_json, to_markdown
+from gcd_train.live.measure import SetResult, differences, methods_of, to_json, to_markdown
 from gcd_train.live.measure_figures import (
     BEFORE,
     NEVER,
     NOW,
     MethodViews,
+    Moments,
     SpreadHistogram,
     Tally,
     Truth,
+    cells,
     fit_spread,
+    frechet_distance,
     scene_interval,
     surface_motion,
 )
-from gcd_train.live.measure_methods import BestHomography, Kept
+from gcd_train.live.measure_methods import BestHomography
 
 FRAMES, HEIGHT, WIDTH = 4, 64, 96
 LENS = Intrinsics.from_hfov(70.0, WIDTH, HEIGHT)
-JUDGES = {"random": random_judge()}
 
 
 def truth(seed: int = 0) -> Truth:
@@ -50,11 +51,10 @@ def truth(seed: int = 0) -> Truth:
         video=video,
         labels=torch.randint(0, 12, (FRAMES, HEIGHT, WIDTH), generator=generator, dtype=torch.uint8),
         visibility=visibility,
-        metres=metres,
         before=before,
         static=static,
         gradient=gradient_map(video[1:]),
-        features=tuple(judge.cells(video[1:]) for judge in JUDGES.values()),
+        features=cells(video[1:]),
     )
 
 
@@ -63,13 +63,12 @@ def perfect(of: Truth) -> MethodViews:
         video=of.video,
         classes=of.labels,
         visibility=of.visibility,
-        log_variance=torch.full(of.metres.shape, -8.0),
-        inverse_depth=1 / of.metres,
+        log_variance=torch.full(of.labels.shape, -8.0),
     )
 
 
 def figures(views: MethodViews, of: Truth) -> dict[str, float]:
-    tally = Tally(LiveConfig().classes, JUDGES)
+    tally = Tally(LiveConfig().classes)
     for _ in range(12):  # enough cells for a covariance
         tally.add("scene", of, views, torch.zeros_like(of.video))
     return tally.figures()
@@ -77,10 +76,10 @@ def figures(views: MethodViews, of: Truth) -> dict[str, float]:
 
 def test_the_truth_itself_has_perfect_figures() -> None:
     made = figures(perfect(truth()), truth())
-    for name in ("psnr", "psnr_last", "psnr_seen", "psnr_now", "psnr_never"):
+    for name in ("psnr", "psnr_seen", "psnr_never"):
         assert made[name] == pytest.approx(100.0)
     pictures = ("ssim", "ssim_seen", "gradient_energy", "flicker", "jump")
-    for name in (*pictures, "miou", "person", "car", "iou_painted", "iou_before", "iou_now", "depth_within_10_seen"):
+    for name in (*pictures, "miou", "person", "car", "iou_painted", "iou_before", "iou_now"):
         assert made[name] == pytest.approx(1.0), name
     assert made["frechet_random"] == pytest.approx(0.0, abs=1e-6)
     assert made["error_ratio_seen"] == pytest.approx(0.0)
@@ -98,15 +97,15 @@ def test_fog_has_no_gradients_and_another_distribution() -> None:
 
 def test_what_a_method_does_not_say_is_not_a_number() -> None:
     made = figures(MethodViews(video=truth().video), truth())
-    assert all(math.isnan(made[name]) for name in ("miou", "iou_now", "inside_90_now", "depth_within_10_seen"))
+    assert all(math.isnan(made[name]) for name in ("miou", "iou_now", "inside_90_now"))
 
 
 def test_the_splat_has_an_error_ratio_of_one() -> None:
     of = truth()
     views = MethodViews(video=of.video.flip(-1))
-    tally = Tally(LiveConfig().classes, {})
-    tally.add("scene", replace(of, features=()), views, views.video)
-    assert tally.figures()["error_ratio_now"] == pytest.approx(1.0)
+    tally = Tally(LiveConfig().classes)
+    tally.add("scene", of, views, views.video)
+    assert tally.figures()["error_ratio_seen"] == pytest.approx(1.0)
 
 
 def test_fit_spread_holds_ninety_per_cent_of_gaussian_errors_in_every_state() -> None:
@@ -148,11 +147,11 @@ def test_a_shimmering_view_flickers_more_than_its_truth() -> None:
 
 def test_frechet_distance_is_that_of_the_means_where_the_spread_is_the_same() -> None:
     features = torch.randn(4000, 64, generator=torch.Generator().manual_seed(1))
-    views, truths = Moments.none(), Moments.none()
+    views, truths = Moments(), Moments()
     truths.add(features)
     views.add(features + 0.5)
     assert frechet_distance(views, truths) == pytest.approx(64 * 0.25, rel=0.06)
-    assert math.isnan(frechet_distance(Moments.none(), truths))
+    assert math.isnan(frechet_distance(Moments(), truths))
 
 
 def turned_clip() -> LiveClip:
@@ -193,26 +192,6 @@ def test_the_homography_of_a_turn_is_exact() -> None:
     assert float(error.permute(0, 2, 3, 1)[seen].mean()) < 1.0
 
 
-def test_kept_views_are_made_once_and_are_the_same_to_a_level(tmp_path: Path) -> None:
-    of, calls = perfect(truth()), []
-
-    @dataclass
-    class Counting:
-        name: str = "counting"
-
-        def views(self, clip: LiveClip) -> MethodViews:
-            calls.append(clip.name)
-            return replace(of, classes=None, within=False)
-
-    kept = Kept(method=Counting(), folder=tmp_path)
-    first, again = kept.views(turned_clip()), kept.views(turned_clip())
-    assert len(calls) == 1
-    torch.testing.assert_close(first.video, of.video, atol=0.5001 / 255, rtol=0)
-    assert torch.equal(again.video, first.video)
-    assert torch.equal(again.visibility, of.visibility)
-    assert (again.classes, again.within, again.cpu_s) == (None, False, first.cpu_s)
-
-
 def test_an_interval_over_scenes_holds_their_mean() -> None:
     low, high = scene_interval([0.1, 0.4, 0.7, 0.2, 0.5])
     assert low < 0.38 < high
@@ -220,21 +199,19 @@ def test_an_interval_over_scenes_holds_their_mean() -> None:
 
 
 def test_reports_hold_every_method_and_the_lead_of_the_live_one() -> None:
-    tallies = {name: Tally(LiveConfig().classes, JUDGES) for name in ("live", "old")}
+    tallies = {name: Tally(LiveConfig().classes) for name in ("live", "old")}
     of = truth()
     tallies["live"].add("a", of, perfect(of), of.video)
-    tallies["old"].add("a", of, MethodViews(video=of.video * 0.9, within=False), of.video)
+    tallies["old"].add("a", of, MethodViews(video=of.video * 0.9), of.video)
     result = SetResult(name="tiny", clips=1, tallies=tallies)
-    lead = differences(result)["live - old"]
-    assert lead["psnr"] > 10
-    assert lead["scenes_within"] == 0
+    assert differences(result)["live - old"]["psnr"] > 10
     assert "|old|" in to_markdown([result])
     assert set(json.loads(json.dumps(to_json([result])))["tiny"]["methods"]) == {"live", "old"}
 
 
 def test_unknown_methods_and_other_weights_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError):
-        methods_of(["telepathy"], "init", tmp_path)
+        methods_of(["telepathy"], "package:live-small", tmp_path)
     save_file({"x": torch.zeros(1)}, tmp_path / "other.safetensors")
     with pytest.raises(CheckpointError):
-        open_networks(str(tmp_path / "other.safetensors"))
+        methods_of(["live"], str(tmp_path / "other.safetensors"), tmp_path)

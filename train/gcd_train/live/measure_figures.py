@@ -1,16 +1,20 @@
 """Figures of views whose truth is known: by what the source had seen of each pixel, and summed clip by clip.
 
-Every figure is over frames 2 to 14; the first is the source's own picture on most paths.
+Every figure is over frames 2 to 14; the first is the source's own picture on most paths. What nobody can know is
+judged by a network of random weights: pictures need not agree pixel by pixel, but must be made of the same stuff, so
+that its features, averaged over cells of 16 x 16 pixels, are as in the truth.
 """
 
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from itertools import chain
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from gcd_model.config import SemanticClass
 from gcd_model.geometry import Intrinsics, invert_rigid
@@ -18,50 +22,48 @@ from gcd_train.evaluation.metrics import (
     class_iou,
     confusion_matrix,
     gradient_map,
-    majority_classes,
     psnr,
     ssim_map,
     window_mask,
 )
 from gcd_train.evaluation.predictors import pixel_rays
 from gcd_train.live.batches import to_video
-from gcd_train.live.clips import SKY_M, LiveClip
-from gcd_train.live.judge import CELL, JudgeNet, Moments, frechet_distance
+from gcd_train.live.clips import LiveClip
 
 NEVER, BEFORE, NOW = 0, 1, 2
 STATES = ("painted", "before", "now")
 """Names of the visibility's values."""
 NAMED_CLASSES = ("person", "cyclist", "car", "pole")
 """Classes whose IoU is reported apart."""
-COARSE = (64, 96)
-"""Height and width of the grid on which class maps of small models are compared."""
-INTERVAL, _Z = 0.9, 1.6448536269514722
+_INTERVAL, _Z = 0.9, 1.6448536269514722
 _FULL_CELL = 0.8
 """A cell counts as never seen from this share of its pixels."""
 _SAME_SURFACE = 0.02
 _BINS, _FARTHEST = 8000, 40.0
-"""Of the histograms of `needed_shift`, which reach this far to both sides: steps of 0.01."""
+"""Of the histograms of shifts, which reach this far to both sides: steps of 0.01."""
+_CELL, _FEATURES, _JUDGE_SEED = 16, 64, 7
+"""Pixels a side of a cell of the judge, its features, and what its weights are drawn from."""
+_RIDGE = 1e-3
+"""Added to every variance of features that vary by 1 in the truth."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Truth:
     """What the target camera saw of a clip.
 
-    video: float32 [T, 3, H, W] in [0, 1]. labels: uint8 [T, H, W]. visibility: uint8 [T, H, W], see STATES. metres:
-    float32 [T, H, W], SKY_M for the sky.
+    video: float32 [T, 3, H, W] in [0, 1]. labels: uint8 [T, H, W]. visibility: uint8 [T, H, W], see STATES.
     before: float32 [T-1, H, W, 2], where the surface of a pixel was a frame earlier, in [-1, 1] across the picture.
     static: bool [T-1, H, W], the pixels whose surface stands still and was in the picture a frame earlier.
-    gradient: float32 [T-1, H, W], of frames 2 to T. features: of the same frames by each judge, [T-1, H/16, W/16, 64].
+    gradient: float32 [T-1, H, W], of frames 2 to T. features: of the same frames by the judge, [T-1, H/16, W/16, 64].
     """
 
     video: Tensor
     labels: Tensor
     visibility: Tensor
-    metres: Tensor
     before: Tensor
     static: Tensor
     gradient: Tensor
-    features: tuple[Tensor, ...]
+    features: Tensor
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -69,27 +71,22 @@ class MethodViews:
     """What a method shows of a clip; None for what it does not say.
 
     video: float32 [T, 3, H, W] in [0, 1]. classes: uint8 [T, H, W], ids of LIVE_CLASSES. visibility: uint8 [T, H, W].
-    log_variance: float32 [T, H, W], of the truth about the video, channel mean. inverse_depth: float32 [T, H, W], of
-    metres, 0 for the sky. within: whether the clip lies within what the method was made for. cpu_s: of computing.
+    log_variance: float32 [T, H, W], of the truth about the video, channel mean.
     """
 
     video: Tensor
     classes: Tensor | None = None
     visibility: Tensor | None = None
     log_variance: Tensor | None = None
-    inverse_depth: Tensor | None = None
-    within: bool = True
-    cpu_s: float | None = None
 
 
-def truth_of(clip: LiveClip, judges: Sequence[JudgeNet]) -> Truth:
+def truth_of(clip: LiveClip) -> Truth:
     """Of a whole clip."""
     arrays = clip.arrays
     height, width = arrays["target.labels"].shape[1:]
     lens = Intrinsics.from_hfov(clip.hfov_deg("target"), width, height)
-    metres = torch.from_numpy(clip.depth("target"))
     before, static = surface_motion(
-        metres,
+        torch.from_numpy(clip.depth("target")),
         torch.from_numpy(arrays["target.moves"] > 0),
         torch.from_numpy(arrays["target.pose"]),
         lens,
@@ -99,11 +96,10 @@ def truth_of(clip: LiveClip, judges: Sequence[JudgeNet]) -> Truth:
         video=video,
         labels=torch.from_numpy(arrays["target.labels"]),
         visibility=torch.from_numpy(arrays["target.visibility"]),
-        metres=metres,
         before=before,
         static=static,
         gradient=gradient_map(video[1:]),
-        features=tuple(judge.cells(video[1:]) for judge in judges),
+        features=cells(video[1:]),
     )
 
 
@@ -131,14 +127,6 @@ def surface_motion(metres: Tensor, moves: Tensor, poses: Tensor, lens: Intrinsic
     return place, inside & same & (there[:, 1] == 0) & ~moves[1:]
 
 
-def needed_shift(error: Tensor, log_variance: Tensor) -> Tensor:
-    """By how much the log-variance must at least rise for each error [T, 3, H, W] to lie in the 90 % interval.
-
-    log_variance: [T, H, W]. An error is inside where this is not above 0.
-    """
-    return 2 * (error.abs().clamp(min=1e-9) / _Z).log() - log_variance[:, None]
-
-
 class SpreadHistogram:
     """How many errors, channel by channel, need which shift of the log-variance, apart for each state of visibility."""
 
@@ -147,7 +135,7 @@ class SpreadHistogram:
 
     def add(self, error: Tensor, log_variance: Tensor, visibility: Tensor) -> None:
         """error: [T, 3, H, W], view minus truth in [0, 1]. log_variance, visibility: [T, H, W], as published."""
-        shift = needed_shift(error, log_variance)
+        shift = 2 * (error.abs().clamp(min=1e-9) / _Z).log() - log_variance[:, None]  # inside where not above 0
         place = torch.ceil((shift + _FARTHEST) * (_BINS / (2 * _FARTHEST))).long().clamp(1, _BINS) - 1
         state = visibility[:, None].expand_as(error).long()
         self.counts += torch.bincount((state * _BINS + place).flatten(), minlength=self.counts.numel()).view(3, -1)
@@ -164,7 +152,7 @@ def fit_spread(histogram: SpreadHistogram) -> tuple[float, float, float]:
     shifts: list[float] = []
     for counts in histogram.counts:
         share = counts.cumsum(0) / counts.sum()
-        enough = int((share < INTERVAL).sum()) + 1  # right edge of the first bin that reaches it
+        enough = int((share < _INTERVAL).sum()) + 1  # right edge of the first bin that reaches it
         shifts.append(enough * (2 * _FARTHEST / _BINS) - _FARTHEST if bool(counts.sum() > 0) else 0.0)
     return shifts[0], shifts[1], shifts[2]
 
@@ -172,22 +160,15 @@ def fit_spread(histogram: SpreadHistogram) -> tuple[float, float, float]:
 class Tally:
     """All figures of one method on one set, clip by clip."""
 
-    def __init__(self, classes: Sequence[SemanticClass], judges: dict[str, JudgeNet]) -> None:
-        """judges: by the names that their distances get; in the order of `Truth.features`."""
+    def __init__(self, classes: Sequence[SemanticClass]) -> None:
         self._names = [entry.name for entry in classes]
-        self._judges = judges
         self._sums: defaultdict[str, float] = defaultdict(float)
-        self._confusions = {"miou": self._square(), "miou_coarse": self._square()}
+        self._confusion = torch.zeros(len(classes), len(classes), dtype=torch.int64)
         self._states = torch.zeros(3, 3, dtype=torch.int64)
-        self._moments = {name: (Moments.none(), Moments.none()) for name in judges}
+        self._views, self._truths = Moments(), Moments()
         self.spread = SpreadHistogram()
         self.psnr: dict[str, list[float]] = defaultdict(list)
         """Mean over frames of every clip, by scene."""
-        self.outside: set[str] = set()
-        """Scenes with a clip that is not what the method was made for."""
-
-    def _square(self) -> Tensor:
-        return torch.zeros(len(self._names), len(self._names), dtype=torch.int64)
 
     def add(self, scene: str, truth: Truth, views: MethodViews, splat: Tensor) -> None:
         """Count a clip in.
@@ -196,23 +177,17 @@ class Tally:
         """
         never = truth.visibility[1:] == NEVER
         made, true = views.video[1:], truth.video[1:]
-        if not views.within:
-            self.outside.add(scene)
         quality = psnr(made, true)
         self.psnr[scene].append(float(quality.mean()))
         self._mean("psnr", quality)
-        self._mean("psnr_last", quality[-1:])
-        self._add_structure(made, true, ~never)
-        self._add_errors(made, true, splat[1:], truth.visibility[1:])
+        likeness = ssim_map(made, true)
+        self._mean("ssim", likeness)
+        self._mean("ssim_seen", likeness, window_mask(~never))
+        self._add_errors(made, true, splat[1:], never)
         self._add_never(made, truth, never)
         self._add_time(views.video, truth)
-        if views.cpu_s is not None:
-            self._mean("cpu_s", torch.tensor([views.cpu_s / len(views.video)]))
         if views.classes is not None:
-            self._add_classes(views.classes[1:], truth.labels[1:])
-        if views.inverse_depth is not None:
-            right = _right_depth(views.inverse_depth[1:], truth.metres[1:])
-            self._mean("depth_seen", right.float(), ~never)
+            self._confusion += confusion_matrix(views.classes[1:], truth.labels[1:], len(self._names))
         if views.visibility is not None:
             self._states += confusion_matrix(views.visibility[1:], truth.visibility[1:], 3)
             if views.log_variance is not None:
@@ -227,13 +202,8 @@ class Tally:
         count = self._sums[f"{name}/count"]
         return self._sums[f"{name}/sum"] / count if count else float("nan")
 
-    def _add_structure(self, made: Tensor, true: Tensor, seen: Tensor) -> None:
-        likeness = ssim_map(made, true)
-        self._mean("ssim", likeness)
-        self._mean("ssim_seen", likeness, window_mask(seen))
-
-    def _add_errors(self, made: Tensor, true: Tensor, splat: Tensor, visibility: Tensor) -> None:
-        for name, mask in (("seen", visibility > NEVER), ("now", visibility == NOW), ("never", visibility == NEVER)):
+    def _add_errors(self, made: Tensor, true: Tensor, splat: Tensor, never: Tensor) -> None:
+        for name, mask in (("seen", ~never), ("never", never)):
             self._mean(f"share_{name}", mask.float())
             self._mean(f"square_{name}", (made - true).square().mean(dim=1), mask)
             self._mean(f"splat_{name}", (splat - true).square().mean(dim=1), mask)
@@ -242,11 +212,9 @@ class Tally:
         inside = _eroded(never)
         self._mean("gradient_made", gradient_map(made), inside)
         self._mean("gradient_true", truth.gradient, inside)
-        cells = F.avg_pool2d(never.float(), CELL) >= _FULL_CELL
-        for (name, judge), features in zip(self._judges.items(), truth.features, strict=True):
-            of_views, of_truths = self._moments[name]
-            of_views.add(judge.cells(made)[cells])
-            of_truths.add(features[cells])
+        judged = F.avg_pool2d(never.float(), _CELL) >= _FULL_CELL
+        self._views.add(cells(made)[judged])
+        self._truths.add(truth.features[judged])
 
     def _add_time(self, video: Tensor, truth: Truth) -> None:
         self._mean("flicker_made", _flicker(video, truth)[1:], truth.static[1:])
@@ -254,53 +222,29 @@ class Tally:
         for name, pictures in (("jump_made", video), ("jump_true", truth.video)):
             self._mean(name, (pictures[2:] - pictures[1:-1]).abs())
 
-    def _add_classes(self, made: Tensor, true: Tensor) -> None:
-        count = len(self._names)
-        self._confusions["miou"] += confusion_matrix(made, true, count)
-        if all(side % cells == 0 for side, cells in zip(true.shape[1:], COARSE, strict=True)):
-            coarse = [majority_classes(labels, *COARSE, count) for labels in (made, true)]
-            self._confusions["miou_coarse"] += confusion_matrix(coarse[0], coarse[1], count)
-
     def figures(self) -> dict[str, float]:
         """All of them by name; NaN for what the method does not say, or what does not occur in the set."""
         read = self._read
-        made = {name: read(name) for name in ("psnr", "psnr_last", "ssim", "ssim_seen")}
-        for name in ("seen", "now", "never"):
+        made = {name: read(name) for name in ("psnr", "ssim", "ssim_seen")}
+        for name in ("seen", "never"):
             made[f"share_{name}"] = read(f"share_{name}")
             made[f"psnr_{name}"] = -10 * float(np.log10(max(read(f"square_{name}"), 1e-10)))
-        for name in ("seen", "now"):
-            made[f"error_ratio_{name}"] = read(f"square_{name}") / max(read(f"splat_{name}"), 1e-10)
+        made["error_ratio_seen"] = read("square_seen") / max(read("splat_seen"), 1e-10)
         made["gradient_energy"] = read("gradient_made") / max(read("gradient_true"), 1e-10)
-        made |= {f"frechet_{name}": frechet_distance(*moments) for name, moments in self._moments.items()}
-        made |= self._class_figures()
+        made["frechet_random"] = frechet_distance(self._views, self._truths)
+        iou = np.array(_occurring_iou(self._confusion))
+        made["miou"] = float(np.nanmean(iou)) if np.isfinite(iou).any() else float("nan")
+        made |= {name: float(iou[self._names.index(name)]) for name in NAMED_CLASSES}
         made |= {f"iou_{name}": iou for name, iou in zip(STATES, _occurring_iou(self._states), strict=True)}
         made |= {f"inside_90_{name}": share for name, share in zip(STATES, self.spread.coverage, strict=True)}
         for name in ("flicker", "jump"):
             made[name] = read(f"{name}_made") / max(read(f"{name}_true"), 1e-10)
-            made[f"{name}_levels"] = 255 * read(f"{name}_made")
-        made["depth_within_10_seen"] = read("depth_seen")
-        made["cpu_ms_a_frame"] = 1000 * read("cpu_s")
-        return made
-
-    def _class_figures(self) -> dict[str, float]:
-        made: dict[str, float] = {}
-        for name, confusion in self._confusions.items():
-            iou = np.array(_occurring_iou(confusion))
-            made[name] = float(np.nanmean(iou)) if np.isfinite(iou).any() else float("nan")
-            suffix = name.removeprefix("miou")
-            made |= {f"{each}{suffix}": float(iou[self._names.index(each)]) for each in NAMED_CLASSES}
         return made
 
 
 def _occurring_iou(confusion: Tensor) -> list[float]:
     """IoU of each class that occurs in the truth, NaN for others; all NaN where nothing was said."""
     return torch.where(confusion.sum(1) > 0, class_iou(confusion), float("nan")).tolist()
-
-
-def _right_depth(inverse: Tensor, metres: Tensor) -> Tensor:
-    """Which pixels are off by less than 10 %; beyond half of SKY_M all is sky."""
-    both_far = (inverse * SKY_M < 2) & (metres > SKY_M / 2)
-    return both_far | ((inverse * metres - 1).abs() < 0.1)
 
 
 def _eroded(mask: Tensor) -> Tensor:
@@ -322,3 +266,61 @@ def scene_interval(differences: Sequence[float], draws: int = 4000, seed: int = 
     means = values[random.integers(len(values), size=(draws, len(values)))].mean(axis=1)
     low, high = np.quantile(means, [0.025, 0.975])
     return float(low), float(high)
+
+
+@cache
+def _judge() -> nn.Module:
+    """0.3 M random weights, always the same; a feature looks at 43 pixels a side, one for every 8."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(_JUDGE_SEED)
+        layers = [(3, 32, 2), (32, 32, 1), (32, 64, 2), (64, 64, 1), (64, 128, 2), (128, 128, 1)]
+        made = [(nn.Conv2d(a, b, 3, stride, 1), nn.GroupNorm(8, b), nn.SiLU()) for a, b, stride in layers]
+        return nn.Sequential(*chain(*made), nn.Conv2d(128, _FEATURES, 1), nn.SiLU()).eval()
+
+
+@torch.no_grad()
+def cells(pictures: Tensor) -> Tensor:
+    """What the judge sees of pictures [N, 3, H, W] in [0, 1]: features of cells, [N, H/16, W/16, 64]."""
+    return F.avg_pool2d(_judge()(pictures * 2 - 1), 2).permute(0, 2, 3, 1)
+
+
+class Moments:
+    """Count, sum and sum of outer products of feature vectors, float64."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.total = torch.zeros(_FEATURES, dtype=torch.float64)
+        self.outer = torch.zeros(_FEATURES, _FEATURES, dtype=torch.float64)
+
+    def add(self, vectors: Tensor) -> None:
+        """vectors: [N, 64]."""
+        vectors = vectors.double()
+        self.count += len(vectors)
+        self.total = self.total + vectors.sum(0)
+        self.outer = self.outer + vectors.T @ vectors
+
+    @property
+    def gaussian(self) -> tuple[Tensor, Tensor]:
+        """Mean [64] and covariance [64, 64]."""
+        mean = self.total / self.count
+        return mean, self.outer / self.count - torch.outer(mean, mean)
+
+
+def frechet_distance(views: Moments, truths: Moments) -> float:
+    """Between the two as Gaussians, in standard deviations of the truth's features; NaN for too few vectors.
+
+        |m - m'|^2 + tr(C + C' - 2 (C^1/2 C' C^1/2)^1/2)
+
+    Source: Dowson and Landau 1982; Heusel et al. 2017, with features of our own.
+    """
+    if min(views.count, truths.count) < 2 * _FEATURES:
+        return float("nan")
+    mean, covariance = views.gaussian
+    true_mean, true_covariance = truths.gaussian
+    scale = true_covariance.diagonal().clamp(min=1e-12).rsqrt()
+    ridge = _RIDGE * torch.eye(_FEATURES, dtype=torch.float64)
+    a, b = (c * scale[:, None] * scale + ridge for c in (covariance, true_covariance))
+    root = torch.linalg.cholesky(a)
+    shared = torch.linalg.eigvalsh(root.T @ b @ root).clamp(min=0).sqrt().sum()
+    apart = ((mean - true_mean) * scale).square().sum() + a.trace() + b.trace() - 2 * shared
+    return max(float(apart), 0.0)

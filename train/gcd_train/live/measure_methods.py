@@ -1,7 +1,5 @@
 """Everything that is measured beside the live model, and the live model itself: a clip in, its target views out."""
 
-import json
-import time
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -12,10 +10,7 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 import torch
-import torch.nn.functional as F
 from numpy.typing import NDArray
-from safetensors import safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from gcd_model.geometry import Intrinsics, invert_rigid
@@ -29,10 +24,7 @@ from gcd_model.live.splat import splat, unproject
 from gcd_model.live.synthesizer import LiveSynthesizer
 from gcd_model.live.view import LiveView
 from gcd_model.loading import load_synthesizer
-from gcd_model.small_files import decode_json
 from gcd_train.errors import DataError
-from gcd_train.evaluation.reprojection import splat as splat_points
-from gcd_train.files import whole
 from gcd_train.live.batches import Pictures, pictures_of, training_paths
 from gcd_train.live.clips import LiveClip, evenly, read_clip
 from gcd_train.live.measure_figures import NEVER, NOW, MethodViews
@@ -51,64 +43,21 @@ class Method(Protocol):
     @property
     def name(self) -> str: ...
     def views(self, clip: LiveClip) -> MethodViews:
-        """All frames of it. Raises DataError for a clip that is nothing for this method."""
+        """All frames of it."""
         ...
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Fill:
-    """What stands for pixels that nobody saw: the training targets' commonest class, and their mean colour, [3]."""
-
-    label: int
-    colour: Tensor
-
-
 @lru_cache
-def fill_of(training: Path, world: str) -> Fill:
-    """Of a world's training clips. Raises DataError if there are none."""
+def commonest_class(training: Path, world: str) -> int:
+    """Of target pixels of a world's training clips. Raises DataError if there are none."""
     paths = [path for path in training_paths(training) if path.parent.name == world]
     if not paths:
         raise DataError(f"{training} holds no training clips of {world!r}; holes are filled as they are on average")
-    counts, total, pixels = np.zeros(256), np.zeros(3), 0
+    counts = np.zeros(256)
     for path in evenly(paths, _SAMPLE):
-        arrays = read_clip(path, slice(6, 7)).arrays
-        counts += np.bincount(arrays["target.labels"].ravel(), minlength=256)
-        total += arrays["target.rgb"].reshape(-1, 3).sum(axis=0)
-        pixels += arrays["target.labels"].size
-    return Fill(label=int(counts.argmax()), colour=torch.from_numpy(total / pixels / 255).float())
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Kept:
-    """A method whose views of one set are kept on disk, pictures in whole levels; made anew where a file is missing."""
-
-    method: Method
-    folder: Path
-
-    @property
-    def name(self) -> str:
-        """The method's own."""
-        return self.method.name
-
-    def views(self, clip: LiveClip) -> MethodViews:
-        """See Method."""
-        path = self.folder / self.name / f"{clip.name}.safetensors"
-        if not path.exists():
-            start = time.process_time()
-            views = self.method.views(clip)
-            self._write(path, replace(views, cpu_s=time.process_time() - start))
-        with safe_open(path, framework="pt") as file:
-            facts = decode_json(file.metadata()["facts"], dict[str, Any])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        return MethodViews(**{**tensors, "video": tensors["video"].float() / 255}, **facts)
-
-    def _write(self, path: Path, views: MethodViews) -> None:
-        names = ("classes", "visibility", "log_variance", "inverse_depth")
-        tensors = {name: tensor for name in names if (tensor := getattr(views, name)) is not None}
-        tensors["video"] = (views.video.clamp(0, 1) * 255).round().to(torch.uint8)
-        facts = json.dumps({"within": views.within, "cpu_s": views.cpu_s})
-        with whole(path) as unfinished:
-            save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, unfinished, {"facts": facts})
+        labels = read_clip(path, slice(6, 7), ["target.labels"]).arrays["target.labels"]
+        counts += np.bincount(labels.ravel(), minlength=256)
+    return int(counts.argmax())
 
 
 def _lens(clip: LiveClip, camera: str) -> Intrinsics:
@@ -133,7 +82,7 @@ class ExactSplat:
         source, lens = pictures_of(clip, "source"), _lens(clip, "target")
         poses, targets = _poses(clip, "source"), _poses(clip, "target")
         rays, nothing = pixel_rays(lens), torch.zeros(lens.height, lens.width)
-        video, votes, coverage, inverse = [], [], [], []
+        video, votes, coverage = [], [], []
         for t, own in enumerate(source.lenses):
             labels = source.labels[t].to(torch.uint8)
             surfels = unproject(source.metres[t], source.video[t], labels, own, poses[t], 1.0)
@@ -141,42 +90,12 @@ class ExactSplat:
             video.append((filled(seen_of(made, None, rays, nothing, torch.zeros(12)))[0].clamp(-1, 1) + 1) / 2)
             votes.append(made.votes.max(dim=0).indices)
             coverage.append(made.coverage)
-            inverse.append(made.inverse_depth)
-        covered, label = torch.stack(coverage), fill_of(self.training, str(clip.facts["world"])).label
+        covered, label = torch.stack(coverage), commonest_class(self.training, str(clip.facts["world"]))
         return MethodViews(
             video=torch.stack(video),
             classes=torch.where(covered > 0, torch.stack(votes), label).to(torch.uint8),
             visibility=torch.where(covered >= COVERED, NOW, NEVER).to(torch.uint8),
-            inverse_depth=torch.stack(inverse),
         )
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PointSplat:
-    """The exact splat that other models are measured beside: bilinear points, holes in the mean colour."""
-
-    training: Path
-    classes: int = len(LiveConfig().classes)
-    name: str = "splat-points"
-
-    def views(self, clip: LiveClip) -> MethodViews:
-        """See Method."""
-        source, lens, fill = (
-            pictures_of(clip, "source"),
-            _lens(clip, "target"),
-            fill_of(self.training, str(clip.facts["world"])),
-        )
-        target_from_source = invert_rigid(_poses(clip, "target")) @ _poses(clip, "source")
-        votes = F.one_hot(source.labels, self.classes).permute(0, 3, 1, 2).float()
-        values = torch.cat([(source.video + 1) / 2, votes], dim=1).flatten(2)  # [T, 3 + K, HW]
-        rays = F.pad(source.rays[0], (0, 0, 0, 0, 0, 1), value=1.0).flatten(1).T.double()  # [HW, 3]
-        video, classes = [], []
-        for t, move in enumerate(target_from_source):
-            points = rays * source.metres[t].flatten()[:, None] @ move[:3, :3].T + move[:3, 3]
-            shown, covered = splat_points(values[t], points, lens)
-            video.append(torch.where(covered, shown[:3], fill.colour[:, None, None]))
-            classes.append(torch.where(covered, shown[3:].max(dim=0).indices, fill.label))
-        return MethodViews(video=torch.stack(video), classes=torch.stack(classes).to(torch.uint8))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -255,15 +174,11 @@ def _warped(picture: Array, source_from_target: Array, interpolation: int) -> Ar
 class LiveModel:
     """The live model, frame by frame as a node runs it.
 
-    exact: the source's true depth, classes and motion instead of the depth network's. odometry: the source's true
-    motion from frame to frame; else its own ego-motion. depth_scale, floor_higher_m, floor_tilt_deg: errors that nobody
-    declares.
+    depth_scale, floor_higher_m, floor_tilt_deg: errors that nobody declares.
     """
 
     networks: LiveNetworks
     name: str = "live"
-    exact: bool = False
-    odometry: bool = False
     depth_scale: float = 1.0
     floor_higher_m: float = 0.0
     floor_tilt_deg: float = 0.0
@@ -274,18 +189,14 @@ class LiveModel:
         view = LiveView(self.networks, steps=self.steps)
         view.eyes = _Misjudging(self.networks, self.depth_scale)
         source, lens = pictures_of(clip, "source"), _lens(clip, "target")
-        poses = _poses(clip, "source")
-        source_from_target = invert_rigid(poses) @ _poses(clip, "target")
+        source_from_target = invert_rigid(_poses(clip, "source")) @ _poses(clip, "target")
         frames = []
         for t, own in enumerate(source.lenses):
-            floor = self._floor(source, t)
             made = view.step(
                 source.video[t],
                 [source_from_target[t]],
                 lens=own,
-                odometry=poses[t] if self.odometry else None,
-                floor=floor,
-                geometry=_exact(source, t) if self.exact else None,
+                floor=self._floor(source, t),
                 target_lens=lens,
             )
             frames.append(made.views[0])
@@ -294,7 +205,6 @@ class LiveModel:
             classes=torch.stack([frame.classes for frame in frames]),
             visibility=torch.stack([frame.visibility for frame in frames]),
             log_variance=torch.stack([frame.log_variance for frame in frames]),
-            inverse_depth=torch.stack([frame.inverse_depth for frame in frames]),
         )
 
     def _floor(self, source: Pictures, t: int) -> Floor:
@@ -317,12 +227,6 @@ class _Misjudging(Eyes):
         return replace(geometry, metres=torch.where(metres < SKY_M, metres * self._scale, metres))
 
 
-def _exact(source: Pictures, t: int) -> FrameGeometry:
-    return FrameGeometry(
-        metres=source.metres[t], labels=source.labels[t].to(torch.uint8), static=source.moves[t] < 0.5, ood=0.0
-    )
-
-
 def live_model(weights: str, *, device: str = "auto") -> LiveSynthesizer:
     """A live model. Raises DataError for weights of another."""
     loaded = load_synthesizer(weights, device=device)
@@ -332,14 +236,11 @@ def live_model(weights: str, *, device: str = "auto") -> LiveSynthesizer:
 
 
 def live_methods(networks: LiveNetworks) -> dict[str, LiveModel]:
-    """The live model as it ships, told its motion, with exact depth, with what may be wrong, and painting otherwise (in
-    several steps, or the mean alone), by name."""
+    """The live model as it ships, with what may be wrong, and painting otherwise: in several steps, or the mean."""
     plain, mean = LiveModel(networks=networks), deepcopy(networks)
     zeroed(mean.paint.detail.out)
     made = [
         plain,
-        replace(plain, name="live-odometry", odometry=True),
-        replace(plain, name="live-exact", exact=True, odometry=True),
         replace(plain, name="live-depth-0.9", depth_scale=0.9),
         replace(plain, name="live-depth-1.1", depth_scale=1.1),
         replace(plain, name="live-floor-20cm", floor_higher_m=0.2),
