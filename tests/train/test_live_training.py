@@ -31,13 +31,22 @@ from gcd_train.live.batches import FrameBatches, lens_rays, pictures_of, trainin
 from gcd_train.live.calibration import calibrate
 from gcd_train.live.clips import read_clip
 from gcd_train.live.depth_training import DepthTask, edge_matches, measure_depth
-from gcd_train.live.inputs import exact_geometry, make_inputs, read_inputs, splats_of
 from gcd_train.live.measure_figures import SpreadHistogram
 from gcd_train.live.measure_methods import LiveModel
 from gcd_train.live.paint_training import HeldOutViews, PaintTask
 from gcd_train.live.recipe import LiveRecipe, LiveStage, live_recipes, load_live_recipe
-from gcd_train.live.target_views import ViewBatches, Views, carried_through, carry, views_of
 from gcd_train.live.training import LivePlaces, train_live
+from gcd_train.live.views import (
+    ViewBatches,
+    Views,
+    carried_through,
+    carry,
+    exact_geometry,
+    make_inputs,
+    read_inputs,
+    splats_of,
+    views_of,
+)
 from gcd_train.recipe import OptimiserRecipe
 from gcd_train.recipe_data import Budget, ComputeRecipe, LogRecipe
 from gcd_train.training.distributed import processes_of
@@ -244,7 +253,7 @@ def test_depth_learns_one_picture_by_heart(places: LivePlaces) -> None:
     torch.manual_seed(0)
     net = DepthNet(TINY.depth, len(TINY.classes))
     paths = training_paths(places.data)[:1]
-    task = DepthTask(net, TINY, paths, paths, 2, 0)
+    task = DepthTask(net, TINY, paths, paths, msgspec.structs.replace(stage(1), small_share=0.0), 0)
     before = measure_depth(net, TINY, paths)["mean_relative"]
     optimiser = torch.optim.Adam(net.parameters(), 1e-2)
     for update in range(60):
@@ -355,7 +364,7 @@ def test_paint_losses_are_lowest_at_the_truth(places: LivePlaces) -> None:
     batches = ViewBatches([path], [places.out], TINY, 2, 0)
     views = HeldOutViews([path], places.out, TINY)
     net = PaintNet(TINY.paint, len(TINY.classes))
-    task = PaintTask(net, TINY, [batches], [path], views)
+    task = PaintTask(net, TINY, [batches], [path], views, 0.0)
     _, now, _ = batches.batch(0)
     with torch.no_grad():
         made = net.first_step(now.seen, filled(now.seen), TINY.sigma_max)
@@ -370,7 +379,7 @@ def test_the_second_half_of_the_training_carries_and_denoises(places: LivePlaces
     make_inputs(places.out, [path], None, TINY, 0)
     net = PaintNet(TINY.paint, len(TINY.classes))
     batches = ViewBatches([path], [places.out], TINY, 2, 0, carried=1.0)
-    task = PaintTask(net, TINY, [batches], [path], HeldOutViews([path], places.out, TINY))
+    task = PaintTask(net, TINY, [batches], [path], HeldOutViews([path], places.out, TINY), 0.0)
     early, late = ([task.step_loss(Progress(u, share)).parts for u in range(8)] for share in (0.0, 0.9))
     assert all("denoising" not in parts for parts in early)
     denoised = [parts["denoising"] for parts in late if "denoising" in parts]

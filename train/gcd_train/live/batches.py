@@ -3,13 +3,14 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
@@ -20,6 +21,7 @@ from gcd_model.live.sweep import LONGEST, Reference, References, sweep_costs
 from gcd_model.loading import default_precision
 from gcd_train.live.clips import LiveClip, clip_paths, evenly, read_clip
 from gcd_train.live.draws import Poses
+from gcd_train.training.loop import Progress
 
 Random = np.random.Generator
 Record = TypeVar("Record")
@@ -58,12 +60,6 @@ class Pictures:
         """[N, bins + 1, H/2, W/2], see `sweep_costs`."""
         each = zip(self.video, self.lenses, self.references, strict=True)
         return torch.stack([sweep_costs(picture, lens, reference, config) for picture, lens, reference in each])
-
-    def last(self) -> "Pictures":
-        """The last of them."""
-        tensors = {name: getattr(self, name)[-1:] for name in ("video", "metres", "labels", "moves")}
-        tuples = {name: getattr(self, name)[-1:] for name in ("lenses", "ups", "heights_m", "references")}
-        return Pictures(**tensors, **tuples)
 
     @property
     def rays(self) -> Tensor:
@@ -183,20 +179,6 @@ def _cross(turn: Tensor) -> Tensor:
     return torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
 
 
-def joined(parts: Sequence[Pictures]) -> Pictures:
-    """Pictures of several clips as one batch."""
-    return Pictures(
-        video=torch.cat([part.video for part in parts]),
-        metres=torch.cat([part.metres for part in parts]),
-        labels=torch.cat([part.labels for part in parts]),
-        moves=torch.cat([part.moves for part in parts]),
-        lenses=sum((part.lenses for part in parts), ()),
-        ups=sum((part.ups for part in parts), ()),
-        heights_m=sum((part.heights_m for part in parts), ()),
-        references=sum((part.references for part in parts), ()),
-    )
-
-
 def halved(pictures: Pictures) -> Pictures:
     """The same at half the size: colours are averages, what cannot be averaged is of one pixel of four."""
     return replace(
@@ -305,6 +287,42 @@ def on(device: torch.device, record: Record) -> Record:
         return record
     moved = {f.name: on(device, getattr(record, f.name)) for f in fields(record)}
     return cast("Record", replace(record, **moved))  # pyright: ignore[reportArgumentType]
+
+
+def joined(parts: Sequence[Record]) -> Record:
+    """Records of pictures or views as one batch."""
+    first: Any = parts[0]
+    if isinstance(first, Tensor):
+        return cast("Record", torch.cat(cast("list[Tensor]", parts)))
+    if isinstance(first, tuple):
+        return cast("Record", tuple(chain(*cast("list[tuple[Any, ...]]", parts))))
+    together = {f.name: joined([getattr(part, f.name) for part in parts]) for f in fields(first)}
+    return replace(first, **together)
+
+
+def some_of(batch: Record, cut: slice) -> Record:
+    """Some pictures or views of a record of them."""
+    if isinstance(batch, Tensor | tuple):
+        return cast("Record", batch[cut])
+    taken = {f.name: some_of(getattr(batch, f.name), cut) for f in fields(cast("Any", batch))}
+    return replace(cast("Any", batch), **taken)
+
+
+class LiveTask:
+    """What all stages' tasks have in common; see SharedTask."""
+
+    def __init__(self, net: nn.Module, config: LiveConfig) -> None:
+        self.module = net
+        self._network, self._config, self._device = net, config, next(net.parameters()).device
+
+    def compute_through(self, network: nn.Module) -> None:
+        """See SharedTask."""
+        self._network = network
+
+    def after_update(self, progress: Progress) -> bool:
+        """Nothing to do."""
+        _ = progress
+        return False
 
 
 class Ahead(Generic[Batch]):

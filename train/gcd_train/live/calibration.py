@@ -16,7 +16,7 @@ from gcd_model.live.depth_net import DepthOutput, depth_inputs, read_depth
 from gcd_model.live.networks import LiveNetworks
 from gcd_model.live.paint_net import filled
 from gcd_train.evaluation.metrics import class_iou, confusion_matrix
-from gcd_train.live.batches import to_video, with_true_references
+from gcd_train.live.batches import some_of, to_video, with_true_references
 from gcd_train.live.clips import read_clip
 from gcd_train.live.measure_figures import SpreadHistogram, fit_spread
 from gcd_train.live.measure_methods import LiveModel
@@ -126,7 +126,7 @@ def _learn_familiar(networks: LiveNetworks, paths: Sequence[Path], random: np.ra
 def _outputs(networks: LiveNetworks, path: Path, t: int) -> Iterator[DepthOutput]:
     """Of a frame of a clip's source: with its mount and an earlier frame, and without."""
     device = next(networks.parameters()).device
-    frame = with_true_references(read_clip(path, slice(t + 1)), "source").last()
+    frame = some_of(with_true_references(read_clip(path, slice(t + 1)), "source"), slice(-1, None))
     ground = frame.ground()
     told = depth_inputs(frame.video, frame.rays, ground).to(device)
     yield networks.depth(told, frame.sweeps(networks.config.depth).to(device))

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
+from gcd_model.colours import palette
 from gcd_model.live.config import LiveConfig
 from gcd_model.live.depth_net import (
     SKY_M,
@@ -22,15 +23,18 @@ from gcd_train.live.batches import (
     PART_SEED,
     Ahead,
     FrameBatches,
+    LiveTask,
     Pictures,
     autocast,
     class_weights,
     halved,
     on,
+    some_of,
     with_true_references,
 )
 from gcd_train.live.clips import evenly, read_clip
-from gcd_train.live.look import depth_sheet
+from gcd_train.live.recipe import LiveStage
+from gcd_train.pictures import write_sheet
 from gcd_train.training.loop import Progress, StepLoss
 from gcd_train.training.optimiser import ParameterGroup
 
@@ -43,7 +47,7 @@ THIN = ("person", "pole", "cyclist", "object")
 """Small things, which are drawn more often."""
 
 
-class DepthTask:
+class DepthTask(LiveTask):
     """Trains a DepthNet on single frames."""
 
     def __init__(
@@ -52,22 +56,16 @@ class DepthTask:
         config: LiveConfig,
         paths: Sequence[Path],
         held_out: Sequence[Path],
-        size: int,
+        stage: LiveStage,
         seed: int,
-        parts: int = 1,
         workers: int = 0,
-        small_share: float = 0.0,
     ) -> None:
-        """size: frames a batch. parts: batches an update. workers: processes that read them.
-
-        small_share: see LiveStage.
-        """
-        self._small_share = small_share
-        self._net, self._config, self._held_out = net, config, list(held_out)
-        self._network: nn.Module = net
-        self._device = next(net.parameters()).device
+        """workers: processes that read batches."""
+        super().__init__(net, config)
+        self._net, self._held_out, self._small_share = net, held_out, stage.small_share
         self._batches = [
-            Ahead(FrameBatches(paths, size, seed + part * PART_SEED).batch, workers) for part in range(parts)
+            Ahead(FrameBatches(paths, stage.batch, seed + part * PART_SEED).batch, workers)
+            for part in range(stage.parts)
         ]
         self._class_weights = class_weights(paths, config, _CLASS_POWER).to(self._device)
         names = [entry.name for entry in config.classes]
@@ -77,15 +75,6 @@ class DepthTask:
     def class_weights(self) -> Tensor:
         """How much a pixel of each class counts, by how often it is drawn and by its weight: [K]."""
         return self._class_weights * (1 + _THIN_WEIGHT * self._thin)
-
-    @property
-    def module(self) -> nn.Module:
-        """The network."""
-        return self._net
-
-    def compute_through(self, network: nn.Module) -> None:
-        """See SharedTask."""
-        self._network = network
 
     def parameter_groups(self) -> Sequence[ParameterGroup]:
         """All weights."""
@@ -142,11 +131,6 @@ class DepthTask:
         edge = ((highest - lowest)[:, 0] > 2 * _EDGE).float()
         return 1 + _EDGE_WEIGHT * edge + _THIN_WEIGHT * self._thin[pictures.labels].float()
 
-    def after_update(self, progress: Progress) -> bool:
-        """Nothing to do."""
-        _ = progress
-        return False
-
     @torch.no_grad()
     def measure(self, picture: Path) -> dict[str, float]:
         """Of held-out clips, see `measure_depth`."""
@@ -170,10 +154,10 @@ def measure_depth(
     confusion = torch.zeros(count, count, dtype=torch.int64)
     names = [entry.name for entry in config.classes]
     is_thin = torch.tensor([name in ("person", "pole") for name in names])
-    shown: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
+    rows: list[list[Tensor]] = []
     for path in paths:
         for frame in frames:
-            truth = with_true_references(read_clip(path, slice(frame + 1)), "source").last()
+            truth = some_of(with_true_references(read_clip(path, slice(frame + 1)), "source"), slice(-1, None))
             device = next(net.parameters()).device
             sweeps = truth.sweeps(config.depth).to(device)
             output = net(depth_inputs(truth.video, truth.rays, truth.ground()).to(device), sweeps)
@@ -187,10 +171,11 @@ def measure_depth(
             classes = output.classes.argmax(1)
             confusion += confusion_matrix(classes, truth.labels, count)
             if frame == frames[0]:
-                shown.append((truth.video[0], true[0], metres[0], classes[0]))
+                colours = palette(config.classes)[classes[0]].permute(2, 0, 1) / 127.5 - 1
+                rows.append([truth.video[0], _shaded(true[0]), _shaded(metres[0]), colours])
     together, small = torch.cat(errors), torch.cat(thin)
     if sheet is not None:
-        depth_sheet(evenly(shown, 8), config.classes, sheet)
+        write_sheet(sheet, evenly(rows, 8))
     iou, occurs = class_iou(confusion), confusion.sum(1) > 0
     return {
         "mean_relative": float(together.mean()),
@@ -200,6 +185,11 @@ def measure_depth(
         "miou": float(iou[occurs].mean()),
         **{f"iou_{names[k]}": float(iou[k]) for k in (8, 10, 11, 7, 16) if occurs[k]},
     }
+
+
+def _shaded(metres: Tensor) -> Tensor:
+    """Near is bright: [H, W] metres -> picture [3, H, W] in [-1, 1]."""
+    return (1 - (metres.clamp(0.3, 200) / 0.3).log() / 3.25).clamp(-1, 1).expand(3, -1, -1)
 
 
 def edge_matches(metres: Tensor, true: Tensor) -> Tensor:

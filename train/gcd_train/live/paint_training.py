@@ -1,7 +1,12 @@
-"""How the paint network learns: the mean of every pixel, its spread, its class and depth, and what was seen of it."""
+"""How the paint network learns: every pixel's mean, spread, class and depth and what was seen of it; then detail.
+
+In the detail stage a critic looks at patches of whole pictures and learns to tell true views from made ones; the detail
+head learns to pass. It alone learns there, on features that are held fixed: all else stays as it was, to the last bit.
+"""
 
 from collections.abc import Iterator, Sequence
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from types import EllipsisType
 
@@ -9,15 +14,26 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.nn.utils.parametrizations import spectral_norm
 
 from gcd_model.live.config import LiveConfig
+from gcd_model.live.depth_net import DepthNet, depth_inputs
 from gcd_model.live.networks import movable_classes
 from gcd_model.live.paint_net import SIGMA_DATA, Painted, PaintNet, Seen, filled
-from gcd_train.live.batches import Ahead, Random, autocast, class_weights, on
+from gcd_train.evaluation.metrics import class_iou, confusion_matrix
+from gcd_train.live.batches import Ahead, LiveTask, Random, autocast, class_weights, on
 from gcd_train.live.clips import read_clip
-from gcd_train.live.inputs import read_inputs
-from gcd_train.live.look import picture, write_rows
-from gcd_train.live.target_views import VIEW_ARRAYS, ViewBatches, Views, carried_through, halved, mirrored, views_of
+from gcd_train.live.views import (
+    VIEW_ARRAYS,
+    ViewBatches,
+    Views,
+    carried_through,
+    halved,
+    mirrored,
+    read_inputs,
+    views_of,
+)
+from gcd_train.pictures import write_sheet
 from gcd_train.training.loop import Progress, StepLoss
 from gcd_train.training.losses import gradient_l1, ssim
 from gcd_train.training.optimiser import ParameterGroup
@@ -35,9 +51,11 @@ _DENOISING_SHARE = 0.3
 _DRAWS = 7_000_003  # seed of which updates these are
 _SEEN_DENOISED = 0.25
 """Weight of a seen pixel beside a never-seen one there."""
+_FEATURES, _CRITIC, _ENERGY, _KEEP, _CLOSE = 1.0, 0.1, 0.5, 1.0, 0.3
+_CRITIC_WIDTHS = (32, 64, 96)
 
 
-class PaintTask:
+class PaintTask(LiveTask):
     """Trains a PaintNet's first step on target views."""
 
     def __init__(
@@ -47,28 +65,15 @@ class PaintTask:
         batches: Sequence[ViewBatches],
         paths: Sequence[Path],
         held_out: "HeldOutViews",
+        small_share: float,
         workers: int = 0,
-        small_share: float = 0.0,
     ) -> None:
-        """batches: of the parts of an update. workers: processes that read them.
-
-        small_share: see LiveStage.
-        """
-        self._small_share = small_share
-        self._net, self._config, self._held_out = net, config, held_out
-        self._network: nn.Module = net
-        self._device, self._batches = next(net.parameters()).device, [Ahead(each.batch, workers) for each in batches]
+        """batches: of the parts of an update. small_share: see LiveStage. workers: processes that read batches."""
+        super().__init__(net, config)
+        self._net, self._held_out, self._small_share = net, held_out, small_share
+        self._batches = [Ahead(each.batch, workers) for each in batches]
         self.class_weights = class_weights(paths, config, _CLASS_POWER).to(self._device)
         self._movable = movable_classes(config).to(self._device)
-
-    @property
-    def module(self) -> nn.Module:
-        """The network."""
-        return self._net
-
-    def compute_through(self, network: nn.Module) -> None:
-        """See SharedTask."""
-        self._network = network
 
     def parameter_groups(self) -> Sequence[ParameterGroup]:
         """All weights but those of the detail."""
@@ -136,16 +141,140 @@ class PaintTask:
             "seen": _SEEN * F.cross_entropy(made.seen[some], views.visibility[some]),
         }
 
-    def after_update(self, progress: Progress) -> bool:
-        """Nothing to do."""
-        _ = progress
-        return False
-
     @torch.no_grad()
     def measure(self, picture: Path) -> dict[str, float]:
         """On held-out views, without what was painted before."""
         self._net.eval()
         return self._held_out.measure(self._net, self._config, picture)
+
+
+class Critic(nn.Module):
+    """Patches of 34 pixels: true or made. Sees the picture and where it is painted."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        widths = (4, *_CRITIC_WIDTHS)
+        self.layers = nn.ModuleList(
+            [spectral_norm(nn.Conv2d(a, b, 4, stride=2, padding=1)) for a, b in pairwise(widths)]
+        )
+        self.last = spectral_norm(nn.Conv2d(widths[-1], 1, 3, padding=1))
+
+    def forward(self, pictures: Tensor, never: Tensor) -> Tensor:
+        """pictures: [N, 3, H, W], never: [N, 1, H, W] -> scores [N, 1, H/8, W/8]."""
+        x = torch.cat([pictures, never], dim=1)
+        for layer in self.layers:
+            x = F.leaky_relu(layer(x), 0.2)
+        return self.last(x)
+
+
+class DetailAndCritic(nn.Module):
+    """What this stage trains and saves."""
+
+    def __init__(self, paint: PaintNet) -> None:
+        super().__init__()
+        self.detail, self.critic = paint.detail, Critic()
+
+
+class DetailTask(LiveTask):
+    """Trains a PaintNet's detail head against a critic; both take a step an update."""
+
+    def __init__(
+        self,
+        net: PaintNet,
+        depth: DepthNet,
+        config: LiveConfig,
+        batches: ViewBatches,
+        held_out: "HeldOutViews",
+        workers: int = 0,
+    ) -> None:
+        """workers: processes that read batches."""
+        net.requires_grad_(False)
+        net.detail.requires_grad_(True)
+        self._trained = DetailAndCritic(net).to(next(net.parameters()).device)
+        super().__init__(self._trained, config)
+        self._net, self._depth = net, depth.eval().requires_grad_(False)
+        self._held_out, self._batch = held_out, Ahead(batches.batch, workers)
+        self._movable = movable_classes(config).to(self._device)
+        torch.manual_seed(0)
+        self._random = nn.Sequential(
+            nn.Conv2d(3, 32, 5, stride=2, padding=2), nn.LeakyReLU(0.2), nn.Conv2d(32, 48, 3, stride=2, padding=1),
+            nn.LeakyReLU(0.2), nn.Conv2d(48, 64, 3, padding=1),
+        ).requires_grad_(False).to(self._device)  # fmt: skip
+
+    def parameter_groups(self) -> Sequence[ParameterGroup]:
+        """The detail head, and the critic at twice its rate."""
+        return [
+            ParameterGroup(parameters=list(self._trained.detail.parameters())),
+            ParameterGroup(parameters=list(self._trained.critic.parameters()), factor=2.0),
+        ]
+
+    def step_loss(self, progress: Progress) -> StepLoss:
+        """Of the detail against the critic, and of the critic: their gradients do not meet."""
+        before, now, random = on(self._device, self._batch(progress.updates))
+        now = carried_through(self._first_step, before, now, self._movable, random)
+        if random.random() < 0.5:
+            now = mirrored(now)
+        self._net.train()
+        made = self._first_step(now.seen)
+        parts = self._losses(made, now)
+        return StepLoss(total=torch.stack(list(parts.values())).sum(), parts=parts, frames=len(now.poses))
+
+    def _first_step(self, seen: Seen) -> Painted:
+        with autocast(self._device):
+            return self._net.first_step(seen, filled(seen), self._config.sigma_max)
+
+    def _losses(self, made: Painted, views: Views) -> dict[str, Tensor]:
+        never = (1 - views.seen.coverage)[:, None]  # share of a pixel that nothing covers
+        patches = F.avg_pool2d(never, 8)  # as the critic sees them
+        picture = made.picture
+        # seen pixels are the truth's in both, so that the critic has nothing else to go by
+        fake = views.target + (picture - views.target) * never
+        critic = self._trained.critic
+        weight = patches / patches.mean().clamp(min=1e-3)
+        true_score, fake_score = critic(views.target, never), critic(fake.detach(), never)
+        telling = (F.relu(1 - true_score) * weight).mean() + (F.relu(1 + fake_score) * weight).mean()
+        critic.requires_grad_(False)
+        passing = -(critic(fake, never) * weight).mean()
+        critic.requires_grad_(True)
+        kept = views.seen.painted_coverage[:, None] * never
+        return {
+            "passing": _CRITIC * passing,
+            "features": _FEATURES * self._feature_distance(fake, views, never),
+            "energy": _ENERGY * _energy_distance(fake, views.target, never),
+            "keep": _KEEP * ((picture - views.seen.painted).abs() * kept).mean(),
+            "close": _CLOSE * (F.avg_pool2d(made.detail, 8).abs() * patches).mean(),
+            "telling": telling,
+        }
+
+    def _feature_distance(self, fake: Tensor, views: Views, never: Tensor) -> Tensor:
+        """Distance in features of the depth network, which knows targets too, and of a random network."""
+        ground = torch.zeros_like(views.seen.ground_m)
+        distance = torch.zeros((), device=self._device)
+        with autocast(self._device):
+            made, true = (self._depth.features(depth_inputs(x, views.seen.rays, ground)) for x in (fake, views.target))
+            made_random, true_random = self._random(fake), self._random(views.target)
+        for a, b in ((made, true), (made_random, true_random)):
+            share = F.adaptive_avg_pool2d(never, (a.shape[-2], a.shape[-1]))
+            scale = b.float().abs().mean().clamp(min=1e-3)
+            distance = distance + ((a.float() - b.float()).abs() / scale * share).mean()
+        return distance
+
+    @torch.no_grad()
+    def measure(self, picture: Path) -> dict[str, float]:
+        """As in the stage before, with the detail in the sheet."""
+        self._net.eval()
+        return self._held_out.measure(self._net, self._config, picture)
+
+
+def _energy_distance(made: Tensor, true: Tensor, never: Tensor) -> Tensor:
+    """How much is drawn in cells of 8 pixels, compared where nothing was seen."""
+    return ((_energy(made) - _energy(true)).abs() * F.avg_pool2d(never, 8)).mean()
+
+
+def _energy(x: Tensor) -> Tensor:
+    across = F.pad(x[..., 1:] - x[..., :-1], (0, 1))
+    down = F.pad(x[..., 1:, :] - x[..., :-1, :], (0, 0, 0, 1))
+    return F.avg_pool2d((across.square() + down.square() + 1e-6).sqrt(), 8)
 
 
 class HeldOutViews:
@@ -172,7 +301,7 @@ class HeldOutViews:
         sums = {"base": 0.0, "mean": 0.0, "seen": 0.0, "never": 0.0}
         counts = {"seen": 0.0, "never": 0.0}
         k = len(config.classes)
-        confusion, states = torch.zeros(k * k), torch.zeros(9)
+        confusion, states = torch.zeros(k, k, dtype=torch.int64), torch.zeros(3, 3, dtype=torch.int64)
         rows: list[list[Tensor]] = []
         device = next(net.parameters()).device
         for i, held in enumerate(self._views):
@@ -188,14 +317,13 @@ class HeldOutViews:
             for name, mask in (("seen", ~never), ("never", never)):
                 sums[name] += float(square[mask].sum())
                 counts[name] += float(mask.sum())
-            confusion += torch.bincount((views.labels * k + made.classes.argmax(1)).flatten(), minlength=k * k)
-            states += torch.bincount((views.visibility * 3 + made.seen.argmax(1)).flatten(), minlength=9)
+            confusion += confusion_matrix(made.classes.argmax(1), views.labels, k)
+            states += confusion_matrix(made.seen.argmax(1), views.visibility, 3)
             if i % max(len(self._views) // 10, 1) == 0:
-                rows.append([picture(x[0]) for x in (views.seen.colour, base, made.mean, made.picture, views.target)])
-        write_rows(rows, sheet)
+                rows.append([x[0] for x in (views.seen.colour, base, made.mean, made.picture, views.target)])
+        write_sheet(sheet, rows)
         n = len(self._views)
-        iou, occurs = _iou(confusion.view(k, k))
-        state_iou, _ = _iou(states.view(3, 3))
+        iou, occurs, state_iou = class_iou(confusion), confusion.sum(1) > 0, class_iou(states)
         names = [entry.name for entry in config.classes]
         return {
             "psnr_base": _psnr(sums["base"] / n),
@@ -206,12 +334,6 @@ class HeldOutViews:
             **{f"iou_{names[c]}": float(iou[c]) for c in (7, 8, 10, 11) if occurs[c]},
             **{f"iou_{name}": float(state_iou[s]) for s, name in enumerate(("painted", "before", "now"))},
         }
-
-
-def _iou(confusion: Tensor) -> tuple[Tensor, Tensor]:
-    inside = confusion.diagonal()
-    union = confusion.sum(0) + confusion.sum(1) - inside
-    return inside / union.clamp(min=1), confusion.sum(1) > 0
 
 
 def _psnr(square: float) -> float:

@@ -23,11 +23,9 @@ from gcd_train.live.batches import PART_SEED, training_paths
 from gcd_train.live.calibration import calibrate
 from gcd_train.live.clips import clip_paths, read_clip
 from gcd_train.live.depth_training import DepthTask
-from gcd_train.live.detail_training import DetailTask
-from gcd_train.live.inputs import make_inputs
-from gcd_train.live.paint_training import HeldOutViews, PaintTask
+from gcd_train.live.paint_training import DetailTask, HeldOutViews, PaintTask
 from gcd_train.live.recipe import LiveRecipe, LiveStage
-from gcd_train.live.target_views import ViewBatches
+from gcd_train.live.views import ViewBatches, make_inputs
 from gcd_train.parallel import map_items
 from gcd_train.recipe_data import ComputeRecipe, LiveStageName
 from gcd_train.stop import StopSignal
@@ -67,10 +65,7 @@ def train_live(recipe: LiveRecipe, places: LivePlaces, stop: StopSignal, process
     run = partial(_stage, recipe, folder, stop)
     alone = partial(processes.by_the_first, stop=stop)
     model, (seed, workers) = recipe.model, (recipe.seed, recipe.workers)
-    stage = recipe.depth
-    depth = DepthTask(
-        networks.depth, model, paths, measured, stage.batch, seed, stage.parts, workers, stage.small_share
-    )
+    depth = DepthTask(networks.depth, model, paths, measured, recipe.depth, seed, workers)
     run("depth", recipe.depth, depth, processes)
     exact, learned, shown = (
         places.out / "inputs" / name / _digest(net, recipe)
@@ -85,7 +80,7 @@ def train_live(recipe: LiveRecipe, places: LivePlaces, stop: StopSignal, process
         for part in range(recipe.paint.parts)
     ]
     views = HeldOutViews(measured, shown, model)
-    paint = PaintTask(networks.paint, model, batches, paths, views, workers, recipe.paint.small_share)
+    paint = PaintTask(networks.paint, model, batches, paths, views, recipe.paint.small_share, workers)
     run("paint", recipe.paint, paint, processes)
     seen = ViewBatches(paths, [learned], model, recipe.detail.batch, seed + 1, carried=0.6)
     path = places.out / f"{recipe.name}.safetensors"

@@ -1,29 +1,158 @@
-"""What the paint network learns from: target views of clips with what is seen of them, in batches by number."""
+"""What the paint network learns from: target views of clips with what is seen of them, in batches by number.
+
+What is seen, the splats of all frames by learned or by exact depth, is worked out once. `<clip>.safetensors` beside the
+clips' own names holds of T frames: colour u8 [T, H, W, 3], coverage, now_share, age (tenths of frames, at most 25.5) u8
+[T, H, W], log_depth u16 (see `encode_depth`), label and label_share u8 [T, H, W].
+"""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from safetensors import safe_open
+from safetensors.numpy import save_file
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from gcd_model.geometry import Intrinsics
-from gcd_model.live.config import LiveConfig
-from gcd_model.live.depth_net import plane_depth
+from gcd_model.live.config import SKY_M, LiveConfig
+from gcd_model.live.depth_net import DepthNet, depth_inputs, plane_depth, read_depth
 from gcd_model.live.paint_net import Painted, Seen, camera_features
-from gcd_model.live.splat import splat, unproject
-from gcd_train.live.batches import Random, lens_rays, to_video
-from gcd_train.live.clips import LiveClip, read_clip
-from gcd_train.live.inputs import read_inputs
+from gcd_model.live.seen_world import SeenWorld
+from gcd_model.live.splat import Splat, splat, unproject
+from gcd_train.files import whole
+from gcd_train.live.batches import (
+    Pictures,
+    Random,
+    autocast,
+    joined,
+    lens_rays,
+    pictures_of,
+    some_of,
+    to_video,
+    with_true_references,
+)
+from gcd_train.live.clips import LiveClip, decode_depth, encode_depth, read_clip
 
+Array = NDArray[Any]
+_DEPTH_NOISE = 0.03
 VIEW_ARRAYS = ("source.pose", *(f"target.{name}" for name in ("pose", "rgb", "depth", "labels", "visibility")))
 """What is read of a clip."""
 _MOST_CARRIED = 3
 """Frames in a row of which each sees what was painted in the one before."""
 _DRIFT = 0.15
 """Largest standard deviation of the colours' drift, for colours in [-1, 1]."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Geometry:
+    """What is known of a clip's source frames: metres [T, H, W], labels uint8 [T, H, W], static bool [T, H, W]."""
+
+    metres: Tensor
+    labels: Tensor
+    static: Tensor
+
+
+@torch.inference_mode()
+def learned_geometry(net: DepthNet, config: LiveConfig, source: Pictures, ground: Tensor) -> Geometry:
+    """By the depth network, frame by frame."""
+    metres, labels, static = [], [], []
+    sweeps = source.sweeps(config.depth)
+    for t in range(len(source.lenses)):
+        inputs = depth_inputs(source.video[t : t + 1], source.rays[t : t + 1], ground[t : t + 1])
+        with autocast(inputs.device):
+            output = net(inputs, sweeps[t : t + 1])
+        metres.append(read_depth(output, config.depth).metres)
+        labels.append(output.classes.argmax(1).to(torch.uint8))
+        static.append(output.moves < 0)
+    return Geometry(metres=torch.cat(metres), labels=torch.cat(labels), static=torch.cat(static))
+
+
+def exact_geometry(source: Pictures, random: Random | None = None) -> Geometry:
+    """The truth; with `random`, off by a few per cent in wide patches, as depth from anywhere is."""
+    metres = source.metres
+    if random is not None:
+        rough = torch.from_numpy(random.normal(size=(len(metres), 1, 4, 6)) * _DEPTH_NOISE).float()
+        smooth = torch.nn.functional.interpolate(rough, size=metres.shape[-2:], mode="bilinear")[:, 0]
+        metres = torch.where(metres < SKY_M, metres * smooth.exp(), metres)
+    return Geometry(metres=metres, labels=source.labels.to(torch.uint8), static=source.moves < 0.5)
+
+
+def splats_of(clip: LiveClip, geometry: Geometry, config: LiveConfig) -> list[Splat]:
+    """What the target camera of every frame sees of what the source has shown so far."""
+    world = SeenWorld(classes=len(config.classes), capacity=config.memory, oldest_frames=config.memory_frames)
+    height, width = geometry.metres.shape[-2:]
+    lens = Intrinsics.from_hfov(clip.hfov_deg("source"), width, height)
+    target_lens = Intrinsics.from_hfov(clip.hfov_deg("target"), width, height)
+    source = pictures_of(clip, "source")
+    made: list[Splat] = []
+    for t in range(clip.frames):
+        pose, target = (torch.from_numpy(clip.arrays[f"{camera}.pose"][t]) for camera in ("source", "target"))
+        world.look(source.video[t], geometry.metres[t], geometry.labels[t], geometry.static[t], lens, pose)
+        made.append(world.splat(target, target_lens))
+    return made
+
+
+def write_inputs(path: Path, splats: Sequence[Splat]) -> None:
+    """Store what the paint network sees; the file appears whole."""
+    stacked = {
+        name: torch.stack([getattr(splat, name) for splat in splats])
+        for name in ("colour", "coverage", "now_share", "age", "inverse_depth", "votes")
+    }
+    share, label = stacked["votes"].max(dim=1)
+    inverse = stacked["inverse_depth"]
+    metres = torch.where(inverse > 0, 1 / inverse.clamp(min=1e-6), 0.0)
+    arrays: dict[str, Array] = {
+        "colour": _byte((stacked["colour"] + 1) / 2).transpose(0, 2, 3, 1).copy(),
+        "coverage": _byte(stacked["coverage"]),
+        "now_share": _byte(stacked["now_share"]),
+        "age": _byte(stacked["age"] / 25.5),
+        "log_depth": encode_depth(metres.numpy()),
+        "label": label.to(torch.uint8).numpy(),
+        "label_share": _byte(share),
+    }
+    with whole(path) as unfinished:
+        save_file(arrays, unfinished)
+
+
+def _byte(share: Tensor) -> Array:
+    return (share.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+
+
+def make_inputs(out: Path, paths: Sequence[Path], net: DepthNet | None, config: LiveConfig, seed: int) -> None:
+    """Inputs of clips; net: None for exact depth."""
+    for path in paths:
+        clip = read_clip(path)
+        source = with_true_references(clip, "source")
+        random = np.random.default_rng([seed, int(path.stem.replace("-", ""))])
+        if net is None:
+            geometry = exact_geometry(source, random)
+        else:
+            geometry = learned_geometry(net, config, source, source.ground(random, whole=True))
+        write_inputs(out / path.parent.name / path.name, splats_of(clip, geometry, config))
+
+
+def read_inputs(path: Path, frames: slice, classes: int) -> dict[str, Tensor]:
+    """The fields of `Seen` that do not depend on the lens, of some frames: see the module."""
+    with safe_open(path, framework="numpy") as file:
+        arrays = {name: file.get_slice(name)[frames] for name in file.keys()}  # noqa: SIM118
+    metres = torch.from_numpy(decode_depth(arrays.pop("log_depth")))
+    cut = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    coverage = cut["coverage"].float() / 255
+    share = (cut["label_share"].float() / 255 * (coverage > 0))[:, None]
+    votes = torch.zeros(len(coverage), classes, *coverage.shape[1:]).scatter_(1, cut["label"].long()[:, None], share)
+    return {
+        "colour": (cut["colour"].permute(0, 3, 1, 2).float() / 127.5 - 1) * (coverage > 0)[:, None],
+        "coverage": coverage,
+        "now_share": cut["now_share"].float() / 255,
+        "age": cut["age"].float() / 10,
+        "log_depth": torch.where(coverage > 0, metres.log(), 0.0),
+        "votes": votes,
+    }
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -76,36 +205,6 @@ def views_of(clip: LiveClip, inputs: dict[str, Tensor], *, ground: bool) -> View
     )
 
 
-def together(parts: Sequence[Views]) -> Views:
-    """Views of several clips as one batch."""
-    names = Seen.__dataclass_fields__
-    seen = Seen(**{name: torch.cat([getattr(part.seen, name) for part in parts]) for name in names})
-    return Views(
-        seen=seen,
-        target=torch.cat([part.target for part in parts]),
-        labels=torch.cat([part.labels for part in parts]),
-        log_depth=torch.cat([part.log_depth for part in parts]),
-        visibility=torch.cat([part.visibility for part in parts]),
-        poses=sum((part.poses for part in parts), ()),
-        lenses=sum((part.lenses for part in parts), ()),
-    )
-
-
-def frame_of(views: Views, index: Tensor) -> Views:
-    """Some of the views."""
-    names = Seen.__dataclass_fields__
-    numbers = index.tolist()
-    return Views(
-        seen=Seen(**{name: getattr(views.seen, name)[index] for name in names}),
-        target=views.target[index],
-        labels=views.labels[index],
-        log_depth=views.log_depth[index],
-        visibility=views.visibility[index],
-        poses=tuple(views.poses[i] for i in numbers),
-        lenses=tuple(views.lenses[i] for i in numbers),
-    )
-
-
 def halved(views: Views) -> Views:
     """The same at half the size: what can be averaged is; the rest is of one pixel of four."""
     seen = views.seen
@@ -154,9 +253,6 @@ class ViewBatches:
         ]
         self._clips = [(path, there) for path, there in places if there]
 
-    def __len__(self) -> int:
-        return len(self._clips)
-
     def batch(self, update: int) -> tuple[tuple[Views, ...], Views, Random]:
         """N views; before them the frames before of the first of them, in order, which see what was painted there.
 
@@ -166,13 +262,12 @@ class ViewBatches:
         carried = int(random.binomial(self._size, self._carried))
         earlier = min(int(random.integers(1, _MOST_CARRIED + 1)), self._config.frames - 1)
         made = [self._views(random, earlier + 1 if i < carried else 1) for i in range(self._size)]
-        rows = [
-            [frame_of(views, torch.tensor([t])) for views in made[:carried]]
-            for t in range(earlier + 1 if carried else 0)
-        ]
-        before = tuple(together(row) for row in rows[:-1])
-        now = [*(rows[-1] if rows else []), *made[carried:]]
-        return before, together(now), random
+        before = tuple(
+            joined([some_of(views, slice(t, t + 1)) for views in made[:carried]])
+            for t in range(earlier if carried else 0)
+        )
+        now = joined([*(some_of(views, slice(-1, None)) for views in made[:carried]), *made[carried:]])
+        return before, now, random
 
     def _views(self, random: Random, count: int) -> Views:
         """Frames in a row of some clip."""
@@ -203,12 +298,12 @@ def mirrored(views: Views) -> Views:
     """All of it seen in a mirror. Poses are not: carry what was painted before."""
     seen = views.seen
     fixed = ("rays", "camera")
-    turned = {name: getattr(seen, name).flip(-1) for name in Seen.__dataclass_fields__ if name not in fixed}
+    turned = {f.name: getattr(seen, f.name).flip(-1) for f in fields(seen) if f.name not in fixed}
     # x becomes -x in both cameras: rotation entries that mix x with another axis change sign, and so does the move in x
     signs = torch.tensor([1.0, -1, -1, -1, 1, 1, -1, 1, 1, -1, 1, 1], device=seen.camera.device)
     return replace(
         views,
-        seen=Seen(**turned, rays=seen.rays, camera=seen.camera * signs),
+        seen=replace(seen, **turned, camera=seen.camera * signs),
         target=views.target.flip(-1),
         labels=views.labels.flip(-1),
         log_depth=views.log_depth.flip(-1),
