@@ -4,15 +4,18 @@ import os
 import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
 import torch
 from live_clips import HEIGHT, WIDTH, write_clip
+from safetensors.torch import load_file
 from torch.distributed import TCPStore  # pyright: ignore[reportPrivateImportUsage]
 from torch.multiprocessing.spawn import start_processes
 
+from gcd_model import load_synthesizer
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.config import DepthConfig, LiveConfig, PaintConfig
 from gcd_model.live.depth_net import (
@@ -34,7 +37,7 @@ from gcd_train.live.depth_training import DepthTask, edge_matches, measure_depth
 from gcd_train.live.measure_figures import SpreadHistogram
 from gcd_train.live.measure_methods import LiveModel
 from gcd_train.live.paint_training import HeldOutViews, PaintTask
-from gcd_train.live.recipe import LiveRecipe, LiveStage, live_recipes, load_live_recipe
+from gcd_train.live.recipe import LiveRecipe, LiveStage, load_live_recipe
 from gcd_train.live.training import LivePlaces, train_live
 from gcd_train.live.views import (
     ViewBatches,
@@ -91,6 +94,14 @@ def places(tmp_path: Path) -> LivePlaces:
     return LivePlaces(data=tmp_path / "data", valid=tmp_path / "valid", out=tmp_path / "out")
 
 
+@pytest.fixture
+def path(places: LivePlaces) -> Path:
+    """A clip, of which it is worked out what is seen."""
+    path = training_paths(places.data)[0]
+    make_inputs(places.out, [path], None, TINY, 0)
+    return path
+
+
 class StopAfter(threading.Event):
     """Set once it was asked so many times."""
 
@@ -110,8 +121,6 @@ def test_all_stages_run_and_a_stopped_run_goes_on_to_the_same_weights(places: Li
         train_live(RECIPE, other, StopAfter(2))
     stopped = train_live(RECIPE, other, threading.Event())
     assert whole.read_bytes() == stopped.read_bytes()
-    from gcd_model import load_synthesizer
-
     assert load_synthesizer(whole).traits.name == "tiny-live"
 
 
@@ -134,8 +143,6 @@ def test_scenes_from_a_million_on_are_not_learned_from(tmp_path: Path) -> None:
 
 
 def test_the_detail_stage_leaves_all_other_weights_as_they_are(places: LivePlaces) -> None:
-    from safetensors.torch import load_file
-
     with_detail = load_file(train_live(RECIPE, places, threading.Event()))
     short = msgspec.structs.replace(RECIPE, detail=stage(1))
     without = load_file(train_live(short, replace(places, out=places.out.with_name("short")), threading.Event()))
@@ -145,8 +152,6 @@ def test_the_detail_stage_leaves_all_other_weights_as_they_are(places: LivePlace
 
 
 def test_a_training_begins_from_a_weight_file_and_leaves_what_it_is_told_to_keep(places: LivePlaces) -> None:
-    from safetensors.torch import load_file
-
     begun = train_live(RECIPE, places, threading.Event())
     more = msgspec.structs.replace(RECIPE, weights=str(begun), keep=frozenset({"depth"}))
     ended = load_file(train_live(more, replace(places, out=places.out.with_name("more")), threading.Event()))
@@ -157,11 +162,6 @@ def test_a_training_begins_from_a_weight_file_and_leaves_what_it_is_told_to_keep
     wider = msgspec.structs.replace(TINY, paint=msgspec.structs.replace(TINY.paint, widths=(16, 16, 16)))
     with pytest.raises(DataError, match="other networks"):
         train_live(msgspec.structs.replace(more, model=wider), places, threading.Event())
-
-
-def test_nothing_is_kept_of_no_weights() -> None:
-    with pytest.raises(RecipeError, match="needs weights"):
-        msgspec.structs.replace(RECIPE, keep=frozenset({"depth"}))
 
 
 def in_one_of_two(rank: int, places: LivePlaces, port: int) -> None:
@@ -176,8 +176,6 @@ def in_one_of_two(rank: int, places: LivePlaces, port: int) -> None:
 @pytest.mark.timeout(600)
 def test_two_processes_end_with_the_weights_of_one(places: LivePlaces) -> None:
     """Half a minute of two CPUs."""
-    from safetensors.torch import load_file
-
     alone = load_file(train_live(SHARED, places, threading.Event()))
     other = replace(places, out=places.out.with_name("two"))
     store = TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)  # as torchrun has it
@@ -187,14 +185,12 @@ def test_two_processes_end_with_the_weights_of_one(places: LivePlaces) -> None:
         assert torch.allclose(alone[name].float(), together[name].float(), atol=2e-3), name
 
 
-def test_the_packaged_recipes_load_and_say_what_they_are() -> None:
-    assert "live-small" in live_recipes()
-    assert all(load_live_recipe(f"package:{name}").kind == "live" for name in live_recipes())
-
-
-def test_a_detail_of_several_batches_is_refused() -> None:
-    with pytest.raises(RecipeError, match="parts"):
-        msgspec.structs.replace(RECIPE, detail=msgspec.structs.replace(stage(1), parts=2))
+@pytest.mark.parametrize(
+    "change", [{"keep": frozenset({"depth"})}, {"detail": msgspec.structs.replace(stage(1), parts=2)}]
+)
+def test_stages_kept_of_no_weights_and_a_detail_of_several_batches_are_refused(change: dict[str, Any]) -> None:
+    with pytest.raises(RecipeError):
+        msgspec.structs.replace(RECIPE, **change)
 
 
 def test_an_unknown_key_is_refused(tmp_path: Path) -> None:
@@ -275,9 +271,7 @@ def test_edges_match_within_a_pixel() -> None:
     assert away[0] == 0
 
 
-def test_inputs_come_back_as_they_were_splatted(places: LivePlaces) -> None:
-    path = training_paths(places.data)[0]
-    make_inputs(places.out, [path], None, TINY, 0)
+def test_inputs_come_back_as_they_were_splatted(places: LivePlaces, path: Path) -> None:
     clip = read_clip(path)
     splats = splats_of(clip, exact_geometry(pictures_of(clip, "source")), TINY)
     back = read_inputs(places.out / path.parent.name / path.name, slice(0, 14), len(TINY.classes))
@@ -288,26 +282,16 @@ def test_inputs_come_back_as_they_were_splatted(places: LivePlaces) -> None:
     assert (back["colour"][5] - splats[5].colour).abs().mean(0)[seen].median() < 0.05
 
 
-def test_an_untrained_paint_network_shows_the_splat(places: LivePlaces) -> None:
-    views = held_out(places)
+def test_an_untrained_paint_network_shows_the_splat(places: LivePlaces, path: Path) -> None:
     net = PaintNet(TINY.paint, len(TINY.classes)).eval()
+    (view, *_) = HeldOutViews([path], places.out, TINY).on(torch.device("cpu"))
     with torch.no_grad():
-        made = net.first_step(views, filled(views), TINY.sigma_max)
-    assert torch.equal(made.mean, filled(views))
+        made = net.first_step(view.seen, filled(view.seen), TINY.sigma_max)
+    assert torch.equal(made.mean, filled(view.seen))
     assert torch.equal(made.picture, made.mean)
 
 
-def held_out(places: LivePlaces) -> Seen:
-    path = training_paths(places.data)[0]
-    make_inputs(places.out, [path], None, TINY, 0)
-    cut = slice(3, 5)
-    inputs = read_inputs(places.out / path.parent.name / path.name, cut, len(TINY.classes))
-    return views_of(read_clip(path, cut), inputs, ground=True).seen
-
-
-def test_what_was_painted_is_carried_to_where_the_camera_sees_it(places: LivePlaces) -> None:
-    path = training_paths(places.data)[0]
-    make_inputs(places.out, [path], None, TINY, 0)
+def test_what_was_painted_is_carried_to_where_the_camera_sees_it(places: LivePlaces, path: Path) -> None:
     inputs = places.out / path.parent.name / path.name
     before, now = (
         views_of(read_clip(path, slice(t, t + 1)), read_inputs(inputs, slice(t, t + 1), 17), ground=True)
@@ -330,9 +314,7 @@ def test_what_was_painted_is_carried_to_where_the_camera_sees_it(places: LivePla
     assert not carry(replace(true, classes=road), before, now, car).seen.painted_coverage.any()
 
 
-def test_painted_pixels_of_several_frames_in_a_row_drift_and_no_others(places: LivePlaces) -> None:
-    path = training_paths(places.data)[0]
-    make_inputs(places.out, [path], None, TINY, 0)
+def test_painted_pixels_of_several_frames_in_a_row_drift_and_no_others(places: LivePlaces, path: Path) -> None:
     batches = ViewBatches([path], [places.out], TINY, 3, 0, carried=0.7)
     net = PaintNet(TINY.paint, len(TINY.classes)).eval()
     runs: set[int] = set()
@@ -358,9 +340,7 @@ def test_painted_pixels_of_several_frames_in_a_row_drift_and_no_others(places: L
     assert drifted > 0
 
 
-def test_paint_losses_are_lowest_at_the_truth(places: LivePlaces) -> None:
-    path = training_paths(places.data)[0]
-    make_inputs(places.out, [path], None, TINY, 0)
+def test_paint_losses_are_lowest_at_the_truth(places: LivePlaces, path: Path) -> None:
     batches = ViewBatches([path], [places.out], TINY, 2, 0)
     views = HeldOutViews([path], places.out, TINY)
     net = PaintNet(TINY.paint, len(TINY.classes))
@@ -374,9 +354,7 @@ def test_paint_losses_are_lowest_at_the_truth(places: LivePlaces) -> None:
     assert losses["square"] > 0
 
 
-def test_the_second_half_of_the_training_carries_and_denoises(places: LivePlaces) -> None:
-    path = training_paths(places.data)[0]
-    make_inputs(places.out, [path], None, TINY, 0)
+def test_the_second_half_of_the_training_carries_and_denoises(places: LivePlaces, path: Path) -> None:
     net = PaintNet(TINY.paint, len(TINY.classes))
     batches = ViewBatches([path], [places.out], TINY, 2, 0, carried=1.0)
     task = PaintTask(net, TINY, [batches], [path], HeldOutViews([path], places.out, TINY), 0.0)

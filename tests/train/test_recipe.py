@@ -179,7 +179,8 @@ def test_a_run_folder_keeps_recipe_and_commands_and_says_what_another_recipe_cha
     assert not caplog.records
 
 
-@pytest.mark.parametrize("recipe", [load_live_recipe(f"package:{live_recipes()[0]}")])
-def test_a_live_recipe_is_kept_too(tmp_path: Path, recipe: LiveRecipe) -> None:
+@pytest.mark.parametrize("name", live_recipes())
+def test_a_live_recipe_is_kept_too(tmp_path: Path, name: str) -> None:
+    recipe = load_live_recipe(f"package:{name}")
     RunFolder(tmp_path).begin(recipe, "gcd-train train")
     assert msgspec.convert(tomllib.loads((tmp_path / "recipe.toml").read_text()), LiveRecipe) == recipe

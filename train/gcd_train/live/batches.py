@@ -208,7 +208,8 @@ def augmented(pictures: Pictures, random: Random) -> Pictures:
     flipped = torch.diag(torch.tensor([-1.0, 1, 1, 1], dtype=torch.float64))
     earlier = [video[i] if each is None else each.picture for i, each in enumerate(pictures.references)]
     seen_earlier = look(turned(torch.stack(earlier)), random)
-    return Pictures(
+    return replace(
+        pictures,
         video=look(turned(video), random),
         references=tuple(
             None
@@ -224,11 +225,9 @@ def augmented(pictures: Pictures, random: Random) -> Pictures:
         metres=turned(pictures.metres),
         labels=turned(pictures.labels),
         moves=turned(pictures.moves),
-        lenses=pictures.lenses,
         ups=tuple(
             up * torch.tensor([-1.0, 1.0, 1.0]) if m else up for up, m in zip(pictures.ups, mirrored, strict=True)
         ),
-        heights_m=pictures.heights_m,
     )
 
 

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
+from gcd_model.live.config import SKY_M
 from gcd_model.live.ontology import LIVE_CLASSES
 from gcd_model.small_files import decode_json
 from gcd_train.errors import DataError, RenderError
@@ -33,8 +34,6 @@ from gcd_train.scenes.description import Scene
 from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.renderer import Renderer, Rendering
 
-SKY_M = 1000.0
-"""Where the sky is taken to be: so far that no step of a clip moves it by a pixel."""
 _NEAREST_M, _CODES = 0.02, 65534
 _SPAN = float(np.log(SKY_M / _NEAREST_M))
 _SAME_SURFACE = 0.02
@@ -93,10 +92,8 @@ def generate_live(
     folder.mkdir(parents=True, exist_ok=True)
     missing = [seed for seed in seeds if not (folder / f"{seed:07d}-0.safetensors").exists()]
     one_thread_each()
-    failures: list[str] = []
-    for outcome in map_items(partial(film_scene, folder, world, settings), missing, workers=workers):
-        if outcome.error is not None:
-            failures.append(outcome.error)
+    outcomes = map_items(partial(film_scene, folder, world, settings), missing, workers=workers)
+    failures = [outcome.error for outcome in outcomes if outcome.error is not None]
     return len(seeds) - len(failures), failures
 
 

@@ -5,7 +5,7 @@ clips -> depth network -> what it shows of every target (inputs) -> paint networ
 
 import hashlib
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -34,8 +34,10 @@ from gcd_train.training.loop import Loop, LoopOptions, Task
 from gcd_train.training.monitor import RunFolder
 
 _log = logging.getLogger(__name__)
-_VALID_SHARE = 8
-"""Every so many-th held-out clip is measured while training."""
+_MEASURED = 8
+"""About so many held-out clips are measured while training."""
+_SHARE = 16
+"""Clips whose inputs a process works out at a time."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -61,7 +63,7 @@ def train_live(recipe: LiveRecipe, places: LivePlaces, stop: StopSignal, process
     folder, paths, held_out = RunFolder(places.out), training_paths(places.data), clip_paths(places.valid)
     torch.manual_seed(recipe.seed)
     networks = _networks(recipe).to(_device(recipe.device), memory_format=torch.channels_last)  # pyright: ignore
-    measured = held_out[:: max(len(held_out) // _VALID_SHARE, 1)]
+    measured = held_out[:: max(len(held_out) // _MEASURED, 1)]
     run = partial(_stage, recipe, folder, stop)
     alone = partial(processes.by_the_first, stop=stop)
     model, (seed, workers) = recipe.model, (recipe.seed, recipe.workers)
@@ -178,8 +180,8 @@ def _make_all_inputs(
         return
     _log.info("working out what is seen of %d clips (%s)", len(missing), out.parent.name)
     state = None if net is None else {name: value.cpu().clone() for name, value in net.state_dict().items()}
-    work = partial(_inputs_of, out, state, recipe)
-    for outcome in map_items(work, list(_shares(missing)), workers=workers):
+    shares = [missing[first : first + _SHARE] for first in range(0, len(missing), _SHARE)]
+    for outcome in map_items(partial(_inputs_of, out, state, recipe), shares, workers=workers):
         outcome.unwrap()
         if stop.is_set():
             break
@@ -191,11 +193,6 @@ def _digest(net: DepthNet | None, recipe: LiveRecipe) -> str:
     for name, value in {} if net is None else net.state_dict().items():
         told.update(name.encode() + value.cpu().numpy().tobytes())
     return told.hexdigest()[:12]
-
-
-def _shares(paths: Sequence[Path], size: int = 16) -> Iterator[list[Path]]:
-    for first in range(0, len(paths), size):
-        yield list(paths[first : first + size])
 
 
 def _inputs_of(out: Path, state: dict[str, Any] | None, recipe: LiveRecipe, paths: list[Path]) -> None:
