@@ -15,12 +15,14 @@ from torch import Tensor
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.data.sample import SceneView
-from gcd_train.errors import DataError, RecipeError
+from gcd_train.errors import DataError
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Number = TypeVar("Number", bound=np.generic)
 
+NEAREST_M, FARTHEST_M = 0.1, 30_000.0
+"""What is not beyond the one in front of the target camera is left out; a source depth beyond the other is unknown."""
 _SIDE = 32  # pixels; larger tiles leave out less, smaller ones take longer to look at
 _MARGIN = 1.0  # pixels beyond each edge, against rounding
 
@@ -30,43 +32,20 @@ class SplatOptions:
     """How points become a picture. The defaults weigh as published, on exact pinhole geometry.
 
     radius: each point also shows in the pixels from -(radius // 2) to (radius + 1) // 2 about its own, both ways: 0 its
-        own alone, 1 also right, below and below right, 2 all eight neighbours. neighbour_share: of its weight there.
-    sharpness: k of the soft depth test, weight = exp(-k (2 d / d_max - 1)), d the depth, d_max the picture's largest.
-    far_from_m: where d_max reaches this, d is min(sqrt(depth), far_limit) and k is far_sharpness.
-    nearest_m: what is not beyond this in front of the target camera is left out. farthest_m: a source depth beyond this
-        is taken for unknown.
+        own alone, 1 also right, below and below right, 2 all eight neighbours.
     negligible: relative weight below which a point is left out before colours are gathered; 0 keeps all.
     published: pixels are whole numbers without the half that leads to their middles, in the source as in the target,
         and what lies up to a pixel beyond the left or upper edge falls on it. For comparing with the published clouds
         only: it shifts pictures that differ in size by part of a pixel.
     compact: forget points outside the picture at once, which on a GPU means to wait for it; None does so on the CPU
         only.
-    Raises RecipeError for numbers that mean nothing.
     Source: Generative Camera Dolly, point renderer as released.
     """
 
     radius: int = 1
-    neighbour_share: float = 0.02
-    sharpness: float = 512.0
-    far_from_m: float = 64.0
-    far_sharpness: float = 256.0
-    far_limit: float = 32.0
-    nearest_m: float = 0.1
-    farthest_m: float = 30_000.0
     negligible: float = 4e-8
     published: bool = False
     compact: bool | None = None
-
-    def __post_init__(self) -> None:
-        if self.radius < 0:
-            raise RecipeError(f"a splat radius must be a whole number of pixels from 0 up, got {self.radius}")
-        if not 0.0 < self.neighbour_share <= 1.0:
-            raise RecipeError(f"a neighbour's share must lie above 0 and up to 1, got {self.neighbour_share:g}")
-        if not 0.0 <= self.negligible < 1.0:
-            raise RecipeError(f"a negligible weight must lie from 0 up and below 1, got {self.negligible:g}")
-        lengths = (self.sharpness, self.far_from_m, self.far_sharpness, self.far_limit, self.nearest_m, self.farthest_m)
-        if not all(math.isfinite(number) and number > 0.0 for number in lengths):
-            raise RecipeError(f"sharpness and distances of a splat must be positive and finite, got {self}")
 
     @property
     def pixel_centre(self) -> float:
@@ -112,15 +91,10 @@ def unproject(view: SceneView, *, published: bool = False) -> Floats:
     """
     _require_size(view.depth, view.lens)
     right, down = tangents(view.lens, 0.0 if published else 0.5)
-    known = np.where(is_known(view.depth, SplatOptions().farthest_m), view.depth, np.nan)
+    known = np.where((view.depth > 0.0) & (view.depth <= FARTHEST_M), view.depth, np.nan)
     turn, position = view.world_from_camera[:3, :3], view.world_from_camera[:3, 3]
     rays = turn[:, 0] * right[None, :, None] + turn[:, 1] * down[:, None, None] + turn[:, 2]  # [H, W, 3]
     return (known[..., None] * rays + position).astype(np.float32)
-
-
-def is_known(depth: Floats, farthest_m: float) -> NDArray[np.bool_]:
-    """Where a depth is one: positive, a number, and not beyond what any scene has."""
-    return (depth > 0.0) & (depth <= farthest_m)
 
 
 def tangents(lens: Intrinsics, pixel_centre: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -199,21 +173,21 @@ class Tiles:
         return across.transpose(2, 0, 1)[:, :, None, :], along.transpose(2, 0, 1)[..., None]
 
 
-def contributing(depth: NDArray[np.float32], pixels: PixelMap, lens: Intrinsics, options: SplatOptions) -> Tiles:
+def contributing(depth: NDArray[np.float32], pixels: PixelMap, lens: Intrinsics) -> Tiles:
     """The tiles that may reach into the target's picture: all that do, and few that do not.
 
     Where the two cameras' fields of view do not meet, there are none, and the depth is not even looked at.
 
     depth: f32 [H, W] of the source, metres. pixels: from there to the target. lens: of the target.
     """
-    frustum = _Frustum(pixels=pixels, lens=lens, options=options)
-    none, all_depths = np.zeros((1, 1)), np.full((1, 1), options.farthest_m)
+    frustum = _Frustum(pixels=pixels, lens=lens)
+    none, all_depths = np.zeros((1, 1)), np.full((1, 1), FARTHEST_M)
     if frustum.misses(pixels.across[None], pixels.along[None], none, all_depths).all():
         return Tiles(row=np.zeros(0, np.intp), column=np.zeros(0, np.intp))
     tiled = _tiled(depth)
     # One axis after the other, the long one last: six times as fast as both at once.
     low, high = tiled.min(axis=1).min(axis=-1), tiled.max(axis=1).max(axis=-1)
-    low, high = np.maximum(low, 0.0), np.minimum(high, options.farthest_m)
+    low, high = np.maximum(low, 0.0), np.minimum(high, FARTHEST_M)
     missed = frustum.misses(_tiled_line(pixels.across), _tiled_line(pixels.along), low, high)
     row, column = np.nonzero(~(missed | (high <= 0.0)))
     return Tiles(row=row, column=column)
@@ -225,7 +199,6 @@ class _Frustum:
 
     pixels: PixelMap
     lens: Intrinsics
-    options: SplatOptions
 
     def misses(
         self, across: Doubles, along: Doubles, low: NDArray[np.floating], high: NDArray[np.floating]
@@ -239,7 +212,7 @@ class _Frustum:
         depths = np.stack([low, high], axis=-1)[..., None, None, None]  # [rows, columns, 2, 1, 1, 1]
         with np.errstate(invalid="ignore"):  # of depths that are no numbers
             x, y, ahead = np.moveaxis(depths * ray[:, :, None] + self.pixels.offset, -1, 0)  # [rows, columns, 2, 2, 2]
-        beyond = [ahead <= self.options.nearest_m]
+        beyond = [ahead <= NEAREST_M]
         for place, centre, size in ((x, self.lens.cx, self.lens.width), (y, self.lens.cy, self.lens.height)):
             beyond += [place + (centre + 1.0 + _MARGIN) * ahead < 0.0, place + (centre - size - _MARGIN) * ahead > 0.0]
         return np.any([side.all(axis=(2, 3, 4)) for side in beyond], axis=0)
@@ -287,7 +260,7 @@ def project(
     All others are left out, or stay, out of the way: see SplatOptions.compact.
     """
     pixels = PixelMap.between(view.world_from_camera, view.lens, world_from_camera, lens, options.pixel_centre)
-    tiles = contributing(view.depth, pixels, lens, options)
+    tiles = contributing(view.depth, pixels, lens)
     if not len(tiles):
         return None
     depth = to_device(tiles.cut(view.depth), device)  # [K, side, side]
@@ -298,7 +271,7 @@ def project(
     )
     shift = 0.5 - options.pixel_centre
     column, row = x / ahead + (lens.cx + shift), y / ahead + (lens.cy + shift)
-    inside = (depth > 0.0) & (depth <= options.farthest_m) & (ahead > options.nearest_m)
+    inside = (depth > 0.0) & (depth <= FARTHEST_M) & (ahead > NEAREST_M)
     inside &= _within(column, lens.width, options) & _within(row, lens.height, options)
     if options.compact or (options.compact is None and device.type == "cpu"):
         return _left_out(column, row, ahead, inside, lens, tiles)

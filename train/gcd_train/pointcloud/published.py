@@ -63,7 +63,7 @@ def published_tensor(
         float32 [height, width, C] in 0..1. With `options.published` a hole is what is black, in each three channels;
         a black surface with colour behind it is none, as the released float64 keeps a trace of that colour.
     Raises:
-        DataError, RecipeError: see splat().
+        DataError: see splat().
     Source: Generative Camera Dolly, as released.
     """
     options = options or SplatOptions()

@@ -20,11 +20,15 @@ from torch import Tensor
 from gcd_model.geometry import Intrinsics
 from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError
-from gcd_train.pointcloud.project import Doubles, Hits, SplatOptions, project, to_device, where_true
+from gcd_train.pointcloud.project import NEAREST_M, Doubles, Hits, SplatOptions, project, to_device, where_true
 
 Bytes = NDArray[np.uint8]
 Labels = NDArray[np.uint8] | NDArray[np.uint16]
 
+# of the soft depth test: weight = exp(-k (2 d / d_max - 1)), d the depth, d_max the picture's largest; where d_max
+# reaches _FAR_FROM_M, d is min(sqrt(depth), _FAR_LIMIT) and k another
+_SHARPNESS, _FAR_FROM_M, _FAR_SHARPNESS, _FAR_LIMIT = 512.0, 64.0, 256.0, 32.0
+_NEIGHBOUR_SHARE = 0.02  # of a point's weight, beside its own pixel
 _FLOAT64_TRACE = 740.0  # a weight e^740 times smaller than the largest is the last that a float64 mean keeps
 
 
@@ -133,19 +137,19 @@ class _Canvas:
         """An empty one, that knows which points are nearest."""
         size = lens.width * lens.height
         nearest_m = torch.full((size,), torch.inf, device=device)
-        farthest = torch.full((), options.nearest_m, device=device)
+        farthest = torch.full((), NEAREST_M, device=device)
         for each in hits:
             nearest_m.scatter_reduce_(0, each.pixel, each.depth, "amin")
             farthest = torch.maximum(farthest, each.farthest)
-        is_far = farthest >= options.far_from_m
-        far_rate = 2.0 * options.far_sharpness / farthest.sqrt().clamp(max=options.far_limit)
+        is_far = farthest >= _FAR_FROM_M
+        far_rate = 2.0 * _FAR_SHARPNESS / farthest.sqrt().clamp(max=_FAR_LIMIT)
         return cls(
             lens=lens,
             options=options,
             is_far=is_far,
-            rate=torch.where(is_far, far_rate, 2.0 * options.sharpness / farthest),
+            rate=torch.where(is_far, far_rate, 2.0 * _SHARPNESS / farthest),
             nearest_m=nearest_m,
-            nearest=_d(nearest_m, is_far, options).masked_fill(nearest_m.isinf(), torch.inf),
+            nearest=_d(nearest_m, is_far).masked_fill(nearest_m.isinf(), torch.inf),
             weight=torch.zeros(size, device=device),
             colour=torch.zeros(channels, size, device=device),
             label=torch.zeros(size, dtype=torch.int32, device=device),
@@ -154,7 +158,7 @@ class _Canvas:
 
     def add(self, hits: Hits, values: Bytes, labels: Labels | None) -> None:
         """Weigh the points of a view, and gather what they show."""
-        behind = (_d(hits.depth, self.is_far, self.options) - self.nearest.index_select(0, hits.pixel)) * self.rate
+        behind = (_d(hits.depth, self.is_far) - self.nearest.index_select(0, hits.pixel)) * self.rate
         pixel, depth, kept = hits.pixel, hits.depth, hits.source
         if len(self.lit):
             self._light(hits, values)
@@ -174,7 +178,7 @@ class _Canvas:
 
     def _light(self, hits: Hits, values: Bytes) -> None:
         """Note how far the nearest points are that are not black, also those that weigh next to nothing."""
-        d = _d(hits.depth, self.is_far, self.options).masked_fill(hits.depth.isinf(), torch.inf)
+        d = _d(hits.depth, self.is_far).masked_fill(hits.depth.isinf(), torch.inf)
         for sums, part in zip(self.lit, _picked(values, hits, hits.source, d.device).split(3, -1), strict=True):
             black = (part == 0).all(-1)
             sums.scatter_reduce_(0, hits.pixel, d.masked_fill(black, torch.inf), "amin")
@@ -197,9 +201,9 @@ class _Canvas:
         return -math.log(negligible) if negligible > 0.0 else math.inf
 
 
-def _d(depth: Tensor, is_far: Tensor, options: SplatOptions) -> Tensor:
+def _d(depth: Tensor, is_far: Tensor) -> Tensor:
     """What the depth test goes by."""
-    return torch.where(is_far, depth.sqrt().clamp(max=options.far_limit), depth)
+    return torch.where(is_far, depth.sqrt().clamp(max=_FAR_LIMIT), depth)
 
 
 def _picked(picture: NDArray[np.generic], hits: Hits, kept: Tensor | None, device: torch.device) -> Tensor:
@@ -239,7 +243,7 @@ class Shown:
 
 def show(gathered: Gathered, options: SplatOptions) -> Shown:
     """Every pixel as the weighted mean of what shows in it; 0 where nothing does."""
-    handicap = -math.log(options.neighbour_share) / gathered.rate  # what a neighbour's point seems to lie further back
+    handicap = -math.log(_NEIGHBOUR_SHARE) / gathered.rate  # what a neighbour's point seems to lie further back
     offsets = [(down, right) for down in options.offsets for right in options.offsets]
     moved = _Moved(gathered.nearest.shape, options)
     seeming = [moved(gathered.nearest, at, torch.inf) + (handicap if at != (0, 0) else 0.0) for at in offsets]
