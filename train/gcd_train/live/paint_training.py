@@ -167,14 +167,6 @@ class Critic(nn.Module):
         return self.last(x)
 
 
-class DetailAndCritic(nn.Module):
-    """What this stage trains and saves."""
-
-    def __init__(self, paint: PaintNet) -> None:
-        super().__init__()
-        self.detail, self.critic = paint.detail, Critic()
-
-
 class DetailTask(LiveTask):
     """Trains a PaintNet's detail head against a critic; both take a step an update."""
 
@@ -190,8 +182,9 @@ class DetailTask(LiveTask):
         """workers: processes that read batches."""
         net.requires_grad_(False)
         net.detail.requires_grad_(True)
-        self._trained = DetailAndCritic(net).to(next(net.parameters()).device)
-        super().__init__(self._trained, config)
+        self._critic = Critic()
+        trained = nn.ModuleDict({"detail": net.detail, "critic": self._critic}).to(next(net.parameters()).device)
+        super().__init__(trained, config)
         self._net, self._depth = net, depth.eval().requires_grad_(False)
         self._held_out, self._batch = held_out, Ahead(batches.batch, workers)
         self._movable = movable_classes(config).to(self._device)
@@ -204,8 +197,8 @@ class DetailTask(LiveTask):
     def parameter_groups(self) -> Sequence[ParameterGroup]:
         """The detail head, and the critic at twice its rate."""
         return [
-            ParameterGroup(parameters=list(self._trained.detail.parameters())),
-            ParameterGroup(parameters=list(self._trained.critic.parameters()), factor=2.0),
+            ParameterGroup(parameters=list(self._net.detail.parameters())),
+            ParameterGroup(parameters=list(self._critic.parameters()), factor=2.0),
         ]
 
     def step_loss(self, progress: Progress) -> StepLoss:
@@ -229,7 +222,7 @@ class DetailTask(LiveTask):
         picture = made.picture
         # seen pixels are the truth's in both, so that the critic has nothing else to go by
         fake = views.target + (picture - views.target) * never
-        critic = self._trained.critic
+        critic = self._critic
         weight = patches / patches.mean().clamp(min=1e-3)
         true_score, fake_score = critic(views.target, never), critic(fake.detach(), never)
         telling = (F.relu(1 - true_score) * weight).mean() + (F.relu(1 + fake_score) * weight).mean()
@@ -240,7 +233,7 @@ class DetailTask(LiveTask):
         return {
             "passing": _CRITIC * passing,
             "features": _FEATURES * self._feature_distance(fake, views, never),
-            "energy": _ENERGY * _energy_distance(fake, views.target, never),
+            "energy": _ENERGY * ((_energy(fake) - _energy(views.target)).abs() * patches).mean(),
             "keep": _KEEP * ((picture - views.seen.painted).abs() * kept).mean(),
             "close": _CLOSE * (F.avg_pool2d(made.detail, 8).abs() * patches).mean(),
             "telling": telling,
@@ -266,12 +259,8 @@ class DetailTask(LiveTask):
         return self._held_out.measure(self._net, self._config, picture)
 
 
-def _energy_distance(made: Tensor, true: Tensor, never: Tensor) -> Tensor:
-    """How much is drawn in cells of 8 pixels, compared where nothing was seen."""
-    return ((_energy(made) - _energy(true)).abs() * F.avg_pool2d(never, 8)).mean()
-
-
 def _energy(x: Tensor) -> Tensor:
+    """How much is drawn in cells of 8 pixels: [N, 3, H / 8, W / 8]."""
     across = F.pad(x[..., 1:] - x[..., :-1], (0, 1))
     down = F.pad(x[..., 1:, :] - x[..., :-1, :], (0, 0, 0, 1))
     return F.avg_pool2d((across.square() + down.square() + 1e-6).sqrt(), 8)

@@ -85,12 +85,10 @@ def exact_geometry(source: Pictures, random: Random | None = None) -> Geometry:
 def splats_of(clip: LiveClip, geometry: Geometry, config: LiveConfig) -> list[Splat]:
     """What the target camera of every frame sees of what the source has shown so far."""
     world = SeenWorld(classes=len(config.classes), capacity=config.memory, oldest_frames=config.memory_frames)
-    height, width = geometry.metres.shape[-2:]
-    lens = Intrinsics.from_hfov(clip.hfov_deg("source"), width, height)
-    target_lens = Intrinsics.from_hfov(clip.hfov_deg("target"), width, height)
     source = pictures_of(clip, "source")
+    target_lens = Intrinsics.from_hfov(clip.hfov_deg("target"), source.lenses[0].width, source.lenses[0].height)
     made: list[Splat] = []
-    for t in range(clip.frames):
+    for t, lens in enumerate(source.lenses):
         pose, target = (torch.from_numpy(clip.arrays[f"{camera}.pose"][t]) for camera in ("source", "target"))
         world.look(source.video[t], geometry.metres[t], geometry.labels[t], geometry.static[t], lens, pose)
         made.append(world.splat(target, target_lens))
