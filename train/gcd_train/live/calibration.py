@@ -92,8 +92,7 @@ def _view_classes(networks: LiveNetworks, views: HeldOutViews) -> Iterator[tuple
 
 def _spread_shift(networks: LiveNetworks, paths: Sequence[Path]) -> tuple[float, float, float]:
     """Of painted, seen before and seen now, so that the 90 % interval holds 90 %."""
-    plain = msgspec.structs.replace(networks.config, spread_shift=(0.0, 0.0, 0.0))
-    networks.config = plain
+    networks.config = msgspec.structs.replace(networks.config, spread_shift=(0.0, 0.0, 0.0))
     model, histogram = LiveModel(networks=networks), SpreadHistogram()
     for path in paths:
         clip = read_clip(path)

@@ -25,7 +25,15 @@ from gcd_model.errors import ModelError
 from gcd_model.live.config import LiveConfig
 from gcd_train.errors import DataError, TrainError
 from gcd_train.live.clips import LiveClip, clip_paths, evenly, read_clip
-from gcd_train.live.measure_figures import STATES, MethodViews, Tally, fit_spread, scene_interval, truth_of
+from gcd_train.live.measure_figures import (
+    NAMED_CLASSES,
+    STATES,
+    MethodViews,
+    Tally,
+    fit_spread,
+    scene_interval,
+    truth_of,
+)
 from gcd_train.live.measure_methods import BestHomography, ExactSplat, Method, live_methods, live_model
 
 _SHEET_FRAMES, _SHEET_CLIPS = (5, 9, 13), 4
@@ -46,21 +54,12 @@ _TABLES: dict[str, dict[str, tuple[str, int]]] = {
         "gradient energy": ("gradient_energy", 2),
         "Frechet, random": ("frechet_random", 2),
     },
-    "Classes": {
-        "mIoU": ("miou", 3),
-        "person": ("person", 3),
-        "cyclist": ("cyclist", 3),
-        "car": ("car", 3),
-        "pole": ("pole", 3),
-    },
+    "Classes": {"mIoU": ("miou", 3), **{name: (name, 3) for name in NAMED_CLASSES}},
     "Visibility and spread": {
         **{f"IoU {name}": (f"iou_{name}", 3) for name in STATES},
         **{f"in 90 %: {name}": (f"inside_90_{name}", 3) for name in STATES},
     },
-    "Time": {
-        "flicker / truth's": ("flicker", 2),
-        "jump / truth's": ("jump", 2),
-    },
+    "Time": {"flicker / truth's": ("flicker", 2), "jump / truth's": ("jump", 2)},
 }
 
 
@@ -75,9 +74,7 @@ class SetResult:
 
 def measure_set(name: str, paths: Sequence[Path], methods: Sequence[Method], sheet: Path) -> SetResult:
     """All methods on all clips of a set; seen pixels of all are compared to the first one's."""
-    result = SetResult(
-        name=name, clips=len(paths), tallies={method.name: Tally(LiveConfig().classes) for method in methods}
-    )
+    tallies = {method.name: Tally(LiveConfig().classes) for method in methods}
     rows: list[NDArray[np.uint8]] = []
     shown = set(np.linspace(0, len(paths) - 1, min(_SHEET_CLIPS, len(paths))).round().astype(int).tolist())
     for index, path in enumerate(paths):
@@ -85,12 +82,12 @@ def measure_set(name: str, paths: Sequence[Path], methods: Sequence[Method], she
         truth, scene = truth_of(clip), clip.name.rsplit("-", 1)[0]
         made = {method.name: method.views(clip) for method in methods}
         for each, views in made.items():
-            result.tallies[each].add(scene, truth, views, made[methods[0].name].video)
+            tallies[each].add(scene, truth, views, made[methods[0].name].video)
         if index in shown:
             rows += _sheet_rows(clip, made, truth.video)
         print(f"{name}: clip {index + 1} of {len(paths)}", flush=True)
     cv2.imwrite(str(sheet), np.ascontiguousarray(np.concatenate(rows)[..., ::-1]))
-    return result
+    return SetResult(name=name, clips=len(paths), tallies=tallies)
 
 
 def _sheet_rows(clip: LiveClip, made: dict[str, MethodViews], truth: Tensor) -> list[NDArray[np.uint8]]:
@@ -108,11 +105,10 @@ def _sheet_rows(clip: LiveClip, made: dict[str, MethodViews], truth: Tensor) -> 
         tiles = []
         for name, video in columns.items():
             tile = np.ascontiguousarray((video[t].clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy())
-            label = f"{name}, frame {t + 1}"
-            cv2.putText(tile, label, (3, 11), cv2.FONT_HERSHEY_SIMPLEX, 0.35, (0, 0, 0), 2, cv2.LINE_AA)
-            tiles.append(
-                cv2.putText(tile, label, (3, 11), cv2.FONT_HERSHEY_SIMPLEX, 0.35, (255, 255, 255), 1, cv2.LINE_AA)
-            )
+            for level, thickness in ((0, 2), (255, 1)):
+                told = (f"{name}, frame {t + 1}", (3, 11), cv2.FONT_HERSHEY_SIMPLEX, 0.35, (level,) * 3, thickness)
+                cv2.putText(tile, *told, cv2.LINE_AA)
+            tiles.append(tile)
         rows.append(np.concatenate(tiles, axis=1).astype(np.uint8))
     return rows
 

@@ -18,14 +18,7 @@ from torch import Tensor, nn
 
 from gcd_model.config import SemanticClass
 from gcd_model.geometry import Intrinsics, invert_rigid
-from gcd_train.evaluation.metrics import (
-    class_iou,
-    confusion_matrix,
-    gradient_map,
-    psnr,
-    ssim_map,
-    window_mask,
-)
+from gcd_train.evaluation.metrics import class_iou, confusion_matrix, gradient_map, psnr, ssim_map, window_mask
 from gcd_train.evaluation.predictors import pixel_rays
 from gcd_train.live.batches import to_video
 from gcd_train.live.clips import LiveClip
