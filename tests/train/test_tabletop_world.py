@@ -12,11 +12,9 @@ from gcd_train.errors import RenderError
 from gcd_train.scenes.frozen import freeze, vertices_of
 from gcd_train.scenes.renderer import Renderer
 from gcd_train.scenes.tabletop import CLASS_NAMES, Episode, TabletopClass, tabletop_episode, tabletop_scene
-from gcd_train.scenes.tabletop.arm import random_arm
-from gcd_train.scenes.tabletop.furniture import random_table
-from gcd_train.scenes.tabletop.layout import random_things
-from gcd_train.scenes.tabletop.model import build_model
+from gcd_train.scenes.tabletop.arm import Model, build_model
 from gcd_train.scenes.tabletop.simulation import Simulation
+from gcd_train.scenes.tabletop.tasks import random_setting
 
 pytest.importorskip("mujoco", reason="needs the extra `scenes`: pip install 'gcd-node[scenes]'")
 
@@ -35,18 +33,6 @@ def test_a_scene_depends_on_its_seed_alone() -> None:
     np.testing.assert_array_equal(first.poses, again.poses)
     other = episode(5).scene
     assert vertices_of(first).tobytes() != vertices_of(other).tobytes()
-
-
-def test_the_cameras_are_the_sixteen_of_kubric() -> None:
-    scene = episode(0).scene
-    assert list(scene.cameras) == [f"view{index}" for index in range(16)]
-    from_centre = np.stack([poses[0, :3, 3] for poses in scene.cameras.values()]) - [0.0, 0.0, 1.0]
-    np.testing.assert_allclose(np.linalg.norm(from_centre, axis=1), 15.0)
-    elevations = np.degrees(np.arcsin(from_centre[:, 2] / 15.0))
-    np.testing.assert_allclose(elevations, [45.0] * 4 + [5.0] * 12)
-    azimuths = np.degrees(np.arctan2(from_centre[:, 1], from_centre[:, 0])) % 360
-    np.testing.assert_allclose(azimuths, [0, 90, 180, 270, *range(15, 360, 30)], atol=1e-9)
-    assert scene.hfov_deg == pytest.approx(53.130102)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -130,27 +116,28 @@ def test_a_grasped_thing_is_lifted_follows_the_gripper_and_stays_where_it_is_put
     assert abs(placed[-1, 2] - rest) < 0.15
 
 
-def test_nothing_is_welded_an_arm_without_grip_lifts_nothing() -> None:
+def at_work() -> tuple[Model, Simulation]:
     random = np.random.default_rng(3)
-    arm = random_arm(random)
-    things = random_things(random, arm, [])
-    model = build_model(arm, random_table(random), [], things)
+    setting = random_setting(random)
+    model = build_model(setting)
+    return model, Simulation(model, setting.things, random, 0.9)
+
+
+def test_nothing_is_welded_an_arm_without_grip_lifts_nothing() -> None:
+    model, simulation = at_work()
     assert model.model.neq == 1  # the two fingers move alike; nothing else is tied to anything
     model.model.actuator_forcerange[model.grips] = [-1e-3, 1e-3]
-    motion = Simulation(model, things, random, 0.9).run(72, 0.0)
+    motion = simulation.run(72, 0.0)
     assert motion.grasps
     assert not any(grasp.held for grasp in motion.grasps)
 
 
 def test_physics_that_diverges_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log where it runs
-    random = np.random.default_rng(3)
-    arm = random_arm(random)
-    things = random_things(random, arm, [])
-    model = build_model(arm, random_table(random), [], things)
+    model, simulation = at_work()
     model.model.opt.gravity[2] = np.nan
     with pytest.raises(RenderError, match="became unstable"):
-        Simulation(model, things, random, 0.9).run(2, 0.0)
+        simulation.run(2, 0.0)
 
 
 def test_clips_begin_at_different_points_of_the_work() -> None:

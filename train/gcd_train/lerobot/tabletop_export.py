@@ -97,7 +97,7 @@ def _options(export: TabletopExport) -> ExportOptions:
 
 
 def _logged(episode: Episode, export: TabletopExport) -> LoggedEpisode:
-    features = {"observation.state": episode.state, "action": episode.action}
+    features = {"observation.state": episode.motion.state, "action": episode.motion.action}
     if WRIST in export.cameras:
         base_from_wrist = np.linalg.inv(episode.world_from_base) @ episode.wrist
         features[_POSE_FEATURE] = _in_metres(base_from_wrist).reshape(-1, 16)

@@ -1,4 +1,7 @@
-"""What the arm does: tasks as steps of the tool, planned when the last one is done, from where things are by then."""
+"""Where things lie at the start, and what the arm does with them: tasks as steps of its tool.
+
+A task is planned when the last one is done, from where things are by then.
+"""
 
 import math
 from collections.abc import Iterator
@@ -6,14 +9,63 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gcd_train.scenes.description import Point
-from gcd_train.scenes.tabletop.layout import FINGER_ROOM_M, is_reachable, reachable_spot
-from gcd_train.scenes.tabletop.model import BASE, Model
-from gcd_train.scenes.tabletop.things import Placed
+from gcd_train.scenes.tabletop.arm import BASE, OPEN_M, REACH_M, Model, random_arm
+from gcd_train.scenes.tabletop.furniture import TABLE_M, random_clutter, random_table
+from gcd_train.scenes.tabletop.things import Placed, Setting, random_thing
 
-_LOWEST_M = 0.021
-_ABOVE_M = 0.11
+_FINGER_ROOM_M = 0.085
+"""How far the open gripper reaches from the middle of what it takes."""
+_WIDEST_AZIMUTH = 1.15
+_GAP_M, _DROP_M, _TRIES = 0.015, 0.002, 400
+_LOWEST_M, _ABOVE_M = 0.021, 0.11
+
+
+def random_setting(random: np.random.Generator) -> Setting:
+    """An arm, a table with clutter, and things that the arm can take."""
+    arm, table, clutter = random_arm(random), random_table(random), random_clutter(random)
+    return Setting(arm=arm, table=table, clutter=clutter, things=random_things(random, clutter))
+
+
+def random_things(random: np.random.Generator, clutter: tuple[Placed, ...] = ()) -> tuple[Placed, ...]:
+    """Five to twelve loose things; the first four or so stand apart and within reach, so that they can be taken."""
+    wanted = int(random.integers(5, 13))
+    placed: list[Placed] = []
+    for _ in range(_TRIES):
+        if len(placed) == wanted:
+            break
+        first = len(placed) < 4
+        thing = random_thing(random, 2 * OPEN_M - 0.022)
+        x, y = _reachable_spot(random) if first else _anywhere(random)
+        gap = _FINGER_ROOM_M - 0.02 if first else _GAP_M
+        if _is_free(x, y, thing.radius_m + gap, (*placed, *clutter)):
+            place = (x, y, thing.size[2] / 2 + _DROP_M)
+            placed.append(Placed(thing=thing, place=place, yaw=float(random.uniform(-math.pi, math.pi))))
+    return tuple(placed)
+
+
+def _reachable_spot(random: np.random.Generator) -> tuple[float, float]:
+    """A point of the table, x and y in metres, that the arm can grasp at from above."""
+    radius = float(random.uniform(REACH_M[0] + 0.02, REACH_M[1] - 0.02))
+    azimuth = float(random.uniform(-_WIDEST_AZIMUTH, _WIDEST_AZIMUTH))
+    return BASE[0] + radius * math.cos(azimuth), BASE[1] + radius * math.sin(azimuth)
+
+
+def _anywhere(random: np.random.Generator) -> tuple[float, float]:
+    return float(random.uniform(-0.3, TABLE_M[0] - 0.1)), float(random.uniform(-TABLE_M[1] + 0.1, TABLE_M[1] - 0.1))
+
+
+def _is_free(x: float, y: float, radius: float, others: tuple[Placed, ...]) -> bool:
+    apart = math.hypot(x - BASE[0], y - BASE[1]) > 0.2 + radius
+    return apart and all(
+        math.hypot(x - other.place[0], y - other.place[1]) > radius + other.thing.radius_m for other in others
+    )
+
+
+def _is_reachable(x: float, y: float) -> bool:
+    return REACH_M[0] <= math.hypot(x - BASE[0], y - BASE[1]) <= REACH_M[1]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -38,7 +90,7 @@ class Planner:
 
     model: Model
     data: Any
-    things: list[Placed]
+    things: tuple[Placed, ...]
     random: np.random.Generator
     speed: float
 
@@ -71,7 +123,7 @@ class Planner:
         turn = self._grip_yaw(index, grip, yaw)
         above: Point = (grip[0], grip[1], max(level + _ABOVE_M, 0.16))
         lifted: Point = (grip[0], grip[1], level + float(self.random.uniform(0.10, 0.17)))
-        opening = min(1.0, (thing.grip_m / 2 + 0.018) / self.model.arm.open_m)
+        opening = min(1.0, (thing.grip_m / 2 + 0.018) / OPEN_M)
         yield self._step("reach", above, turn, opening, here, index)
         yield self._step("descend", grip, turn, opening, above, index)
         yield Step(name="close", place=grip, yaw=turn, opening=0.0, seconds=0.22, thing=index)
@@ -106,12 +158,9 @@ class Planner:
             ahead = np.array([math.cos(away + turn), math.sin(away + turn)])
             before = np.array(place[:2]) - (radius + 0.035) * ahead
             after = np.array(place[:2]) + (0.10 - radius) * ahead
-            inside = all(is_reachable(self.model.arm, *spot.tolist()) for spot in (before, after))
-            if (
-                inside
-                and self._clearance(before, index) > 0.06
-                and self._clearance(after + radius * ahead, index) > 0.03
-            ):
+            inside = _is_reachable(*before) and _is_reachable(*after)
+            free = self._clearance(before, index) > 0.06 and self._clearance(after + radius * ahead, index) > 0.03
+            if inside and free:
                 start, end = before.tolist(), after.tolist()
                 return (start[0], start[1], low), (end[0], end[1], low), away + turn
         return None
@@ -120,19 +169,19 @@ class Planner:
         place, _ = self._pose(index)
         thing = self.things[index].thing
         stands = abs(place[2] - thing.size[2] / 2) < 0.01 and self._is_upright(index)
-        near = is_reachable(self.model.arm, place[0], place[1])
+        near = _is_reachable(place[0], place[1])
         return thing.grip_m > 0 and stands and near and self._clearance(np.array(place[:2]), index) > 0.06
 
     def _free_spot(self, index: int) -> tuple[float, float]:
         """A spot with room for the thing and the hand, as far from where it is as a few tries find."""
         place, _ = self._pose(index)
         radius = self.things[index].thing.radius_m
-        tries = [reachable_spot(self.random, self.model.arm) for _ in range(40)]
-        room = [spot for spot in tries if self._clearance(np.array(spot), index) > max(FINGER_ROOM_M, radius + 0.03)]
+        tries = [_reachable_spot(self.random) for _ in range(40)]
+        room = [spot for spot in tries if self._clearance(np.array(spot), index) > max(_FINGER_ROOM_M, radius + 0.03)]
         room = [spot for spot in room if 0.12 < math.hypot(spot[0] - place[0], spot[1] - place[1]) < 0.45]
         return room[0] if room else (place[0], place[1])
 
-    def _clearance(self, spot: "np.ndarray[Any, Any]", but: int) -> float:
+    def _clearance(self, spot: NDArray[np.float64], but: int) -> float:
         """Distance from a point of the table to the nearest other loose thing's circle, metres."""
         gaps = [
             math.hypot(*(spot - np.array(self._pose(i)[0][:2]))) - self.things[i].thing.radius_m
