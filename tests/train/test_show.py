@@ -18,8 +18,7 @@ from gcd_train.cli.main import app
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.layouts.scene_writer import SceneFormat, write_scene
 from gcd_train.look.clip import SKY_M, UNSEEN, Footage
-from gcd_train.look.open_scene import open_scene
-from gcd_train.look.scene_clip import ShowOptions
+from gcd_train.look.open_scene import ShowOptions, open_scene
 from gcd_train.scenes.pair_world import DEPTH_UNIT_M, World
 
 FRAMES = 4
@@ -89,14 +88,16 @@ def test_every_layout_gives_a_clip_whose_path_begins_at_the_source(layout: str, 
 
 def test_only_surfaces_that_were_not_seen_turn_orange(pairs: Path) -> None:
     footage = opened(pairs)
-    visible, surface = footage.visible.copy(), footage.surface.copy()
+    assert footage.target_depth is not None
+    visible, depth = footage.visible.copy(), footage.target_depth.copy()
     visible[:, :, :8] = False
-    surface[:, :, :4] = False  # sky
-    painted = replace(footage, visible=visible, surface=surface).seen()
+    depth[:, :, :4] = 0.0  # sky
+    footage = replace(footage, visible=visible, target_depth=depth)
+    painted = footage.seen()
     assert np.array_equal(painted[:, :, 8:], footage.target[:, :, 8:])
     assert np.array_equal(painted[:, :, :4], footage.target[:, :, :4])
     assert np.abs(painted[:, :, 4:8].astype(int) - UNSEEN).max() < 100
-    assert replace(footage, visible=visible, surface=surface).seen_shares[0] == pytest.approx(40 / 44)
+    assert footage.seen_shares[0] == pytest.approx(40 / 44)
 
 
 # which clip

@@ -11,40 +11,39 @@ from numpy.typing import NDArray
 
 from gcd_train.evaluation.galleries import HOLD_S, write_mp4
 from gcd_train.evaluation.plots import DPI, new_figure, save, to_pixels
-from gcd_train.look.clip import SKY_M, UNKNOWN, UNSEEN, Footage, depth_colours, depth_table, depth_ticks
+from gcd_train.look.clip import SKY_M, UNSEEN, Bytes, Footage
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import SubFigure
     from mpl_toolkits.mplot3d import Axes3D
 
-
 Doubles = NDArray[np.float64]
-SOURCE_COLOUR, TARGET_COLOUR, POINT_COLOUR = "#12873f", "#1c4fd8", "#d42a2a"
+_SOURCE_COLOUR, _TARGET_COLOUR, _POINT_COLOUR = "#12873f", "#1c4fd8", "#d42a2a"
 _SHOWN = 6  # frusta along the path
 _POINTS, _CELLS = 6000, 84
 _CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
 
 
-def draw_trajectory(axes: "Axes3D", footage: Footage) -> None:
+def _draw_trajectory(axes: "Axes3D", footage: Footage) -> None:
     """Fill 3D axes: source and target frusta, path, look-at point, and the input's points around them."""
     low, high = _box(footage)
     size = 0.085 * float((high - low)[:2].max())
     _points(axes, footage, low, high)
     for number in np.unique(np.linspace(0, footage.frames - 1, _SHOWN).round().astype(int)):
         strength = 0.35 + 0.65 * number / max(footage.frames - 1, 1)
-        _frustum(axes, footage, footage.world_from_target[number], size, TARGET_COLOUR, strength)
-    _frustum(axes, footage, footage.world_from_source[0], size, SOURCE_COLOUR, 1.0)
+        _frustum(axes, footage, footage.world_from_target[number], size, _TARGET_COLOUR, strength)
+    _frustum(axes, footage, footage.world_from_source[0], size, _SOURCE_COLOUR, 1.0)
     x, y, z = footage.world_from_target[:, :3, 3].T
-    axes.plot(x, y, z, color=TARGET_COLOUR, linewidth=2.0, label=f"target, {footage.frames} frames", zorder=5)
-    axes.scatter(*footage.world_from_target[-1, :3, 3], color=TARGET_COLOUR, s=20, zorder=5)
+    axes.plot(x, y, z, color=_TARGET_COLOUR, linewidth=2.0, label=f"target, {footage.frames} frames", zorder=5)
+    axes.scatter(*footage.world_from_target[-1, :3, 3], color=_TARGET_COLOUR, s=20, zorder=5)
     source = footage.world_from_source[0, :3, 3]
-    axes.scatter(*source, color=SOURCE_COLOUR, s=20, label=f"source ({footage.source_camera})", zorder=5)
+    axes.scatter(*source, color=_SOURCE_COLOUR, s=20, label=f"source ({footage.source_camera})", zorder=5)
     if footage.look_at is not None:
         x, y, z = footage.look_at
         label = f"look-at ({x:g}, {y:g}, {z:g}) m"
         point = np.array(footage.look_at)
-        axes.scatter(*point, color=POINT_COLOUR, marker="x", s=44, linewidths=2.0, label=label, zorder=6)
+        axes.scatter(*point, color=_POINT_COLOUR, marker="x", s=44, linewidths=2.0, label=label, zorder=6)
     _frame(axes, footage, low, high)
 
 
@@ -130,10 +129,13 @@ def _across_the_path(footage: Footage) -> float:
     return float(np.degrees(np.arctan2(-ahead[1], -ahead[0]))) + 50.0
 
 
-Bytes = NDArray[np.uint8]
 _COLUMNS = 5
 _LEGEND_ROWS = 14
-INK, FAINT = "#1b2530", "#5c6875"
+_INK, _FAINT = "#1b2530", "#5c6875"
+_UNKNOWN = (38, 38, 38)
+"""Colour of depth that is not known, and of sky."""
+_TURBO = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1].astype(np.uint8)
+"""RGB of 256 steps from far to near."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -156,7 +158,7 @@ def rows_of(footage: Footage) -> list[Row]:
         Row(
             name="depth",
             told="of the input, along\nthe optical axis",
-            pictures=depth_colours(footage.depth, near, far),
+            pictures=_depth_colours(footage.depth, near, far),
         ),
     ]
     painted = footage.painted()
@@ -165,16 +167,25 @@ def rows_of(footage: Footage) -> list[Row]:
     return rows
 
 
-def write_sheet(footage: Footage, out: Path, facts: Sequence[tuple[str, str]]) -> None:
+def _depth_colours(depth: NDArray[np.float32], near_m: float, far_m: float) -> Bytes:
+    """Depth in metres [...] as RGB u8 [..., 3]: near is red, far is dark blue, in equal steps of the logarithm."""
+    known = (depth > 0) & (depth < SKY_M)
+    span = max(np.log(max(far_m, 1e-6) / max(near_m, 1e-6)), 1e-6)
+    share = np.log(np.maximum(depth, 1e-6) / max(near_m, 1e-6)) / span
+    coloured = _TURBO[(255 * (1 - share.clip(0, 1))).round().astype(np.uint8)]
+    return np.where(known[..., None], coloured, np.array(_UNKNOWN, np.uint8))
+
+
+def write_sheet(footage: Footage, out: Path) -> None:
     """One page as PNG. Raises: RenderError without matplotlib, RunError where it cannot be written."""
     rows = rows_of(footage)
     height, width = footage.source.shape[1:3]
     tall = 1.84 * height / width
     figure = new_figure(15.2, 0.78 + len(rows) * (tall + 0.045))
-    figure.text(0.012, 0.99, footage.title, fontsize=15, fontweight="bold", color=INK, va="top")
+    figure.text(0.012, 0.99, footage.title, fontsize=15, fontweight="bold", color=_INK, va="top")
     parts = figure.add_gridspec(1, 2, width_ratios=[3.05, 1.0], wspace=0.0)
     _draw_rows(figure.add_subfigure(parts[0]), footage, rows)
-    _draw_side(figure.add_subfigure(parts[1]), footage, facts)
+    _draw_side(figure.add_subfigure(parts[1]), footage)
     save(figure, out)
 
 
@@ -182,11 +193,11 @@ def write_trajectory(footage: Footage, out: Path) -> None:
     """The camera path alone, as PNG. Raises as `write_sheet`."""
     figure = new_figure(7.2, 5.6)
     axes: Axes3D = figure.add_axes((0.03, 0.03, 0.93, 0.84), projection="3d")  # pyright: ignore[reportAssignmentType]
-    draw_trajectory(axes, footage)
+    _draw_trajectory(axes, footage)
     axes.legend(loc="upper left", fontsize=8, frameon=False)
-    figure.text(0.03, 0.95, f"{footage.title}: camera path", fontsize=12, fontweight="bold", color=INK)
-    figure.text(0.03, 0.92, footage.path.replace(",\n", ", ").replace("\n", ", "), fontsize=8.5, color=FAINT)
-    figure.text(0.03, 0.89, footage.world, fontsize=8.5, color=FAINT)
+    figure.text(0.03, 0.95, f"{footage.title}: camera path", fontsize=12, fontweight="bold", color=_INK)
+    figure.text(0.03, 0.92, footage.path.replace(",\n", ", ").replace("\n", ", "), fontsize=8.5, color=_FAINT)
+    figure.text(0.03, 0.89, footage.world, fontsize=8.5, color=_FAINT)
     save(figure, out)
 
 
@@ -212,23 +223,23 @@ def _draw_rows(grid: "SubFigure", footage: Footage, rows: Sequence[Row]) -> None
     for column, moment in enumerate(moments):
         time = f"t = {footage.seconds[moment]:.2f} s\nframe {footage.frame_numbers[moment]}"
         place = column * (width + gap) + width / 2
-        axes.text(place, -0.04 * height, time, fontsize=9, color=FAINT, ha="center", va="bottom")
+        axes.text(place, -0.04 * height, time, fontsize=9, color=_FAINT, ha="center", va="bottom")
     axes.imshow(mosaic, interpolation="antialiased", aspect="auto")
     share = height / len(mosaic)
-    depth_bar(axes.inset_axes((1.008, 0.02 * share, 0.012, 0.94 * share)), footage)
+    _depth_bar(axes.inset_axes((1.008, 0.02 * share, 0.012, 0.94 * share)), footage)
 
 
 def _name_row(axes: "Axes", x: float, y: float, step: float, row: Row) -> None:
-    axes.text(x, y, row.name, fontsize=11.5, fontweight="bold", color=INK, va="center", ha="right")
-    axes.text(x, y + 2.3 * step, row.told, fontsize=7, color=FAINT, va="top", ha="right", linespacing=1.15)
+    axes.text(x, y, row.name, fontsize=11.5, fontweight="bold", color=_INK, va="center", ha="right")
+    axes.text(x, y + 2.3 * step, row.told, fontsize=7, color=_FAINT, va="top", ha="right", linespacing=1.15)
 
 
 def _badge(axes: "Axes", left: float, bottom: float, text: str) -> None:
     box = {"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": "none", "alpha": 0.85}
-    axes.annotate(text, (left, bottom), xytext=(5, 6), textcoords="offset points", fontsize=8, color=INK, bbox=box)
+    axes.annotate(text, (left, bottom), xytext=(5, 6), textcoords="offset points", fontsize=8, color=_INK, bbox=box)
 
 
-def depth_bar(bar: "Axes", footage: Footage) -> None:
+def _depth_bar(bar: "Axes", footage: Footage) -> None:
     """Fill axes with the colours of depth, near at the bottom, ticks in metres."""
     near, far = footage.depth_range_m
     bar.set_xticks([])
@@ -237,23 +248,35 @@ def depth_bar(bar: "Axes", footage: Footage) -> None:
     if far <= near:
         bar.set_yticks([])
         return
-    bar.imshow(depth_table()[::-1][:, None], aspect="auto", origin="lower", extent=(0, 1, 0, 1))
-    ticks = depth_ticks(near, far)
+    bar.imshow(_TURBO[::-1][:, None], aspect="auto", origin="lower", extent=(0, 1, 0, 1))
+    ticks = _depth_ticks(near, far)
     bar.set_yticks([float(np.log(tick / near) / np.log(far / near)) for tick in ticks], [f"{t:g}" for t in ticks])
     bar.yaxis.tick_right()
-    bar.tick_params(labelsize=7, length=2, colors=FAINT)
-    bar.set_title("m", fontsize=8, color=FAINT, pad=2)
+    bar.tick_params(labelsize=7, length=2, colors=_FAINT)
+    bar.set_title("m", fontsize=8, color=_FAINT, pad=2)
 
 
-def _draw_side(side: "SubFigure", footage: Footage, facts: Sequence[tuple[str, str]]) -> None:
+def _depth_ticks(near_m: float, far_m: float) -> list[float]:
+    """Round numbers of metres between two depths, at most eight; in a narrow range evenly spaced."""
+    rounds = [digit * 10.0**power for power in range(-2, 5) for digit in (1, 2, 3, 5, 7)]
+    ticks = [number for number in rounds if near_m <= number <= far_m]
+    if len(ticks) > 8:
+        return [tick for tick in ticks if f"{tick:e}"[0] in "125"]
+    if len(ticks) >= 3 or far_m <= near_m:
+        return ticks
+    step = next(number for number in rounds if number >= (far_m - near_m) / 5)
+    return [round(number * step, 3) for number in range(int(near_m / step) + 1, int(far_m / step) + 1)]
+
+
+def _draw_side(side: "SubFigure", footage: Footage) -> None:
     axes: Axes3D = side.add_axes((0.02, 0.60, 0.96, 0.335), projection="3d")  # pyright: ignore[reportAssignmentType]
-    draw_trajectory(axes, footage)
+    _draw_trajectory(axes, footage)
     axes.tick_params(labelsize=6.5, pad=-1)
     axes.legend(loc="upper left", bbox_to_anchor=(0.02, 1.18), fontsize=7.5, frameon=False, ncol=1)
     top = 0.575
-    for name, value in facts:
-        side.text(0.03, top, name, fontsize=8, color=FAINT, va="top")
-        side.text(0.27, top, value, fontsize=8, color=INK, va="top", linespacing=1.2)
+    for name, value in footage.facts():
+        side.text(0.03, top, name, fontsize=8, color=_FAINT, va="top")
+        side.text(0.27, top, value, fontsize=8, color=_INK, va="top", linespacing=1.2)
         top -= 0.0195 + 0.0165 * value.count("\n")
     _legend(side, footage, top - 0.015)
 
@@ -262,18 +285,18 @@ def _legend(side: "SubFigure", footage: Footage, top: float) -> None:
     """Names, colours and pixel shares of what is most seen, then the colours that have no bar."""
     shares = footage.shares()
     if shares:
-        side.text(0.03, top, f"{footage.kind_plural}, share of the input's pixels", fontsize=8, color=FAINT, va="top")
+        side.text(0.03, top, f"{footage.kind_plural}, share of the input's pixels", fontsize=8, color=_FAINT, va="top")
         top -= 0.027
     for label, share in shares[:_LEGEND_ROWS]:
         _swatch(side, top, label.colour, f"{label.name}", percent(share))
         top -= 0.0195
     if len(shares) > _LEGEND_ROWS:
         rest = percent(sum(share for _, share in shares[_LEGEND_ROWS:]))
-        side.text(0.09, top, f"and {len(shares) - _LEGEND_ROWS} more, {rest}", fontsize=7.5, color=FAINT, va="top")
+        side.text(0.09, top, f"and {len(shares) - _LEGEND_ROWS} more, {rest}", fontsize=7.5, color=_FAINT, va="top")
         top -= 0.0195
     top -= 0.008
     _swatch(side, top, UNSEEN, "surfaces the input never saw", "")
-    _swatch(side, top - 0.0195, UNKNOWN, "sky, or no depth", "")
+    _swatch(side, top - 0.0195, _UNKNOWN, "sky, or no depth", "")
 
 
 def percent(share: float) -> str:
@@ -286,8 +309,8 @@ def _swatch(side: "SubFigure", top: float, colour: tuple[int, int, int], name: s
     side.text(
         0.035, top, "      ", fontsize=6, va="top", bbox={"facecolor": face, "edgecolor": "#00000030", "pad": 1.2}
     )
-    side.text(0.09, top, name, fontsize=7.5, color=INK, va="top")
-    side.text(0.93, top, value, fontsize=7.5, color=INK, va="top", ha="right")
+    side.text(0.09, top, name, fontsize=7.5, color=_INK, va="top")
+    side.text(0.93, top, value, fontsize=7.5, color=_INK, va="top", ha="right")
 
 
 _PANELS = 3
@@ -321,14 +344,14 @@ def _page(footage: Footage, rows: Sequence[Row], places: Sequence[tuple[int, int
     down = max(top for _, top in places) + height + _GAP
     across, down = across + across % 2, down + down % 2
     figure = new_figure(across / DPI, down / DPI)
-    figure.text(_GAP / across, 1 - 13 / down, footage.title, fontsize=12, fontweight="bold", color=INK, va="top")
+    figure.text(_GAP / across, 1 - 13 / down, footage.title, fontsize=12, fontweight="bold", color=_INK, va="top")
     for row, (left, top) in zip(rows, places, strict=True):
         at = (left / across, 1 - (top - 7) / down)
-        figure.text(*at, row.name, fontsize=9.5, fontweight="bold", color=INK)
+        figure.text(*at, row.name, fontsize=9.5, fontweight="bold", color=_INK)
         told = row.told.replace("\n", " ")
-        figure.text((left + 92) / across, at[1], told, fontsize=7.5, color=FAINT)
+        figure.text((left + 92) / across, at[1], told, fontsize=7.5, color=_FAINT)
     left, top = places[-1]
-    depth_bar(
+    _depth_bar(
         figure.add_axes(((left + width + 8) / across, 1 - (top + height) / down, 10 / across, (height - 14) / down)),
         footage,
     )
