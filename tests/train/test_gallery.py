@@ -35,7 +35,7 @@ from gcd_model.errors import OptionError
 from gcd_train.cli.gallery import gallery_command
 from gcd_train.errors import DataError
 from gcd_train.look.gallery import ViewRecipe, mounted, paths, view_window
-from gcd_train.look.real_video import WindowChoice, Windowed, find_videos, kept_share, read_windows
+from gcd_train.look.real_video import WindowChoice, Windowed, find_videos, read_windows
 
 T, H, W = 4, 32, 64
 REAL = Path(os.environ.get("GCD_REAL_VIDEOS", "no folder of videos"))
@@ -115,9 +115,17 @@ def test_a_folder_of_pictures_is_a_video_in_the_order_of_names(tmp_path: Path) -
         windows_of(tmp_path)
 
 
-@pytest.mark.parametrize(("hfov", "trained", "share"), [(None, 53.0, 1.0), (60.0, None, 1.0), (50.0, 85.0, 1.0)])
-def test_what_is_not_too_wide_is_kept_whole(hfov: float | None, trained: float | None, share: float) -> None:
-    assert kept_share(hfov, trained) == share
+@pytest.mark.parametrize(
+    ("hfov", "width", "kept"),
+    [(None, 64, None), (40.0, 64, 40.0), (100.0, 64, 53.13), (100.0, 128, 53.13), (40.0, 80, 32.5)],
+)
+def test_what_is_wider_than_trained_is_cut_off(
+    tmp_path: Path, hfov: float | None, width: int, kept: float | None
+) -> None:
+    path = write_video(tmp_path / "a.avi", 6, 24.0, size=(width, H))
+    window = windows_of(path, WindowChoice(hfov_deg=hfov))[0]
+    assert window.pictures.shape == (T, H, W, 3)
+    assert window.hfov_deg == (None if kept is None else pytest.approx(kept, abs=1.5))
 
 
 @pytest.mark.parametrize(
