@@ -78,15 +78,7 @@ def _points(axes: "Axes3D", footage: Footage, low: Doubles, high: Doubles) -> No
     cells = ((points - low) / (high - low).max() * _CELLS).astype(np.int64) @ (1, _CELLS, _CELLS**2)
     chosen = np.unique(cells, return_index=True)[1]  # one a cell, or near surfaces hide the rest
     chosen = chosen[np.random.default_rng(0).permutation(len(chosen))[:_POINTS]]
-    axes.scatter(
-        *points[chosen].T,
-        c=colours[chosen],
-        s=5,
-        linewidths=0,
-        alpha=0.75,
-        depthshade=False,
-        zorder=1,
-    )
+    axes.scatter(*points[chosen].T, c=colours[chosen], s=5, linewidths=0, alpha=0.75, depthshade=False, zorder=1)
 
 
 def _box(footage: Footage) -> tuple[Doubles, Doubles]:
@@ -120,17 +112,16 @@ def _frame(axes: "Axes3D", footage: Footage, low: Doubles, high: Doubles) -> Non
     axes.set_ylabel("y [m]")
     axes.set_zlabel("z [m]")
     axes.computed_zorder = False
-    axes.view_init(elev=24, azim=_across_the_path(footage))
+    ahead = footage.world_from_source[0, :2, 2]  # looked at from behind the cameras and beside the path
+    axes.view_init(elev=24, azim=float(np.degrees(np.arctan2(-ahead[1], -ahead[0]))) + 50.0)
 
 
-def _across_the_path(footage: Footage) -> float:
-    """Azimuth to look from, degrees: behind the cameras and beside the path."""
-    ahead = footage.world_from_source[0, :2, 2]
-    return float(np.degrees(np.arctan2(-ahead[1], -ahead[0]))) + 50.0
-
-
-_COLUMNS = 5
-_LEGEND_ROWS = 14
+_COLUMNS, _LEGEND_ROWS = 5, 14
+_BADGE: dict[str, Any] = {
+    "xytext": (5, 6),
+    "textcoords": "offset points",
+    "bbox": {"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": "none", "alpha": 0.85},
+}
 _INK, _FAINT = "#1b2530", "#5c6875"
 _UNKNOWN = (38, 38, 38)
 """Colour of depth that is not known, and of sky."""
@@ -218,8 +209,12 @@ def _draw_rows(grid: "SubFigure", footage: Footage, rows: Sequence[Row]) -> None
             left = column * (width + gap)
             mosaic[top : top + height, left : left + width] = row.pictures[moment]
             if row.name == "visibility":
-                _badge(axes, left, top + height, f"{100 * footage.seen_shares[moment]:.0f} % seen")
-        _name_row(axes, -0.02 * width, top + 0.4 * height, 0.05 * height, row)
+                seen = f"{100 * footage.seen_shares[moment]:.0f} % seen"
+                axes.annotate(seen, (left, top + height), fontsize=8, color=_INK, **_BADGE)
+        x, y = -0.02 * width, top + 0.4 * height
+        axes.text(x, y, row.name, fontsize=11.5, fontweight="bold", color=_INK, va="center", ha="right")
+        y += 0.115 * height
+        axes.text(x, y, row.told, fontsize=7, color=_FAINT, va="top", ha="right", linespacing=1.15)
     for column, moment in enumerate(moments):
         time = f"t = {footage.seconds[moment]:.2f} s\nframe {footage.frame_numbers[moment]}"
         place = column * (width + gap) + width / 2
@@ -227,16 +222,6 @@ def _draw_rows(grid: "SubFigure", footage: Footage, rows: Sequence[Row]) -> None
     axes.imshow(mosaic, interpolation="antialiased", aspect="auto")
     share = height / len(mosaic)
     _depth_bar(axes.inset_axes((1.008, 0.02 * share, 0.012, 0.94 * share)), footage)
-
-
-def _name_row(axes: "Axes", x: float, y: float, step: float, row: Row) -> None:
-    axes.text(x, y, row.name, fontsize=11.5, fontweight="bold", color=_INK, va="center", ha="right")
-    axes.text(x, y + 2.3 * step, row.told, fontsize=7, color=_FAINT, va="top", ha="right", linespacing=1.15)
-
-
-def _badge(axes: "Axes", left: float, bottom: float, text: str) -> None:
-    box = {"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": "none", "alpha": 0.85}
-    axes.annotate(text, (left, bottom), xytext=(5, 6), textcoords="offset points", fontsize=8, color=_INK, bbox=box)
 
 
 def _depth_bar(bar: "Axes", footage: Footage) -> None:
@@ -288,7 +273,7 @@ def _legend(side: "SubFigure", footage: Footage, top: float) -> None:
         side.text(0.03, top, f"{footage.kind_plural}, share of the input's pixels", fontsize=8, color=_FAINT, va="top")
         top -= 0.027
     for label, share in shares[:_LEGEND_ROWS]:
-        _swatch(side, top, label.colour, f"{label.name}", percent(share))
+        _swatch(side, top, label.colour, label.name, percent(share))
         top -= 0.0195
     if len(shares) > _LEGEND_ROWS:
         rest = percent(sum(share for _, share in shares[_LEGEND_ROWS:]))
