@@ -38,8 +38,8 @@ class Thing:
     """Something made of parts, in its own frame.
 
     size, middle: of the bounding box along its own axes, metres; `middle` is the origin but for links of the arm.
-    grip_m: distance of the fingers that hold it, across its own y axis, 0 if it is not to be grasped. grip_z: where on
-    its own z axis. any_yaw: it may be grasped from any side. rolls: it is stopped from rolling for ever.
+    grip_z: where on its own z axis fingers hold it, across its y axis. any_yaw: it may be grasped from any side.
+    rolls: it is stopped from rolling for ever.
     """
 
     name: str
@@ -48,7 +48,6 @@ class Thing:
     mass_kg: float
     friction: float
     middle: Point = (0.0, 0.0, 0.0)
-    grip_m: float = 0.0
     grip_z: float = 0.0
     any_yaw: bool = False
     rolls: bool = False
@@ -136,17 +135,10 @@ def random_thing(random: _Random, widest: float) -> Thing:
 def _block(random: _Random, widest: float) -> Thing:
     """A block or a carton, at most `widest` across its y axis."""
     wide, deep = float(random.uniform(0.035, widest)), float(random.uniform(0.04, 0.12))
-    high = float(random.uniform(0.04, 0.15))
+    size = (deep, wide, float(random.uniform(0.04, 0.15)))
     paint, _ = _paints(random)
-    return Thing(
-        name="block" if high < 0.08 else "carton",
-        parts=(shaped(paint, "box", (deep, wide, high)),),
-        size=(deep, wide, high),
-        mass_kg=_mass(deep * wide * high, random),
-        friction=float(random.uniform(0.6, 1.0)),
-        grip_m=wide,
-        grip_z=_below_top(high),
-    )
+    name = "block" if size[2] < 0.08 else "carton"
+    return _loose(name, (shaped(paint, "box", size),), size, deep * wide * size[2], random, grip_z=_below_top(size[2]))
 
 
 def _can(random: _Random, widest: float) -> Thing:
@@ -160,7 +152,7 @@ def _bottle(random: _Random, widest: float) -> Thing:
     radius, high = float(random.uniform(0.022, min(widest / 2, 0.034))), float(random.uniform(0.13, 0.155))
     paint, plain = _paints(random)
     body = _cylinder(paint, radius, 0.62 * high, -0.19 * high)
-    shoulder = _ball_of(paint, radius * 0.985, 0.12 * high)
+    shoulder = _sphere(paint, radius * 0.985, 0.12 * high)
     neck = _cylinder(plain, radius * 0.4, 0.38 * high, 0.31 * high)
     bottle = _round("bottle", (body, shoulder, neck), radius, high, random)
     return replace(bottle, grip_z=0.12 * high - 0.010)
@@ -183,33 +175,17 @@ def _mug(random: _Random, widest: float) -> Thing:
 
 def _ball(random: _Random, widest: float) -> Thing:
     radius = float(random.uniform(0.025, widest / 2))
-    paint, _ = _paints(random)
-    return Thing(
-        name="ball",
-        parts=(_ball_of(paint, radius),),
-        size=(2 * radius, 2 * radius, 2 * radius),
-        mass_kg=_mass(4 * radius**3, random),
-        friction=float(random.uniform(0.7, 1.0)),
-        grip_m=2 * radius,
-        any_yaw=True,
-        rolls=True,
-    )
+    ball = _sphere(_paints(random)[0], radius)
+    return _loose("ball", (ball,), ball.size, 4 * radius**3, random, any_yaw=True, rolls=True)
 
 
 def _bar(random: _Random, widest: float) -> Thing:
     """A thick stick that lies along x: a sausage, a marker, a roll."""
     radius, half = float(random.uniform(0.018, min(widest / 2, 0.03))), float(random.uniform(0.03, 0.07))
     lying: Quaternion = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
-    paint, _ = _paints(random)
-    return Thing(
-        name="bar",
-        parts=(replace(shaped(paint, "capsule", (2 * radius, 2 * radius, 2 * half)), turn=lying),),
-        size=(2 * (half + radius), 2 * radius, 2 * radius),
-        mass_kg=_mass(6 * half * radius**2, random),
-        friction=float(random.uniform(0.7, 1.0)),
-        grip_m=2 * radius,
-        rolls=True,
-    )
+    stick = replace(shaped(_paints(random)[0], "capsule", (2 * radius, 2 * radius, 2 * half)), turn=lying)
+    size = (2 * (half + radius), 2 * radius, 2 * radius)
+    return _loose("bar", (stick,), size, 6 * half * radius**2, random, rolls=True)
 
 
 def _bridge(random: _Random, widest: float) -> Thing:
@@ -221,36 +197,19 @@ def _bridge(random: _Random, widest: float) -> Thing:
         shaped(plain, "box", (0.03, wide, 2 * (high / 2 - 0.014)), (x, 0, -0.014))
         for x in (0.015 - long / 2, long / 2 - 0.015)
     ]
-    return Thing(
-        name="bridge",
-        parts=(beam, *feet),
-        size=(long, wide, high),
-        mass_kg=_mass(long * wide * 0.05, random),
-        friction=float(random.uniform(0.6, 1.0)),
-        grip_m=wide,
-        grip_z=high / 2 - 0.018,
-    )
+    size = (long, wide, high)
+    return _loose("bridge", (beam, *feet), size, long * wide * 0.05, random, grip_z=high / 2 - 0.018)
+
+
+_MAKERS: tuple[Callable[[_Random, float], Thing], ...] = (_block, _block, _can, _bottle, _mug, _ball, _bar, _bridge)
 
 
 def _cylinder(paint: Part, radius: float, high: float, z: float = 0.0) -> Part:
     return shaped(paint, "cylinder", (2 * radius, 2 * radius, high), (0, 0, z))
 
 
-def _ball_of(paint: Part, radius: float, z: float = 0.0) -> Part:
+def _sphere(paint: Part, radius: float, z: float = 0.0) -> Part:
     return shaped(paint, "sphere", (2 * radius, 2 * radius, 2 * radius), (0, 0, z))
-
-
-def _round(name: str, parts: tuple[Part, ...], radius: float, high: float, random: _Random) -> Thing:
-    return Thing(
-        name=name,
-        parts=parts,
-        size=(2 * radius, 2 * radius, high),
-        mass_kg=_mass(math.pi * radius**2 * high, random),
-        friction=float(random.uniform(0.6, 1.0)),
-        grip_m=2 * radius,
-        grip_z=_below_top(high),
-        any_yaw=True,
-    )
 
 
 def _below_top(high: float) -> float:
@@ -258,9 +217,30 @@ def _below_top(high: float) -> float:
     return max(0.0, high / 2 - 0.035)
 
 
-def _mass(volume: float, random: _Random) -> float:
-    """Between balsa and water."""
-    return max(0.02, volume * float(random.uniform(250, 800)))
+def _round(name: str, parts: tuple[Part, ...], radius: float, high: float, random: _Random) -> Thing:
+    size, volume = (2 * radius, 2 * radius, high), math.pi * radius**2 * high
+    return _loose(name, parts, size, volume, random, grip_z=_below_top(high), any_yaw=True)
 
 
-_MAKERS: tuple[Callable[[_Random, float], Thing], ...] = (_block, _block, _can, _bottle, _mug, _ball, _bar, _bridge)
+def _loose(
+    name: str,
+    parts: tuple[Part, ...],
+    size: Point,
+    volume: float,
+    random: _Random,
+    *,
+    grip_z: float = 0.0,
+    any_yaw: bool = False,
+    rolls: bool = False,
+) -> Thing:
+    """A thing with a density between balsa and water. volume: m3, roughly."""
+    return Thing(
+        name=name,
+        parts=parts,
+        size=size,
+        mass_kg=max(0.02, volume * float(random.uniform(250, 800))),
+        friction=float(random.uniform(0.7 if rolls else 0.6, 1.0)),
+        grip_z=grip_z,
+        any_yaw=any_yaw,
+        rolls=rolls,
+    )
