@@ -9,10 +9,13 @@ import numpy as np
 from gcd_train.scenes.description import Colour, Light, Part, Pattern, Point, Sheet
 from gcd_train.scenes.tabletop.things import Placed, TabletopClass, Thing, solid
 
+UNITS_A_METRE = 10.0
 TABLE_M = (0.66, 0.72)
 """Half length along x and half width along y of the table top; its surface is at z = 0."""
+TABLE_Z_M = -0.12
+"""Height of that surface in the world: arm and things are then in the middle of the pictures."""
 FLOOR_M = -0.76
-_WALL_M = 3.6
+_WALL, _WALL_TOP = 36.0, 19.0  # units
 _WOODS: tuple[Colour, ...] = ((0.62, 0.43, 0.26), (0.78, 0.62, 0.42), (0.45, 0.29, 0.18), (0.83, 0.74, 0.60))
 _FLATS: tuple[Colour, ...] = ((0.86, 0.86, 0.84), (0.36, 0.38, 0.40), (0.55, 0.62, 0.60), (0.24, 0.30, 0.36))
 _WALLS: tuple[Colour, ...] = ((0.85, 0.83, 0.78), (0.68, 0.74, 0.76), (0.78, 0.70, 0.62), (0.60, 0.64, 0.58))
@@ -60,7 +63,8 @@ def random_clutter(random: np.random.Generator) -> tuple[Placed, ...]:
 
 def _clutter_thing(random: np.random.Generator) -> Thing:
     kind = int(random.integers(4))
-    colour = (float(random.uniform(0.15, 0.9)), float(random.uniform(0.15, 0.85)), float(random.uniform(0.15, 0.85)))
+    red, green, blue = (float(random.uniform(0.15, most)) for most in (0.9, 0.85, 0.85))
+    colour = (red, green, blue)
     if kind == 0:
         return _bin(colour, random)
     if kind == 1:
@@ -115,19 +119,15 @@ def _still(name: str, parts: tuple[Part, ...], size: Point) -> Thing:
     return Thing(name=name, parts=parts, size=size, mass_kg=1.0, friction=0.8)
 
 
-def room(random: np.random.Generator, table_m: float, scale: float) -> tuple[tuple[Part, ...], tuple[Sheet, ...]]:
-    """Floor, four walls and the sky above them, in scene units; lower than the sun at the table.
-
-    table_m: height of the table's surface in the world, metres. scale: units a metre.
-    """
-    wall, low, high = _WALL_M * scale, (FLOOR_M + table_m) * scale, 1.9 * scale
-    colour = _pick(_WALLS, random)
-    middle, height = (low + high) / 2, high - low
+def room(random: np.random.Generator) -> tuple[tuple[Part, ...], tuple[Sheet, ...]]:
+    """Floor, four walls and the sky above them, in scene units; lower than the sun at the table."""
+    low, colour = (FLOOR_M + TABLE_Z_M) * UNITS_A_METRE, _pick(_WALLS, random)
+    middle, height = (low + _WALL_TOP) / 2, _WALL_TOP - low
     parts = [
         Part(
             shape="box",
-            centre=(x * wall, y * wall, middle),
-            size=(1.0 if x else 2 * wall, 1.0 if y else 2 * wall, height),
+            centre=(x * _WALL, y * _WALL, middle),
+            size=(1.0 if x else 2 * _WALL, 1.0 if y else 2 * _WALL, height),
             colour=colour,
             accent=(0.9 * colour[0], 0.9 * colour[1], 0.92 * colour[2]),
             pattern=Pattern.CLOUDY,
@@ -136,33 +136,27 @@ def room(random: np.random.Generator, table_m: float, scale: float) -> tuple[tup
         )
         for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1))
     ]
-    parts += _panels(random, wall, low, scale)
-    size = (-5.5 * wall, 5.5 * wall, 5.5 * wall)  # its inside faces the cameras, hence the negative size
+    parts += _panels(random, low)
+    size = (-5.5 * _WALL, 5.5 * _WALL, 5.5 * _WALL)  # its inside faces the cameras, hence the negative size
     parts.append(
         Part(shape="ball", centre=(0, 0, 0), size=size, colour=(1, 1, 1), pattern=Pattern.SKY, label=TabletopClass.SKY)
     )
-    return tuple(parts), (_floor(random, wall, low),)
+    return tuple(parts), (_floor(random, low),)
 
 
-def _panels(random: np.random.Generator, wall: float, low: float, scale: float) -> list[Part]:
+def _panels(random: np.random.Generator, low: float) -> list[Part]:
     """Cupboards, pictures and doors along the walls, so that the background tells where it is."""
     made: list[Part] = []
     for side in range(4):
         for along in np.arange(-0.75, 0.76, 0.5) + random.uniform(-0.12, 0.12, 4):
-            wide, deep = float(random.uniform(5, 11)), float(random.uniform(0.6, 4.5))
-            high = float(random.uniform(6, 22)) * scale / 10
-            colour = (
-                float(random.uniform(0.2, 0.85)),
-                float(random.uniform(0.2, 0.8)),
-                float(random.uniform(0.2, 0.8)),
-            )
-            lift = 0.0 if deep > 1.5 else 8.0
-            grey = 0.5 * (colour[0] + colour[1])
+            wide, deep, high = (float(random.uniform(*sides)) for sides in ((5, 11), (0.6, 4.5), (6, 22)))
+            red, green, blue = (float(random.uniform(0.2, most)) for most in (0.85, 0.8, 0.8))
+            lift, grey = 0.0 if deep > 1.5 else 8.0, 0.5 * (red + green)
             part = Part(
                 shape="box",
-                centre=(float(along) * wall, wall - 0.5 - deep / 2, low + lift + high / 2),
+                centre=(float(along) * _WALL, _WALL - 0.5 - deep / 2, low + lift + high / 2),
                 size=(wide, deep, high),
-                colour=((colour[0] + grey) / 2, (colour[1] + grey) / 2, (colour[2] + grey) / 2),
+                colour=((red + grey) / 2, (green + grey) / 2, (blue + grey) / 2),
                 accent=(0.4, 0.35, 0.3),
                 pattern=Pattern(int(random.choice([Pattern.PLAIN, Pattern.WOOD, Pattern.STRIPES]))),
                 grain_m=2.0,
@@ -172,8 +166,8 @@ def _panels(random: np.random.Generator, wall: float, low: float, scale: float) 
     return made
 
 
-def _floor(random: np.random.Generator, wall: float, low: float) -> Sheet:
-    a, b, c, d = ((-wall, -wall, low), (wall, -wall, low), (wall, wall, low), (-wall, wall, low))
+def _floor(random: np.random.Generator, low: float) -> Sheet:
+    a, b, c, d = ((x * _WALL, y * _WALL, low) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1)))
     pattern = Pattern(int(random.choice([Pattern.PLANKS, Pattern.TERRAZZO, Pattern.CHECKER, Pattern.CLOUDY])))
     colour = _pick(_WOODS if pattern == Pattern.PLANKS else _FLATS, random)
     return Sheet(

@@ -15,14 +15,11 @@ from numpy.typing import NDArray
 from gcd_train.scenes.description import Extent, Part, Point, Scene, SceneObject, rotations
 from gcd_train.scenes.drop import HFOV_DEG, orbit_cameras
 from gcd_train.scenes.tabletop.arm import BASE, Model, arm_links, build_model
-from gcd_train.scenes.tabletop.furniture import random_light, room
+from gcd_train.scenes.tabletop.furniture import TABLE_Z_M, UNITS_A_METRE, random_light, room
 from gcd_train.scenes.tabletop.simulation import Motion, Simulation
 from gcd_train.scenes.tabletop.tasks import random_setting
 from gcd_train.scenes.tabletop.things import Placed, Setting, TabletopClass, Thing
 
-UNITS_A_METRE = 10.0
-TABLE_M = -0.12
-"""Height of the table's surface in the world, metres: arm and things are then in the middle of the pictures."""
 _EXTENT = Extent(near_m=0.2, far_m=150.0, shadow_radius_m=12.0, shadow_depth_m=40.0, shadow_pixels=2048)
 _TABLE = 1
 """The scene's body that carries table, clutter and, one number further each, the bodies of the physics model."""
@@ -68,7 +65,7 @@ def tabletop_episode(seed: int, *, frames: int = 60, skipped_s: float | None = N
     drawn_s, speed = float(random.uniform(0, 1.4)), float(random.uniform(0.5, 0.9))
     motion = Simulation(model, setting.things, random, speed).run(frames, drawn_s if skipped_s is None else skipped_s)
     world_from_table = _table_pose(float(random.uniform(-math.pi, math.pi)))
-    walls, sheets = room(random, TABLE_M, UNITS_A_METRE)
+    walls, sheets = room(random)
     task = _in_words(motion, setting)
     counted = _counted(model, setting)
     scene = Scene(
@@ -190,7 +187,7 @@ def _table_pose(yaw: float) -> Floats:
     """world_from_table [4, 4]: turned about the vertical, metres."""
     turn = np.eye(4)
     turn[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
-    turn[2, 3] = TABLE_M
+    turn[2, 3] = TABLE_Z_M
     return turn
 
 

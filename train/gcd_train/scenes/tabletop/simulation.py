@@ -30,13 +30,12 @@ class Grasp:
     """One attempt to hold a thing.
 
     thing: index. lifted: by how much it had risen at the end of the lift, metres. slip: the most by which it moved in
-    the hand until it was put down or the clip ended. closed: time since the clip began, seconds; negative for before.
+    the hand until it was put down or the clip ended.
     """
 
     thing: int
     lifted: float
     slip: float
-    closed: float
 
     @property
     def held(self) -> bool:
@@ -82,7 +81,10 @@ class Simulation:
 
         Raises: RenderError if the physics became unstable.
         """
-        self._settle()
+        m, data = self._m, self._data
+        data.qpos[m.joints], data.qpos[m.fingers] = self._joints, OPEN_M
+        self._command(self._joints)
+        m.mujoco.mj_step(m.model, data, round(_SETTLE_S / STEP_S))
         first = round(skipped_s / _TICK_S)
         self._watch.clock = -first * _TICK_S
         for tick, step in enumerate(self._followed()):
@@ -90,23 +92,16 @@ class Simulation:
                 self._keep(step)
             if len(self._names) == frames:
                 break
-            self._m.mujoco.mj_step(self._m.model, self._data, _STEPS_A_TICK)
+            m.mujoco.mj_step(m.model, data, _STEPS_A_TICK)
             self._watch.tick()
         self._watch.end()
-        faults = self._m.mujoco.mjtWarning  # MuJoCo starts a diverging simulation anew and only counts that
+        faults = m.mujoco.mjtWarning  # MuJoCo starts a diverging simulation anew and only counts that
         kinds = (faults.mjWARN_BADQPOS, faults.mjWARN_BADQVEL, faults.mjWARN_BADQACC)
-        if any(self._data.warning[int(kind)].number for kind in kinds):
+        if any(data.warning[int(kind)].number for kind in kinds):
             raise RenderError("the physics of this tabletop scene became unstable; leave its seed out")
         kept = {name: np.stack([row[name] for row in self._rows]) for name in self._rows[0]}
-        watch = self._watch
-        return Motion(**kept, steps=tuple(self._names), grasps=tuple(watch.grasps), tasks=tuple(watch.tasks))
-
-    def _settle(self) -> None:
-        m, data = self._m, self._data
-        data.qpos[m.joints] = self._joints
-        data.qpos[m.fingers] = OPEN_M
-        self._command(self._joints)
-        m.mujoco.mj_step(m.model, data, round(_SETTLE_S / STEP_S))
+        grasps, tasks = tuple(self._watch.grasps), tuple(self._watch.tasks)
+        return Motion(**kept, steps=tuple(self._names), grasps=grasps, tasks=tasks)
 
     def _followed(self) -> Iterator[Step]:
         """The step in force at every tick, for ever; the actuators have their targets when it is yielded."""
@@ -165,14 +160,13 @@ class _Watch:
         self.clock = 0.0
         self.grasps: list[Grasp] = []
         self.tasks: list[tuple[str, int]] = []
-        self._thing, self._closed = -1, 0.0
-        self._offset = np.zeros(3)
+        self._thing, self._offset = -1, np.zeros(3)
         self._low, self._lifted, self._slip = 0.0, math.nan, 0.0
 
     def begin(self, step: Step) -> None:
         """A step begins: at the lift the fingers have closed, at the opening the grasp ends."""
         if step.name == "lift":
-            self._thing, self._closed, self._slip, self._lifted = step.thing, self.clock, 0.0, math.nan
+            self._thing, self._slip, self._lifted = step.thing, 0.0, math.nan
             self._offset, self._low = self._in_hand(), self._height()
         if step.name == "carry":
             self._lifted = self._height() - self._low
@@ -190,8 +184,7 @@ class _Watch:
     def end(self) -> None:
         """The grasp is over; one that never got to the end of the lift does not count."""
         if self._thing >= 0 and not math.isnan(self._lifted):
-            grasp = Grasp(thing=self._thing, lifted=self._lifted, slip=self._slip, closed=self._closed)
-            self.grasps.append(grasp)
+            self.grasps.append(Grasp(thing=self._thing, lifted=self._lifted, slip=self._slip))
         self._thing = -1
 
     def _in_hand(self) -> Floats:
