@@ -9,16 +9,20 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+from box_world import box_scene
 from headless import needs_egl
 from stage_world import STAGE
 from tiny_scenes4d import write_driving, write_kubric
 from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
+from gcd_train.data.files import FileFault
 from gcd_train.errors import DataError, RecipeError
+from gcd_train.layouts.manifest import GEOMETRY
 from gcd_train.layouts.scene_writer import SceneFormat, write_scene
 from gcd_train.look.clip import SKY_M, UNSEEN, Footage
 from gcd_train.look.open_scene import ShowOptions, open_scene
+from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.pair_world import DEPTH_UNIT_M, World
 
 FRAMES = 4
@@ -190,3 +194,14 @@ def test_a_scene_of_ours_is_wholly_seen_from_where_its_source_stands(compact: bo
     footage = opened(tmp_path / "scn00000")
     assert footage.target_is.startswith("rendered")
     assert footage.seen_shares[0] > 0.9
+    points = opened(tmp_path / "scn00000", exact=False)
+    assert points.target_depth is None
+    assert np.abs(points.target[0].astype(int) - footage.target[0]).mean() < 8
+
+
+def test_geometry_of_too_few_frames_is_named(tmp_path: Path) -> None:
+    scene = write_kubric(tmp_path, 7, views=5, frames=FRAMES)
+    with (scene / GEOMETRY).open("wb") as file:
+        freeze(box_scene(0, 1)).save(file)
+    with pytest.raises(FileFault, match=GEOMETRY):
+        opened(scene)

@@ -186,8 +186,8 @@ def _target(
     folder = data.folder(scene)
     if exact and (folder / GEOMETRY).exists():
         try:
-            cameras = {"target": geometry_poses(folder, numbers) @ poses}
             still = frames_of(folder, list(numbers), lens)
+            cameras = {"target": geometry_poses(folder, numbers) @ poses}
             with renderer_kind()(lens.width, lens.height, oversample=1) as renderer:
                 views = [view for _, _, view in renderer.views(still, cameras)]
             colour, depth = np.stack([view.rgb for view in views]), np.stack([view.depth for view in views])

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gcd_train.errors import RenderError
 from gcd_train.scenes.description import Colour, Part, Point, rotations
 from gcd_train.scenes.tabletop.furniture import FLOOR_M
-from gcd_train.scenes.tabletop.things import CLASS_NAMES, Placed, Setting, TabletopClass, Thing
+from gcd_train.scenes.tabletop.things import Placed, Setting, TabletopClass, Thing
 
 BASE = (-0.36, 0.0, 0.0)
 """Where the arm is bolted to the table, metres from the middle of its surface."""
@@ -199,8 +199,8 @@ def arm_links(model: Model) -> list[tuple[Thing, int, TabletopClass]]:
         parts = _parts_of_body(model, body, label)
         middle, size = _bounding_box(parts)
         mass_kg = float(model.model.body_mass[body])
-        asset = f"{CLASS_NAMES[label].replace(' ', '_')}/{name}"
-        link = Thing(name=asset, parts=parts, size=size, middle=middle, mass_kg=mass_kg, friction=0.8)
+        name = f"{label.name.lower()}/{name}"
+        link = Thing(name=name, parts=parts, size=size, middle=middle, mass_kg=mass_kg, friction=0.8)
         found.append((link, body, label))
     return found
 

@@ -29,10 +29,6 @@ class TabletopClass(IntEnum):
     CLUTTER = 7
 
 
-CLASS_NAMES = ("sky", "floor", "wall", "table", "robot arm", "gripper", "object", "clutter")
-"""By id, as metadata and ontologies write them."""
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Thing:
     """Something made of parts, in its own frame.
