@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_train.evaluation.galleries import HOLD_S, write_mp4
-from gcd_train.evaluation.plots import DPI, new_figure, save, to_pixels
+from gcd_train.evaluation.galleries import HOLD_S, Strip, beside, write_mp4
+from gcd_train.evaluation.plots import new_figure, save
 from gcd_train.look.clip import SKY_M, UNSEEN, Bytes, Footage
 
 if TYPE_CHECKING:
@@ -298,60 +298,19 @@ def _swatch(side: "SubFigure", top: float, colour: tuple[int, int, int], name: s
     side.text(0.93, top, value, fontsize=7.5, color=_INK, va="top", ha="right")
 
 
-_PANELS = 3
-_GAP, _NAME, _TOP, _BAR = 10, 26, 44, 44  # pixels
-_PLAYS = 2
-
-
 def write_video(footage: Footage, out: Path) -> None:
-    """The clip at its own speed, twice over, as MP4 (MPEG-4 part 2).
-
-    Raises: RenderError without matplotlib, RunError if the file cannot be written.
-    """
-    rows = rows_of(footage)
-    height, width = footage.source.shape[1:3]
-    places = [_place(number, width, height) for number in range(len(rows))]
-    page = _page(footage, rows, places)
-    moments = [*range(footage.frames), *[footage.frames - 1] * round(HOLD_S * footage.fps)] * _PLAYS
-    write_mp4((_video_frame(footage, rows, places, page, moment) for moment in moments), footage.fps, out)
+    """The clip at its own speed, twice over, as MP4 (MPEG-4 part 2). Raises RunError if it cannot be written."""
+    strips = [Strip.of(row.name, row.pictures) for row in rows_of(footage)]
+    moments = [*range(footage.frames), *[footage.frames - 1] * round(HOLD_S * footage.fps)] * 2
+    write_mp4((_video_frame(footage, strips, moment) for moment in moments), footage.fps, out)
 
 
-def _place(number: int, width: int, height: int) -> tuple[int, int]:
-    """Left upper corner of a panel, pixels."""
-    row, column = divmod(number, _PANELS)
-    return _GAP + column * (width + _GAP), _TOP + _NAME + row * (height + _NAME + _GAP)
-
-
-def _page(footage: Footage, rows: Sequence[Row], places: Sequence[tuple[int, int]]) -> Bytes:
-    """Everything that does not move, drawn once: u8 [H, W, 3], even sizes as codecs want them."""
-    height, width = footage.source.shape[1:3]
-    across = _PANELS * (width + _GAP) + _GAP + _BAR
-    down = max(top for _, top in places) + height + _GAP
-    across, down = across + across % 2, down + down % 2
-    figure = new_figure(across / DPI, down / DPI)
-    figure.text(_GAP / across, 1 - 13 / down, footage.title, fontsize=12, fontweight="bold", color=_INK, va="top")
-    for row, (left, top) in zip(rows, places, strict=True):
-        at = (left / across, 1 - (top - 7) / down)
-        figure.text(*at, row.name, fontsize=9.5, fontweight="bold", color=_INK)
-        told = row.told.replace("\n", " ")
-        figure.text((left + 92) / across, at[1], told, fontsize=7.5, color=_FAINT)
-    left, top = places[-1]
-    _depth_bar(
-        figure.add_axes(((left + width + 8) / across, 1 - (top + height) / down, 10 / across, (height - 14) / down)),
-        footage,
-    )
-    return to_pixels(figure)
-
-
-def _video_frame(
-    footage: Footage, rows: Sequence[Row], places: Sequence[tuple[int, int]], page: Bytes, moment: int
-) -> Bytes:
-    picture = page.copy()
-    height, width = footage.source.shape[1:3]
-    for row, (left, top) in zip(rows, places, strict=True):
-        picture[top : top + height, left : left + width] = row.pictures[moment]
-    seen = f"{100 * footage.seen_shares[moment]:.0f} % seen"
-    told = f"t = {footage.seconds[moment]:.2f} s   frame {footage.frame_numbers[moment]:3d}   {seen}"
-    at = (_GAP + _PANELS * (width + _GAP) - 340, 28)
-    cv2.putText(picture, told, at, cv2.FONT_HERSHEY_SIMPLEX, 0.52, (60, 70, 82), 1, cv2.LINE_AA)
-    return picture
+def _video_frame(footage: Footage, strips: Sequence[Strip], moment: int) -> Bytes:
+    """Two lines of pictures with their names; below them the time, and how much the input camera saw."""
+    upper, lower = beside(strips[:3], moment), beside(strips[3:], moment)
+    missing = upper.shape[1] - lower.shape[1]
+    page = np.concatenate([upper, np.pad(lower, ((0, 24), (0, missing), (0, 0)), constant_values=255)])
+    seen, at = f"{100 * footage.seen_shares[moment]:.0f} % seen", (2, len(page) - 8)
+    words = f"t = {footage.seconds[moment]:.2f} s, frame {footage.frame_numbers[moment]}, {seen}"
+    cv2.putText(page, words, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (40, 40, 40), 1, cv2.LINE_AA)
+    return page
