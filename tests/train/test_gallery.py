@@ -179,14 +179,19 @@ def a_window() -> Windowed:
     )
 
 
-def test_each_angle_is_a_row_below_the_input() -> None:
+def test_each_angle_is_a_row_below_the_input_and_samples_come_with_their_uncertainty() -> None:
     model = Mirror(traits())
     angles = (SphericalDelta(azimuth_deg=40.0), SphericalDelta(elevation_deg=20.0, radius_m=1.0))
-    viewed = view_window(model, a_window(), ViewRecipe(angles=angles))
-    assert [strip.name for strip in viewed.strips] == ["input", "az +40 el +0 r +0", "az +0 el +20 r +1"]
+    viewed = view_window(model, a_window(), ViewRecipe(angles=angles, samples=2))
     assert [path.goal_delta for path in model.paths] == list(angles)
     assert all(len(strip.frames) == T for strip in viewed.strips)
     assert np.array_equal(viewed.strips[1].frames[0], viewed.strips[0].frames[0])
+    names = [strip.name for strip in viewed.strips]
+    assert names[:3] == ["input", "az +40 el +0 r +0", "az +40 el +0 r +0 sample 2"]
+    assert names[4:6] == ["az +0 el +20 r +1", "az +0 el +20 r +1 sample 2"]
+    shown = re.fullmatch(r"uncertainty, white (\S+)", names[3])
+    assert shown is not None
+    assert float(shown[1]) == pytest.approx(2.0 * 0.05 * 100 / 255, abs=1e-3)  # scale x half the difference
 
 
 def test_goals_are_counted_from_where_the_source_camera_stands() -> None:
@@ -198,15 +203,6 @@ def test_goals_are_counted_from_where_the_source_camera_stands() -> None:
     assert not torch.allclose(usual.source_from_target[-1], told.source_from_target[-1], atol=0.5)
     with pytest.raises(OptionError):
         paths(traits("driving"), replace(high, angles=()))
-
-
-def test_samples_come_with_their_uncertainty() -> None:
-    viewed = view_window(Mirror(traits()), a_window(), ViewRecipe(angles=(SphericalDelta(azimuth_deg=9.0),), samples=2))
-    names = [strip.name for strip in viewed.strips]
-    assert names[1:3] == ["az +9 el +0 r +0", "az +9 el +0 r +0 sample 2"]
-    shown = re.fullmatch(r"uncertainty, white (\S+)", names[3])
-    assert shown is not None
-    assert float(shown[1]) == pytest.approx(2.0 * 0.05 * 100 / 255, abs=1e-3)  # scale x half the difference
 
 
 def test_the_live_models_view_knows_how_the_camera_is_mounted() -> None:

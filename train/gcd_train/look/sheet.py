@@ -130,7 +130,7 @@ _TURBO = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Row:
+class _Row:
     """One kind of picture. name, told: what it is. pictures: u8 [T, H, W, 3]."""
 
     name: str
@@ -138,23 +138,19 @@ class Row:
     pictures: Bytes
 
 
-def rows_of(footage: Footage) -> list[Row]:
+def _rows(footage: Footage) -> list[_Row]:
     """Everything there is to see of a clip, in the order of the sheet."""
-    near, far = footage.depth_range_m
+    depth = _depth_colours(footage.depth, *footage.depth_range_m)
     rows = [
-        Row(name="input", told=f"{footage.source_camera}, colour", pictures=footage.source),
-        Row(name="target", told=footage.target_is, pictures=footage.target),
-        Row(name="splat", told="the input's points from\nthe target; black: none", pictures=footage.splat),
-        Row(name="visibility", told="orange: surfaces\nthe input never saw", pictures=footage.seen()),
-        Row(
-            name="depth",
-            told="of the input, along\nthe optical axis",
-            pictures=_depth_colours(footage.depth, near, far),
-        ),
+        _Row(name="input", told=f"{footage.source_camera}, colour", pictures=footage.source),
+        _Row(name="target", told=footage.target_is, pictures=footage.target),
+        _Row(name="splat", told="the input's points from\nthe target; black: none", pictures=footage.splat),
+        _Row(name="visibility", told="orange: surfaces\nthe input never saw", pictures=footage.seen()),
+        _Row(name="depth", told="of the input, along\nthe optical axis", pictures=depth),
     ]
     painted = footage.painted()
     if painted is not None:
-        rows.insert(4, Row(name=footage.kind_plural, told="of the input", pictures=painted))
+        rows.insert(4, _Row(name=footage.kind_plural, told="of the input", pictures=painted))
     return rows
 
 
@@ -169,7 +165,7 @@ def _depth_colours(depth: NDArray[np.float32], near_m: float, far_m: float) -> B
 
 def write_sheet(footage: Footage, out: Path) -> None:
     """One page as PNG. Raises: RenderError without matplotlib, RunError where it cannot be written."""
-    rows = rows_of(footage)
+    rows = _rows(footage)
     height, width = footage.source.shape[1:3]
     tall = 1.84 * height / width
     figure = new_figure(15.2, 0.78 + len(rows) * (tall + 0.045))
@@ -192,7 +188,7 @@ def write_trajectory(footage: Footage, out: Path) -> None:
     save(figure, out)
 
 
-def _draw_rows(grid: "SubFigure", footage: Footage, rows: Sequence[Row]) -> None:
+def _draw_rows(grid: "SubFigure", footage: Footage, rows: Sequence[_Row]) -> None:
     """All pictures in one piece (thirty axes would take longer than all else), names and times around them.
 
     Always as wide as five moments, so that a shorter clip leaves white and no picture is stretched.
@@ -300,7 +296,7 @@ def _swatch(side: "SubFigure", top: float, colour: tuple[int, int, int], name: s
 
 def write_video(footage: Footage, out: Path) -> None:
     """The clip at its own speed, twice over, as MP4 (MPEG-4 part 2). Raises RunError if it cannot be written."""
-    strips = [Strip.of(row.name, row.pictures) for row in rows_of(footage)]
+    strips = [Strip.of(row.name, row.pictures) for row in _rows(footage)]
     moments = [*range(footage.frames), *[footage.frames - 1] * round(HOLD_S * footage.fps)] * 2
     write_mp4((_video_frame(footage, strips, moment) for moment in moments), footage.fps, out)
 

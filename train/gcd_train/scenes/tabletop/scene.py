@@ -66,8 +66,7 @@ def tabletop_episode(seed: int, *, frames: int = 60, skipped_s: float | None = N
     motion = Simulation(model, setting.things, random, speed).run(frames, drawn_s if skipped_s is None else skipped_s)
     world_from_table = _table_pose(float(random.uniform(-math.pi, math.pi)))
     walls, sheets = room(random)
-    task = _in_words(motion, setting)
-    counted = _counted(model, setting)
+    task, counted = _in_words(motion, setting), _counted(model, setting)
     scene = Scene(
         parts=(*walls, *_parts(setting, counted)),
         sheets=sheets,
@@ -84,7 +83,7 @@ def tabletop_episode(seed: int, *, frames: int = 60, skipped_s: float | None = N
         scene=scene,
         motion=motion,
         wrist=_in_units(world_from_table @ motion.tool @ _hand_from_camera()),
-        world_from_base=_in_units(world_from_table @ _table_from_base()),
+        world_from_base=_world_from_base(world_from_table),
         task=task,
     )
 
@@ -191,15 +190,16 @@ def _table_pose(yaw: float) -> Floats:
     return turn
 
 
-def _table_from_base() -> Floats:
-    base = np.eye(4)
-    base[:3, 3] = BASE
-    return base
+def _world_from_base(world_from_table: Floats) -> Floats:
+    """[4, 4], decimetres."""
+    table_from_base = np.eye(4)
+    table_from_base[:3, 3] = BASE
+    return _in_units(world_from_table @ table_from_base)
 
 
 def upright_base() -> Floats:
     """world_from_base [4, 4] of an arm whose table is not turned, decimetres."""
-    return _in_units(_table_pose(0.0) @ _table_from_base())
+    return _world_from_base(_table_pose(0.0))
 
 
 def _hand_from_camera() -> Floats:
