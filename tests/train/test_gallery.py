@@ -32,6 +32,7 @@ from gcd_model import (
 )
 from gcd_model.config import SMALL
 from gcd_model.errors import OptionError
+from gcd_model.geometry import Intrinsics
 from gcd_train.cli.gallery import gallery_command
 from gcd_train.errors import DataError
 from gcd_train.look.gallery import ViewRecipe, mounted, paths, view_window
@@ -151,10 +152,12 @@ class Mirror:
 
     traits: Traits
     paths: list[Trajectory] = field(default_factory=list)
+    clips: list[Clip] = field(default_factory=list)
 
     def encode(
         self, clip: Clip, augmentation: Augmentation | None = None, extra: torch.Tensor | None = None
     ) -> SourceFeatures:
+        self.clips.append(clip)
         return SourceFeatures(tokens=None, latents=clip.video, extra=None, fps=clip.fps, augmentation=0.0)
 
     def render(
@@ -210,6 +213,13 @@ def test_the_live_models_view_knows_how_the_camera_is_mounted() -> None:
     assert mounted(live, ViewRecipe(), None) is None
     assert mounted(live, ViewRecipe(tilt_deg=4.0), 60.0) == CameraMount(tilt_deg=4.0, hfov_deg=60.0)
     assert mounted(traits(), ViewRecipe(height_m=2.0), None) is None
+
+
+def test_the_live_model_knows_the_lens_without_a_mount() -> None:
+    model = Mirror(load_synthesizer("random:live", device="cpu").traits)
+    view_window(model, replace(a_window(), hfov_deg=60.0), ViewRecipe())
+    view_window(model, a_window(), ViewRecipe())
+    assert [clip.lens for clip in model.clips] == [Intrinsics.from_hfov(60.0, W, H), None]
 
 
 # --- the command ------------------------------------------------------------------------------------------------------

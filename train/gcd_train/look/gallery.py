@@ -21,6 +21,7 @@ from gcd_model import (
     ViewSynthesizer,
 )
 from gcd_model.errors import OptionError
+from gcd_model.geometry import Intrinsics
 from gcd_train.data.sample import to_network
 from gcd_train.evaluation.galleries import Strip, painted, to_bytes, write_sheet, write_video
 from gcd_train.files import write_whole
@@ -94,7 +95,10 @@ def view_window(synthesizer: ViewSynthesizer, window: Windowed, recipe: ViewReci
     """Encode a window once and render every goal. Raises: ModelError and its kind."""
     traits = synthesizer.traits
     mount = mounted(traits, recipe, window.hfov_deg)
-    features = synthesizer.encode(Clip(video=to_network(window.pictures), fps=window.fps, mount=mount))
+    lens, (high, wide) = None, window.pictures.shape[1:3]
+    if traits.live and window.hfov_deg is not None:
+        lens = Intrinsics.from_hfov(window.hfov_deg, wide, high)
+    features = synthesizer.encode(Clip(video=to_network(window.pictures), fps=window.fps, mount=mount, lens=lens))
     options = RenderOptions(samples=recipe.samples, steps=recipe.steps, seed=recipe.seed)
     strips = [Strip.of("input", window.pictures)]
     for name, path in paths(traits, recipe, window.hfov_deg):
@@ -104,7 +108,7 @@ def view_window(synthesizer: ViewSynthesizer, window: Windowed, recipe: ViewReci
     rate = "" if window.trained_rate else f", a rate {traits.name} was not trained with"
     notes = (
         f"from {window.start_s:.1f} s, {len(window.pictures)} frames at {window.fps:g} a second{rate}",
-        f"cut from {width} x {height} to {window.pictures.shape[2]} x {window.pictures.shape[1]}",
+        f"cut from {width} x {height} to {wide} x {high}",
     )
     return Viewed(window=window, strips=tuple(strips), notes=notes)
 
