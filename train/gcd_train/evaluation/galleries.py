@@ -218,7 +218,7 @@ def write_video(rows: Sequence[Strip], fps: float, out: Path) -> bool:
     moments = sorted(set.intersection(*(set(row.frames) for row in rows))) if rows else []
     if len(moments) < 2:
         return False
-    frames = [_beside(rows, moment) for moment in moments]
+    frames = [beside(rows, moment) for moment in moments]
     write_mp4([*frames, *frames[-1:] * round(HOLD_S * fps)], max(fps, 1.0), out)
     return True
 
@@ -258,7 +258,7 @@ def _row(label: str, strip: Strip) -> Pictures:
     return np.concatenate([margin, *(each.astype(np.uint8) for each in framed)], axis=1)
 
 
-def _beside(rows: Sequence[Strip], moment: int) -> Pictures:
+def beside(rows: Sequence[Strip], moment: int) -> Pictures:
     """All rows' pictures of one moment with their names above, of even size as codecs want it."""
     pictures = [row.frames[moment] for row in rows]
     captions = [caption(row.name, each.shape[1]) for row, each in zip(rows, pictures, strict=True)]

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gcd_train.errors import RenderError
 from gcd_train.evaluation.runs import Method
@@ -44,13 +43,6 @@ def new_figure(width_in: float, height_in: float) -> "Figure":
     figure = Figure(figsize=(width_in, height_in), dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
     return figure
-
-
-def to_pixels(figure: "Figure") -> NDArray[np.uint8]:
-    """A drawn figure as u8 [H, W, 3]."""
-    canvas = figure.canvas
-    canvas.draw()
-    return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3])  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def save(figure: "Figure", out: Path) -> None:
