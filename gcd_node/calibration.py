@@ -1,7 +1,7 @@
 """What is known of a lens, and where it comes from: ROS camera_info files, CameraInfo messages, a camera's memory."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from gcd_model import FileError, read_json, read_small
+from gcd_model import FileError, read_small
 from gcd_node.errors import ConfigError
 
 Distortion: TypeAlias = Literal["none", "plumb_bob", "rational_polynomial", "equidistant"]
@@ -36,8 +36,6 @@ _NAMES: dict[str, Distortion] = {
 _SHAPE_TOLERANCE = 0.01
 _LARGEST_FILE = 16384
 _DEPTHAI_MODELS = {"Perspective": "rational_polynomial", "Fisheye": "equidistant"}
-_CAMERA_TYPES = {0: "Perspective", 1: "Fisheye"}
-_ROTATION_TOLERANCE = 1e-3
 HALF_PIXEL = 0.5
 """OpenCV and ROS count pixels from the centre of the first, this project from its corner."""
 
@@ -221,73 +219,3 @@ def depthai_lens(
     kind, d = _distortion(_DEPTHAI_MODELS[model], (*coefficients, *[0.0] * count)[:count])
     (fx, _, cx), (_, fy, cy), _ = matrix
     return LensModel(width=size[0], height=size[1], fx=fx, fy=fy, cx=cx, cy=cy, distortion=kind, coefficients=d)
-
-
-class _Extrinsics(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
-    """From this camera's axes to those of another on the board, centimetres; -1 is no other."""
-
-    rotation_matrix: tuple[tuple[float, float, float], ...]
-    translation: dict[str, float]
-    to_camera_socket: int
-
-    @property
-    def transform(self) -> NDArray[np.float64] | None:
-        """[4, 4], metres; None if the rotation is none: DepthAI fills what was never calibrated with zeros."""
-        rotation, transform = np.array(self.rotation_matrix), np.eye(4)
-        if rotation.shape != (3, 3) or np.linalg.det(rotation) < 0:
-            return None
-        transform[:3, :3] = rotation
-        transform[:3, 3] = [self.translation.get(axis, math.nan) / 100 for axis in "xyz"]
-        return transform if np.abs(rotation @ rotation.T - np.eye(3)).max() < _ROTATION_TOLERANCE else None
-
-
-class _Camera(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
-    camera_type: int = 0  # 0 perspective, 1 fish-eye
-    width: int
-    height: int
-    intrinsic_matrix: tuple[tuple[float, float, float], ...]
-    distortion_coeff: tuple[float, ...]
-    extrinsics: _Extrinsics
-
-
-class _Board(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
-    camera_data: tuple[tuple[int, _Camera], ...]
-
-
-def load_stereo(path: Path, left: int, right: int) -> tuple[LensModel, LensModel, NDArray[np.float64]]:
-    """The lenses of two sockets, and right_from_left, [4, 4], metres, out of what DepthAI's `eepromToJsonFile` wrote:
-    the memory of an OAK.
-
-    Raises:
-        ConfigError: missing, or not such a file; no such camera, or the pair was never calibrated.
-    """
-    try:
-        cameras = dict(read_json(path, _Board).camera_data)
-    except FileError as error:
-        raise ConfigError(f"it {error}; give the JSON file of DepthAI's eepromToJsonFile") from error
-    if not {left, right} <= cameras.keys():
-        raise ConfigError(f"there must be cameras at sockets {left} and {right}, there are at {sorted(cameras)}")
-    found = (cameras[left], cameras[right])
-    models = [_CAMERA_TYPES.get(each.camera_type, str(each.camera_type)) for each in found]
-    lenses = [
-        depthai_lens(each.intrinsic_matrix, each.distortion_coeff, model, (each.width, each.height))
-        for each, model in zip(found, models, strict=True)
-    ]
-    left_chain, right_chain = _chain(cameras, left), _chain(cameras, right)
-    common = next((socket for socket in left_chain if socket in right_chain), None)
-    if common is None:
-        raise ConfigError(f"how the cameras at sockets {left} and {right} stand to each other is not in it: calibrate")
-    return lenses[0], lenses[1], np.linalg.inv(right_chain[common]) @ left_chain[common]
-
-
-def _chain(cameras: Mapping[int, _Camera], socket: int) -> dict[int, NDArray[np.float64]]:
-    """other_from_socket, for each camera that the file leads to from this one."""
-    chain, here = {socket: np.eye(4)}, socket
-    while here in cameras:
-        extrinsics = cameras[here].extrinsics
-        onward, step = extrinsics.to_camera_socket, extrinsics.transform
-        if onward < 0 or onward in chain or step is None:
-            break
-        chain[onward] = step @ chain[here]
-        here = onward
-    return chain

@@ -1,6 +1,6 @@
 """One clip, one view, offline: what `gcd-node synthesize` reads, plans, renders and writes.
 
-A video, folder, still, array or stereo pair becomes one clip of T frames. Its depth, where there is any, goes the way
+A video, folder, still or array becomes one clip of T frames. Its depth, where there is any, goes the way
 of its pictures: the same frames, crop and size.
 """
 
@@ -35,7 +35,7 @@ from gcd_node.image_io import (
 )
 from gcd_node.preprocess import Fit, assumed_hfov_deg, stated_mount, stated_sphere, to_clip_tensor
 from gcd_node.sources import SourcePose
-from gcd_node.sources.depth import DepthPicture, OnnxDepth, StereoDepth, clean_depth
+from gcd_node.sources.depth import DepthPicture, OnnxDepth, clean_depth
 from gcd_node.sources.files import PICTURES, ImageFolder, VideoFile, list_pictures, read_depth, read_picture
 
 _LOG = logging.getLogger(__name__)
@@ -53,10 +53,9 @@ class ClipRequest:
 
     start, stride: in frames of the input. fps: what the network is told; else worked out.
     height, width: else the trained size. An array keeps its own size.
-    hfov_deg: horizontal field of view of the input's pictures, if known; of a stereo pair, of the rectified ones.
+    hfov_deg: horizontal field of view of the input's pictures, if known.
     depth: of the input's frames: a folder of 16-bit pictures in millimetres, one such picture of a still, .npy of
-        [T, H, W] metres, a network as .onnx, or with a calibration the right video of a stereo pair.
-    calibration: of the pair, as DepthAI writes it. rectified: the device has rectified both.
+        [T, H, W] metres, or a network as .onnx.
     depth_kind: what a network gives. unit_m: metres in one unit of the model's radius.
     """
 
@@ -67,8 +66,6 @@ class ClipRequest:
     width: int | None = None
     hfov_deg: float | None = None
     depth: Path | None = None
-    calibration: Path | None = None
-    rectified: bool = False
     depth_kind: Literal["metric", "inverse"] = "metric"
     unit_m: float = 1.0
 
@@ -79,16 +76,12 @@ class ClipRequest:
             raise UsageError("--height and --width go together; give both or none")
         if not 0 < self.unit_m < math.inf:
             raise UsageError(f"--unit-m must be a positive number of metres, got {self.unit_m:g}")
-        if self.calibration is not None and self.depth is None:
-            raise UsageError("--calibration is of a stereo pair; give its right video as --depth, or leave it out")
-        if self.rectified and self.calibration is None:
-            raise UsageError("--rectified is about a stereo pair; give --depth and --calibration, or leave it out")
 
     @property
     def network(self) -> Path | None:
         """The depth network, if that is where depth comes from."""
         depth = self.depth
-        return depth if depth is not None and depth.suffix == ".onnx" and self.calibration is None else None
+        return depth if depth is not None and depth.suffix == ".onnx" else None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -109,12 +102,10 @@ def read_clip(path: Path, request: ClipRequest, traits: Traits, pose: SourcePose
     Raises:
         SourceError: missing, empty, damaged, undecodable. TooShortError: fewer frames than a clip needs.
         OptionError: a size the network cannot take. UsageError: what the model or an array has no use for.
-        DepthError: the depth does not belong to the pictures, or there is none. ConfigError: a calibration of no pair.
+        DepthError: the depth does not belong to the pictures, or there is none.
     """
     request = _with_lens(request, traits, pose)
-    if request.calibration is not None:
-        source = _from_pair(path, request, traits)
-    elif path.suffix.lower() == ".npy" and not path.is_dir():
+    if path.suffix.lower() == ".npy" and not path.is_dir():
         source = _from_array(path, request, traits)
     else:
         source = _from_pictures(path, request, traits)
@@ -137,7 +128,7 @@ def _with_lens(request: ClipRequest, traits: Traits, pose: SourcePose | None) ->
     needed = measured or traits.live
     if request.hfov_deg is not None and not needed:
         raise UsageError(f"{traits.name} has no use for --hfov-deg; leave it out")
-    if not needed or request.calibration is not None or request.hfov_deg is not None:
+    if not needed or request.hfov_deg is not None:
         return request
     trained = None if traits.family is None else traits.family.hfov_deg
     hfov_deg = assumed_hfov_deg(pose) if traits.live else trained
@@ -163,33 +154,6 @@ def _from_pictures(path: Path, request: ClipRequest, traits: Traits) -> OfflineC
         depth=_stacked(depth) if depth else None,
     )
     return OfflineClip(clip=clip, pictures=fitted, hfov_deg=None if lens is None else lens.hfov_deg)
-
-
-def _from_pair(path: Path, request: ClipRequest, traits: Traits) -> OfflineClip:
-    """Pictures are the left camera's, rectified."""
-    right, calibration = request.depth, request.calibration
-    assert right is not None, "a calibration comes with the right video"
-    assert calibration is not None, "it is a pair"
-    size, frames = _size(request, traits), traits.config.frames
-    (left, fps), (other, other_fps) = (_pictures(each, request, frames) for each in (path, right))
-    if fps != other_fps:
-        raise SourceError(f"{path} runs at {fps}, {right} at {other_fps} frames per second; give one recording's two")
-    stereo = StereoDepth.from_depthai(
-        calibration,
-        size=size,
-        rectified=request.rectified,
-        hfov_deg=request.hfov_deg,
-        match_scale=2 if left[0].shape[1] >= 2 * size[0] else 1,
-    )
-    pairs = [stereo(*pair) for pair in zip(left, other, strict=True)]
-    pictures = np.stack([picture for picture, _ in pairs])
-    clip = Clip(
-        video=torch.from_numpy(to_clip_tensor(pictures)),
-        fps=_label(request, fps, traits),
-        lens=stereo.lens,
-        depth=_stacked([depth for _, depth in pairs]),
-    )
-    return OfflineClip(clip=clip, pictures=pictures, hfov_deg=stereo.lens.hfov_deg)
 
 
 def _from_array(path: Path, request: ClipRequest, traits: Traits) -> OfflineClip:

@@ -177,11 +177,12 @@ def test_distortion_has_our_names(coefficients: list[float], model: str, wanted:
 
 
 def test_a_lens_that_makes_no_sense_is_no_lens() -> None:
-    broken = memory(coefficients=RATIONAL, model="Perspective", width=1000)
     for stored in (
         dai.CalibrationHandler(dai.EepromData()),
-        broken,
+        memory(coefficients=RATIONAL, model="Perspective", width=1000),
         memory(coefficients=RATIONAL, model="RadialDivision"),
+        memory(coefficients=[], model="Fisheye"),  # DepthAI ends the process if it is asked for them
+        memory(coefficients=[0.1, 0.0, 0.0], model="Fisheye"),
     ):
         assert lens_in_memory(stored, SOCKET, 500, 500) is None
 
