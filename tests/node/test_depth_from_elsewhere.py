@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, fake_config, live_traits, made_node, traits
+from media import noise
 from msgspec.structs import replace as struct_replace
 
 from gcd_client.protocol import to_json
@@ -84,11 +85,10 @@ def synthesize(source: Path, weights: str, out: Path, *options: object) -> int:
 
 @pytest.fixture
 def still_clip(tmp_path: Path) -> Path:
-    np.save(tmp_path / "clip.npy", np.random.default_rng(0).random((FRAMES, HEIGHT, WIDTH, 3), np.float32))
     depth = np.full((FRAMES, HEIGHT, WIDTH), 3.0, np.float32)
     depth[:, :, :20] = np.nan
     np.save(tmp_path / "depth.npy", depth)
-    return tmp_path / "clip.npy"
+    return noise(tmp_path / "clip", HEIGHT, WIDTH)
 
 
 def test_a_live_view_is_written_with_all_it_tells(still_clip: Path, tmp_path: Path) -> None:
