@@ -105,7 +105,7 @@ def test_a_live_view_is_written_with_all_it_tells(still_clip: Path, tmp_path: Pa
 def test_with_depth_a_published_model_tells_what_was_seen_in_the_units_of_its_radius(
     still_clip: Path, tmp_path: Path
 ) -> None:
-    orbit = ("--azimuth-deg", 5, "--steps", 1)
+    orbit = ("--azimuth-deg", 5, "--steps", 1, "--height", HEIGHT, "--width", WIDTH)
     np.save(tmp_path / "small.npy", np.load(tmp_path / "depth.npy") / 10)
     for name, (file, unit_m) in {"a": ("depth.npy", 1), "b": ("small.npy", 0.1), "c": ("small.npy", 1)}.items():
         options = (*orbit, "--depth", tmp_path / file, "--unit-m", unit_m)
