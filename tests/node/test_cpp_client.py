@@ -245,16 +245,6 @@ def test_jpeg_is_written_as_it_came(client: Path, sender: Sender, tmp_path: Path
     assert written == message.payload
 
 
-def test_a_class_map_is_written_as_grey(client: Path, sender: Sender, tmp_path: Path) -> None:
-    process = start(client, sender.endpoint, "--every", "--kind", "cls", "--limit", "1", "--ppm", str(tmp_path))
-    assert sender.socket.poll(1000 * PATIENCE_S)
-    assert sender.socket.recv() == b"\1" + b"view/top/cls".ljust(32, b"\0")
-    message = class_map(5)
-    sender.send(encode(message))
-    assert fields_of(lines_of(process)[0])["shape"] == "2x4x6x1"
-    assert (tmp_path / "top_cls_000005_01.pgm").read_bytes() == b"P5\n6 4\n255\n" + bytes(message.payload[24:])
-
-
 def read_map(client: Path, sender: Sender, message: ViewMessage, folder: Path) -> list[str]:
     """What the client says of one message of its kind."""
     kind = message.topic.rpartition("/")[2]
@@ -265,11 +255,12 @@ def read_map(client: Path, sender: Sender, message: ViewMessage, folder: Path) -
     return lines_of(process, 69)
 
 
-def test_visibility_is_written_as_grey(client: Path, sender: Sender, tmp_path: Path) -> None:
-    message = visibility(5)
+@pytest.mark.parametrize("message", [class_map(5), visibility(5)], ids=["cls", "vis"])
+def test_maps_are_written_as_grey(client: Path, sender: Sender, tmp_path: Path, message: ViewMessage) -> None:
     told = fields_of(read_map(client, sender, message, tmp_path)[0])
     assert (told["shape"], told["encoding"]) == ("2x4x6x1", "class8")
-    assert (tmp_path / "top_vis_000005_01.pgm").read_bytes() == b"P5\n6 4\n255\n" + bytes(message.payload[24:])
+    written = (tmp_path / f"top_{told['kind']}_000005_01.pgm").read_bytes()
+    assert written == b"P5\n6 4\n255\n" + bytes(message.payload[24:])
 
 
 def test_every_depth_is_read_as_in_python(client: Path, sender: Sender, tmp_path: Path) -> None:
@@ -288,13 +279,6 @@ def test_a_depth_that_is_none_is_dropped(client: Path, sender: Sender, tmp_path:
     message = depth(inverse=np.array([[[0.5, value]]], "<f2"))
     (line, _) = read_map(client, sender, message, tmp_path)
     assert line.endswith("rule=7: inverse depth is negative or not finite")
-
-
-def test_a_picture_that_cannot_be_written_ends_it(client: Path, sender: Sender, tmp_path: Path) -> None:
-    process = start(client, sender.endpoint, "--every", "--ppm", str(tmp_path / "missing"))
-    sender.wait_for_readers()
-    sender.send(sent(window(), 0))
-    assert "does the folder exist" in lines_of(process, 73)[-1]
 
 
 def jpeg_window() -> ViewMessage:
