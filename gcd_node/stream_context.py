@@ -25,10 +25,9 @@ from gcd_model import (
     Traits,
     sampler_of,
 )
-from gcd_node.calibration import LensModel, load_lens
 from gcd_node.config import ModelSection, NodeConfig
 from gcd_node.errors import ConfigError
-from gcd_node.frame import SourceInfo
+from gcd_node.frame import LensModel, SourceInfo, load_lens
 from gcd_node.preprocess import (
     Fit,
     Rectifier,

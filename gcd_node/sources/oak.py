@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, TypeAlias
 import cv2
 import numpy as np
 
-from gcd_node.calibration import LensModel, depthai_lens
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError, SourceLostError
-from gcd_node.frame import Frame, Image, SourceInfo
+from gcd_node.frame import Frame, Image, LensModel, SourceInfo, depthai_lens
 from gcd_node.sources import OakSource
 from gcd_node.sources.live import LiveCamera
 

@@ -10,9 +10,9 @@ from unittest.mock import create_autospec
 import pytest
 from media import HEIGHT, WIDTH, environment
 
-from gcd_node.calibration import LensModel
 from gcd_node.config import parse_config
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError
+from gcd_node.frame import LensModel
 from gcd_node.sources import OakSource
 from gcd_node.sources.oak import camera_pipeline, lens_in_memory, open_oak, open_pipeline
 

@@ -13,10 +13,9 @@ from fakes import HEIGHT, WIDTH, traits
 from numpy.typing import NDArray
 
 from gcd_model import Intrinsics, center_crop_box
-from gcd_node.calibration import LensModel
 from gcd_node.config import NodeConfig, parse_config
 from gcd_node.errors import ConfigError
-from gcd_node.frame import Image, SourceInfo
+from gcd_node.frame import Image, LensModel, SourceInfo
 from gcd_node.preprocess import Fit, Rectifier, project, to_clip_tensor, widest_camera
 from gcd_node.stream_context import prepare_stream
 
