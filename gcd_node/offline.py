@@ -1,6 +1,6 @@
 """One clip, one view, offline: what `gcd-node synthesize` reads, plans, renders and writes.
 
-A video, folder or still becomes one clip of T frames. Its depth, where there is any, goes the way
+A video, folder, still or stereo pair becomes one clip of T frames. Its depth, where there is any, goes the way
 of its pictures: the same frames, crop and size.
 """
 
@@ -37,6 +37,7 @@ from gcd_node.preprocess import Fit, assumed_hfov_deg, stated_mount, stated_sphe
 from gcd_node.sources import SourcePose
 from gcd_node.sources.depth import DepthPicture, OnnxDepth, clean_depth
 from gcd_node.sources.files import PICTURES, ImageFolder, VideoFile, list_pictures, read_depth, read_picture
+from gcd_node.sources.stereo import StereoDepth
 
 _LOG = logging.getLogger(__name__)
 _RATE_TOLERANCE = 0.05
@@ -53,9 +54,10 @@ class ClipRequest:
 
     start, stride: in frames of the input. fps: what the network is told; else worked out.
     height, width: else the trained size.
-    hfov_deg: horizontal field of view of the input's pictures, if known.
+    hfov_deg: horizontal field of view of the input's pictures, if known; of a stereo pair, of the rectified ones.
     depth: of the input's frames: a folder of 16-bit pictures in millimetres, one such picture of a still, .npy of
-        [T, H, W] metres, or a network as .onnx.
+        [T, H, W] metres, a network as .onnx, or with a calibration the right video of a stereo pair.
+    calibration: of the pair, as DepthAI writes it. rectified: the device has rectified both.
     depth_kind: what a network gives. unit_m: metres in one unit of the model's radius.
     """
 
@@ -66,6 +68,8 @@ class ClipRequest:
     width: int | None = None
     hfov_deg: float | None = None
     depth: Path | None = None
+    calibration: Path | None = None
+    rectified: bool = False
     depth_kind: Literal["metric", "inverse"] = "metric"
     unit_m: float = 1.0
 
@@ -76,12 +80,16 @@ class ClipRequest:
             raise UsageError("--height and --width go together; give both or none")
         if not 0 < self.unit_m < math.inf:
             raise UsageError(f"--unit-m must be a positive number of metres, got {self.unit_m:g}")
+        if self.calibration is not None and self.depth is None:
+            raise UsageError("--calibration is of a stereo pair; give its right video as --depth, or leave it out")
+        if self.rectified and self.calibration is None:
+            raise UsageError("--rectified is about a stereo pair; give --depth and --calibration, or leave it out")
 
     @property
     def network(self) -> Path | None:
         """The depth network, if that is where depth comes from."""
         depth = self.depth
-        return depth if depth is not None and depth.suffix == ".onnx" else None
+        return depth if depth is not None and depth.suffix == ".onnx" and self.calibration is None else None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -102,10 +110,13 @@ def read_clip(path: Path, request: ClipRequest, traits: Traits, pose: SourcePose
     Raises:
         SourceError: missing, empty, damaged, undecodable. TooShortError: fewer frames than a clip needs.
         OptionError: a size the network cannot take. UsageError: what the model has no use for.
-        DepthError: the depth does not belong to the pictures, or there is none.
+        DepthError: the depth does not belong to the pictures, or there is none. ConfigError: a calibration of no pair.
     """
     request = _with_lens(request, traits, pose)
-    source = _from_pictures(path, request, traits)
+    if request.calibration is not None:
+        source = _from_pair(path, request, traits)
+    else:
+        source = _from_pictures(path, request, traits)
     mount, depth = stated_mount(pose, source.hfov_deg, traits), source.clip.depth
     if request.network is not None:
         scale = mount if request.depth_kind == "inverse" else None
@@ -125,7 +136,7 @@ def _with_lens(request: ClipRequest, traits: Traits, pose: SourcePose | None) ->
     needed = measured or traits.live
     if request.hfov_deg is not None and not needed:
         raise UsageError(f"{traits.name} has no use for --hfov-deg; leave it out")
-    if not needed or request.hfov_deg is not None:
+    if not needed or request.calibration is not None or request.hfov_deg is not None:
         return request
     trained = None if traits.family is None else traits.family.hfov_deg
     hfov_deg = assumed_hfov_deg(pose) if traits.live else trained
@@ -151,6 +162,33 @@ def _from_pictures(path: Path, request: ClipRequest, traits: Traits) -> OfflineC
         depth=_stacked(depth) if depth else None,
     )
     return OfflineClip(clip=clip, pictures=fitted, hfov_deg=None if lens is None else lens.hfov_deg)
+
+
+def _from_pair(path: Path, request: ClipRequest, traits: Traits) -> OfflineClip:
+    """Pictures are the left camera's, rectified."""
+    right, calibration = request.depth, request.calibration
+    assert right is not None, "a calibration comes with the right video"
+    assert calibration is not None, "it is a pair"
+    size, frames = _size(request, traits), traits.config.frames
+    (left, fps), (other, other_fps) = (_pictures(each, request, frames) for each in (path, right))
+    if fps != other_fps:
+        raise SourceError(f"{path} runs at {fps}, {right} at {other_fps} frames per second; give one recording's two")
+    stereo = StereoDepth.from_depthai(
+        calibration,
+        size=size,
+        rectified=request.rectified,
+        hfov_deg=request.hfov_deg,
+        match_scale=2 if left[0].shape[1] >= 2 * size[0] else 1,
+    )
+    pairs = [stereo(*pair) for pair in zip(left, other, strict=True)]
+    pictures = np.stack([picture for picture, _ in pairs])
+    clip = Clip(
+        video=torch.from_numpy(to_clip_tensor(pictures)),
+        fps=_label(request, fps, traits),
+        lens=stereo.lens,
+        depth=_stacked([depth for _, depth in pairs]),
+    )
+    return OfflineClip(clip=clip, pictures=pictures, hfov_deg=stereo.lens.hfov_deg)
 
 
 def _size(request: ClipRequest, traits: Traits) -> tuple[int, int]:

@@ -172,6 +172,13 @@ def manifest_of_run(here: Path, plant: Plant) -> list[str]:
 
 
 @text_door("json")
+def stereo_calibration(here: Path, plant: Plant) -> list[str]:
+    film = str(Path(__file__).parents[1] / "gcd_node" / "assets" / "drive.mp4")
+    pair = ["--depth", film, "--calibration", plant("board.json")]
+    return ["gcd-node", "synthesize", film, "--weights", "random:live", "--out", "out", *pair]
+
+
+@text_door("json")
 def export_manifest(here: Path, plant: Plant) -> list[str]:
     (here / "export").mkdir()
     plant("export/manifest.json")

@@ -67,12 +67,14 @@ FieldOfView = Annotated[float | None, _mount(help="Horizontal field of view of t
 
 Depth = Annotated[
     Path | None,
-    _depth(help="A folder of 16-bit PNG in mm, .npy of [T, H, W] metres, or a network as .onnx."),
+    _depth(help="A folder of 16-bit PNG in mm, .npy of [T, H, W] metres, a network as .onnx, or a pair's right video."),
 ]
 DepthKind = Annotated[
     Literal["metric", "inverse"],
     _depth(help="What a network gives: metres, or relative inverse depth (state the mount)."),
 ]
+Calibration = Annotated[Path | None, _depth(help="Of the stereo pair: JSON as DepthAI writes it.")]
+Rectified = Annotated[bool, _depth("--rectified", help="The device has rectified the pair.")]
 UnitM = Annotated[float, _depth(help="Metres in one unit of a radius, for models whose radius is none in metres.")]
 
 Start = Annotated[int, _clip(help="First frame of the input.")]
@@ -128,6 +130,8 @@ def synthesize(
     mount_tilt: MountTilt = None,
     hfov_deg: FieldOfView = None,
     depth: Depth = None,
+    calibration: Calibration = None,
+    rectified: Rectified = False,
     depth_kind: DepthKind = "metric",
     unit_m: UnitM = 1.0,
     start: Start = 0,
@@ -156,7 +160,7 @@ def synthesize(
 ) -> None:
     """See one clip from another camera, offline: frames, video, class map, depth, and what was seen."""
     clip = ClipRequest(start=start, stride=stride, fps=fps, height=height, width=width, unit_m=unit_m, depth=depth)
-    clip = replace(clip, hfov_deg=hfov_deg, depth_kind=depth_kind)
+    clip = replace(clip, hfov_deg=hfov_deg, calibration=calibration, rectified=rectified, depth_kind=depth_kind)
     pose = _pose(source_elevation_deg, source_radius, (mount_height, mount_forward, mount_left, mount_tilt))
     path = partial(plan, poses=poses, trajectory=trajectory, move_time=move_time, source=pose)
     path = partial(path, change=(azimuth_deg, elevation_deg, radius))
@@ -238,7 +242,7 @@ def _assumed(
             f"The source camera is taken to stand at an elevation of {start.elevation_deg:g} degrees and a radius of "
             f"{start.radius_m:g}; say where with --source-elevation-deg and --source-radius."
         )
-    if traits.live and clip.hfov_deg is None and source.hfov_deg is not None:
+    if traits.live and clip.hfov_deg is None and clip.calibration is None and source.hfov_deg is not None:
         yield f"The pictures are taken to be {source.hfov_deg:.4g} degrees wide; say it with --hfov-deg."
 
 

@@ -63,6 +63,9 @@ def view(
         Option(help="Windows, frames at the goal pose, deviations, class maps, what was seen, depth, or all of these."),
     ] = "win",
     save: Annotated[Path | None, Option(help="Folder for PNG files and a lossless MKV per view.")] = None,
+    hatch: Annotated[
+        bool, Option("--hatch", help="Save windows with lines over their painted pixels; over all where nobody says.")
+    ] = False,
     limit: Annotated[int | None, Option(min=1, help="End after so many messages.")] = None,
     timeout: Annotated[
         float | None, Option(help="End when nothing came for so many seconds; 69 if nothing ever did.")
@@ -71,14 +74,16 @@ def view(
     node_key: NodeKey = None,
 ) -> None:
     """Watch the views of a node: a live table, and with --save pictures on disk."""
-    kinds = None if kind == "all" else kind
+    if hatch and kind not in ("win", "all"):
+        raise typer.BadParameter("--hatch is for windows: --kind win or all")
+    kinds = None if kind == "all" else ("win", "vis") if hatch else kind
     keys, console, table, damaged = client_keys(key_folder, node_key), Console(markup=False), ViewTable(), 0
     with ExitStack() as stack:
         saver = None
         if save is not None:
             from gcd_node.image_io import ViewSaver  # takes seconds, in which a subscriber would lose views
 
-            saver = stack.enter_context(ViewSaver(save))
+            saver = stack.enter_context(ViewSaver(save, hatch=hatch))
         views = stack.enter_context(ViewSubscriber(endpoint, name, kinds, conflate=False, keys=keys))
         live = stack.enter_context(Live(console=console, auto_refresh=False)) if console.is_terminal else None
         if live is None:  # the last picture of it, also after Ctrl-C

@@ -131,3 +131,7 @@ def test_view_saves_windows_and_class_maps_of_a_running_node(weights: Path, tmp_
     assert len(list(saved.glob("*.png"))) == len(list((saved / "cls").glob("*_*.png"))) == 28
     assert [np.load(path).shape for path in sorted((saved / "cls").glob("*.npy"))] == [(14, HEIGHT, WIDTH)] * 2
     assert (saved / "cls" / "legend.png").exists()
+
+
+def test_hatching_is_for_windows_alone() -> None:
+    assert run_app(["view", "ipc", "--kind", "cls", "--hatch"]) == 64

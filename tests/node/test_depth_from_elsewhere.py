@@ -123,6 +123,7 @@ def test_with_depth_a_published_model_tells_what_was_seen_in_the_units_of_its_ra
     ("weights", "options", "code"),
     [
         ("random:svd", ["--depth", "depth.npy"], 64),
+        ("random:live", ["--calibration", "calib.json"], 64),
         ("random:live", ["--depth", "depth.npy", "--unit-m", "0.1"], 64),
         ("random:kubric90", ["--depth", "depth.npy", "--unit-m", "0"], 64),
         ("random:live", ["--depth", "missing.onnx"], 78),

@@ -19,6 +19,7 @@ from wire_messages import BOOT, CLASSES, OTHER_BOOT, class_map, depth, end, numb
 
 from gcd_client.protocol import EndMessage, OriginHeader, StatusMessage, StatusTopic, ViewMessage
 from gcd_client.subscriber import ReceivedView
+from gcd_model import hatched
 from gcd_node.auth import Client, ServerSecurity, new_key_pair, write_key_pair
 from gcd_node.cli.main import run_app
 from gcd_node.cli.watch import StatusBoard, ViewTable
@@ -58,13 +59,13 @@ def read_video(path: Path) -> np.ndarray:
     return np.stack(frames)
 
 
-def watch(folder: Path, options: list[str], *messages: ViewMessage | EndMessage) -> int:
+def watch(folder: Path, options: list[str], *messages: ViewMessage | EndMessage, readers: int = 1) -> int:
     """The exit code of `gcd-node view` beside a publisher that sends these."""
     codes: list[int] = []
     command = ["view", f"ipc://{folder}/data", "--timeout", "20", *options]
     opened = partial(
         Publisher,
-        PublishConfig(data=command[1], status=command[1] + ".status", min_subscribers=1, end_delay_ms=0),
+        PublishConfig(data=command[1], status=command[1] + ".status", min_subscribers=readers, end_delay_ms=0),
         lockstep=True,
         drain_ms=3000,
     )
@@ -108,6 +109,14 @@ def test_saved_pictures_and_video_are_the_published_pixels(tmp_path: Path, capsy
     assert np.array_equal(picture(out / "top" / "000001_01.png"), sent[1][1])
 
 
+def test_a_watch_for_hatching_takes_windows_with_their_visibility(tmp_path: Path) -> None:
+    image = pixels(0, height=16, width=16)
+    messages = (window(0, images=image), class_map(0), visibility(0, seen=SEEN), end(), end(kind="vis"))
+    options = ["--view", "top", "--hatch", "--save", str(tmp_path / "out")]
+    assert watch(tmp_path, options, *messages, readers=2) == 0
+    assert np.array_equal(read_video(tmp_path / "out" / "top.mkv"), hatched(image, SEEN))
+
+
 def test_maps_are_saved_in_colour_and_as_numbers_apart_from_windows(tmp_path: Path) -> None:
     drawn = [numbers(i, height=16, width=16) for i in range(2)]
     with ViewSaver(tmp_path) as saver:
@@ -130,6 +139,18 @@ def test_maps_are_saved_in_colour_and_as_numbers_apart_from_windows(tmp_path: Pa
     metres = 1 / np.load(tmp_path / "top" / "depth" / "000002.npy")
     assert metres.dtype == np.float32
     assert np.allclose(metres, 10, rtol=1e-3)
+
+
+def test_saved_windows_are_hatched_where_they_are_painted_and_all_over_where_nobody_says(tmp_path: Path) -> None:
+    shown = [pixels(i, height=16, width=16) for i in range(3)]
+    with ViewSaver(tmp_path, hatch=True) as saver:
+        saver.add(received(window(0, images=shown[0])))
+        saver.add(received(visibility(0, seen=SEEN)))
+        saver.add(received(window(1, images=shown[1])))
+        saver.add(received(visibility(5, seen=SEEN)))  # of another window
+        saver.add(received(window(2, images=shown[2])))
+    expected = [hatched(image, seen) for image, seen in zip(shown, (SEEN, 0 * SEEN, 0 * SEEN), strict=True)]
+    assert np.array_equal(read_video(tmp_path / "top.mkv"), np.concatenate(expected))
 
 
 def test_a_view_that_changes_its_size_and_a_folder_that_cannot_be_written_are_errors(tmp_path: Path) -> None:

@@ -77,7 +77,7 @@ class MapOverlay {
   }
 }
 
-// What was never seen is painted: thin amber diagonals over it.
+// What was never seen is painted: thin amber diagonals over it, as `gcd-node view --hatch` draws them.
 export class VisibilityOverlay extends MapOverlay {
   constructor() {
     super("vis", element("vis-legend"));

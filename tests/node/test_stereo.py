@@ -1,0 +1,296 @@
+"""Depth of a stereo pair: against ray-cast scenes, and of a real one."""
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from fakes import HEIGHT, WIDTH, live_traits
+from numpy.typing import NDArray
+
+from gcd_model import Intrinsics
+from gcd_node.errors import ConfigError, DepthError
+from gcd_node.frame import Image, LensModel
+from gcd_node.image_io import write_video
+from gcd_node.offline import ClipRequest, read_clip
+from gcd_node.preprocess import project
+from gcd_node.sources.stereo import StereoDepth
+
+FX, BASELINE_M, DISPARITY = 300.0, 0.09, 10
+PAIR_SIZE = (384, 256)
+REAL = Path(__file__).parents[2].parent / "shared" / "real" / "oak-stereo"
+SIZE = (320, 192)
+IDEAL = LensModel(width=320, height=192, fx=260.0, fy=260.0, cx=159.5, cy=95.5)
+
+
+TEXTURE = cv2.GaussianBlur(np.random.default_rng(3).integers(0, 256, (512, 512, 3)).astype(np.float32), (0, 0), 1.2)
+TEXTURE = ((TEXTURE - TEXTURE.mean()) * 3 + 128).clip(0, 255)
+FLOOR_Y, BACK_Z, BOX = 0.7, 4.0, (-0.35, 0.35, -0.4, 0.2, 1.6)  # left, right, top, bottom, depth
+
+
+def cast(centre: NDArray[np.float64], rays: NDArray[np.float64]) -> tuple[Image, NDArray[np.float64]]:
+    """A floor, a wall behind and a box, as rays [H, W, 3] from a point see them: the picture and the points hit."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        wall, box = (BACK_Z - centre[2]) / rays[..., 2], (BOX[4] - centre[2]) / rays[..., 2]
+        floor = np.where(rays[..., 1] > 0, (FLOOR_Y - centre[1]) / rays[..., 1], np.inf)
+    at = centre + rays * box[..., None]
+    on_box = (at[..., 0] > BOX[0]) & (at[..., 0] < BOX[1]) & (at[..., 1] > BOX[2]) & (at[..., 1] < BOX[3])
+    reach = np.where(on_box, box, np.minimum(wall, floor))
+    points = centre + rays * reach[..., None]
+    on_floor = ~on_box & (floor < wall)
+    u, v = points[..., 0] * 90, np.where(on_floor, points[..., 2], points[..., 1]) * 90 + 130 * on_box
+    wrapped = [np.mod(each, 511).astype(np.float32) for each in (u, v)]
+    return cv2.remap(TEXTURE, *wrapped, cv2.INTER_LINEAR).round().astype(np.uint8), points
+
+
+def taken_by(lens: LensModel, world_from_camera: NDArray[np.float64]) -> Image:
+    """The scene as a distorting camera takes it: each pixel's ray is searched for until it projects there."""
+    pixels = np.stack(np.meshgrid(np.arange(lens.width), np.arange(lens.height)), axis=-1).astype(np.float64)
+    aim = (pixels - (lens.cx, lens.cy)) / (lens.fx, lens.fy)
+    rays = aim.copy()
+    off = np.inf
+    while off > 1e-3:
+        away = pixels - project(lens, rays.reshape(-1, 2)).reshape(rays.shape)
+        rays += away / (lens.fx, lens.fy)
+        off = np.abs(away).max()
+    ahead = np.concatenate([rays, np.ones_like(rays[..., :1])], axis=-1)
+    return cast(world_from_camera[:3, 3], ahead @ world_from_camera[:3, :3].T)[0]
+
+
+def truth(camera: Intrinsics, world_from_ideal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Depth along the ideal camera's axis."""
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
+    _, points = cast(world_from_ideal[:3, 3], rays @ world_from_ideal[:3, :3].T)
+    return (points - world_from_ideal[:3, 3]) @ world_from_ideal[:3, 2]
+
+
+def step_errors(stereo: StereoDepth, depth: NDArray[Any], exact: NDArray[Any]) -> NDArray[Any]:
+    """Of the known pixels, in pixels of disparity."""
+    known = depth > 0
+    return np.abs(1 / depth[known] - 1 / exact[known]) * stereo.lens.fx * stereo.baseline_m
+
+
+def moved(x: float = 0.0, turn: Sequence[float] = (0.0, 0.0, 0.0), y: float = 0.0, z: float = 0.0) -> NDArray[Any]:
+    """A rigid transform; turn: a rotation vector, degrees."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(np.radians(turn))[0], (x, y, z)
+    return pose
+
+
+@pytest.mark.parametrize("size", [SIZE, (160, 96)])
+def test_a_rectified_pair_gives_its_depth_back_within_a_disparity_step(size: tuple[int, int]) -> None:
+    stereo = StereoDepth((IDEAL, IDEAL), moved(-0.1), size=size)
+    left, depth = stereo(taken_by(IDEAL, np.eye(4)), taken_by(IDEAL, moved(0.1)))
+    errors = step_errors(stereo, depth, truth(stereo.lens, np.eye(4)))
+    assert left.shape == (size[1], size[0], 3)
+    assert (stereo.lens.width, stereo.lens.height) == size
+    assert stereo.lens.hfov_deg == pytest.approx(math.degrees(2 * math.atan(160 / 260)), abs=0.5)  # a pixel beyond
+    assert np.mean(depth > 0) > 0.75
+    assert np.median(errors) < 0.2
+    assert np.mean(errors < 1.0) > 0.97
+
+
+RATIONAL = (1.9, -1.1, 3e-4, -2e-4, 0.35, 2.2, -0.85, 0.2, 0.0, 0.0, 0.0, 0.0, 0.004, -0.003)
+BENT: Any = {"width": 640, "height": 400, "distortion": "rational_polynomial", "coefficients": RATIONAL}
+LEFT_LENS = LensModel(fx=405.0, fy=404.0, cx=316.0, cy=204.0, **BENT)
+RIGHT_LENS = LensModel(fx=409.0, fy=408.0, cx=327.0, cy=197.0, **BENT)
+WORLD_FROM_LEFT = moved(0.0, (2.0, -1.0, 0.5))
+WORLD_FROM_RIGHT = moved(0.09, (1.2, 1.3, -0.4), y=0.002, z=-0.001)
+
+
+def camera_data(lens: LensModel, step: NDArray[Any] | None, onward: int) -> dict[str, Any]:
+    """As DepthAI writes it; step: from this camera's axes to those of socket `onward`, metres; None is all zeros."""
+    rotation, shift = (np.zeros((3, 3)), np.zeros(3)) if step is None else (step[:3, :3], step[:3, 3] * 100)
+    return {
+        "cameraType": 0,
+        "width": lens.width,
+        "height": lens.height,
+        "intrinsicMatrix": [[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]],
+        "distortionCoeff": list(lens.coefficients),
+        "lensPosition": 0,
+        "extrinsics": {
+            "rotationMatrix": rotation.tolist(),
+            "translation": dict(zip("xyz", shift.tolist(), strict=True)),
+            "toCameraSocket": onward,
+        },
+    }
+
+
+def board() -> dict[str, Any]:
+    """A colour camera between the two, to which both lead: DepthAI chains cameras as it likes."""
+    right, colour = WORLD_FROM_RIGHT, moved(0.04)
+    return {
+        "boardName": "made up",
+        "cameraData": [
+            [0, camera_data(LEFT_LENS, None, -1)],
+            [1, camera_data(LEFT_LENS, np.linalg.inv(right) @ WORLD_FROM_LEFT, 2)],
+            [2, camera_data(RIGHT_LENS, np.linalg.inv(colour) @ right, 0)],
+        ],
+    }
+
+
+def written(path: Path, content: object) -> Path:
+    path.write_text(json.dumps(content))
+    return path
+
+
+def rectified_pose() -> NDArray[np.float64]:
+    """Of the ideal camera in the world, by OpenCV itself."""
+    step = np.linalg.inv(WORLD_FROM_RIGHT) @ WORLD_FROM_LEFT
+    turn, *_ = cv2.stereoRectify(
+        LEFT_LENS.matrix, np.zeros(5), RIGHT_LENS.matrix, np.zeros(5), (640, 400), step[:3, :3], step[:3, 3:]
+    )
+    pose = WORLD_FROM_LEFT.copy()
+    pose[:3, :3] = WORLD_FROM_LEFT[:3, :3] @ turn.T
+    return pose
+
+
+@pytest.fixture(scope="module")
+def pair() -> tuple[Image, Image]:
+    return taken_by(LEFT_LENS, WORLD_FROM_LEFT), taken_by(RIGHT_LENS, WORLD_FROM_RIGHT)
+
+
+@pytest.mark.parametrize(("shrink", "match_scale", "hfov_deg"), [(1, 2, None), (2, 1, None), (1, 1, 90.0)])
+def test_an_unrectified_pair_gives_its_depth_through_its_calibration(
+    tmp_path: Path, pair: tuple[Image, Image], shrink: int, match_scale: Any, hfov_deg: float | None
+) -> None:
+    path = written(tmp_path / "calib.json", board())
+    stereo = StereoDepth.from_depthai(path, size=SIZE, match_scale=match_scale, hfov_deg=hfov_deg)
+    small = (640 // shrink, 400 // shrink)
+    left, depth = stereo(*(cv2.resize(each, small, interpolation=cv2.INTER_AREA) for each in pair))
+    exact = truth(stereo.lens, rectified_pose())
+    errors = step_errors(stereo, depth, exact)
+    assert stereo.baseline_m == pytest.approx(0.09003, abs=1e-4)
+    assert left.shape == (192, 320, 3)
+    unseen = ~left.any(axis=2)
+    assert (unseen.mean() > 0.01) == (hfov_deg is not None)
+    assert not depth[cv2.erode(unseen.astype(np.uint8), np.ones((3, 3))) > 0].any()
+    assert np.mean(depth[~unseen] > 0) > 0.7
+    assert np.median(errors) < 0.25 / match_scale  # SGBM leans towards whole pixels
+    assert np.mean(errors < 1.0) > 0.95
+
+
+def change(content: Any, *keys: Any, to: Any) -> Any:
+    inner = content
+    for key in keys[:-1]:
+        inner = inner[key]
+    inner[keys[-1]] = to
+    return content
+
+
+@pytest.mark.parametrize("axis", [0, 2], ids=["tilted", "rolled"])
+def test_the_calibration_of_another_device_is_noticed_in_the_pictures(
+    tmp_path: Path, pair: tuple[Image, Image], axis: int
+) -> None:
+    off = moved(turn=[2.0 * (axis == each) for each in range(3)])
+    content = board()
+    step = off @ np.linalg.inv(WORLD_FROM_RIGHT) @ WORLD_FROM_LEFT
+    content["cameraData"][1][1] = camera_data(LEFT_LENS, step, 2)
+    stereo = StereoDepth.from_depthai(written(tmp_path / "calib.json", content), size=SIZE)
+    for _ in range(2):
+        with pytest.raises(DepthError):
+            stereo(*pair)
+
+
+def test_swapped_pictures_are_noticed() -> None:
+    left, right = (taken_by(IDEAL, moved(x)) for x in (0.0, 0.05))
+    with pytest.raises(DepthError):
+        StereoDepth((IDEAL, IDEAL), moved(-0.05), size=SIZE)(right, left)
+
+
+LEFT = ("cameraData", 1, 1)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        change(board(), *LEFT, "extrinsics", "toCameraSocket", to=-1),
+        change(board(), *LEFT, "extrinsics", "rotationMatrix", to=[[0.0] * 3] * 3),
+        change(board(), *LEFT, "extrinsics", "translation", to={"x": 9.0, "y": 0.0, "z": 0.0}),
+        change(board(), *LEFT, "intrinsicMatrix", to=[[405.0, 0, 9999.0], [0, 405, 200], [0, 0, 1]]),
+        change(board(), *LEFT, "cameraType", to=7),
+        change(board(), *LEFT, "width", to="wide"),
+        {"cameraData": []},
+    ],
+    ids=lambda _: "",
+)
+def test_a_calibration_of_no_such_pair_is_refused_with_one_line(tmp_path: Path, content: object) -> None:
+    path = written(tmp_path / "calib.json", content)
+    with pytest.raises(ConfigError) as raised:
+        StereoDepth.from_depthai(path, size=SIZE)
+    assert str(path) in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_pictures_the_calibration_is_not_for_are_refused_and_the_next_ones_taken() -> None:
+    stereo = StereoDepth((IDEAL, IDEAL), moved(-0.1), size=SIZE)
+    good = np.zeros((192, 320, 3), np.uint8)
+    with pytest.raises(DepthError):
+        stereo(good, np.zeros((192, 256, 3), np.uint8))
+    _, depth = stereo(good, good)
+    assert depth.shape == (192, 320)
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="needs the OAK's pair in ../shared/real/oak-stereo")
+def test_a_real_unrectified_pair_shows_a_floor_and_a_head_at_their_distance() -> None:
+    pictures = []
+    for side in ("left", "right"):
+        capture = cv2.VideoCapture(str(REAL / f"{side}.mp4"))
+        capture.set(cv2.CAP_PROP_POS_FRAMES, 510)
+        read, picture = capture.read()
+        assert read
+        pictures.append(picture)
+    stereo = StereoDepth.from_depthai(REAL / "calib.json", size=(640, 400))
+    _, depth = stereo(*pictures)
+    assert stereo.baseline_m == pytest.approx(0.0738, abs=1e-4)
+    assert np.mean(depth > 0) > 0.8
+    floor, head = depth[160:280, 60:240], depth[120:160, 310:350]
+    assert np.median(floor[floor > 0]) == pytest.approx(2.7, abs=0.15)
+    assert np.median(head[head > 0]) == pytest.approx(1.0, abs=0.1)
+
+
+def board_camera(step_cm: float, onward: int) -> dict[str, Any]:
+    return {
+        "width": PAIR_SIZE[0],
+        "height": PAIR_SIZE[1],
+        "cameraType": 0,
+        "intrinsicMatrix": [[FX, 0.0, 191.5], [0.0, FX, 127.5], [0.0, 0.0, 1.0]],
+        "distortionCoeff": [0.0] * 14,
+        "extrinsics": {
+            "rotationMatrix": np.eye(3).tolist(),
+            "translation": {"x": step_cm, "y": 0.0, "z": 0.0},
+            "toCameraSocket": onward,
+        },
+    }
+
+
+@pytest.fixture(scope="module")
+def films(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """left.mkv, right.mkv and calib.json of a camera before a wall."""
+    folder = tmp_path_factory.mktemp("pair")
+    wall = np.random.default_rng(1).integers(0, 256, (256, 384 + DISPARITY, 3)).astype(np.float32)
+    wall = cv2.normalize(cv2.GaussianBlur(wall, (0, 0), 2.0), np.empty(0), 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    write_video(folder / "left.mkv", [np.ascontiguousarray(wall[:, :384])] * 14, 10.0)
+    write_video(folder / "right.mkv", [np.ascontiguousarray(wall[:, DISPARITY:])] * 14, 10.0)
+    left, right = board_camera(-100 * BASELINE_M, 2), board_camera(0.0, -1)
+    (folder / "calib.json").write_text(json.dumps({"boardName": "made up", "cameraData": [[1, left], [2, right]]}))
+    return folder
+
+
+@pytest.mark.parametrize("rectified", [False, True])
+def test_a_stereo_pair_gives_its_rectified_left_picture_with_lens_and_depth(films: Path, rectified: bool) -> None:
+    request = ClipRequest(depth=films / "right.mkv", calibration=films / "calib.json", rectified=rectified)
+    source = read_clip(films / "left.mkv", request, live_traits())
+    depth, lens = source.clip.depth, source.clip.lens
+    assert depth is not None
+    assert lens is not None
+    assert (lens.width, lens.height) == (WIDTH, HEIGHT)
+    assert source.hfov_deg == lens.hfov_deg
+    known = depth[depth > 0]
+    assert len(known) > 0.6 * depth.numel()
+    assert float(known.median()) == pytest.approx(FX * BASELINE_M / DISPARITY, rel=0.06)
