@@ -12,9 +12,11 @@ from torch.testing import assert_close
 from gcd_model.geometry import Intrinsics, Spherical, Trajectory, relative_pose, to_pose
 from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError
+from gcd_train.evaluation.baselines import HexPlane
 from gcd_train.evaluation.hexplane import (
     SPACE,
     TIME,
+    Camera,
     HexPlanes,
     HexPlaneSettings,
     SceneBounds,
@@ -22,7 +24,6 @@ from gcd_train.evaluation.hexplane import (
     sampled,
     weights,
 )
-from gcd_train.evaluation.hexplane_learning import Camera, HexPlane, PosedPicture
 from gcd_train.evaluation.predictors import CameraPair, SourceClip
 
 LENS = Intrinsics.from_hfov(53.0, 24, 16)
@@ -65,11 +66,6 @@ def video(angles: tuple[float, float]) -> list[SceneView]:
 def colours(views: list[SceneView]) -> Tensor:
     """[T, 3, H, W]."""
     return torch.from_numpy(np.stack([each.rgb for each in views])).permute(0, 3, 1, 2).float() / 255.0
-
-
-def posed(seen: SceneView) -> PosedPicture:
-    camera = Camera(lens=seen.lens, world_from_camera=torch.from_numpy(seen.world_from_camera), time=-1.0)
-    return PosedPicture(colours=colours([seen])[0], camera=camera)
 
 
 def bounds() -> SceneBounds:
@@ -174,11 +170,11 @@ def test_rays_go_through_the_middles_of_their_pixels() -> None:
     lens = replace(LENS, cx=10.0, cy=9.0)
     pose = to_pose(Spherical(azimuth_deg=40.0, elevation_deg=10.0, radius_m=15.0))
     rays = Camera(lens=lens, world_from_camera=pose, time=0.5).rays()
-    seen = ((rays.origins + 3.0 * rays.directions).double() - pose[:3, 3]) @ pose[:3, :3]
+    seen = ((rays[:, :3] + 3.0 * rays[:, 3:6]).double() - pose[:3, 3]) @ pose[:3, :3]
     u, v = lens.fx * seen[:, 0] / seen[:, 2] + lens.cx, lens.fy * seen[:, 1] / seen[:, 2] + lens.cy
     assert_close(u.view(16, 24), (torch.arange(24) + 0.5).expand(16, 24).double(), rtol=0, atol=1e-4)
     assert_close(v.view(16, 24), (torch.arange(16) + 0.5)[:, None].expand(16, 24).double(), rtol=0, atol=1e-4)
-    assert_close(rays.directions.norm(dim=-1), torch.ones(len(rays.directions)))
+    assert_close(rays[:, 3:6].norm(dim=-1), torch.ones(len(rays)))
 
 
 def made(method: HexPlane) -> Tensor:

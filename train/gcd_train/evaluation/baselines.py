@@ -8,9 +8,8 @@ from dataclasses import asdict, dataclass, field, replace
 import torch
 
 from gcd_model.config import SemanticClass
-from gcd_train.errors import RecipeError
-from gcd_train.evaluation.hexplane import HexPlaneSettings
-from gcd_train.evaluation.hexplane_learning import HexPlane
+from gcd_train.errors import DataError, RecipeError
+from gcd_train.evaluation.hexplane import Camera, HexPlaneSettings, SceneBounds, draw, learn
 from gcd_train.evaluation.metrics import NO_CLASS
 from gcd_train.evaluation.predictors import (
     CopySource,
@@ -20,6 +19,7 @@ from gcd_train.evaluation.predictors import (
     Predictor,
     SourceClip,
     TargetStatistics,
+    to_pictures,
 )
 from gcd_train.evaluation.reprojection import (
     REPROJECT_RGBD,
@@ -94,6 +94,62 @@ class ClassesAlone:
         """See Predictor."""
         made = self.inner.predict(clip)
         return replace(made, video=None, more=tuple(replace(each, video=None) for each in made.more))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class HexPlane:
+    """HexPlane with so many input views: the source clip, and further cameras of the scene from two on.
+
+    views: K. settings: what is learnt of each clip, and how long. seed, device: of the learning, see `learn`.
+    With two views or more it is given more than the others, so `privileged`. It makes no class maps.
+    Source: Cao and Johnson 2023 (HexPlane); as a baseline, Van Hoorick et al. 2024 (GCD), section 5.
+    """
+
+    views: int = 1
+    settings: HexPlaneSettings = HexPlaneSettings()  # noqa: RUF009  it is frozen
+    seed: int = 0
+    device: str = "auto"
+
+    @property
+    def name(self) -> str:
+        """`hexplane_K`."""
+        return f"hexplane_{self.views}"
+
+    @property
+    def privileged(self) -> bool:
+        """True from two views on."""
+        return self.views > 1
+
+    def predict(self, clip: SourceClip) -> Prediction:
+        """See Predictor. Raises DataError where the clip's scene has fewer cameras."""
+        if self.views > 1 and clip.others is None:
+            raise DataError(
+                f"{self.name} wants {self.views} cameras of a scene, but clip {clip.key or 'without a key'} has one; "
+                "give a 4D data set, or ask for hexplane_1"
+            )
+        own, frames = clip.cameras, len(clip.source)
+        times = [2.0 * number / max(frames - 1, 1) - 1.0 for number in range(frames)]
+        pictures = [
+            (colours, Camera(lens=own.source, world_from_camera=own.ground_from_source, time=time))
+            for colours, time in zip(to_pictures(clip.source), times, strict=True)
+        ]
+        for video in clip.others(self.views - 1) if clip.others is not None and self.views > 1 else ():
+            pictures += [
+                (
+                    to_pictures(view.rgb[None])[0],
+                    Camera(lens=view.lens, world_from_camera=torch.from_numpy(view.world_from_camera), time=time),
+                )
+                for view, time in zip(video, times, strict=True)
+            ]
+        wanted = own.ground_from_source @ own.source_from_target  # [T, 4, 4]
+        known = torch.stack([camera.world_from_camera for _, camera in pictures])
+        bounds = SceneBounds.around(torch.cat([known, wanted]))
+        field = learn(pictures, bounds, self.settings, frames=frames, seed=self.seed, device=self.device)
+        drawn = [
+            draw(field, Camera(lens=own.target, world_from_camera=pose, time=time), self.settings)
+            for pose, time in zip(wanted, times, strict=True)
+        ]
+        return Prediction(video=torch.stack(drawn))
 
 
 def baseline_names(*, hexplane: Sequence[int] = HEXPLANE_VIEWS) -> tuple[str, ...]:
