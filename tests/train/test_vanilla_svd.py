@@ -15,9 +15,8 @@ from gcd_model.conditioning import SourceFeatures
 from gcd_model.config import SVD_14
 from gcd_model.geometry import CameraMount
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.evaluation.baselines import BaselineSettings, build, described
+from gcd_train.evaluation.baselines import BaselineSettings, VanillaSVD, build, described
 from gcd_train.evaluation.predictors import CameraPair, SourceClip
-from gcd_train.evaluation.svd import VanillaSVD
 
 SIZE = (16, 32)
 """As small as the networks can halve."""

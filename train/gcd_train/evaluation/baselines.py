@@ -1,13 +1,31 @@
 """Every baseline by name, and what it is built from."""
 
 import difflib
+import hashlib
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Self
 
 import torch
+import torch.nn.functional as F
+from torch import Tensor
 
+from gcd_model import (
+    Augmentation,
+    Clip,
+    RenderOptions,
+    SourceFeatures,
+    ViewSynthesizer,
+    inspect_weights,
+    load_synthesizer,
+    pose_trajectory,
+    weights_path,
+)
 from gcd_model.config import SemanticClass
+from gcd_model.diffusion import unit_noise
+from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.hexplane import Camera, HexPlaneSettings, SceneBounds, draw, learn
 from gcd_train.evaluation.metrics import NO_CLASS
@@ -28,10 +46,11 @@ from gcd_train.evaluation.reprojection import (
     ReprojectRgbd,
     ReprojectSemd,
 )
-from gcd_train.evaluation.svd import VANILLA_SVD, VanillaSVD, weights_named
 
-DEPTH_ON_MEAN = "depth_reprojection_on_mean"
-"""Depth reprojection with holes as in the mean target and the majority map."""
+VANILLA_SVD, DEPTH_ON_MEAN = "vanilla_svd", "depth_reprojection_on_mean"
+"""Stable Video Diffusion, and depth reprojection with holes as in the mean target and the majority map."""
+MOTION_BUCKET = 127.0
+"""What Stable Video Diffusion is told of the motion: the middle of its range."""
 HEXPLANE_VIEWS = (1, 2, 4, 8)
 """Numbers of input views that a HexPlane is usually given; any other number goes too."""
 FROM_EXACT_CLASSES = ("copy_source", "ground_homography")
@@ -152,6 +171,94 @@ class HexPlane:
         return Prediction(video=torch.stack(drawn))
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class VanillaSVD:
+    """A video out of the first frame, for each draw from noise of its own.
+
+    The frame is stretched to the size the network was trained at, and what comes out is stretched back: nothing is
+    cropped, so that all of the target is measured.
+
+    synthesizer: without camera control. size: height and width it works at, None for the weights' own (576 x 1024 of
+        the published). steps: None as the weights say. samples: draws of each clip. seed: all noise comes from it and
+        the clip's key.
+    Source: Blattmann et al. 2023 (SVD); Van Hoorick et al. 2024 (GCD), section 5, "Vanilla SVD". Stretching is ours.
+    """
+
+    synthesizer: ViewSynthesizer
+    size: tuple[int, int] | None = None
+    steps: int | None = None
+    samples: int = 1
+    seed: int = 0
+    name: str = VANILLA_SVD
+    privileged: bool = False
+
+    @classmethod
+    def open(cls, weights: str | Path, *, device: str = "auto", dtype: str | None = None) -> Self:
+        """The published file `svd.safetensors`, its diffusers folder, or our own weights of the same task.
+
+        Args: see `gcd_model.load_synthesizer`; a published file is taken to be SVD, whatever it is called.
+        Raises:
+            CheckpointError: the file is missing, damaged or of another architecture.
+            DataError: it is steered: that is another task.
+        """
+        of_ours = isinstance(weights, str) and weights.startswith(("package:", "random:"))
+        family = None if of_ours or inspect_weights(weights).family else "svd"
+        return cls(synthesizer=load_synthesizer(weights, family=family, device=device, dtype=dtype))
+
+    def __post_init__(self) -> None:
+        traits = self.synthesizer.traits
+        if traits.config.camera != "none":
+            raise DataError(
+                f"{self.name} wants weights that make a video out of a picture, {traits.name} is told a camera path; "
+                "give svd.safetensors"
+            )
+
+    def predict(self, clip: SourceClip) -> Prediction:
+        """See Predictor. No class map. Raises DataError for a clip that is longer than what the network makes."""
+        traits, frames = self.synthesizer.traits, len(clip.source)
+        if frames > traits.config.frames:
+            raise DataError(
+                f"{traits.name} makes {traits.config.frames} frames, {clip.key or 'a clip'} has {frames}; evaluate on "
+                "shorter clips"
+            )
+        height, width = clip.cameras.target.height, clip.cameras.target.width
+        features = self._features(clip)
+        draws = [
+            Prediction(video=_stretched(self._draw(features, clip.key, number), height, width)[:frames])
+            for number in range(self.samples)
+        ]
+        return replace(draws[0], more=tuple(draws[1:]))
+
+    def _features(self, clip: SourceClip) -> SourceFeatures:
+        """Of the first frame, encoded once, for all frames."""
+        config = self.synthesizer.traits.config
+        height, width = self.size or (config.height, config.width)
+        first = _stretched(to_network(clip.source[:1]), height, width, low=-1.0)
+        noise = Augmentation(noise=unit_noise(tuple(first.shape), self._seed(clip.key)))
+        told = self.synthesizer.encode(Clip(video=first, fps=clip.fps), noise)
+        tokens = None if told.tokens is None else told.tokens.repeat(config.frames, 1)
+        return replace(told, tokens=tokens, latents=told.latents.repeat(config.frames, 1, 1, 1))
+
+    def _draw(self, features: SourceFeatures, key: str, number: int) -> Tensor:
+        """One video, [T, 3, H, W] in [0, 1]: draws go one by one, as full size leaves no room for two."""
+        still = torch.eye(4, dtype=torch.float64).repeat(features.frames, 1, 1)
+        seed = self._seed(f"{key}#{number}")
+        options = RenderOptions(steps=self.steps, seed=seed, motion_bucket=MOTION_BUCKET)
+        (view,) = self.synthesizer.render(features, [pose_trajectory(still)], options)
+        return view.video
+
+    def _seed(self, name: str) -> int:
+        return int.from_bytes(hashlib.sha256(f"{self.seed}:{name}".encode()).digest()[:6])
+
+
+def _stretched(pictures: Tensor, height: int, width: int, *, low: float = 0.0) -> Tensor:
+    """[T, 3, ...] at another size, within low..1."""
+    if pictures.shape[-2:] == (height, width):
+        return pictures
+    resized = F.interpolate(pictures, size=(height, width), mode="bicubic", align_corners=False, antialias=True)
+    return resized.clamp(low, 1.0)
+
+
 def baseline_names(*, hexplane: Sequence[int] = HEXPLANE_VIEWS) -> tuple[str, ...]:
     """All there are, in the order of the tables. hexplane: numbers of views that are listed."""
     return (*_NAMES, *(f"hexplane_{views}" for views in hexplane))
@@ -195,7 +302,9 @@ def described(name: str, settings: BaselineSettings, trained_on: str = "nothing"
     told |= {"seed": str(settings.seed)} if svd or hexplane else {}
     told |= {"means of": trained_on} if name in _OF_MEANS else {}
     told |= {"published rounding": "yes"} if settings.published and name in (REPROJECT_RGBD, REPROJECT_SEMD) else {}
-    told |= {"weights": weights_named(settings.svd)} if svd and settings.svd is not None else {}
+    if svd and settings.svd is not None:  # 12 digits of the digest, or `random:...` as it is
+        of_ours = settings.svd.startswith("random:")
+        told["weights"] = settings.svd if of_ours else inspect_weights(weights_path(settings.svd)).digest[:12]
     told |= {key: str(value) for key, value in asdict(settings.hexplane).items()} if hexplane else {}
     filled = settings.statistics is not None and name != REPROJECT_SEMD
     return told | ({"holes": "of no class"} if settings.classes and name in _WITH_HOLES and not filled else {})

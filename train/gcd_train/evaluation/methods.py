@@ -25,14 +25,20 @@ from gcd_model.colours import nearest_classes
 from gcd_model.config import SemanticClass
 from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.evaluation.baselines import BaselineSettings, build, described, hexplane_views, usual_baselines
+from gcd_train.evaluation.baselines import (
+    VANILLA_SVD,
+    BaselineSettings,
+    build,
+    described,
+    hexplane_views,
+    usual_baselines,
+)
 from gcd_train.evaluation.clips import ClipFacts, names_of
 from gcd_train.evaluation.metrics import NO_CLASS
 from gcd_train.evaluation.predictors import CameraPair, Prediction, Predictor, SourceClip
 from gcd_train.evaluation.runner import Maker
 from gcd_train.evaluation.saved_frames import SavedFrames
 from gcd_train.evaluation.store import FRAMES_IN
-from gcd_train.evaluation.svd import VANILLA_SVD
 
 _SAME_PATH_M = 1e-3
 """Largest difference between the entries of two poses that count as one; more is another path."""

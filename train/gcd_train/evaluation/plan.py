@@ -16,7 +16,7 @@ from gcd_model.geometry import CameraMount
 from gcd_train.data.pairs import PairedClips
 from gcd_train.data.splits import require_apart
 from gcd_train.errors import RecipeError
-from gcd_train.evaluation.baselines import BaselineSettings
+from gcd_train.evaluation.baselines import VANILLA_SVD, BaselineSettings
 from gcd_train.evaluation.clips import EvaluationSet, PairedSet, class_grid, identity_of, require_same_kind
 from gcd_train.evaluation.galleries import Strip, contact_rows, write_sheet
 from gcd_train.evaluation.hexplane import HexPlaneSettings
@@ -37,7 +37,6 @@ from gcd_train.evaluation.scene_clips import SceneSet
 from gcd_train.evaluation.statistics import FigureName, Selection
 from gcd_train.evaluation.store import LPIPS, ClipRecord, RunKeeper, RunNote
 from gcd_train.evaluation.summary import Conditions, MountNumbers, Shot, Summary, best_of, evaluation
-from gcd_train.evaluation.svd import VANILLA_SVD
 from gcd_train.layouts.manifest import package_version
 
 ProgressBar: TypeAlias = Callable[[str, int], AbstractContextManager[Callable[[int], None]]]
