@@ -176,9 +176,9 @@ def test_cameras_that_no_scene_has_are_refused_at_once(kubric: Path, driving: Pa
 
 def test_rates_follow_the_strides(kubric: Path, tmp_path: Path) -> None:
     drawn = opened(kubric, replace(KUBRIC, bounds=FrameBounds(), protocol="paper"))
-    assert (drawn.fps, tuple(drawn.rates)) == (24.0, (24.0, 12.0, 8.0, 6.0))
+    assert tuple(drawn.rates) == (24.0, 12.0, 8.0, 6.0)
     released = opened(kubric, replace(KUBRIC, bounds=FrameBounds(), protocol="release"))
-    assert (released.fps, tuple(released.rates)) == (12.0, (12.0,))
+    assert tuple(released.rates) == (12.0,)
     listed = opened(kubric, replace(KUBRIC, bounds=FrameBounds(), controls=controls(tmp_path, ["scn02900"])))
     assert tuple(listed.rates) == (24.0,)
     assert tuple(opened(kubric, replace(KUBRIC, bounds=FrameBounds(skip=3))).rates) == (8.0,)

@@ -33,7 +33,7 @@ from gcd_train.evaluation.baselines import (
     hexplane_views,
     usual_baselines,
 )
-from gcd_train.evaluation.clips import ClipFacts, names_of
+from gcd_train.evaluation.clips import EvaluationSet, names_of
 from gcd_train.evaluation.metrics import NO_CLASS
 from gcd_train.evaluation.predictors import CameraPair, Prediction, Predictor, SourceClip
 from gcd_train.evaluation.runner import Maker
@@ -60,7 +60,7 @@ class SynthesizedViews:
     privileged: bool = False
 
     @classmethod
-    def of(cls, synthesizer: ViewSynthesizer, clips: ClipFacts, options: RenderOptions | None = None) -> Self:
+    def of(cls, synthesizer: ViewSynthesizer, clips: EvaluationSet, options: RenderOptions | None = None) -> Self:
         """A model that is measured on these clips.
 
         Raises DataError where model and clips do not fit together.
@@ -148,7 +148,7 @@ def told_of(options: RenderOptions) -> str:
     return ", ".join(told)
 
 
-def _require_fit(synthesizer: ViewSynthesizer, clips: ClipFacts) -> None:
+def _require_fit(synthesizer: ViewSynthesizer, clips: EvaluationSet) -> None:
     traits = synthesizer.traits
     wanted = (traits.config.frames, traits.config.height, traits.config.width)
     given = (clips.frames, clips.height, clips.width)
@@ -191,7 +191,9 @@ class Weights:
         return _opened(self)
 
 
-def of_weights(weights: Weights, clips: ClipFacts, options: RenderOptions, steps: Sequence[int]) -> tuple[Method, ...]:
+def of_weights(
+    weights: Weights, clips: EvaluationSet, options: RenderOptions, steps: Sequence[int]
+) -> tuple[Method, ...]:
     """The weights as they ship, then with each other number of steps.
 
     Args:
@@ -283,7 +285,7 @@ def require_names_apart(methods: Sequence[Method]) -> None:
         )
 
 
-def _of_weights(weights: Weights, clips: ClipFacts, options: RenderOptions) -> Method:
+def _of_weights(weights: Weights, clips: EvaluationSet, options: RenderOptions) -> Method:
     made = SynthesizedViews.of(weights.open(), clips, options)
     traits = made.synthesizer.traits
     used = sampler_of(traits.config.sampling, options)

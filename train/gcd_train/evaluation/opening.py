@@ -23,7 +23,7 @@ from gcd_train.data.pictures import PictureOptions
 from gcd_train.data.splits import MOST_BYTES, Part, present, read_controls, read_scene_list, read_split
 from gcd_train.data.views import ViewPairs
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.evaluation.clips import EvaluationSet, PairedSet, chosen
+from gcd_train.evaluation.clips import EvaluationSet, PairedSet, SceneSet, chosen
 from gcd_train.evaluation.protocol import (
     AS_PLANNED,
     SAMPLES,
@@ -39,7 +39,6 @@ from gcd_train.evaluation.protocol import (
     scene_number,
     usual_clips,
 )
-from gcd_train.evaluation.scene_clips import SceneSet
 from gcd_train.layouts import kubric4d, parallel_domain4d
 from gcd_train.layouts.manifest import MANIFEST, read_manifest
 

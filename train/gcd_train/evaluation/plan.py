@@ -15,9 +15,9 @@ from gcd_model import Quality, RenderOptions, SolverName, Traits
 from gcd_model.geometry import CameraMount
 from gcd_train.data.pairs import PairedClips
 from gcd_train.data.splits import require_apart
-from gcd_train.errors import RecipeError
+from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.baselines import VANILLA_SVD, BaselineSettings
-from gcd_train.evaluation.clips import EvaluationSet, PairedSet, class_grid, identity_of, require_same_kind
+from gcd_train.evaluation.clips import EvaluationSet, PairedSet, SceneSet, identity_of, names_of
 from gcd_train.evaluation.galleries import Strip, contact_rows, write_sheet
 from gcd_train.evaluation.hexplane import HexPlaneSettings
 from gcd_train.evaluation.lpips import Lpips
@@ -33,7 +33,6 @@ from gcd_train.evaluation.methods import (
 from gcd_train.evaluation.opening import Choice, SceneCuts, data_kind, open_pairs, open_scenes, usual_samples
 from gcd_train.evaluation.predictors import TargetStatistics, fit_statistics
 from gcd_train.evaluation.protocol import FrameBounds, ProtocolName
-from gcd_train.evaluation.scene_clips import SceneSet
 from gcd_train.evaluation.statistics import FigureName, Selection
 from gcd_train.evaluation.store import LPIPS, ClipRecord, RunKeeper, RunNote
 from gcd_train.evaluation.summary import Conditions, MountNumbers, Shot, Summary, best_of, evaluation
@@ -170,7 +169,7 @@ class Plan:
             frames=clips.frames,
             height=clips.height,
             width=clips.width,
-            fps=clips.fps,
+            fps=clips.rates[0],
             rates=tuple(clips.rates) if len(clips.rates) > 1 else (),
             seed=options.seed,
             classes=tuple(each.name for each in clips.classes),
@@ -193,7 +192,7 @@ class Plan:
                 shots=tuple(Shot.of(clips, record) for record in next(iter(rows.values()))),
                 frames=clips.frames,
                 size=(clips.height, clips.width),
-                grid=class_grid(clips),
+                grid=(clips.height // 2, clips.width // 2),
                 camera=clips.camera,
                 true_mount=MountNumbers.of(None if pairs is None else pairs.clips.mount),
                 declared_mount=MountNumbers.of(None if pairs is None else pairs.declared),
@@ -317,7 +316,15 @@ def _training(options: EvaluateOptions, clips: EvaluationSet) -> PairedClips | N
     if not isinstance(clips, PairedSet):
         raise RecipeError("means are taken over pairs, and these are scenes: leave out --train")
     training = PairedClips.open(list(options.train), options.train_limit)
-    require_same_kind(training, clips.clips)
+    kinds = [
+        f"T, H, W = {(each.frames, each.height, each.width)}, classes {names_of(each.classes)}, camera control "
+        f"{each.camera!r}"
+        for each in (training, clips.clips)
+    ]
+    if kinds[0] != kinds[1]:
+        raise DataError(
+            f"training and held-out clips must be of one kind, got {kinds[0]} and {kinds[1]}; generate both alike"
+        )
     require_apart(training.scenes, clips.clips.scenes)
     return training
 
