@@ -12,9 +12,8 @@ from torch import Tensor
 from gcd_model.errors import NonFiniteError, ShapeError
 from gcd_model.geometry import CameraMount
 from gcd_train.evaluation.clips import HeldOutClip
-from gcd_train.evaluation.lpips import Lpips
 from gcd_train.evaluation.measure import measure
-from gcd_train.evaluation.metrics import NO_CLASS, masked_mean, masked_psnr, psnr, ssim_map, window_mask
+from gcd_train.evaluation.metrics import NO_CLASS, Lpips, masked_mean, masked_psnr, psnr, ssim_map, window_mask
 from gcd_train.evaluation.predictors import CameraPair, Prediction, SourceClip, to_pictures
 from gcd_train.evaluation.statistics import class_counts
 from gcd_train.evaluation.store import ClipRecord, Counted

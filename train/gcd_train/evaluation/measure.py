@@ -13,8 +13,7 @@ from gcd_model.config import SemanticClass
 from gcd_model.errors import NonFiniteError, ShapeError
 from gcd_train.evaluation import metrics
 from gcd_train.evaluation.clips import HeldOutClip
-from gcd_train.evaluation.lpips import Lpips
-from gcd_train.evaluation.metrics import void_ids
+from gcd_train.evaluation.metrics import Lpips, void_ids
 from gcd_train.evaluation.predictors import Prediction, Predictor, to_labels, to_pictures
 from gcd_train.evaluation.store import ClipRecord, Counted, Frames, Region, RegionRecord
 
@@ -61,7 +60,7 @@ def measure(
         draws=len(prediction.draws),
         seconds=seconds,
         regions={region: _region(mask, target, shown, painted) for region, mask in masks.items()},
-        lpips=None if lpips is None or draws is None else tuple(map(_frames, lpips.of_draws(draws, target))),
+        lpips=None if lpips is None or draws is None else tuple(map(_frames, lpips(draws, target))),
         step=None if draws is None else tuple(tuple(metrics.frame_change(each).tolist()) for each in draws),
         step_target=tuple(metrics.frame_change(target).tolist()),
         grid_confusion=None if painted is None else _counted(painted.halved().confusion(None)),

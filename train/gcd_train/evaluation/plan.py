@@ -20,7 +20,6 @@ from gcd_train.evaluation.baselines import VANILLA_SVD, BaselineSettings
 from gcd_train.evaluation.clips import EvaluationSet, PairedSet, SceneSet, identity_of, names_of
 from gcd_train.evaluation.galleries import Strip, contact_rows, write_sheet
 from gcd_train.evaluation.hexplane import HexPlaneSettings
-from gcd_train.evaluation.lpips import Lpips
 from gcd_train.evaluation.methods import (
     Method,
     Weights,
@@ -30,6 +29,7 @@ from gcd_train.evaluation.methods import (
     require_names_apart,
     require_views,
 )
+from gcd_train.evaluation.metrics import Lpips
 from gcd_train.evaluation.opening import Choice, SceneCuts, data_kind, open_pairs, open_scenes, usual_samples
 from gcd_train.evaluation.predictors import TargetStatistics, fit_statistics
 from gcd_train.evaluation.protocol import FrameBounds, ProtocolName

@@ -12,8 +12,8 @@ from gcd_model.errors import ModelError
 from gcd_train.errors import DataError, RunError, TrainError
 from gcd_train.evaluation.clips import EvaluationSet, HeldOutClip
 from gcd_train.evaluation.galleries import KeptViews, has_rows, has_views, write_rows, write_views
-from gcd_train.evaluation.lpips import Lpips
 from gcd_train.evaluation.measure import predicted_and_measured
+from gcd_train.evaluation.metrics import Lpips
 from gcd_train.evaluation.predictors import Prediction, Predictor
 from gcd_train.evaluation.statistics import FIRST_MEASURED
 from gcd_train.evaluation.store import ClipRecord, RunKeeper
