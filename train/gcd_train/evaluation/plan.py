@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from math import isnan
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -22,12 +23,11 @@ from gcd_train.evaluation.galleries import Strip, contact_rows, write_sheet
 from gcd_train.evaluation.hexplane import HexPlaneSettings
 from gcd_train.evaluation.methods import (
     Method,
-    Weights,
     of_baselines,
     of_saved_frames,
     of_weights,
+    open_weights,
     require_names_apart,
-    require_views,
 )
 from gcd_train.evaluation.metrics import Lpips
 from gcd_train.evaluation.opening import Choice, SceneCuts, data_kind, open_pairs, open_scenes, usual_samples
@@ -228,14 +228,14 @@ def planned(options: EvaluateOptions) -> Plan:
     choice = Choice(split=options.split, listed=options.listed, limit=options.limit)
     weights = None
     if options.weights is not None:
-        weights = Weights(path=_resolved(options.weights), device=options.device, dtype=options.dtype)
+        weights = partial(open_weights, _resolved(options.weights), options.device, options.dtype)
     painted = False
     if data_kind(options.data) == "pairs":
         _require_pairs_options(options)
         clips, notes = open_pairs(options.data, choice, options.mount)
-        model = None if weights is None else weights.open().traits
+        model = None if weights is None else weights().traits
     else:
-        model = None if weights is None else weights.open().traits
+        model = None if weights is None else weights().traits
         cuts = _cuts(options, model)
         clips, notes = open_scenes(options.data[0], choice, cuts)
         painted = cuts.semantic
@@ -368,8 +368,7 @@ def _baselines(
         hexplane=options.hexplane,
     )
     further = len(clips.dataset.cameras) - 1 if isinstance(clips, SceneSet) else 0  # pairs have one camera
-    require_views(options.names or (), further)
-    return of_baselines(options.names, settings, trained_on)
+    return of_baselines(options.names, settings, trained_on=trained_on, others=further)
 
 
 def _on_the_sheet(summary: Summary) -> list[str]:
