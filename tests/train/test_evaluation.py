@@ -139,33 +139,6 @@ class Painted:
         return Prediction(video=self.video, classes=self.classes)
 
 
-CAR, PERSON = 8, 11
-
-
-def block(label: int, rows: slice, columns: slice) -> Tensor:
-    """Road everywhere but for a block of another class, uint8 [4, 32, 48]."""
-    classes = torch.ones(4, 32, 48, dtype=torch.uint8)
-    classes[:, rows, columns] = label
-    return classes
-
-
-def test_iou_of_car_and_person_is_what_one_counts_by_hand() -> None:
-    clips = PlaneClips.make(1)
-    clip = clips[0]
-    clip.target_classes[:] = block(CAR, slice(0, 8), slice(0, 12)).numpy()  # 96 pixels, 24 cells
-    clip.target_classes[:, 16:20, 0:4] = PERSON  # 16 pixels, 4 cells
-    said = block(CAR, slice(0, 8), slice(4, 16))  # 96 pixels, 64 of them right: 64 / 128
-    said[:, 16:20, 2:10] = PERSON  # 32 pixels, 8 of them right: 8 / 40
-    (found,) = evaluated([Painted(classes=said)], clips)
-    for iou in (found.class_iou(), found.class_iou(full=True)):
-        assert iou[CAR] == pytest.approx(64 / 128)
-        assert iou[PERSON] == pytest.approx(8 / 40)
-    road = (32 * 48 - 96 - 16, 32 * 48 - 96 - 32)  # true, said
-    both = 32 * 48 - 128 - 40  # neither a car nor a person for either of them
-    expected = (64 / 128 + 8 / 40 + both / (sum(road) - both)) / 3
-    assert found.value("miou_full") == pytest.approx(expected)
-
-
 def test_a_model_gets_the_clip_in_its_own_range_and_its_shipped_settings() -> None:
     clips = PlaneClips.make(2)
     synthesizer = fake(clips)

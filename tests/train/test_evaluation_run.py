@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
-import numpy as np
 import pytest
 from driving_plane import PlaneClips
 from made_records import note, record
@@ -19,7 +18,6 @@ from gcd_train.evaluation.galleries import KeptViews, png
 from gcd_train.evaluation.predictors import CopySource, Prediction, Predictor, SourceClip, to_pictures
 from gcd_train.evaluation.report import Choices, make_report
 from gcd_train.evaluation.runner import GIVE_UP_AFTER, Account, ClipWork, assign_gpus, measure_all
-from gcd_train.evaluation.saved_frames import SavedFrames
 from gcd_train.evaluation.store import RunKeeper, folder_name, read_run
 
 
@@ -179,11 +177,6 @@ def test_a_method_that_fails_takes_nothing_from_the_others(tmp_path: Path) -> No
     }
 
 
-def test_nothing_to_measure_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError):
-        finished(tmp_path, PairedSet(clips=PlaneClips.make(1, frames=2), identity="plane"), CopySource())
-
-
 def test_rows_of_the_contact_sheet_are_kept_and_drawn_again_only_where_they_lack(tmp_path: Path) -> None:
     method = Counting()
     for sheet in (("plane-00000000",), ("plane-00000000", "plane-00000001")) * 2:
@@ -235,19 +228,6 @@ def test_processes_find_what_one_finds(tmp_path: Path) -> None:
 
 
 # --- frames --------------------------------------------------------------------------------------------------------
-
-
-def test_kept_frames_are_predictions_that_score_the_same(tmp_path: Path) -> None:
-    clips = pairs(1)
-    work = ClipWork(folder=tmp_path, clips=clips, makers={"copy_source": CopySource}, views="all")
-    *_, account = measure_all(work)
-    assert account.failures == {}
-    (place,) = (tmp_path / "views" / "copy_source").iterdir()
-    assert {path.name for path in place.iterdir()} >= {"source", "target", "sample_0", "classes_0", "target_classes"}
-    clip = clips.clip("plane-00000000")
-    read = SavedFrames.open("copy", tmp_path / "views" / "copy_source").predict(clip.seen)
-    assert read.video is not None
-    assert np.array_equal((read.video * 255).round().byte().permute(0, 2, 3, 1).numpy(), clip.seen.source)
 
 
 def pictures_in(folder: Path) -> dict[str, bytes]:
@@ -364,6 +344,7 @@ def test_frames_of_a_method_that_was_given_more_are_starred(tmp_path: Path) -> N
         (["--no-baselines", "--predictions", "frames"], 78, "NAME=FOLDER"),
         (["--methods", "copy_source", "--privileged", "mine"], 78, "got 'mine'; there are none"),
         ([], 78, "baselines want training clips"),
+        (["--train", "nowhere"], 66, "nowhere"),
     ],
 )
 def test_the_command_says_what_is_wrong(tmp_path: Path, options: list[str], code: int, words: str) -> None:

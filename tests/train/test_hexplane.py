@@ -16,12 +16,10 @@ from gcd_train.evaluation.baselines import HexPlane
 from gcd_train.evaluation.hexplane import (
     SPACE,
     TIME,
-    Camera,
     HexPlanes,
     HexPlaneSettings,
     SceneBounds,
     resampled,
-    sampled,
     weights,
 )
 from gcd_train.evaluation.predictors import CameraPair, SourceClip
@@ -96,15 +94,6 @@ def psnr_db(one: Tensor, other: Tensor) -> float:
     return -10.0 * math.log10(float(((one - other) ** 2).mean()))
 
 
-def test_planes_are_exact_on_what_is_linear_along_each_axis() -> None:
-    across, down = torch.linspace(-1, 1, 7).double(), torch.linspace(-1, 1, 5).double()[:, None]
-    table = 0.3 + 2.0 * across - 0.7 * down + 1.5 * across * down
-    at = torch.rand(50, 3, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 2 - 1
-    u, v = at[..., 0], at[..., 1]
-    values = sampled(table.expand(3, 1, 5, 7), at)[:, 0]
-    assert_close(values, (0.3 + 2.0 * u - 0.7 * v + 1.5 * u * v).T)
-
-
 def test_each_plane_of_space_is_multiplied_with_the_plane_that_shares_no_axis_with_it() -> None:
     assert [set(one) | set(other) for one, other in zip(SPACE, TIME, strict=True)] == [{0, 1, 2, 3}] * 3
     planes = HexPlanes(features=1, side=4, moments=4, generator=torch.Generator().manual_seed(0))
@@ -154,27 +143,6 @@ def test_the_cube_stands_where_cameras_of_an_orbit_look() -> None:
     assert found.half_m == pytest.approx(4.5, abs=0.01)
     assert found.begin == pytest.approx(0.6, abs=0.01)
     assert found.reach == pytest.approx(2.5, abs=0.01)
-
-
-def test_all_of_space_fits_in_the_planes_and_the_cube_is_to_scale() -> None:
-    where = bounds()
-    directions = F.normalize(torch.randn(30, 3, generator=torch.Generator().manual_seed(8)), dim=-1)
-    distances = torch.tensor([0.0, 1.0, 3.9, 4.1, 10.0, 100.0, 1e6])
-    placed = where.to_planes(where.centre + distances[:, None, None] * directions)
-    assert (placed.abs() <= 1).all()
-    assert (placed.norm(dim=-1).diff(dim=0) > 0).all()
-    assert_close(placed[1], directions / 8.0)
-
-
-def test_rays_go_through_the_middles_of_their_pixels() -> None:
-    lens = replace(LENS, cx=10.0, cy=9.0)
-    pose = to_pose(Spherical(azimuth_deg=40.0, elevation_deg=10.0, radius_m=15.0))
-    rays = Camera(lens=lens, world_from_camera=pose, time=0.5).rays()
-    seen = ((rays[:, :3] + 3.0 * rays[:, 3:6]).double() - pose[:3, 3]) @ pose[:3, :3]
-    u, v = lens.fx * seen[:, 0] / seen[:, 2] + lens.cx, lens.fy * seen[:, 1] / seen[:, 2] + lens.cy
-    assert_close(u.view(16, 24), (torch.arange(24) + 0.5).expand(16, 24).double(), rtol=0, atol=1e-4)
-    assert_close(v.view(16, 24), (torch.arange(16) + 0.5)[:, None].expand(16, 24).double(), rtol=0, atol=1e-4)
-    assert_close(rays[:, 3:6].norm(dim=-1), torch.ones(len(rays)))
 
 
 def made(method: HexPlane) -> Tensor:

@@ -2,7 +2,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
 import torch
@@ -100,19 +99,6 @@ def test_visible_and_occluded_pixels_make_up_all_of_them() -> None:
     assert everything.equal(seen + unseen)
 
 
-def test_the_target_itself_is_perfect_in_every_frame_and_region() -> None:
-    clip = held_out()
-    perfect = Prediction(video=to_pictures(clip.target), classes=torch.from_numpy(clip.target_classes.copy()))
-    record = record_of(clip, perfect)
-    assert record.regions["all"].psnr_db == ((pytest.approx(100.0),) * FRAMES,)
-    assert record.regions["occluded"].ssim == ((pytest.approx(1.0),) * FRAMES,)
-    assert record.regions["all"].gradient == (record.regions["all"].gradient_target,)
-    assert record.step == (record.step_target,)
-    for counted in (record.grid_confusion, record.regions["all"].confusion):
-        assert counted is not None
-        assert all(true == said for frame in counted for true, said, _ in frame)
-
-
 def test_figures_of_each_draw_and_region_are_those_of_the_metrics() -> None:
     clip = held_out()
     prediction = drawn(clip, 3)
@@ -128,12 +114,6 @@ def test_figures_of_each_draw_and_region_are_those_of_the_metrics() -> None:
         assert visible.ssim[number][:-1] == pytest.approx(inside.tolist(), abs=1e-6)
 
 
-def test_regions_are_left_out_where_nobody_knows_them() -> None:
-    clip, unseen = held_out(), held_out(visible=False)
-    short, long = record_of(unseen, noisy(clip, 0)), record_of(clip, noisy(clip, 0))
-    assert short == msgspec.structs.replace(long, regions={"all": long.regions["all"]})
-
-
 def test_a_method_that_only_names_classes_has_no_picture_figures() -> None:
     clip = held_out()
     record = record_of(clip, Prediction(classes=noisy(clip, 0).classes))
@@ -141,7 +121,6 @@ def test_a_method_that_only_names_classes_has_no_picture_figures() -> None:
     assert (region.psnr_db, region.ssim, region.diversity, region.gradient, record.step, record.lpips) == (None,) * 6
     assert region.confusion is not None
     assert record.grid_confusion is not None
-    assert len(record.step_target) == FRAMES - 1
     assert len(record.step_target) == FRAMES - 1
 
 

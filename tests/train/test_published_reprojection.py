@@ -116,12 +116,6 @@ def test_a_run_is_told_where_holes_of_class_maps_are_of_no_class() -> None:
     }
 
 
-@pytest.mark.parametrize("name", ["mean_target", "majority_map", "depth_reprojection_on_mean"])
-def test_means_want_training_clips(name: str) -> None:
-    with pytest.raises(RecipeError, match=name):
-        build(name, SETTINGS)
-
-
 def test_without_training_clips_holes_are_black_and_the_others_are_offered() -> None:
     assert usual_baselines(SETTINGS) == (
         "copy_source",
@@ -149,13 +143,3 @@ def test_where_targets_are_class_maps_only_class_maps_count() -> None:
     for name in ("reproject_rgbd", "hexplane_2"):
         with pytest.raises(RecipeError, match=name):
             build(name, painted)
-
-
-def test_without_an_ontology_nothing_of_classes_is_offered_or_built() -> None:
-    plain = replace(SETTINGS, classes=())
-    assert [name for name in usual_baselines(plain) if "sem" in name or "majority" in name] == []
-    assert plain.fill.majority is None
-    for name in ("reproject_semd", "majority_map"):
-        statistics = replace(SETTINGS.fill, majority=None)
-        with pytest.raises(RecipeError, match=name):
-            build(name, replace(plain, statistics=statistics))

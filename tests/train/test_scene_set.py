@@ -106,14 +106,6 @@ def traits(family: FamilyName, move_time: int) -> Traits:
     )
 
 
-def test_a_scene_has_the_same_clips_whatever_others_there_are_and_another_seed_has_others() -> None:
-    first = [DRAWN.control("scn02900", name, 60) for name in DRAWN.names("scn02900")]
-    assert first == [DRAWN.control("scn02900", name, 60) for name in DRAWN.names("scn02900")]
-    assert len({str(each.goal) for each in first}) == 4
-    assert first[0].goal != DRAWN.control("scn02901", "sample_00", 60).goal
-    assert first[0].goal != replace(DRAWN, seed=4).control("scn02900", "sample_00", 60).goal
-
-
 def test_the_released_script_makes_one_clip_of_its_own_angles() -> None:
     control = ListedControls(
         controls=released_controls(["scn02900"], orbit=True), clips=1, bounds=FrameBounds(skip=4)
@@ -205,14 +197,6 @@ def test_lists_and_splits_choose_scenes(kubric: Path, tmp_path: Path) -> None:
         opened(kubric, KUBRIC, split="kubric4d-train")
     with pytest.raises(RecipeError, match="not both"):
         opened(kubric, KUBRIC, split="kubric4d-test", listed=listed)
-
-
-@pytest.mark.parametrize("scenes", ["kubric", "driving"])
-def test_a_public_split_of_another_world_is_refused(scenes: str, request: pytest.FixtureRequest) -> None:
-    root = request.getfixturevalue(scenes)
-    said = "the world drop, but .* is of kubric4d" if scenes == "kubric" else "the world drop, but .* parallel_domain4d"
-    with pytest.raises(DataError, match=f"--split drop-test is for {said}; give another"):
-        opened(root, KUBRIC if scenes == "kubric" else DRIVING, split="drop-test")
 
 
 def test_a_scene_of_ours_is_of_the_world_that_its_manifest_says(tmp_path: Path) -> None:
