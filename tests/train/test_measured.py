@@ -8,17 +8,19 @@ import torch
 from driving_plane import PlaneClips
 from torch import Tensor
 
+from gcd_model.config import SemanticClass
 from gcd_model.errors import NonFiniteError, ShapeError
 from gcd_model.geometry import CameraMount
 from gcd_train.evaluation.clips import HeldOutClip
-from gcd_train.evaluation.measure import measure
+from gcd_train.evaluation.measure import predicted_and_measured
 from gcd_train.evaluation.metrics import NO_CLASS, Lpips, masked_mean, masked_psnr, psnr, ssim_map, window_mask
-from gcd_train.evaluation.predictors import CameraPair, Prediction, SourceClip, to_pictures
+from gcd_train.evaluation.predictors import CameraPair, Fixed, Prediction, SourceClip, to_pictures
 from gcd_train.evaluation.statistics import class_counts
 from gcd_train.evaluation.store import ClipRecord, Counted
 from gcd_train.evaluation.summary import evaluation
 
 FRAMES, HEIGHT, WIDTH, CLASSES = 4, 32, 48, 14
+KINDS = tuple(SemanticClass(name=f"kind {number}", colour=(number, 0, 0)) for number in range(CLASSES))
 
 
 def held_out(*, visible: bool = True, classes: bool = True) -> HeldOutClip:
@@ -57,7 +59,7 @@ def drawn(clip: HeldOutClip, draws: int) -> Prediction:
 
 
 def record_of(clip: HeldOutClip, prediction: Prediction, *, lpips: Lpips | None = None) -> ClipRecord:
-    return measure(clip, prediction, method="noisy", privileged=False, seconds=2.5, classes=CLASSES, lpips=lpips)
+    return predicted_and_measured(Fixed(name="noisy", prediction=prediction), clip, classes=KINDS, lpips=lpips)[1]
 
 
 def matrix(counted: Sequence[Counted]) -> Tensor:
@@ -104,7 +106,7 @@ def test_figures_of_each_draw_and_region_are_those_of_the_metrics() -> None:
     prediction = drawn(clip, 3)
     record, target = record_of(clip, prediction), to_pictures(clip.target)
     seen = torch.from_numpy(clip.visible)
-    assert (record.draws, record.frames, record.seconds) == (3, FRAMES, 2.5)
+    assert (record.draws, record.frames) == (3, FRAMES)
     for number, draw in enumerate(prediction.draws):
         found, visible = record.regions["all"], record.regions["visible"]
         assert found.psnr_db[number] == pytest.approx(psnr(draw.video, target).tolist())
@@ -130,16 +132,9 @@ def test_void_is_not_counted_where_it_is_true_and_wrong_where_it_is_said() -> No
     void, road = int(true[0, 0, 0]), int(true[0, -1, WIDTH // 2])
     said = true.clone()
     said[:, -2:] = void  # on the ground, the last row of the class grid
-    record = measure(
-        clip,
-        Prediction(classes=said),
-        method="noisy",
-        privileged=False,
-        seconds=0.0,
-        classes=CLASSES,
-        lpips=None,
-        void=(void,),
-    )
+    kinds = [SemanticClass(name="Void", colour=(0, 0, 0)) if i == void else kind for i, kind in enumerate(KINDS)]
+    named = Fixed(name="noisy", prediction=Prediction(classes=said))
+    record = predicted_and_measured(named, clip, classes=kinds)[1]
     for counted, rows, shape in (
         (record.regions["all"].confusion, 2, true[0].shape),
         (record.grid_confusion, 1, (HEIGHT // 2, WIDTH // 2)),

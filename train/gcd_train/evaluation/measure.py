@@ -5,6 +5,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import msgspec
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -13,45 +14,38 @@ from gcd_model.config import SemanticClass
 from gcd_model.errors import NonFiniteError, ShapeError
 from gcd_train.evaluation import metrics
 from gcd_train.evaluation.clips import HeldOutClip
-from gcd_train.evaluation.metrics import Lpips, void_ids
 from gcd_train.evaluation.predictors import Prediction, Predictor, to_labels, to_pictures
 from gcd_train.evaluation.store import ClipRecord, Counted, Frames, Region, RegionRecord
 
 
-def measure(
-    clip: HeldOutClip,
-    prediction: Prediction,
-    *,
-    method: str,
-    privileged: bool,
-    seconds: float,
-    classes: int,
-    lpips: Lpips | None,
-    void: Sequence[int] = (),
-) -> ClipRecord:
-    """All figures of one view, of every frame from the first on.
+def predicted_and_measured(
+    predictor: Predictor, clip: HeldOutClip, *, classes: Sequence[SemanticClass], lpips: metrics.Lpips | None = None
+) -> tuple[Prediction, ClipRecord]:
+    """What a method makes of a clip, and all figures of that, of every frame from the first on.
 
     Visible and occluded pixels are measured apart, too, where it is known which those are.
 
     Args:
-        seconds: that the method took. classes: how many there are, 0 for none. lpips: None where no weights were given.
-        void: ids among them that stand for no class, see `void_ids`: not counted where they are true, wrong where they
-            are said.
+        classes: the ontology, empty for none. Those that stand for no class, see `void_ids`, are not counted where they
+            are true, and wrong where they are said. lpips: None for no such figure.
     Raises:
-        ShapeError: a view is of another size or length than its target, a class id is unknown, or the draws of one
-            prediction do not all show the same kinds of things.
-        NonFiniteError: a view holds values that are no numbers.
+        what the method raises; ShapeError: a view is of another size or length than its target, a class id is unknown,
+            or the draws of one prediction do not all show the same kinds of things; NonFiniteError: a view holds values
+            that are no numbers.
     """
-    target, draws = to_pictures(clip.target), _pictures(prediction, f"{method} on {clip.key}")
-    painted = _Painted.of(clip, prediction, classes, void)
+    start = time.perf_counter()
+    prediction = predictor.predict(clip.seen)
+    seconds = time.perf_counter() - start
+    target, draws = to_pictures(clip.target), _pictures(prediction, f"{predictor.name} on {clip.key}")
+    painted = _Painted.of(clip, prediction, classes)
     shown = None if draws is None else _Shown.of(draws, target)
     masks: dict[Region, Tensor | None] = {"all": None}
     if clip.visible is not None:
         visible = torch.from_numpy(clip.visible.copy())
         masks |= {"visible": visible, "occluded": ~visible}
-    return ClipRecord(
-        method=method,
-        privileged=privileged,
+    return prediction, ClipRecord(
+        method=predictor.name,
+        privileged=predictor.privileged,
         key=clip.key,
         scene=clip.scene,
         change=clip.change,
@@ -75,7 +69,6 @@ class _Shown:
     """
 
     draws: Tensor
-    target: Tensor
     likeness: tuple[Tensor, ...]
     detail: tuple[Tensor, ...]
     target_detail: Tensor
@@ -84,28 +77,10 @@ class _Shown:
     def of(cls, draws: Tensor, target: Tensor) -> "_Shown":
         return cls(
             draws=draws,
-            target=target,
             likeness=tuple(metrics.ssim_map(each, target) for each in draws),
             detail=tuple(map(metrics.gradient_map, draws)),
             target_detail=metrics.gradient_map(target),
         )
-
-    def psnr(self, mask: Tensor | None) -> tuple[Frames, ...]:
-        if mask is None:
-            return tuple(_frames(metrics.psnr(each, self.target)) for each in self.draws)
-        return tuple(_frames(metrics.masked_psnr(each, self.target, mask)) for each in self.draws)
-
-    def ssim(self, mask: Tensor | None) -> tuple[Frames, ...]:
-        if mask is None:
-            return tuple(_frames(each.mean(dim=(1, 2))) for each in self.likeness)
-        inside = metrics.window_mask(mask)
-        return tuple(_frames(metrics.masked_mean(each, inside)) for each in self.likeness)
-
-    def gradient(self, mask: Tensor | None) -> tuple[Frames, ...]:
-        return tuple(_within(each, mask) for each in self.detail)
-
-    def diversity(self, mask: Tensor | None) -> Frames | None:
-        return None if len(self.draws) < 2 else _frames(metrics.diversity(self.draws, mask))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -117,14 +92,13 @@ class _Painted:
     classes: int
 
     @classmethod
-    def of(cls, clip: HeldOutClip, prediction: Prediction, classes: int, void: Sequence[int]) -> "_Painted | None":
+    def of(cls, clip: HeldOutClip, prediction: Prediction, classes: Sequence[SemanticClass]) -> "_Painted | None":
         said = _alike([draw.classes for draw in prediction.draws], "class maps")
-        true = to_labels(clip.target_classes)
+        true, void = to_labels(clip.target_classes), metrics.void_ids([each.name for each in classes])
         if said is None or true is None or not classes:
             return None
-        return cls(
-            said=metrics.without_classes(said.cpu(), void), true=metrics.without_classes(true, void), classes=classes
-        )
+        said, true = metrics.without_classes(said.cpu(), void), metrics.without_classes(true, void)
+        return cls(said=said, true=true, classes=len(classes))
 
     def confusion(self, mask: Tensor | None) -> Tensor:
         """Of each frame, all draws together: int64 [T, K, K + 1], last what is said to be of no class."""
@@ -146,14 +120,19 @@ class _Painted:
 def _region(mask: Tensor | None, target: Tensor, shown: _Shown | None, painted: _Painted | None) -> RegionRecord:
     """Figures on some pixels. mask: bool [T, H, W], or None for all."""
     share = torch.ones(len(target)) if mask is None else mask.double().mean(dim=(1, 2))
-    return RegionRecord(
-        pixels=tuple(share.tolist()),
-        psnr_db=None if shown is None else shown.psnr(mask),
-        ssim=None if shown is None else shown.ssim(mask),
-        diversity=None if shown is None else shown.diversity(mask),
-        gradient=None if shown is None else shown.gradient(mask),
-        gradient_target=None if shown is None else _within(shown.target_detail, mask),
-        confusion=None if painted is None else _counted(painted.confusion(mask)),
+    confusion = None if painted is None else _counted(painted.confusion(mask))
+    found = RegionRecord(pixels=tuple(share.tolist()), confusion=confusion)
+    if shown is None:
+        return found
+    near = (metrics.psnr(d, target) if mask is None else metrics.masked_psnr(d, target, mask) for d in shown.draws)
+    inside = None if mask is None else metrics.window_mask(mask)
+    return msgspec.structs.replace(
+        found,
+        psnr_db=tuple(map(_frames, near)),
+        ssim=tuple(_within(each, inside) for each in shown.likeness),
+        diversity=None if len(shown.draws) < 2 else _frames(metrics.diversity(shown.draws, mask)),
+        gradient=tuple(_within(each, mask) for each in shown.detail),
+        gradient_target=_within(shown.target_detail, mask),
     )
 
 
@@ -195,28 +174,3 @@ def _counted(confusions: Tensor) -> tuple[Counted, ...]:
 def _frames(values: Tensor) -> Frames:
     """NaN, where there was no pixel to measure, becomes None."""
     return tuple(None if math.isnan(value) else value for value in tuple(values.tolist()))
-
-
-def predicted_and_measured(
-    predictor: Predictor, clip: HeldOutClip, *, classes: Sequence[SemanticClass], lpips: Lpips | None = None
-) -> tuple[Prediction, ClipRecord]:
-    """What a method makes of a clip, and the record of that.
-
-    Args:
-        classes: the ontology, empty for none. lpips: None for no such figure.
-    Raises: what the method raises; ShapeError, NonFiniteError: see `measure`.
-    """
-    start = time.perf_counter()
-    prediction = predictor.predict(clip.seen)
-    seconds = time.perf_counter() - start
-    record = measure(
-        clip,
-        prediction,
-        method=predictor.name,
-        privileged=predictor.privileged,
-        seconds=seconds,
-        classes=len(classes),
-        void=void_ids([each.name for each in classes]),
-        lpips=lpips,
-    )
-    return prediction, record
