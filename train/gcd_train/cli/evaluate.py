@@ -14,7 +14,7 @@ from gcd_model import Quality, SolverName
 from gcd_train.cli.errors import errors_shown
 from gcd_train.cli.progress_bar import progress_bar
 from gcd_train.cli.training_run import command_line
-from gcd_train.errors import RecipeError
+from gcd_train.errors import RecipeError, TrainError
 from gcd_train.evaluation.galleries import KeptViews
 from gcd_train.evaluation.hexplane import HexPlaneSettings
 from gcd_train.evaluation.plan import EvaluateOptions, planned
@@ -158,7 +158,7 @@ def _evaluate(
     typer.echo(text)
     _say(f"wrote {out}/run.json, records, evaluation.json, evaluation.md" + " and contact_sheet.png" * bool(keys))
     if account.failures:
-        raise typer.Exit(account.exit_code)
+        raise typer.Exit(TrainError.exit_code)
 
 
 def _measured(work: ClipWork, workers: int, ray: str | None, device: str) -> Account:

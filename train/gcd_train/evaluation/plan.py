@@ -19,7 +19,7 @@ from gcd_train.data.splits import require_apart
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.baselines import VANILLA_SVD, BaselineSettings
 from gcd_train.evaluation.clips import EvaluationSet, PairedSet, SceneSet, identity_of, names_of
-from gcd_train.evaluation.galleries import Strip, contact_rows, write_sheet
+from gcd_train.evaluation.galleries import contact_rows, write_sheet
 from gcd_train.evaluation.hexplane import HexPlaneSettings
 from gcd_train.evaluation.methods import (
     Method,
@@ -209,11 +209,12 @@ class Plan:
 
     def write_sheet(self, path: Path, summary: Summary, keys: Sequence[str], keeper: RunKeeper) -> None:
         """The contact sheet of the first clips of a summary. Raises RunError."""
-        clips: list[tuple[str, tuple[Strip, ...]]] = []
-        for each, key in zip(summary.conditions.shots, keys, strict=False):
-            methods = [(name, keeper.sheet_rows(name, key)) for name in _on_the_sheet(summary)]
-            clips.append((str(each), contact_rows(self.clips.clip(key), methods, self.clips.classes)))
-        write_sheet(clips, path)
+        shown, classes = _on_the_sheet(summary), self.clips.classes
+        rows = [
+            contact_rows(self.clips.clip(key), [(name, keeper.sheet_rows(name, key)) for name in shown], classes)
+            for key in keys
+        ]
+        write_sheet(list(zip(map(str, summary.conditions.shots), rows, strict=False)), path)
 
 
 def planned(options: EvaluateOptions) -> Plan:

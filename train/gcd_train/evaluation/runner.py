@@ -10,11 +10,11 @@ from typing import TypeAlias
 
 from gcd_model.errors import ModelError
 from gcd_train.errors import DataError, RunError, TrainError
-from gcd_train.evaluation.clips import EvaluationSet, HeldOutClip
+from gcd_train.evaluation.clips import EvaluationSet
 from gcd_train.evaluation.galleries import KeptViews, has_rows, has_views, write_rows, write_views
 from gcd_train.evaluation.measure import predicted_and_measured
 from gcd_train.evaluation.metrics import Lpips
-from gcd_train.evaluation.predictors import Prediction, Predictor
+from gcd_train.evaluation.predictors import Predictor
 from gcd_train.evaluation.statistics import FIRST_MEASURED
 from gcd_train.evaluation.store import ClipRecord, RunKeeper
 from gcd_train.parallel import Outcome, map_items, one_thread_each
@@ -68,14 +68,22 @@ class ClipWork:
         """Raises: DataError where the clip cannot be read, RunError where nothing can be written."""
         predictors = {name: self._predictor(name) for name in (*item.methods, *item.unseen)}
         clip, measured, drawn = self.clips.clip(item.key), list[ClipRecord](), list[str]()
-        failed: dict[str, str] = {}
+        keeper, classes, failed = RunKeeper(self.folder), self.clips.classes, dict[str, str]()
+        lpips = None if self.lpips is None else _opened_lpips(self.lpips)
         for name, predictor in predictors.items():
             try:
                 if name in item.methods:
-                    measured.append(self._measured(predictor, clip))
+                    prediction, record = predicted_and_measured(predictor, clip, classes=classes, lpips=lpips)
                 else:
-                    self._keep_frames(clip, name, predictor.predict(clip.seen))
+                    prediction, record = predictor.predict(clip.seen), None
+                write_views(keeper.views(name, clip.key), clip, prediction, self.views, classes)
+                if clip.key in self.sheet:
+                    write_rows(keeper.sheet_rows(name, clip.key), prediction, classes)
+                if record is None:
                     drawn.append(name)
+                else:  # written last: what has a record is whole
+                    keeper.keep(record)
+                    measured.append(record)
             except RunError:
                 raise
             except (TrainError, ModelError) as error:
@@ -84,22 +92,18 @@ class ClipWork:
 
     def missing(self) -> list[ClipItem]:
         """Clips with the methods that have no record of them, or not the frames that are to be kept."""
-        items = [self._missing(key) for key in self.clips.keys]
-        return [item for item in items if item.methods or item.unseen]
+        keeper, items = RunKeeper(self.folder), list[ClipItem]()
+        for key in self.clips.keys:
+            lacking = tuple(name for name in self.makers if not keeper.has(name, key))
+            others = [name for name in self.makers if name not in lacking]
+            unseen = tuple(name for name in others if not self._has_frames(keeper, name, key))
+            items += [ClipItem(key=key, methods=lacking, unseen=unseen)] if lacking or unseen else []
+        return items
 
-    def _missing(self, key: str) -> ClipItem:
-        keeper = RunKeeper(self.folder)
-        lacking = tuple(name for name in self.makers if not keeper.has(name, key))
-        unseen = [
-            name
-            for name in self.makers
-            if name not in lacking
-            and not (
-                has_views(keeper.views(name, key), self.views, self.clips.frames)
-                and (key not in self.sheet or has_rows(keeper.sheet_rows(name, key), keeper.read(name, key)))
-            )
-        ]
-        return ClipItem(key=key, methods=lacking, unseen=tuple(unseen))
+    def _has_frames(self, keeper: RunKeeper, name: str, key: str) -> bool:
+        if not has_views(keeper.views(name, key), self.views, self.clips.frames):
+            return False
+        return key not in self.sheet or has_rows(keeper.sheet_rows(name, key), keeper.read(name, key))
 
     def _predictor(self, name: str) -> Predictor:
         """The method of that name, made once in each process."""
@@ -109,24 +113,8 @@ class ClipWork:
             _MADE[self.run, name] = self.makers[name]()
         return _MADE[self.run, name]
 
-    def _measured(self, predictor: Predictor, clip: HeldOutClip) -> ClipRecord:
-        """The record is written last: what has one is whole."""
-        lpips = None if self.lpips is None else _opened_lpips(self.lpips)
-        prediction, record = predicted_and_measured(predictor, clip, classes=self.clips.classes, lpips=lpips)
-        self._keep_frames(clip, record.method, prediction)
-        RunKeeper(self.folder).keep(record)
-        return record
 
-    def _keep_frames(self, clip: HeldOutClip, method: str, prediction: Prediction) -> None:
-        keeper = RunKeeper(self.folder)
-        write_views(keeper.views(method, clip.key), clip, prediction, self.views, self.clips.classes)
-        if clip.key in self.sheet:
-            write_rows(keeper.sheet_rows(method, clip.key), prediction, self.clips.classes)
-
-
-@lru_cache(maxsize=1)
-def _opened_lpips(folder: Path) -> Lpips:
-    return Lpips.open(folder)
+_opened_lpips = lru_cache(maxsize=1)(Lpips.open)
 
 
 @dataclass(slots=True)
@@ -164,11 +152,6 @@ class Account:
         for what, why in self.failures.items():
             reasons.setdefault(what.partition(", ")[2] or "every method", []).append(why)
         return tuple(f"{name} on {len(each)} of {self.clips} clips ({each[0]})" for name, each in reasons.items())
-
-    @property
-    def exit_code(self) -> int:
-        """Of the command."""
-        return TrainError.exit_code if self.failures else 0
 
     def add(self, outcome: Outcome[ClipItem, ClipDone]) -> None:
         """Count one clip. Raises RunError where nothing can be written."""
