@@ -11,10 +11,9 @@ from made_records import FRAMES, note, record, region
 from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
-from gcd_train.evaluation.comparison import differences
-from gcd_train.evaluation.comparison import differences_markdown as differences_told
 from gcd_train.evaluation.galleries import caption
-from gcd_train.evaluation.report import Choices, make_report
+from gcd_train.evaluation.report import Choices, differences, make_report
+from gcd_train.evaluation.report import differences_markdown as differences_told
 from gcd_train.evaluation.runs import EvaluatedSet, Run, gather, on_the_same_goals
 from gcd_train.evaluation.store import ClipRecord, RegionRecord, RunKeeper
 from gcd_train.evaluation.tables import Measured, frames_csv, main_tables, region_table, to_markdown

@@ -20,7 +20,7 @@ from gcd_train.cli.main import app
 from gcd_train.data.paths import FrameSampling, OrbitSampling
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.clips import EvaluationSet
-from gcd_train.evaluation.opening import Choice, SceneCuts, open_scenes, public_split, public_split_names
+from gcd_train.evaluation.opening import Choice, SceneCuts, open_scenes, public_split, public_splits
 from gcd_train.evaluation.protocol import (
     RELEASED_SOURCE,
     DrawnControls,
@@ -240,7 +240,7 @@ def test_the_identity_follows_the_files_and_neither_their_place_nor_their_times(
 
 
 def test_public_splits_of_a_world_share_no_scene() -> None:
-    assert {"driving-test", "drop-test", "tabletop-test", "kubric4d-test20"} <= set(public_split_names())
+    assert {"driving-test", "drop-test", "tabletop-test", "kubric4d-test20"} <= set(public_splits())
     for world in ("driving", "drop", "tabletop", "kubric4d"):
         parts = [public_split(f"{world}-{part}") for part in ("train", "valid", "test")]
         assert all(len(part) > 0 for part in parts)

@@ -97,8 +97,7 @@ class ListedControls:
 
     def strides(self, scene: str, /) -> Sequence[int]:
         """As listed, or as bound."""
-        names = self.names(scene)
-        return [self.bounds.of(each).frame_skip for each in self.controls.get(scene, ()) if each.name in names]
+        return [self.bounds.of(each).frame_skip for each in self.controls.get(scene, ())[: self.clips]]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -196,21 +195,21 @@ def controlled(
 
 def require_cameras(data: Dataset4D) -> None:
     """Raises DataError, with the first fault, where no scene can be opened with all of its cameras."""
-    faults: list[DataError] = []
+    fault: DataError | None = None
     for scene in data.scenes:
         try:
             data.frames(scene)
-        except DataError as fault:
-            faults.append(fault)
+        except DataError as error:
+            fault = fault or error
         else:
             return
-    if faults:
-        few = len(data.cameras) <= _NAMED
-        cameras = f"the cameras {', '.join(data.cameras)}" if few else f"its {len(data.cameras)} cameras"
+    if fault is not None:
+        names, count = ", ".join(data.cameras), len(data.cameras)
+        cameras = f"the cameras {names}" if count <= _NAMED else f"its {count} cameras"
         raise DataError(
-            f"none of {len(faults)} scenes can be opened with {cameras}: {faults[0]}; name those there are with "
+            f"none of {len(data.scenes)} scenes can be opened with {cameras}: {fault}; name those there are with "
             "--camera"
-        ) from faults[0]
+        ) from fault
 
 
 def orbit_notes(controls: ListedControls, scenes: Sequence[str], listed: Path) -> tuple[str, ...]:

@@ -8,6 +8,8 @@ from math import isnan, nan
 from statistics import fmean
 from typing import Any
 
+import numpy as np
+
 from gcd_train.evaluation.paper import (
     CLASS_COLUMNS,
     PICTURE_COLUMNS,
@@ -368,3 +370,22 @@ def frames_csv(measured: Measured) -> str:
                 of_frame = [method.name, str(frame), region]
                 lines += [[*of_frame, name, f"{value:.6g}"] for name, value in values.items() if not isnan(value)]
     return csv_text(["method", "frame", "pixels", "figure", "value"], lines)
+
+
+WORST_REGIONS: tuple[Region, ...] = ("all", "occluded")
+"""That clips are looked at in one by one."""
+_BY_CLIP: tuple[FigureName, ...] = ("psnr_db", "ssim", "miou_full")
+
+
+def clips_csv(measured: Measured) -> str:
+    """Every method on every clip: one line each, frames 2 to the last."""
+    columns: list[tuple[FigureName, Region]] = [(name, region) for region in WORST_REGIONS for name in _BY_CLIP]
+    lines: list[list[str]] = []
+    for method in measured.of.methods:
+        by_clip = np.stack([measured.by_clip(method, region, name) for name, region in columns], axis=1)
+        for record, values in zip(method.records, by_clip.tolist(), strict=True):
+            change = ("", "", "") if record.change is None else tuple(f"{part:g}" for part in record.change)
+            cells = ["" if np.isnan(value) else f"{value:.6g}" for value in values]
+            lines.append([method.name, record.key, record.scene, *change, *cells, f"{record.seconds:.4g}"])
+    named = [f"{name} {region}" for name, region in columns]
+    return csv_text(["method", "clip", "scene", "azimuth", "elevation", "radius", *named, "seconds"], lines)
