@@ -15,9 +15,9 @@ from gcd_train.data.pairs import PairedClips
 from gcd_train.errors import DataError, RunError
 from gcd_train.evaluation.clips import HeldOutClip, PairedSet, chosen, identity_of
 from gcd_train.evaluation.galleries import KeptViews, png
+from gcd_train.evaluation.measure import GIVE_UP_AFTER, Account, ClipWork, assign_gpus, measure_all
 from gcd_train.evaluation.predictors import CopySource, Prediction, Predictor, SourceClip, to_pictures
 from gcd_train.evaluation.report import Choices, make_report
-from gcd_train.evaluation.runner import GIVE_UP_AFTER, Account, ClipWork, assign_gpus, measure_all
 from gcd_train.evaluation.store import RunKeeper, folder_name, read_run
 
 

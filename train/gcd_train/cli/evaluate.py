@@ -15,8 +15,8 @@ from gcd_train.cli.training_run import command_line
 from gcd_train.errors import RecipeError, TrainError
 from gcd_train.evaluation.galleries import KeptViews
 from gcd_train.evaluation.hexplane import HexPlaneSettings
+from gcd_train.evaluation.measure import Account, ClipWork, assign_gpus, measure_all
 from gcd_train.evaluation.plan import EvaluateOptions, planned
-from gcd_train.evaluation.runner import Account, ClipWork, assign_gpus, measure_all
 from gcd_train.evaluation.store import RunKeeper
 from gcd_train.evaluation.summary import complete_rows, to_markdown, write_summary
 

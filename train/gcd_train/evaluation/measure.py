@@ -1,9 +1,14 @@
-"""One method's view of one clip against its target, as the record that all tables are made from."""
+"""Methods measured on clips: one view against its target as a record, and all clips over processes or a Ray cluster."""
 
 import math
+import os
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import TypeAlias
 
 import msgspec
 import torch
@@ -11,11 +16,15 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gcd_model.config import SemanticClass
-from gcd_model.errors import NonFiniteError, ShapeError
+from gcd_model.errors import ModelError, NonFiniteError, ShapeError
+from gcd_train.errors import DataError, RunError, TrainError
 from gcd_train.evaluation import metrics
-from gcd_train.evaluation.clips import HeldOutClip
+from gcd_train.evaluation.clips import EvaluationSet, HeldOutClip
+from gcd_train.evaluation.galleries import KeptViews, has_rows, has_views, write_rows, write_views
 from gcd_train.evaluation.predictors import Prediction, Predictor, to_labels, to_pictures
-from gcd_train.evaluation.store import ClipRecord, Counted, Frames, Region, RegionRecord
+from gcd_train.evaluation.statistics import FIRST_MEASURED
+from gcd_train.evaluation.store import ClipRecord, Counted, Frames, Region, RegionRecord, RunKeeper
+from gcd_train.parallel import Outcome, map_items, one_thread_each
 
 
 def predicted_and_measured(
@@ -174,3 +183,217 @@ def _counted(confusions: Tensor) -> tuple[Counted, ...]:
 def _frames(values: Tensor) -> Frames:
     """NaN, where there was no pixel to measure, becomes None."""
     return tuple(None if math.isnan(value) else value for value in tuple(values.tolist()))
+
+
+GIVE_UP_AFTER = 5
+"""Clips in a row of which nothing could be measured, after which a run stops: something is wrong with all of them."""
+
+Maker: TypeAlias = Callable[[], Predictor]
+"""Makes a method where it is to run. It is sent to other processes: a function of a module, or `partial` of one."""
+
+_MADE: dict[tuple[str, str], Predictor] = {}
+"""Methods of this process by run and name: weights are opened once, and those of an earlier run are let go."""
+_VISIBLE = "CUDA_VISIBLE_DEVICES"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ClipItem:
+    """One clip, the methods that have no record of it yet, and those that only lack frames that are to be kept."""
+
+    key: str
+    methods: tuple[str, ...]
+    unseen: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ClipDone:
+    """What became of a clip's methods. drawn: for their frames alone. failed: name to why there is nothing."""
+
+    measured: tuple[ClipRecord, ...]
+    failed: dict[str, str]
+    drawn: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ClipWork:
+    """Measures methods on one clip and keeps the records; goes to other processes whole.
+
+    folder: the run's. makers: of all methods, by name. lpips: folder of the weights, or None. views: frames to keep.
+    sheet: clips of the contact sheet. run: names this run within a process.
+    """
+
+    folder: Path
+    clips: EvaluationSet
+    makers: Mapping[str, Maker]
+    lpips: Path | None = None
+    views: KeptViews = "none"
+    sheet: tuple[str, ...] = ()
+    run: str = field(default_factory=lambda: uuid.uuid4().hex)
+
+    def __call__(self, item: ClipItem) -> ClipDone:
+        """Raises: DataError where the clip cannot be read, RunError where nothing can be written."""
+        predictors = {name: self._predictor(name) for name in (*item.methods, *item.unseen)}
+        clip, measured, drawn = self.clips.clip(item.key), list[ClipRecord](), list[str]()
+        keeper, classes, failed = RunKeeper(self.folder), self.clips.classes, dict[str, str]()
+        lpips = None if self.lpips is None else _opened_lpips(self.lpips)
+        for name, predictor in predictors.items():
+            try:
+                if name in item.methods:
+                    prediction, record = predicted_and_measured(predictor, clip, classes=classes, lpips=lpips)
+                else:
+                    prediction, record = predictor.predict(clip.seen), None
+                write_views(keeper.views(name, clip.key), clip, prediction, self.views, classes)
+                if clip.key in self.sheet:
+                    write_rows(keeper.sheet_rows(name, clip.key), prediction, classes)
+                if record is None:
+                    drawn.append(name)
+                else:  # written last: what has a record is whole
+                    keeper.keep(record)
+                    measured.append(record)
+            except RunError:
+                raise
+            except (TrainError, ModelError) as error:
+                failed[name] = str(error)
+        return ClipDone(measured=tuple(measured), failed=failed, drawn=tuple(drawn))
+
+    def missing(self) -> list[ClipItem]:
+        """Clips with the methods that have no record of them, or not the frames that are to be kept."""
+        keeper, items = RunKeeper(self.folder), list[ClipItem]()
+        for key in self.clips.keys:
+            lacking = tuple(name for name in self.makers if not keeper.has(name, key))
+            others = [name for name in self.makers if name not in lacking]
+            unseen = tuple(name for name in others if not self._has_frames(keeper, name, key))
+            items += [ClipItem(key=key, methods=lacking, unseen=unseen)] if lacking or unseen else []
+        return items
+
+    def _has_frames(self, keeper: RunKeeper, name: str, key: str) -> bool:
+        if not has_views(keeper.views(name, key), self.views, self.clips.frames):
+            return False
+        return key not in self.sheet or has_rows(keeper.sheet_rows(name, key), keeper.read(name, key))
+
+    def _predictor(self, name: str) -> Predictor:
+        """The method of that name, made once in each process."""
+        for place in [place for place in _MADE if place[0] != self.run]:
+            del _MADE[place]
+        if (self.run, name) not in _MADE:
+            _MADE[self.run, name] = self.makers[name]()
+        return _MADE[self.run, name]
+
+
+_opened_lpips = lru_cache(maxsize=1)(metrics.Lpips.open)
+
+
+@dataclass(slots=True)
+class Account:
+    """How far a run is. there: clips that had all their records before, and all frames that are to be kept.
+
+    measured: clips with a new record. drawn: clips of which only frames were lacking, and now are there. failures:
+    clip, or clip and method, to why. gave_up: stopped before its end, see `GIVE_UP_AFTER`. records: the new ones, by
+    method and key.
+    """
+
+    clips: int
+    there: int = 0
+    measured: int = 0
+    drawn: int = 0
+    failures: dict[str, str] = field(default_factory=dict[str, str])
+    records: dict[tuple[str, str], ClipRecord] = field(default_factory=dict[tuple[str, str], ClipRecord])
+    _tried: int = 0
+    _in_a_row: int = 0
+
+    @property
+    def done(self) -> int:
+        """Clips with an outcome."""
+        return self.there + self._tried
+
+    @property
+    def gave_up(self) -> bool:
+        """Whether too many clips in a row had no record."""
+        return self._in_a_row >= GIVE_UP_AFTER
+
+    def failed(self) -> tuple[str, ...]:
+        """For each method that failed on clips, on how many and why the first time; all of them for clips that could
+        not be read."""
+        reasons: dict[str, list[str]] = {}
+        for what, why in self.failures.items():
+            reasons.setdefault(what.partition(", ")[2] or "every method", []).append(why)
+        return tuple(f"{name} on {len(each)} of {self.clips} clips ({each[0]})" for name, each in reasons.items())
+
+    def add(self, outcome: Outcome[ClipItem, ClipDone]) -> None:
+        """Count one clip. Raises RunError where nothing can be written."""
+        self._tried += 1
+        key, useful, faults = outcome.item.key, False, dict[str, str]()
+        try:
+            found = outcome.unwrap()
+        except RunError:
+            if outcome.kind == RunError.__name__:
+                raise
+            faults = {key: outcome.error or "unknown"}
+        except TrainError as error:
+            faults = {key: str(error)}
+        else:
+            faults = {f"{key}, {name}": why for name, why in found.failed.items()}
+            useful = bool(found.measured or found.drawn)
+            self.measured += bool(found.measured)
+            self.drawn += bool(found.drawn and not found.measured)
+            self.records |= {(record.method, key): record for record in found.measured}
+        self.failures |= faults
+        self._in_a_row = self._in_a_row + 1 if faults and not useful else 0
+
+    def lines(self) -> list[str]:
+        """What to tell at the end: a summary, and one line for each failure."""
+        again = f", {self.drawn} drawn again for their frames" if self.drawn else ""
+        counts = f"clips: {self.measured} measured, {self.there} there already{again}; {len(self.failures)} failures"
+        lines = [counts, *(f"  {what}: {why}" for what, why in self.failures.items())]
+        if self.gave_up:
+            lines.append(f"  gave up after {GIVE_UP_AFTER} clips in a row without a record; the same line goes on")
+        return lines
+
+
+def measure_all(
+    work: ClipWork,
+    *,
+    workers: int = 1,
+    ray_address: str | None = None,
+    gpus: float = 0.0,
+    environments: Sequence[Mapping[str, str]] = (),
+) -> Iterator[Account]:
+    """Measure every method on every clip that has no record of it; gives the account after every clip, the same object.
+
+    Where only frames that are to be kept are missing, they are drawn again and the record stays as it is.
+
+    Args:
+        workers, ray_address, gpus, environments: see `map_items`.
+    Raises:
+        DataError: there is nothing to measure. RunError: nothing can be written, or as `map_items`.
+    """
+    clips = work.clips
+    if not clips.keys or clips.frames <= FIRST_MEASURED + 1:
+        raise DataError(
+            f"evaluation wants a clip of 3 frames or more, got {len(clips.keys)} of {clips.frames}; generate some"
+        )
+    if workers > 1 or ray_address is not None:
+        one_thread_each()
+    items = work.missing()
+    account = Account(clips=len(clips.keys), there=len(clips.keys) - len(items))
+    yield account
+    for outcome in map_items(
+        work, items, workers=workers, ray_address=ray_address, gpus=gpus, environments=environments
+    ):
+        account.add(outcome)
+        yield account
+        if account.gave_up:
+            return
+
+
+def assign_gpus(device: str, count: int) -> tuple[Mapping[str, str], ...]:
+    """Environments of workers that see one GPU each, in turn; none where there is no choice.
+
+    Args:
+        device: as asked for; one that is named, as `cuda:1` or `cpu`, is every worker's. count: of this process' GPUs.
+    """
+    if device not in ("auto", "cuda") or count < 2:
+        return ()
+    given = [name.strip() for name in os.environ.get(_VISIBLE, "").split(",") if name.strip()]
+    names = given[:count] if len(given) >= count else [str(number) for number in range(count)]
+    return tuple({_VISIBLE: name} for name in names)

@@ -35,9 +35,9 @@ from gcd_train.evaluation.baselines import (
     usual_baselines,
 )
 from gcd_train.evaluation.clips import EvaluationSet, names_of
+from gcd_train.evaluation.measure import Maker
 from gcd_train.evaluation.metrics import NO_CLASS
 from gcd_train.evaluation.predictors import CameraPair, Prediction, Predictor, SourceClip
-from gcd_train.evaluation.runner import Maker
 from gcd_train.evaluation.saved_frames import SavedFrames
 from gcd_train.evaluation.store import FRAMES_IN
 
