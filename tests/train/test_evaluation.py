@@ -219,20 +219,6 @@ def test_a_model_of_another_size_ontology_or_camera_is_refused() -> None:
         SynthesizedViews.of(fake(clips), PlaneClips.orbits(CHANGES))
 
 
-def test_several_draws_are_measured_each_and_their_spread_is_told() -> None:
-    clips = PlaneClips.make(1)
-    synthesizer = fake(clips)
-    rows = [SynthesizedViews.of(synthesizer, clips, RenderOptions(samples=each, seed=7)) for each in (1, 3)]
-    one, three = evaluated(rows, clips)
-    assert [each.samples for each in synthesizer.options] == [1, 3]
-    assert {each.seed for each in synthesizer.options} == {7}
-    assert np.isnan(one.value("diversity"))
-    assert three.value("diversity") > 0
-    drawn = rows[1].predict(PairedSet(clips=clips, identity="plane").clip("plane-00000000").seen).draws
-    each = [evaluated([Painted(video=draw.video)], clips)[0].value("psnr_db") for draw in drawn]
-    assert three.value("psnr_db") == pytest.approx(np.mean(each))
-
-
 def test_a_model_of_another_pace_than_driving_clips_is_refused() -> None:
     clips = PlaneClips.make(1)
     synthesizer = fake(clips)

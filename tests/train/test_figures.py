@@ -14,7 +14,6 @@ from gcd_train.evaluation.statistics import (
     class_counts,
     difference,
     lead,
-    scene_weights,
 )
 from gcd_train.evaluation.store import ClipRecord
 from gcd_train.evaluation.summary import evaluation
@@ -36,13 +35,6 @@ def figure(records: Sequence[ClipRecord], name: FigureName, selection: Selection
 
 
 # --- how sure -----------------------------------------------------------------------------------------------------
-
-
-def test_every_draw_takes_as_many_scenes_as_there_are_and_the_same_seed_takes_the_same() -> None:
-    weights = scene_weights(7, draws=50, seed=1)
-    np.testing.assert_array_equal(weights.sum(axis=1), np.full(50, 7.0))
-    np.testing.assert_array_equal(weights, scene_weights(7, draws=50, seed=1))
-    assert not np.array_equal(weights, scene_weights(7, draws=50, seed=2))
 
 
 def test_interval_and_error_of_a_mean_are_those_of_a_plain_bootstrap_over_scenes() -> None:
@@ -112,13 +104,6 @@ def test_sharpness_and_flicker_are_ratios_of_sums_without_the_first_frame() -> N
         found = figure([clip], "gradient_energy", selection), figure([clip], "flicker", selection)
         assert found == pytest.approx(expected)
     assert math.isnan(figure([clip], "flicker", Selection(frames=1)))
-
-
-def test_draws_are_averaged_and_their_spread_is_told() -> None:
-    draws = region((20.0,) * 4, draws=2)
-    apart = type(draws)(pixels=draws.pixels, psnr_db=((10.0,) * 4, (20.0,) * 4), ssim=draws.ssim, diversity=(0.02,) * 4)
-    clip = record(regions={"all": apart}, draws=2)
-    assert (figure([clip], "psnr_db"), figure([clip], "diversity")) == pytest.approx((15.0, 0.02))
 
 
 # --- classes ------------------------------------------------------------------------------------------------------

@@ -20,7 +20,6 @@ from gcd_train.evaluation.hexplane import (
     HexPlaneSettings,
     SceneBounds,
     resampled,
-    weights,
 )
 from gcd_train.evaluation.predictors import CameraPair, SourceClip
 
@@ -105,23 +104,6 @@ def test_each_plane_of_space_is_multiplied_with_the_plane_that_shares_no_axis_wi
     expected = [(x + 10 * y) * (100 * z + 1000 * t), (x + 10 * z) * (100 * y + 1000 * t)]
     expected += [(y + 10 * z) * (100 * x + 1000 * t)]
     assert_close(planes(torch.tensor([[x, y, z, t]]))[0], torch.tensor(expected), rtol=1e-4, atol=1e-2)
-
-
-def test_finer_planes_hold_what_the_coarser_ones_held() -> None:
-    planes = HexPlanes(features=3, side=5, moments=4, generator=torch.Generator().manual_seed(3))
-    points = torch.rand(40, 4, generator=torch.Generator().manual_seed(4)) * 2 - 1
-    before = planes(points)
-    planes.refine(9)
-    assert planes.space.shape == (3, 3, 9, 9)
-    assert planes.time.shape == (3, 3, 4, 9)
-    assert_close(planes(points), before)
-
-
-def test_what_does_not_add_to_the_light_of_a_ray_has_passed_through_all_of_it() -> None:
-    depth = torch.rand(20, 9, generator=torch.Generator().manual_seed(6)) * 2
-    share = weights(depth)
-    assert (share >= 0).all()
-    assert_close(1 - share.sum(dim=1), (-depth.sum(dim=1)).exp())
 
 
 def test_samples_gather_where_the_light_is_and_keep_the_ends() -> None:

@@ -1,12 +1,10 @@
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from driving_plane import PlaneClips
-from torch import Tensor
 
 from gcd_model.config import SemanticClass
 from gcd_model.errors import NonFiniteError, ShapeError
@@ -16,7 +14,7 @@ from gcd_train.evaluation.measure import predicted_and_measured
 from gcd_train.evaluation.metrics import NO_CLASS, Lpips, masked_mean, masked_psnr, psnr, ssim_map, window_mask
 from gcd_train.evaluation.predictors import CameraPair, Fixed, Prediction, SourceClip, to_pictures
 from gcd_train.evaluation.statistics import class_counts
-from gcd_train.evaluation.store import ClipRecord, Counted
+from gcd_train.evaluation.store import ClipRecord
 from gcd_train.evaluation.summary import evaluation
 
 FRAMES, HEIGHT, WIDTH, CLASSES = 4, 32, 48, 14
@@ -60,45 +58,6 @@ def drawn(clip: HeldOutClip, draws: int) -> Prediction:
 
 def record_of(clip: HeldOutClip, prediction: Prediction, *, lpips: Lpips | None = None) -> ClipRecord:
     return predicted_and_measured(Fixed(name="noisy", prediction=prediction), clip, classes=KINDS, lpips=lpips)[1]
-
-
-def matrix(counted: Sequence[Counted]) -> Tensor:
-    """Of all frames together."""
-    confusion = torch.zeros(CLASSES, CLASSES, dtype=torch.int64)
-    for frame in counted:
-        for true, said, count in frame:
-            confusion[true, said] += count
-    return confusion
-
-
-def mixed(record: ClipRecord, frame: int) -> float:
-    """Squared error of a frame from that of its visible and its occluded pixels."""
-    total = 0.0
-    for region in (record.regions["visible"], record.regions["occluded"]):
-        assert region.psnr_db is not None
-        decibel = region.psnr_db[0][frame]
-        total += 0.0 if decibel is None else region.pixels[frame] * 10 ** (-decibel / 10)
-    return total
-
-
-def test_visible_and_occluded_pixels_make_up_all_of_them() -> None:
-    clip = held_out()
-    record = record_of(clip, noisy(clip, 0))
-    whole, parts = record.regions["all"], [record.regions["visible"], record.regions["occluded"]]
-    assert whole.pixels == (1.0,) * FRAMES
-    assert [a + b for a, b in zip(parts[0].pixels, parts[1].pixels, strict=True)] == [1.0] * FRAMES
-    assert whole.psnr_db is not None
-    squared = [10 ** (-(each or 0.0) / 10) for each in whole.psnr_db[0]]
-    assert [mixed(record, frame) for frame in range(FRAMES)] == pytest.approx(squared, rel=1e-5)
-    counted = [part.confusion for part in (whole, *parts)]
-    assert all(each is not None for each in counted)
-    for frame in range(FRAMES):  # lengths of gradients too are means over pixels
-        lengths = [0.0 if part.gradient is None else (part.gradient[0][frame] or 0.0) for part in (whole, *parts)]
-        shares = [part.pixels[frame] for part in parts]
-        assert shares[0] * lengths[1] + shares[1] * lengths[2] == pytest.approx(lengths[0], rel=1e-5)
-        assert lengths[0] > 0.0
-    everything, seen, unseen = (matrix(each) for each in counted if each is not None)
-    assert everything.equal(seen + unseen)
 
 
 def test_figures_of_each_draw_and_region_are_those_of_the_metrics() -> None:

@@ -11,7 +11,7 @@ from driving_plane import PlaneClips, plane_clip
 from gcd_model.config import SemanticClass
 from gcd_model.geometry import CameraMount
 from gcd_train.data.sample import SceneView
-from gcd_train.errors import DataError, RecipeError
+from gcd_train.errors import RecipeError
 from gcd_train.evaluation.baselines import BaselineSettings, ClassesAlone, build, described, usual_baselines
 from gcd_train.evaluation.metrics import NO_CLASS
 from gcd_train.evaluation.predictors import CameraPair, SourceClip, fit_statistics
@@ -90,13 +90,6 @@ def test_points_of_the_data_sets_own_views_are_drawn_instead_where_there_are_som
     off = (made - usual).abs().mean(dim=1)[both]
     assert 0.0 < float(off.mean()) < 0.05
     assert (classes(finer) == classes())[both].float().mean() > 0.9
-
-
-def test_a_clip_without_classes_or_with_unknown_ones_is_refused_by_its_name() -> None:
-    with pytest.raises(DataError, match="class maps, got plane-0 without"):
-        classes(replace(SEEN, source_classes=None))
-    with pytest.raises(DataError, match="plane-0 has class 4 of 2"):
-        classes(kinds=CLASSES[:2])
 
 
 def test_a_run_is_told_where_holes_of_class_maps_are_of_no_class() -> None:

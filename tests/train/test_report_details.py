@@ -1,6 +1,5 @@
 """What stands in a report's tables, stars, ticks and captions, and which options it refuses."""
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -8,15 +7,13 @@ import cv2
 import msgspec
 import pytest
 from made_records import FRAMES, note, record, region
-from typer.testing import CliRunner
 
-from gcd_train.cli.main import app
 from gcd_train.evaluation.galleries import caption
-from gcd_train.evaluation.report import Choices, differences, make_report
+from gcd_train.evaluation.report import differences
 from gcd_train.evaluation.report import differences_markdown as differences_told
 from gcd_train.evaluation.runs import EvaluatedSet, Run, gather, on_the_same_goals
 from gcd_train.evaluation.store import ClipRecord, RegionRecord, RunKeeper
-from gcd_train.evaluation.tables import Measured, frames_csv, main_tables, region_table, to_markdown
+from gcd_train.evaluation.tables import Measured, main_tables, region_table, to_markdown
 
 COUNTS = [(0, 0, 9), (1, 0, 1)]
 
@@ -61,21 +58,6 @@ def test_methods_outside_the_papers_rows_stand_below_in_the_last_frame_too(kind:
     ]
 
 
-@pytest.mark.parametrize(
-    ("kind", "protocol", "hint"),
-    [
-        ("kubric", "paper", "--row mine: no row is called 'anything'; there are GCD (direct, max 90, scratch);"),
-        ("orbit", "pairs", "none of them is for these clips"),
-    ],
-)
-def test_a_row_that_no_table_has_is_refused(tmp_path: Path, kind: str, protocol: str, hint: str) -> None:
-    folder = kept(tmp_path / "run", kind=kind, protocol=protocol)
-    given = ["report", str(folder), "--out", str(tmp_path / "out"), "--no-plots", "--row", "mine=anything"]
-    done = CliRunner().invoke(app, given)
-    assert (done.exit_code, done.output.count("\n")) == (78, 1)
-    assert hint in done.output
-
-
 # --- stars --------------------------------------------------------------------------------------------------------
 
 
@@ -109,17 +91,6 @@ def test_visible_pixels_diversity_and_sharpness_stand_in_a_table() -> None:
     assert values == ["20.00", "30.00", "10.00", "0.500", "0.500", "0.500", "0.0100", "0.50"]
     assert str(table.rows[1].cells[6]) == "-"
     assert "nan" not in to_markdown(table)
-
-
-def test_every_frame_has_its_figures_on_all_kinds_of_pixels(tmp_path: Path) -> None:
-    lines = list(csv.DictReader(frames_csv(measured(two("a", draws=2))).splitlines()))
-    found = {(line["frame"], line["pixels"], line["figure"]): line["value"] for line in lines}
-    assert {frame for frame, _, _ in found} == {"2", "3", "4"}
-    assert (found["3", "visible", "psnr_db"], found["4", "occluded", "psnr_db"]) == ("30", "10")
-    assert found["2", "all", "diversity"] == "0.01"
-    text = make_report([kept(tmp_path / "run")], tmp_path / "out", Choices(drawn=False, worst=0)).read_text()
-    assert "frame by frame: [frames.csv](tables/frames.csv)" in text
-    assert "### Visible and occluded pixels, diversity, sharpness: frames 2-4" in text
 
 
 # --- pictures -----------------------------------------------------------------------------------------------------
@@ -188,9 +159,3 @@ def test_the_same_path_at_another_moment_is_another_goal(change: Change | None) 
     found = on_the_same_goals(sets_of(k0=[clips("a", change, change)], k1=[moved]))
     assert (found[0], len(found[1])) == ((), 1)
     assert "the target's pictures differ" in found[1][0]
-
-
-def test_another_way_to_the_same_last_picture_is_joined() -> None:
-    direct = clips("b", None, target=(5.0, 5.0, 5.0, 2.0))
-    (joined,) = on_the_same_goals(sets_of(k0=[clips("a", None)], k1=[direct]))[0]
-    assert [method.name for method in joined.methods] == ["a", "b"]

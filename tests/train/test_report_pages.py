@@ -1,7 +1,6 @@
 """Reports from runs that are made up: tables, intervals, curves, galleries, failure cases."""
 
 import csv
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -293,6 +292,7 @@ def test_a_gallery_has_source_methods_and_target_and_plays(tmp_path: Path) -> No
         (("--row", "mine"), 78, "METHOD=ROW"),
         (("--lead", "nobody"), 73, "no method is called 'nobody'"),
         (("--row", "nobody=DynIBaR"), 73, "no method is called 'nobody'"),
+        (("--row", "copy_source=DynIBaR"), 78, "none of them is for these clips"),
     ],
 )
 def test_a_wrong_option_is_said_in_one_line(tmp_path: Path, arguments: tuple[str, ...], code: int, hint: str) -> None:
@@ -305,7 +305,4 @@ def test_a_wrong_option_is_said_in_one_line(tmp_path: Path, arguments: tuple[str
 def test_an_empty_run_is_refused(tmp_path: Path) -> None:
     RunKeeper(tmp_path).begin(note(methods={"a": {}}))
     with pytest.raises(RunError, match="holds no record yet"):
-        Run.read(tmp_path)
-    (tmp_path / "run.json").write_text(json.dumps({"command": 1}))
-    with pytest.raises(RunError, match=r"run\.json cannot be used"):
         Run.read(tmp_path)
