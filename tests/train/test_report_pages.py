@@ -118,11 +118,11 @@ def test_a_released_run_also_has_its_own_figures_over_all_frames(tmp_path: Path)
 def test_a_method_finds_its_row(method: str, details: Mapping[str, str], table: int, label: str | None) -> None:
     found = row_label(method, details, PAPER_TABLES[table])
     assert found == label
-    assert found is None or any(row.label == found for row in PAPER_TABLES[table].rows)
+    assert found is None or found in PAPER_TABLES[table].rows
 
 
 def test_the_papers_tables_hold_all_it_prints() -> None:
-    printed = [[value for row in table.rows for value in row.printed if value is not None] for table in PAPER_TABLES]
+    printed = [[value for row in table.rows.values() for value in row if value is not None] for table in PAPER_TABLES]
     assert [len(values) for values in printed] == [40, 20, 8, 33, 18, 3]
     assert [table.name for table in PAPER_TABLES] == [f"table{number}" for number in range(1, 7)]
     assert [table.frames for table in PAPER_TABLES] == ["last"] * 3 + ["2-last"] * 3
@@ -132,7 +132,7 @@ def test_the_papers_tables_hold_all_it_prints() -> None:
 
 def test_the_means_that_the_papers_text_tells_follow_from_its_rows() -> None:
     table = PAPER_TABLES[0]
-    first = {row.label: row.printed[0] or 0.0 for row in table.rows}
+    first = {label: row[0] or 0.0 for label, row in table.rows.items()}
     for gain in table.gains:
         better = [label for label in first if gain.better in label]
         apart = [first[label] - first[label.replace(gain.better, gain.worse)] for label in better]

@@ -159,8 +159,9 @@ def shown_clips(of: EvaluatedSet, methods: Sequence[Method], count: int) -> tupl
 
 def strips(methods: Sequence[Method], key: str) -> tuple[Strip, ...]:
     """Source, each method that kept frames of this clip, target. Raises DataError for a damaged picture."""
-    made = [Strip(name=method.name, frames=_read(_folder(method, key) / "sample_0")) for method in methods]
-    seen = {side: _side(methods, key, side) for side in ("source", "target")}
+    folders = [_folder(method, key) for method in methods]
+    made = [Strip(name=of.name, frames=_read(at / "sample_0")) for of, at in zip(methods, folders, strict=True)]
+    seen = {side: next(filter(None, (_read(at / side) for at in folders)), {}) for side in ("source", "target")}
     every = [Strip(name="source", frames=seen["source"]), *made, Strip(name="target", frames=seen["target"])]
     return tuple(strip for strip in every if strip.frames)
 
@@ -225,11 +226,6 @@ def write_video(rows: Sequence[Strip], fps: float, out: Path) -> bool:
 
 def _folder(method: Method, key: str) -> Path:
     return RunKeeper(method.folder).views(method.name, key)
-
-
-def _side(methods: Sequence[Method], key: str, side: str) -> dict[int, Pictures]:
-    """The source or the target, from whichever method it was kept beside."""
-    return next((found for method in methods if (found := _read(_folder(method, key) / side))), {})
 
 
 def _read(folder: Path) -> dict[int, Pictures]:

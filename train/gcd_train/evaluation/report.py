@@ -102,7 +102,7 @@ def _require_choices(choices: Choices, sets: Sequence[EvaluatedSet]) -> None:
         raise RunError(f"no method is called {unknown[0]!r} in these runs; there are {', '.join(known)}")
     for method, label in choices.rows.items():
         its = [each for each in sets if any(known.name == method for known in each.methods)]
-        labels = dict.fromkeys(row.label for each in its for table in tables_for(each.note) for row in table.rows)
+        labels = dict.fromkeys(row for each in its for table in tables_for(each.note) for row in table.rows)
         if not labels:
             raise RecipeError(
                 f"--row says where {method} stands in the paper's tables, and none of them is for these clips; "

@@ -1,7 +1,7 @@
 """From the records of a run to what `evaluate` prints and writes: tables and JSON."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -334,22 +334,18 @@ def _with_full(iou: float, full: float) -> str:
 
 def _clips(summary: Summary) -> list[str]:
     """Every clip by name, and where the model is ahead of the best baseline and where not."""
-    columns = list(_clip_columns(summary))
-    names = [str(shot) for shot in summary.conditions.shots]
-    rows = [list(row) for row in zip(names, *(cells for _, cells in columns), strict=True)]
-    return ["Clips:", "", *markdown_rows(["clip", *(heading for heading, _ in columns)], rows)]
-
-
-def _clip_columns(summary: Summary) -> Iterator[tuple[str, list[str]]]:
-    model = summary.model[0]
+    columns = [["clip", *map(str, summary.conditions.shots)]]
     for column in (_PSNR, _MIOU):
-        if math.isnan(model.value(column.figure)):
+        if math.isnan(summary.model[0].value(column.figure)):
             continue
-        own, best = model.clips.figure(column.figure), best_of(summary.baselines, column.figure)
-        yield column.heading, [_with_error(value, math.nan, column.digits) for value in own]
+        own, best = summary.model[0].clips.figure(column.figure), best_of(summary.baselines, column.figure)
+        columns.append([column.heading, *(_with_error(value, math.nan, column.digits) for value in own)])
         if best is not None:
             apart = own - best.clips.figure(column.figure)
-            yield f"over {best.name}", [_with_error(value, math.nan, column.digits, "+") for value in apart]
+            cells = (_with_error(value, math.nan, column.digits, "+") for value in apart)
+            columns.append([f"over {best.name}", *cells])
+    headings, *rows = zip(*columns, strict=True)
+    return ["Clips:", "", *markdown_rows(headings, rows)]
 
 
 def _with_error(value: float, error: float, digits: int, sign: str = "") -> str:

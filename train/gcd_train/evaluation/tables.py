@@ -4,9 +4,10 @@ import csv
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import zip_longest
 from math import isnan, nan
 from statistics import fmean
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -15,7 +16,6 @@ from gcd_train.evaluation.paper import (
     PICTURE_COLUMNS,
     Column,
     Gain,
-    PaperRow,
     PaperTable,
     row_label,
     tables_for,
@@ -225,7 +225,7 @@ def _own_table(
         name=name,
         title=title,
         headings=tuple(column.heading for column in columns),
-        rows=tuple(_row(measured, method, columns, frames, PaperRow(label="")) for method in measured.of.methods),
+        rows=tuple(_row(measured, method, columns, frames) for method in measured.of.methods),
         notes=(*_notes(measured.of, columns, frames), *notes),
     )
 
@@ -235,13 +235,13 @@ def _paper_table(measured: Measured, table: PaperTable) -> Table:
     for method in measured.of.methods:
         label = measured.rows.get(method.name) or row_label(method.name, method.details, table)
         placed.setdefault(label or "", []).append(method)
-    rows: list[Row] = []
-    for row in table.rows:
-        found = placed.pop(row.label, [])
-        rows += [_row(measured, each, table.columns, table.frames, row) for each in found]
-        rows += [] if found else [Row(label=row.label, cells=_not_run(row, table.columns))]
-    below = [
-        _row(measured, each, table.columns, table.frames, PaperRow(label=_below(label)))
+    rows, columns, frames = list[Row](), table.columns, table.frames
+    for label, printed in table.rows.items():
+        found = placed.pop(label, [])
+        rows += [_row(measured, each, columns, frames, label, printed) for each in found]
+        rows += [] if found else [Row(label=label, cells=_not_run(printed, columns))]
+    below = [  # label: of a row in another of the paper's tables, or empty
+        _row(measured, each, columns, frames, f"{label}, not in this table" if label else "not in the paper")
         for label, methods in placed.items()
         for each in methods
     ]
@@ -268,12 +268,17 @@ def _gain(rows: Sequence[Row], gain: Gain, columns: Sequence[Column]) -> Row:
     )
 
 
-def _below(label: str) -> str:
-    """How a method is called below the paper's rows. label: of its row in another of the paper's tables, or empty."""
-    return f"{label}, not in this table" if label else "not in the paper"
+Printed: TypeAlias = Sequence[float | None]
 
 
-def _row(measured: Measured, method: Method, columns: Sequence[Column], frames: Span, row: PaperRow) -> Row:
+def _row(
+    measured: Measured,
+    method: Method,
+    columns: Sequence[Column],
+    frames: Span,
+    label: str = "",
+    printed: Printed = (),
+) -> Row:
     """A method's figures, beside what the paper prints in its row."""
     cells = tuple(
         Cell(
@@ -283,15 +288,14 @@ def _row(measured: Measured, method: Method, columns: Sequence[Column], frames: 
             paper=blank.paper,
             starred=method.copies_classes and column.of_classes,
         )
-        for column, blank in zip(columns, _not_run(row, columns), strict=True)
+        for column, blank in zip(columns, _not_run(printed, columns), strict=True)
     )
     clips = f"{len(method.records)} of {len(measured.of.keys)}"
-    return Row(label=row.label, method=method.starred, clips=clips, cells=cells)
+    return Row(label=label, method=method.starred, clips=clips, cells=cells)
 
 
-def _not_run(row: PaperRow, columns: Sequence[Column]) -> tuple[Cell, ...]:
-    printed = (*row.printed, *(None,) * len(columns))
-    return tuple(Cell(note=NOT_RUN, paper=paper) for _, paper in zip(columns, printed, strict=False))
+def _not_run(printed: Printed, columns: Sequence[Column]) -> tuple[Cell, ...]:
+    return tuple(Cell(note=NOT_RUN, paper=paper) for _, paper in zip_longest(columns, printed))
 
 
 def _why_not(of: EvaluatedSet, method: Method, column: Column) -> str:
