@@ -8,14 +8,13 @@ from gcd_model.geometry import CameraMount, SphericalDelta, spherical_trajectory
 from gcd_train.data.pairs import PairedClip
 from gcd_train.evaluation.predictors import (
     CameraPair,
-    GroundHomography,
     SourceClip,
     TargetStatistics,
     fit_statistics,
     pixel_rays,
     to_pictures,
 )
-from gcd_train.evaluation.reprojection import DepthReprojection, splat
+from gcd_train.evaluation.reprojection import DepthReprojection, GroundHomography, splat
 
 FRAMES, HEIGHT, WIDTH = 5, 64, 96
 MARK, MARK_CLASS = -1.0, 12

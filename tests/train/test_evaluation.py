@@ -18,7 +18,6 @@ from gcd_train.evaluation.clips import PairedSet
 from gcd_train.evaluation.methods import SynthesizedViews
 from gcd_train.evaluation.predictors import (
     CopySource,
-    GroundHomography,
     Prediction,
     SourceClip,
     fit_statistics,
@@ -26,6 +25,7 @@ from gcd_train.evaluation.predictors import (
     to_pictures,
     to_pixels,
 )
+from gcd_train.evaluation.reprojection import GroundHomography
 
 
 @dataclass

@@ -32,7 +32,6 @@ from gcd_train.evaluation.metrics import NO_CLASS
 from gcd_train.evaluation.predictors import (
     CopySource,
     Fixed,
-    GroundHomography,
     Prediction,
     Predictor,
     SourceClip,
@@ -43,6 +42,7 @@ from gcd_train.evaluation.reprojection import (
     REPROJECT_RGBD,
     REPROJECT_SEMD,
     DepthReprojection,
+    GroundHomography,
     ReprojectRgbd,
     ReprojectSemd,
 )

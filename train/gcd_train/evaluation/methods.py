@@ -37,8 +37,7 @@ from gcd_train.evaluation.baselines import (
 from gcd_train.evaluation.clips import EvaluationSet, names_of
 from gcd_train.evaluation.measure import Maker
 from gcd_train.evaluation.metrics import NO_CLASS
-from gcd_train.evaluation.predictors import CameraPair, Prediction, Predictor, SourceClip
-from gcd_train.evaluation.saved_frames import SavedFrames
+from gcd_train.evaluation.predictors import CameraPair, Prediction, Predictor, SavedFrames, SourceClip
 from gcd_train.evaluation.store import FRAMES_IN
 
 _SAME_PATH_M = 1e-3
