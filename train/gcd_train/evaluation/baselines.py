@@ -3,7 +3,7 @@
 import difflib
 import hashlib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Self
@@ -51,8 +51,6 @@ VANILLA_SVD, DEPTH_ON_MEAN = "vanilla_svd", "depth_reprojection_on_mean"
 """Stable Video Diffusion, and depth reprojection with holes as in the mean target and the majority map."""
 MOTION_BUCKET = 127.0
 """What Stable Video Diffusion is told of the motion: the middle of its range."""
-HEXPLANE_VIEWS = (1, 2, 4, 8)
-"""Numbers of input views that a HexPlane is usually given; any other number goes too."""
 FROM_EXACT_CLASSES = ("copy_source", "ground_homography")
 """Baselines that are not privileged in their pictures, but make their class maps from the source's exact ones."""
 
@@ -259,11 +257,6 @@ def _stretched(pictures: Tensor, height: int, width: int, *, low: float = 0.0) -
     return resized.clamp(low, 1.0)
 
 
-def baseline_names(*, hexplane: Sequence[int] = HEXPLANE_VIEWS) -> tuple[str, ...]:
-    """All there are, in the order of the tables. hexplane: numbers of views that are listed."""
-    return (*_NAMES, *(f"hexplane_{views}" for views in hexplane))
-
-
 def hexplane_views(name: str) -> int | None:
     """How many views the HexPlane of this name is given; None for another method."""
     found = re.fullmatch(r"hexplane_([1-9]\d*)", name)
@@ -279,9 +272,10 @@ def build(name: str, settings: BaselineSettings) -> Predictor:
     """
     views = hexplane_views(name)
     if name not in _NAMES and not views:
-        near = difflib.get_close_matches(name, baseline_names(), n=1)
+        every = (*_NAMES, *(f"hexplane_{views}" for views in (1, 2, 4, 8)))  # any other number goes too
+        near = difflib.get_close_matches(name, every, n=1)
         meant = f"did you mean {near[0]}? " if near else ""
-        raise RecipeError(f"no baseline is called {name!r}; {meant}there are {', '.join(baseline_names())}")
+        raise RecipeError(f"no baseline is called {name!r}; {meant}there are {', '.join(every)}")
     if settings.painted and (views or name in _PICTURES_ALONE):
         raise RecipeError(f"{name} makes no class maps, and these targets are class maps; leave it out")
     if views:

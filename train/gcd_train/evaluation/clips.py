@@ -363,7 +363,7 @@ class SceneSet:
         return np.stack([nearest_resized(row, self.width, self.height) for row in rows])
 
     def _others(self, scene: str, times: Sequence[int], count: int) -> Sequence[Sequence[SceneView]]:
-        """See OtherViews. The farthest from the source first, then always the one farthest from all before."""
+        """See SourceClip. The farthest from the source first, then always the one farthest from all before."""
         names = [name for name in self.dataset.cameras if name != self.dataset.source_camera]
         if not 0 <= count <= len(names):
             raise DataError(

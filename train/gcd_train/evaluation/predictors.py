@@ -84,13 +84,6 @@ def to_pixels(points: Tensor, camera: Intrinsics) -> Tensor:
     return torch.stack([u, v], dim=-1)
 
 
-OtherViews = Callable[[int], Sequence[Sequence[SceneView]]]
-"""The T views of each of so many further cameras of the scene. Raises DataError if it has fewer."""
-
-SourcePoints = Callable[[], Sequence[SceneView]]
-"""The T views of the source camera as the data set holds them. Raises DataError where one cannot be read."""
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SourceClip:
     """What a predictor may look at: the source side of a clip, and where it is to be seen from.
@@ -99,9 +92,9 @@ class SourceClip:
     privileged predictors only. source_classes: uint8 [T, H, W]; None where the world has no ontology.
     cameras: of the clip, the source's as it is declared. fps: frames per second.
     key: names the clip in its set; frames that others have made are found by it.
-    others: what further cameras of the scene saw, for predictors that are given them; None where there is one camera.
-    points: the source views at their full size, for privileged predictors only, with ids as in `source_classes`; None
-    where `source` is all there is.
+    others: the T views of each of so many further cameras of the scene, for predictors that are given them (raises
+    DataError if it has fewer); None where there is one camera. points: the T source views at their full size, for
+    privileged predictors only, with ids as in `source_classes`; None where `source` is all there is.
     """
 
     source: Bytes
@@ -110,8 +103,8 @@ class SourceClip:
     cameras: CameraPair
     fps: float
     key: str = ""
-    others: OtherViews | None = None
-    points: SourcePoints | None = None
+    others: Callable[[int], Sequence[Sequence[SceneView]]] | None = None
+    points: Callable[[], Sequence[SceneView]] | None = None
 
 
 FAR_M = 1e4
