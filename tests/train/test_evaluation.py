@@ -126,19 +126,6 @@ def test_the_target_itself_is_perfect_and_its_first_frame_is_not_looked_at() -> 
     assert [found.value(name) for name in names] == pytest.approx([1.0] * 6, abs=1e-6)
 
 
-@dataclass
-class Painted:
-    """Says the same of every clip."""
-
-    video: Tensor | None = None
-    classes: Tensor | None = None
-    name: str = "painted"
-    privileged: bool = False
-
-    def predict(self, clip: SourceClip) -> Prediction:
-        return Prediction(video=self.video, classes=self.classes)
-
-
 def test_a_model_gets_the_clip_in_its_own_range_and_its_shipped_settings() -> None:
     clips = PlaneClips.make(2)
     synthesizer = fake(clips)

@@ -65,10 +65,6 @@ def colours(views: list[SceneView]) -> Tensor:
     return torch.from_numpy(np.stack([each.rgb for each in views])).permute(0, 3, 1, 2).float() / 255.0
 
 
-def bounds() -> SceneBounds:
-    return SceneBounds(centre=torch.tensor([1.0, -2.0, 0.5]), half_m=4.0, begin=0.5, reach=5.0)
-
-
 def source_clip() -> SourceClip:
     """The box from a camera that stands; the view that is wanted stands too."""
     path = relative_pose(pose_of(SOURCE), pose_of(HELD_OUT)).expand(FRAMES, 4, 4)

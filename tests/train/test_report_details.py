@@ -12,7 +12,7 @@ from gcd_train.evaluation.galleries import caption
 from gcd_train.evaluation.report import differences
 from gcd_train.evaluation.report import differences_markdown as differences_told
 from gcd_train.evaluation.runs import EvaluatedSet, Run, gather, on_the_same_goals
-from gcd_train.evaluation.store import ClipRecord, RegionRecord, RunKeeper
+from gcd_train.evaluation.store import ClipRecord
 from gcd_train.evaluation.tables import Measured, main_tables, region_table, to_markdown
 
 COUNTS = [(0, 0, 9), (1, 0, 1)]
@@ -34,14 +34,6 @@ def measured(*methods: list[ClipRecord], **told: object) -> Measured:
     note_ = note(methods=named, **told)  # pyright: ignore[reportArgumentType]
     (found,) = gather([Run(folder=Path("run"), note=note_, records=tuple(r for each in methods for r in each))])
     return Measured(of=found)
-
-
-def kept(folder: Path, **told: object) -> Path:
-    keeper = RunKeeper(folder)
-    keeper.begin(note(methods={"mine": {"weights": "ab"}}, **told))  # pyright: ignore[reportArgumentType]
-    for each in two("mine"):
-        keeper.keep(each)
-    return folder
 
 
 # --- rows ---------------------------------------------------------------------------------------------------------
@@ -111,31 +103,23 @@ AHEAD: Change = (30.0, 5.0, 0.0)
 ASIDE: Change = (-60.0, 20.0, 1.0)
 
 
-def sharp(values: Sequence[float]) -> RegionRecord:
-    """All pixels of a clip whose target is so sharp in each frame."""
-    return msgspec.structs.replace(region((20.0,) * FRAMES), gradient_target=tuple(values))
-
-
 def clips(method: str, *changes: Change | None, target: Sequence[float] = (2.0,) * FRAMES) -> list[ClipRecord]:
-    """A clip of each of as many scenes as there are changes."""
+    """A clip of each of as many scenes as there are changes, whose targets are so sharp in each frame."""
+    sharp = msgspec.structs.replace(region((20.0,) * FRAMES), gradient_target=tuple(target))
     return [
-        record(method, f"scn{number:05d}.sample_00", change=change, regions={"all": sharp(target)})
+        record(method, f"scn{number:05d}.sample_00", change=change, regions={"all": sharp})
         for number, change in enumerate(changes)
     ]
 
 
-def sets_of(**methods: list[list[ClipRecord]]) -> tuple[EvaluatedSet, ...]:
-    """A run by each name, of clips of its own digest."""
-    return gather([goal_run(name, *of) for name, of in methods.items()])
-
-
-def goal_run(name: str, *of: list[ClipRecord]) -> Run:
-    told = note(kind="kubric", protocol="paper", data_identity=name, methods={each[0].method: {} for each in of})
-    return Run(folder=Path(name), note=told, records=tuple(each for method in of for each in method))
+def sets_of(**runs: list[ClipRecord]) -> tuple[EvaluatedSet, ...]:
+    """A run of one method by each name, of clips of its own digest."""
+    told = {name: note(kind="kubric", protocol="paper", data_identity=name, methods={name: {}}) for name in runs}
+    return gather([Run(folder=Path(name), note=told[name], records=tuple(of)) for name, of in runs.items()])
 
 
 def test_clips_of_the_same_name_that_go_elsewhere_are_not_joined_and_it_is_said_why() -> None:
-    found = on_the_same_goals(sets_of(k0=[clips("a", AHEAD, ASIDE)], k1=[clips("b", ASIDE, AHEAD)]))
+    found = on_the_same_goals(sets_of(k0=clips("a", AHEAD, ASIDE), k1=clips("b", ASIDE, AHEAD)))
     assert found[0] == ()
     (told,) = found[1]
     assert told.startswith("k0 and k1: of 2 clips of the same names 2 do not end at the same goal")
@@ -144,7 +128,7 @@ def test_clips_of_the_same_name_that_go_elsewhere_are_not_joined_and_it_is_said_
 
 def test_of_clips_that_end_at_the_same_goal_in_part_only_those_are_joined() -> None:
     nearly = (30.001, 5.0, 0.0)
-    found = on_the_same_goals(sets_of(k0=[clips("a", AHEAD, ASIDE)], k1=[clips("b", nearly, AHEAD)]))
+    found = on_the_same_goals(sets_of(k0=clips("a", AHEAD, ASIDE), k1=clips("b", nearly, AHEAD)))
     (joined,) = found[0]
     assert {method.name: method.keys for method in joined.methods} == {
         "a": ("scn00000.sample_00", "scn00001.sample_00"),
@@ -156,6 +140,6 @@ def test_of_clips_that_end_at_the_same_goal_in_part_only_those_are_joined() -> N
 @pytest.mark.parametrize("change", [None, AHEAD])
 def test_the_same_path_at_another_moment_is_another_goal(change: Change | None) -> None:
     moved = clips("b", change, change, target=(2.0, 2.0, 2.0, 2.01))
-    found = on_the_same_goals(sets_of(k0=[clips("a", change, change)], k1=[moved]))
+    found = on_the_same_goals(sets_of(k0=clips("a", change, change), k1=moved))
     assert (found[0], len(found[1])) == ((), 1)
     assert "the target's pictures differ" in found[1][0]

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import shorten
-from typing import NamedTuple, Self, cast
+from typing import Self, cast
 
 import torch
 import torch.nn.functional as F
@@ -267,7 +267,8 @@ def _alexnet() -> nn.Sequential:
     )
 
 
-class _Kind(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class _Kind:
     """How a network is found and used: files of its features and of its linear weights, places of the features that are
     compared among torchvision's, their channels, and a side of the smallest picture."""
 
