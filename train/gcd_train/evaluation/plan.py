@@ -17,7 +17,7 @@ from gcd_model.geometry import CameraMount
 from gcd_train.data.pairs import PairedClips
 from gcd_train.data.splits import require_apart
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.evaluation.baselines import VANILLA_SVD, BaselineSettings
+from gcd_train.evaluation.baselines import VANILLA_SVD, BaselineSettings, build
 from gcd_train.evaluation.clips import EvaluationSet, PairedSet, SceneSet, identity_of, names_of
 from gcd_train.evaluation.galleries import contact_rows, write_sheet
 from gcd_train.evaluation.hexplane import HexPlaneSettings
@@ -31,7 +31,7 @@ from gcd_train.evaluation.methods import (
 )
 from gcd_train.evaluation.metrics import Lpips
 from gcd_train.evaluation.opening import Choice, SceneCuts, data_kind, open_pairs, open_scenes, usual_samples
-from gcd_train.evaluation.predictors import TargetStatistics, fit_statistics
+from gcd_train.evaluation.predictors import fit_statistics
 from gcd_train.evaluation.protocol import FrameBounds, ProtocolName
 from gcd_train.evaluation.statistics import FigureName, Selection
 from gcd_train.evaluation.store import LPIPS, ClipRecord, RunKeeper, RunNote
@@ -115,8 +115,8 @@ class Plan:
 
     notes: what is odd about the clips, line by line. models, baselines, saved: methods, in the order of the table;
     baselines that want means cannot be used before `with_means`. model: what is known of the weights, None without.
-    training: pairs for means, of the identity `trained_on`. painted: targets are class maps in colours. lpips: digest
-    of its weights, None without.
+    settings: of the baselines. training: pairs for means. painted: targets are class maps in colours. lpips: digest of
+    its weights, None without.
     """
 
     options: EvaluateOptions
@@ -126,8 +126,8 @@ class Plan:
     baselines: tuple[Method, ...]
     saved: tuple[Method, ...]
     model: Traits | None
+    settings: BaselineSettings
     training: PairedClips | None
-    trained_on: str
     painted: bool
     lpips: str | None
 
@@ -145,9 +145,9 @@ class Plan:
             return self
         with bar("training clips", len(self.training)) as show:
             statistics = fit_statistics(self.training, progress=lambda done, _: show(done))
-        return replace(
-            self, baselines=_baselines(self.options, self.clips, statistics, self.trained_on, painted=self.painted)
-        )
+        settings = replace(self.settings, statistics=statistics)
+        made = tuple(replace(each, make=partial(build, each.name, settings)) for each in self.baselines)
+        return replace(self, baselines=made, settings=settings)
 
     def note(self, command: str) -> RunNote:
         """What the run says of itself. command: the line that began it."""
@@ -241,10 +241,13 @@ def planned(options: EvaluateOptions) -> Plan:
         clips, notes = open_scenes(options.data[0], choice, cuts)
         painted = cuts.semantic
     training = _training(options, clips)
-    trained_on = "nothing" if training is None else identity_of(training)
     models = () if weights is None else of_weights(weights, clips, options.sampling, options.steps or ())
-    standing_in = None if training is None else _nothing_yet(clips)
-    baselines = _baselines(options, clips, standing_in, trained_on, painted=painted)
+    settings = _settings(options, clips, training, painted=painted)
+    trained_on = "nothing" if training is None else identity_of(training)
+    further = len(clips.dataset.cameras) - 1 if isinstance(clips, SceneSet) else 0  # pairs have one camera
+    baselines = (
+        of_baselines(options.names, settings, trained_on=trained_on, others=further) if options.baselines else ()
+    )
     saved = of_saved_frames(
         options.predictions or (), clips.classes if painted else (), privileged=options.privileged or ()
     )
@@ -259,8 +262,8 @@ def planned(options: EvaluateOptions) -> Plan:
         baselines=baselines,
         saved=saved,
         model=model,
+        settings=settings,
         training=training,
-        trained_on=trained_on,
         painted=painted,
         lpips=lpips,
     )
@@ -330,25 +333,11 @@ def _training(options: EvaluateOptions, clips: EvaluationSet) -> PairedClips | N
     return training
 
 
-def _nothing_yet(clips: EvaluationSet) -> TargetStatistics:
-    """What stands where means will be, in their shapes."""
-    frame = (clips.height, clips.width)
-    majority = torch.zeros(clips.frames, *frame, dtype=torch.uint8) if clips.classes else None
-    return TargetStatistics(mean=torch.zeros(clips.frames, 3, *frame), majority=majority)
-
-
-def _baselines(
-    options: EvaluateOptions,
-    clips: EvaluationSet,
-    statistics: TargetStatistics | None,
-    trained_on: str,
-    *,
-    painted: bool,
-) -> tuple[Method, ...]:
-    """Those that are wanted. statistics: of the training clips. Raises RecipeError as `of_baselines`."""
-    if not options.baselines:
-        return ()
-    if options.methods is None and statistics is None and isinstance(clips, PairedSet):
+def _settings(
+    options: EvaluateOptions, clips: EvaluationSet, training: PairedClips | None, *, painted: bool
+) -> BaselineSettings:
+    """With nothing in the places of means that are not known yet. Raises RecipeError where some want training clips."""
+    if options.baselines and options.methods is None and training is None and isinstance(clips, PairedSet):
         raise RecipeError(
             "baselines want training clips for their means: give --train FOLDER, name some that need none with "
             "--methods, or --no-baselines"
@@ -359,7 +348,6 @@ def _baselines(
         width=clips.width,
         classes=tuple(clips.classes),
         painted=painted,
-        statistics=statistics,
         svd=None if options.svd is None else _resolved(options.svd),
         device=options.device,
         dtype=options.dtype,
@@ -368,8 +356,7 @@ def _baselines(
         published=options.protocol == "release",
         hexplane=options.hexplane,
     )
-    further = len(clips.dataset.cameras) - 1 if isinstance(clips, SceneSet) else 0  # pairs have one camera
-    return of_baselines(options.names, settings, trained_on=trained_on, others=further)
+    return settings if training is None else replace(settings, statistics=settings.fill)
 
 
 def _on_the_sheet(summary: Summary) -> list[str]:
