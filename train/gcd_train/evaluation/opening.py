@@ -37,7 +37,6 @@ from gcd_train.evaluation.protocol import (
     released_controls,
     require_cameras,
     scene_number,
-    usual_clips,
 )
 from gcd_train.layouts import kubric4d, parallel_domain4d
 from gcd_train.layouts.manifest import MANIFEST, read_manifest
@@ -297,7 +296,7 @@ def _dataset(folder: Path, cuts: SceneCuts, *, orbits: bool) -> Kubric4D | Paral
 
 
 def _controls(cuts: SceneCuts, scenes: Sequence[str], *, orbits: bool) -> ClipControls:
-    clips = usual_clips(cuts.protocol, orbit=orbits) if cuts.clips is None else cuts.clips
+    clips = cuts.clips or (4 if cuts.protocol == "paper" and orbits else 1)
     if cuts.controls is not None:
         if cuts.protocol == "paper" and cuts.bounds != AS_PLANNED:
             raise RecipeError(

@@ -227,16 +227,14 @@ def planned(options: EvaluateOptions) -> Plan:
     _require_used(options)
     lpips = None if options.lpips is None else Lpips.open(options.lpips).identity
     choice = Choice(split=options.split, listed=options.listed, limit=options.limit)
-    weights = None
+    weights, model, painted = None, None, False
     if options.weights is not None:
         weights = partial(open_weights, _resolved(options.weights), options.device, options.dtype)
-    painted = False
+        model = weights().traits
     if data_kind(options.data) == "pairs":
         _require_pairs_options(options)
         clips, notes = open_pairs(options.data, choice, options.mount)
-        model = None if weights is None else weights().traits
     else:
-        model = None if weights is None else weights().traits
         cuts = _cuts(options, model)
         clips, notes = open_scenes(options.data[0], choice, cuts)
         painted = cuts.semantic

@@ -27,17 +27,10 @@ PAPER_ELEVATION_DEG = 5.0
 """How high the source camera stands in the paper's evaluation on Kubric-4D."""
 RELEASED_SOURCE = Spherical(azimuth_deg=20.0, elevation_deg=10.0, radius_m=15.0)
 """Where the released script's source camera stands without controls."""
-RELEASED_CHANGE = SphericalDelta(azimuth_deg=30.0, elevation_deg=15.0, radius_m=0.0)
-"""Where it goes from there."""
-RELEASED_START, RELEASED_SKIP = 0, 2
-"""First frame and stride of the released script."""
+_RELEASED_CHANGE = SphericalDelta(azimuth_deg=30.0, elevation_deg=15.0, radius_m=0.0)  # where it goes from there
+_RELEASED_START, _RELEASED_SKIP = 0, 2  # its first frame and stride
 SAMPLES: dict[ProtocolName, int] = {"paper": 4, "release": 2}
 """Draws of each clip of a scene; of pairs, which no protocol cuts, there is one."""
-
-
-def usual_clips(protocol: ProtocolName, *, orbit: bool) -> int:
-    """Clips of each scene."""
-    return 4 if protocol == "paper" and orbit else 1
 
 
 class ClipControls(Protocol):
@@ -151,10 +144,10 @@ def released_controls(scenes: Sequence[str], *, orbit: bool) -> Controls:
     """The one clip of each scene that the released script makes without a control list. orbit: False in driving."""
     control = Control(
         name="sample_00",
-        frame_start=RELEASED_START,
-        frame_skip=RELEASED_SKIP,
+        frame_start=_RELEASED_START,
+        frame_skip=_RELEASED_SKIP,
         start=RELEASED_SOURCE if orbit else None,
-        goal=RELEASED_SOURCE + RELEASED_CHANGE if orbit else None,
+        goal=RELEASED_SOURCE + _RELEASED_CHANGE if orbit else None,
     )
     return dict.fromkeys(scenes, (control,))
 

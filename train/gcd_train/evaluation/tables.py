@@ -4,7 +4,7 @@ import csv
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import zip_longest
+from itertools import product, zip_longest
 from math import isnan, nan
 from statistics import fmean
 from typing import Any, TypeAlias
@@ -347,32 +347,31 @@ def _has(of: EvaluatedSet, column: Column) -> bool:
 def all_figures(measured: Measured) -> str:
     """Every figure of every method, frames and pixels with its interval, as CSV: one figure a line."""
     lines: list[list[str]] = []
-    for method in measured.of.methods:
-        for frames in _SPANS:
-            for region in measured.of.regions:
-                sums = measured.sums(method, Selection(frames=frames, region=region))
-                cells = {name: Cell(figure=sums.interval(name)).numbers() for name in FIGURE_NAMES}
-                clips = str(len(method.records))
-                lines += [[method.name, frames, region, name, *cell, clips] for name, cell in cells.items() if cell[0]]
+    for method, frames, region in product(measured.of.methods, _SPANS, measured.of.regions):
+        sums, clips = measured.sums(method, Selection(frames=frames, region=region)), str(len(method.records))
+        cells = {name: Cell(figure=sums.interval(name)).numbers() for name in FIGURE_NAMES}
+        lines += [[method.name, frames, region, name, *cell, clips] for name, cell in cells.items() if cell[0]]
     return csv_text(["method", "frames", "pixels", "figure", "value", "low", "high", "clips"], lines)
 
 
 _BY_FRAME: tuple[FigureName, ...] = (
-    *("psnr_db", "ssim", "lpips", "diversity"),
-    *("gradient_energy", "flicker", "miou_common"),
+    "psnr_db",
+    "ssim",
+    "lpips",
+    "diversity",
+    "gradient_energy",
+    "flicker",
+    "miou_common",
 )
 
 
 def frames_csv(measured: Measured) -> str:
     """Every figure of every method in each frame from the second on: one figure a line, without intervals."""
-    lines: list[list[str]] = []
-    for method in measured.of.methods:
-        for frame in range(FIRST_MEASURED + 1, measured.of.note.frames + 1):
-            for region in measured.of.regions:
-                sums = measured.sums(method, Selection(frames=frame, region=region))
-                values = {name: sums.value(name) for name in _BY_FRAME}
-                of_frame = [method.name, str(frame), region]
-                lines += [[*of_frame, name, f"{value:.6g}"] for name, value in values.items() if not isnan(value)]
+    lines, every = list[list[str]](), range(FIRST_MEASURED + 1, measured.of.note.frames + 1)
+    for method, frame, region in product(measured.of.methods, every, measured.of.regions):
+        sums = measured.sums(method, Selection(frames=frame, region=region))
+        values = {name: f"{sums.value(name):.6g}" for name in _BY_FRAME}
+        lines += [[method.name, str(frame), region, name, text] for name, text in values.items() if text != "nan"]
     return csv_text(["method", "frame", "pixels", "figure", "value"], lines)
 
 
