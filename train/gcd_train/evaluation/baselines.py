@@ -96,16 +96,8 @@ class ClassesAlone:
     """A predictor whose pictures do not count, as the targets are class maps."""
 
     inner: Predictor
-
-    @property
-    def name(self) -> str:
-        """See Predictor."""
-        return self.inner.name
-
-    @property
-    def privileged(self) -> bool:
-        """See Predictor."""
-        return self.inner.privileged
+    name: str
+    privileged: bool
 
     def predict(self, clip: SourceClip) -> Prediction:
         """See Predictor."""
@@ -281,7 +273,7 @@ def build(name: str, settings: BaselineSettings) -> Predictor:
     if views:
         return HexPlane(views=views, settings=settings.hexplane, seed=settings.seed, device=settings.device)
     made = _made(name, settings)
-    return ClassesAlone(inner=made) if settings.painted else made
+    return ClassesAlone(inner=made, name=made.name, privileged=made.privileged) if settings.painted else made
 
 
 def described(name: str, settings: BaselineSettings, trained_on: str = "nothing") -> dict[str, str]:
