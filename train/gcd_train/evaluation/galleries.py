@@ -77,10 +77,13 @@ def write_rows(place: Path, prediction: Prediction, classes: Sequence[SemanticCl
 
     place: of both, without a suffix.
     """
+    made: dict[str, Pictures] = {}
     if prediction.classes is not None and classes:
-        write_whole(Path(f"{place}.classes.png"), png(_in_a_row(painted(prediction.classes, classes))))
+        made[".classes.png"] = painted(prediction.classes, classes)
     if prediction.video is not None:
-        write_whole(Path(f"{place}.png"), png(_in_a_row(to_bytes(prediction.video))))
+        made[".png"] = to_bytes(prediction.video)
+    for suffix, frames in made.items():
+        write_whole(Path(f"{place}{suffix}"), png(np.concatenate(list(frames[shown_frames(len(frames))]), axis=1)))
 
 
 def has_rows(place: Path, record: ClipRecord) -> bool:
@@ -101,10 +104,6 @@ def read_row(path: Path, width: int) -> Pictures:
 def shown_frames(count: int) -> list[int]:
     """Those of so many frames that a row of a sheet shows, evenly among them."""
     return np.linspace(0, count - 1, min(SHOWN_FRAMES, count)).round().astype(int).tolist()
-
-
-def _in_a_row(frames: Pictures) -> Pictures:
-    return np.concatenate([frames[t] for t in shown_frames(len(frames))], axis=1)
 
 
 def painted(labels: Tensor, classes: Sequence[SemanticClass]) -> Pictures:

@@ -319,17 +319,15 @@ def _steps(shipped: Evaluation, *others: Evaluation) -> list[str]:
 
 def _classes(summary: Summary) -> list[str]:
     shown = [each for each in summary.evaluations if not math.isnan(each.value("miou"))]
-    columns = [
-        ["-" if cell == "- (-)" else cell for cell in map(_with_full, each.class_iou(), each.class_iou(full=True))]
-        for each in shown
-    ]
+    columns = [list(map(_with_full, each.class_iou(), each.class_iou(full=True))) for each in shown]
     every = [[name, *cells] for name, *cells in zip(summary.classes, *columns, strict=False)]
     rows = [row for row in every if set(row[1:]) != {"-"}]  # a class that is neither true nor said, as void
     return ["IoU of each class:", "", *markdown_rows(["class", *(each.name for each in shown)], rows)]
 
 
 def _with_full(iou: float, full: float) -> str:
-    return "{} ({})".format(*("-" if math.isnan(value) else f"{value:.2f}" for value in (iou, full)))
+    both = ("-" if math.isnan(value) else f"{value:.2f}" for value in (iou, full))
+    return "-" if math.isnan(iou) and math.isnan(full) else "{} ({})".format(*both)
 
 
 def _clips(summary: Summary) -> list[str]:
