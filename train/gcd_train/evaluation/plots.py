@@ -106,15 +106,13 @@ def error_by_angle(measured: Measured) -> Plot:
 
     Source: GCD, the study of angles in appendix B.2: error against the rotation about the scene.
     """
-    curves: list[Curve] = []
+    curves, last = list[Curve](), Selection(frames="last")
     for method in measured.of.methods:
         turned = [(record, abs(record.change[0])) for record in method.records if record.change is not None]
         groups: dict[float, list[ClipRecord]] = {}
         for (record, _), place in zip(turned, angle_bins([angle for _, angle in turned]), strict=True):
             groups.setdefault(place, []).append(record)
-        sums = {
-            place: bootstrap(groups[place], Selection(frames="last"), seed=measured.seed) for place in sorted(groups)
-        }
+        sums = {place: bootstrap(groups[place], last, seed=measured.seed) for place in sorted(groups)}
         points = [Point(x=x, y=each.interval("psnr_db"), clips=len(groups[x])) for x, each in sums.items()]
         curves.append(Curve.of(method.name, points))
     return Plot(
