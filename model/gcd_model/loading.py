@@ -14,9 +14,8 @@ from gcd_model.engines.onnx_export import ExportPrecision, Manifest, Report, exp
 from gcd_model.engines.torch import Engine
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.live.config import LIVE_TINY
-from gcd_model.live.networks import LiveNetworks
 from gcd_model.live.synthesizer import LiveSynthesizer
-from gcd_model.networks import LoadedWeights, Networks, random_networks, weights_digest
+from gcd_model.networks import LiveNetworks, LoadedWeights, Networks, random_networks, weights_digest
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
 from gcd_model.weights.card import FULL_PRECISION, precision

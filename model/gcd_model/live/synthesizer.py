@@ -13,10 +13,10 @@ from gcd_model.conditioning import SourceFeatures, SourceGeometry
 from gcd_model.errors import Cancelled, NonFiniteError, ShapeError
 from gcd_model.geometry import CameraMount, Intrinsics, Trajectory
 from gcd_model.live.eyes import Eyes, Floor, SeenFrame
-from gcd_model.live.networks import COVERED, PAINTED, SEEN_NOW, LiveNetworks
-from gcd_model.live.painter import Painter, ViewFrame
-from gcd_model.live.seen_world import PlacedFrame, seen_world
+from gcd_model.live.memory import PlacedFrame, seen_world
+from gcd_model.live.painter import COVERED, PAINTED, SEEN_NOW, Painter, ViewFrame
 from gcd_model.live.splat import splat, unproject
+from gcd_model.networks import LiveNetworks
 from gcd_model.synthesizer import out_of_memory_is_our_error, whole_levels
 from gcd_model.traits import Traits
 from gcd_model.weights.card import Card, Entry

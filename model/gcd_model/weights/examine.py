@@ -12,8 +12,7 @@ from torch import Tensor
 from gcd_model.config import ModelConfig
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.live.config import LiveConfig
-from gcd_model.live.networks import LiveNetworks
-from gcd_model.networks import Networks, empty_networks
+from gcd_model.networks import LiveNetworks, Networks, empty_networks
 from gcd_model.weights.adapter import ADAPTER_KEY
 from gcd_model.weights.card import CONFIG_KEY, Card, Layout, Leftover, NetworkReport
 from gcd_model.weights.families import (

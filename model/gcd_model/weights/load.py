@@ -15,8 +15,7 @@ from typing import BinaryIO, Literal, Unpack
 from torch import Tensor
 
 from gcd_model.errors import CheckpointError
-from gcd_model.live.networks import LiveNetworks
-from gcd_model.networks import LoadedWeights, Networks, weights_digest
+from gcd_model.networks import LiveNetworks, LoadedWeights, Networks, weights_digest
 from gcd_model.weights.adapter import Adapter, adapted
 from gcd_model.weights.card import Card, Entry, WeightsReport, precision
 from gcd_model.weights.examine import (
