@@ -46,8 +46,9 @@ from gcd_model.loading import EngineName, default_precision, export_weights, loa
 from gcd_model.small_files import decode_toml, explain_settings_error, printable, read_json, read_small
 from gcd_model.synthesizer import FrameSynthesizer, Synthesizer, ViewSynthesizer, synthesize
 from gcd_model.traits import ASSUMED_SOURCE, Traits
+from gcd_model.weights.card import WeightsReport
 from gcd_model.weights.families import FAMILIES, LIVE_LENS_DEG, Family
-from gcd_model.weights.load import WeightsReport, convert_weights, inspect_weights
+from gcd_model.weights.load import convert_weights, inspect_weights
 
 __all__ = [
     "ASSUMED_SOURCE",

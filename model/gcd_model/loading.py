@@ -19,9 +19,9 @@ from gcd_model.networks import LiveNetworks, LoadedWeights, Networks, random_net
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
 from gcd_model.weights.card import FULL_PRECISION, precision
-from gcd_model.weights.examine import Options, Told
 from gcd_model.weights.families import LIVE, Family, family_named
-from gcd_model.weights.load import load_adapted, load_weights, read_adapter
+from gcd_model.weights.infer import Hints
+from gcd_model.weights.load import Told, load_adapted, load_weights, read_adapter
 
 EngineName = Literal["torch", "cuda", "onnxruntime"]
 """What can compute networks; see `Engine`."""
@@ -50,7 +50,7 @@ def load_synthesizer(
         dtype: "float32", "bfloat16" or "float16"; else float32 on the CPU, bfloat16 on CUDA. The VAE decoder
             stays float32 (on CUDA torch may use TF32 in its convolutions, see torch.backends.cudnn). The live model
             computes in bfloat16 also on a CPU that multiplies in it (Intel AMX).
-        told: family, head_width, image_heads, frames, see `Options`.
+        told: family, head_width, image_heads, frames, see `Told`.
         adapter: file of a low-rank adapter that was trained on these weights; family and path are then the adapter's.
         engine: what computes the networks: "torch" as they are, or "cuda", compiled and as CUDA graphs, for a GPU; it
             settles the decoder's precision itself, see `CudaOptions`. "onnxruntime" runs the folder of an export,
@@ -127,7 +127,7 @@ def weights_path(source: str | Path) -> Path:
 
 def random_weights(family: str, *, frames: int | None = None) -> LoadedWeights:
     """Small random networks with the camera control of a family; always the same ones."""
-    Options(frames=frames)  # checks it
+    Hints(frames=frames)  # checks it
     chosen = family_named(family)
     networks = _random_networks(chosen, frames)
     return LoadedWeights(

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from gcd_model.errors import CheckpointError
-from gcd_model.weights.save import NOTES
+from gcd_model.weights.card import NOTES
 
 
 class Placeholder:
