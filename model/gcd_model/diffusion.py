@@ -281,7 +281,7 @@ class Backbone(Protocol):
         """All that does not depend on the pixels. labels: float32 [S], c_noise of every step, anywhere."""
         ...
 
-    def predict(self, rows: Tensor, condition: Tensor, inputs: tuple[StageInputs, ...]) -> Tensor:
+    def predict(self, rows: Tensor, condition: Tensor, inputs: StageInputs) -> Tensor:
         """One evaluation, see `VideoUNet.forward`. rows: float32 [N, C, h, w] -> float32, the same shape."""
         ...
 
@@ -296,7 +296,7 @@ class TorchBackbone:
         on_device = labels.to(self._unet.stem.weight.device)
         return self._unet.plan(on_device, given.vector, given.camera, given.tokens, repeats=given.branches)
 
-    def predict(self, rows: Tensor, condition: Tensor, inputs: tuple[StageInputs, ...]) -> Tensor:
+    def predict(self, rows: Tensor, condition: Tensor, inputs: StageInputs) -> Tensor:
         return self._unet(rows.to(self._unet.stem.weight), condition, inputs).float()
 
 
@@ -335,18 +335,7 @@ def planned_denoiser(backbone: Backbone, given: Conditioning, schedule: Schedule
         condition, inputs = given.latents, plan.step(step)
         if branches < given.branches:
             condition = condition.chunk(given.branches)[-1]
-            inputs = tuple(_conditional(each, given.branches) for each in inputs)
+            inputs = inputs.chunk(given.branches)[-1]  # the conditional rows come last
         return backbone.predict(rows, condition, inputs)
 
     return GuidedDenoiser(network, schedule, given.latents.device)
-
-
-def _conditional(inputs: StageInputs, branches: int) -> StageInputs:
-    """What the conditional rows alone are given; they come last."""
-    spatial, temporal = inputs.spatial_cross, inputs.temporal_cross
-    return StageInputs(
-        inputs.spatial_embedding.chunk(branches)[-1],
-        inputs.temporal_embedding.chunk(branches)[-1],
-        None if spatial is None else spatial.chunk(branches)[-1],
-        None if temporal is None else temporal.chunk(branches)[-1],
-    )

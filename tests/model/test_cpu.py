@@ -31,7 +31,7 @@ def _unet() -> VideoUNet:
     return unet
 
 
-def _inputs(unet: VideoUNet) -> tuple[StageInputs, ...]:
+def _inputs(unet: VideoUNet) -> StageInputs:
     rows = CLIPS * FRAMES
     vector, camera, tokens = (
         draw(rows, UNET.vector_width),

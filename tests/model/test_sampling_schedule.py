@@ -49,7 +49,7 @@ def test_outside_the_interval_the_network_sees_the_conditional_rows_alone(
     unet, seen = synthesizer.networks.unet, list[int]()
     forward = unet.forward
 
-    def counted(rows: Tensor, condition: Tensor, inputs: tuple[StageInputs, ...]) -> Tensor:
+    def counted(rows: Tensor, condition: Tensor, inputs: StageInputs) -> Tensor:
         seen.append(len(rows))
         return forward(rows, condition, inputs)
 

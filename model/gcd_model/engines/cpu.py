@@ -5,7 +5,7 @@ is computed for it. Smaller ones are used again. The networks know nothing of th
 they compute stays the same; on other devices, with gradient and in a compiler a wrapped part is as it was.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from itertools import repeat
 
@@ -133,11 +133,10 @@ def _laid_out(_module: nn.Module, _given: object, x: Tensor) -> Tensor:
     return x.contiguous(memory_format=torch.channels_last if last else torch.contiguous_format)
 
 
-def _clip_by_clip(unet: VideoUNet, latents: Tensor, condition: Tensor, inputs: Sequence[StageInputs]) -> Tensor:
+def _clip_by_clip(unet: VideoUNet, latents: Tensor, condition: Tensor, inputs: StageInputs) -> Tensor:
     """Clips that are large together go through it one after the other: nothing of one is held for the next."""
     clips, widest = len(latents) // unet.frames, unet.stem.out_channels * latents.shape[-2:].numel()
     if clips == 1 or _rows_at_once(widest) >= len(latents):
         return VideoUNet.forward(unet, latents, condition, inputs).contiguous()
-    each = zip(*(stage.split(clips) for stage in inputs), strict=True)
-    parts = zip(latents.chunk(clips), condition.chunk(clips), each, strict=True)
+    parts = zip(latents.chunk(clips), condition.chunk(clips), inputs.chunk(clips), strict=True)
     return torch.cat([VideoUNet.forward(unet, *part).contiguous() for part in parts])

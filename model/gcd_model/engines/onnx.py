@@ -23,7 +23,7 @@ from gcd_model.image_encoder import clip_pixels
 from gcd_model.networks import empty_networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
-from gcd_model.unet import StageInputs, StagePlan, UNetPlan
+from gcd_model.unet import StageInputs, UNetPlan
 from gcd_model.weights.card import Card
 from gcd_model.weights.families import family_named
 
@@ -138,7 +138,7 @@ class OnnxEngine:
 
 
 class OnnxBackbone:
-    """The U-Net as graphs. Its plan has one entry for all stages, side by side. Source: `Backbone`."""
+    """The U-Net as graphs. Source: `Backbone`."""
 
     def __init__(self, graphs: Graphs, frames: int) -> None:
         self._graphs, self._frames = graphs, frames
@@ -151,14 +151,13 @@ class OnnxBackbone:
         crosses: Sequence[Tensor | None] = (None, None)
         if given.tokens is not None:
             crosses = self._joined([("crosses", clip) for clip in given.tokens.split(self._frames)])
-        return UNetPlan((StagePlan(spatial, temporal, crosses[0], crosses[1]),), given.branches)
+        return UNetPlan(spatial, temporal, crosses[0], crosses[1], given.branches)
 
-    def predict(self, rows: Tensor, condition: Tensor, inputs: tuple[StageInputs, ...]) -> Tensor:
-        (stage,) = inputs
-        parts = [rows, condition, stage.spatial_embedding, stage.temporal_embedding]
+    def predict(self, rows: Tensor, condition: Tensor, inputs: StageInputs) -> Tensor:
+        parts = [rows, condition, inputs.spatial_embedding, inputs.temporal_embedding]
         clips = [each.split(self._frames) for each in parts]
-        if stage.spatial_cross is not None and stage.temporal_cross is not None:
-            clips += [stage.spatial_cross.split(self._frames), stage.temporal_cross.split(1)]
+        if inputs.spatial_cross is not None and inputs.temporal_cross is not None:
+            clips += [inputs.spatial_cross.split(self._frames), inputs.temporal_cross.split(1)]
         return torch.cat([self._graphs.run("step", *clip)[0] for clip in zip(*clips, strict=True)])
 
     def _joined(self, runs: Sequence[tuple[Any, ...]]) -> tuple[Tensor, ...]:
