@@ -11,10 +11,8 @@ from torch import Tensor
 from gcd_model.clip import Augmentation, Clip, RenderOptions, View
 from gcd_model.colours import nearest_classes
 from gcd_model.conditioning import Conditioning, SourceFeatures, condition_latents, condition_tokens, micro_conditioning
-from gcd_model.config import SemanticClass
 from gcd_model.diffusion import Schedule, unit_noise
-from gcd_model.engines.cpu import arrange
-from gcd_model.engines.torch import Engine, TorchEngine
+from gcd_model.engines.torch import Engine, TorchEngine, arrange
 from gcd_model.errors import DeviceMemoryError, NonFiniteError, OptionError, ShapeError
 from gcd_model.geometry import Trajectory
 from gcd_model.layers import prepare
@@ -144,63 +142,9 @@ def _begun(source: Tensor) -> tuple[Tensor, torch.cuda.Event]:
     return held, arrived
 
 
-# --- from latents to pictures ----------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Pictures:
-    """One view on the CPU: pixels [S, T, 3, H, W], RGB; classes uint8 [S, T, H, W] or None.
-
-    pixels: float32 in [0, 1], or whole levels, uint8 in 0..255. finite: what was decoded held neither NaN nor Inf.
-    """
-
-    pixels: Tensor
-    classes: Tensor | None
-    finite: bool
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Coming:
-    """A decoded clip that may still be arriving. finite: bool, on the device."""
-
-    pixels: Download
-    classes: Download | None
-    finite: Tensor
-
-
-def decode(engine: Engine, latents: Tensor, painted: tuple[SemanticClass, ...], *, as_levels: bool) -> list[Pictures]:
-    """Decode view by view, one clip at a time; while one is decoded, the one before it arrives on the CPU.
-
-    latents: [V, S, T, C, h, w], unscaled: V views, S samples of each.
-    """
-    views = [[_decoded_clip(engine, clip, painted, as_levels=as_levels) for clip in view] for view in latents]
-    return [_arrived(clips) for clips in views]
-
-
-def _decoded_clip(engine: Engine, latents: Tensor, painted: tuple[SemanticClass, ...], *, as_levels: bool) -> _Coming:
-    """latents: [T, C, h, w]. Pixels [T, 3, H, W] and class ids [T, H, W]."""
-    decoded = engine.decode(latents)
-    pixels = to_pixels(decoded)
-    return _Coming(
-        pixels=Download(whole_levels(pixels) if as_levels else pixels),
-        classes=Download(nearest_classes(pixels, painted)) if painted else None,
-        finite=decoded.isfinite().all(),
-    )
-
-
 def whole_levels(pixels: Tensor) -> Tensor:
     """[0, 1] -> uint8 in 0..255, the nearest level."""
     return (pixels * 255).round().to(torch.uint8)
-
-
-def _arrived(clips: list[_Coming]) -> Pictures:
-    """The samples of one view."""
-    classes = [clip.classes.result() for clip in clips if clip.classes is not None]
-    return Pictures(
-        pixels=torch.stack([clip.pixels.result() for clip in clips]),
-        classes=torch.stack(classes) if classes else None,
-        finite=all(clip.finite.item() for clip in clips),
-    )
 
 
 # --- the door ------------------------------------------------------------------------------------------------------
@@ -270,18 +214,18 @@ class Synthesizer:
         buckets = [self._bucket(path, options) for path in trajectories]
         job = _Job(features, tuple(trajectories), tuple(buckets), options)
         made = self._denoise(job)
-        pictures = self._decode(job, made)
+        pictures = self._decode(made / self._config.vae.scale, as_levels=options.whole_levels)
         latents = made.cpu()
         return [
             View(
-                samples=pictures[v].pixels,
+                samples=pixels,
                 latents=latents[v],
-                trajectory=path,
+                trajectory=trajectories[v],
                 motion_bucket=buckets[v],
-                classes=pictures[v].classes,
+                classes=classes,
                 uncertainty_scale=self._traits.uncertainty_scale,
             )
-            for v, path in enumerate(trajectories)
+            for v, (pixels, classes) in enumerate(pictures)
         ]
 
     @property
@@ -343,12 +287,31 @@ class Synthesizer:
             branches=2 if unconditional else 1,
         )
 
-    def _decode(self, job: "_Job", latents: Tensor) -> list[Pictures]:
-        painted, as_levels = self._traits.painted_classes, job.options.whole_levels
-        pictures = decode(self._engine, latents / self._config.vae.scale, painted, as_levels=as_levels)
-        if not all(view.finite for view in pictures):
+    def _decode(self, latents: Tensor, *, as_levels: bool) -> list[tuple[Tensor, Tensor | None]]:
+        """Of every view pixels [S, T, 3, H, W] and class ids, on the CPU. latents: [V, S, T, C, h, w], unscaled.
+
+        One clip at a time; while one is decoded, the one before it arrives.
+        """
+        painted, finite = self._traits.painted_classes, list[Tensor]()
+        coming: list[list[tuple[Download, Download | None]]] = []
+        for view in latents:
+            coming.append([])
+            for clip in view:
+                decoded = self._engine.decode(clip)
+                pixels = to_pixels(decoded)
+                classes = Download(nearest_classes(pixels, painted)) if painted else None
+                coming[-1].append((Download(whole_levels(pixels) if as_levels else pixels), classes))
+                finite.append(decoded.isfinite().all())
+        if not all(each.item() for each in finite):
             raise NonFiniteError(f"{self._traits.name} decoded to NaN or Inf; the weights are damaged")
-        return pictures
+        arrived = [[(pixels.result(), classes and classes.result()) for pixels, classes in view] for view in coming]
+        return [
+            (
+                torch.stack([pixels for pixels, _ in view]),
+                torch.stack([classes for _, classes in view if classes is not None]) if painted else None,
+            )
+            for view in arrived
+        ]
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,12 +36,6 @@ def test_a_field_of_view_survives_the_round_trip(hfov_deg: float) -> None:
     assert (camera.cx, camera.cy) == (192.0, 128.0)
 
 
-def with_entry(row: int, column: int, value: float) -> Tensor:
-    matrix = CAMERA.matrix
-    matrix[row, column] = value
-    return matrix
-
-
 @pytest.mark.parametrize(
     ("make", "error"),
     [
@@ -54,9 +48,6 @@ def with_entry(row: int, column: int, value: float) -> Tensor:
         (lambda: Intrinsics.from_hfov(180.0, 384, 256), OptionError),
         (lambda: Intrinsics.from_hfov(math.nan, 384, 256), OptionError),
         (lambda: Intrinsics.from_hfov(50.0, 0, 256), ShapeError),
-        (lambda: Intrinsics.from_matrix(with_entry(0, 1, 3.0), 640, 480), OptionError),
-        (lambda: Intrinsics.from_matrix(with_entry(2, 2, 2.0), 640, 480), OptionError),
-        (lambda: Intrinsics.from_matrix(torch.eye(4), 640, 480), ShapeError),
         (lambda: center_crop_box(640, 480, -1.5), OptionError),
         (lambda: center_crop_box(640, 480, math.nan), OptionError),
     ],
@@ -64,12 +55,6 @@ def with_entry(row: int, column: int, value: float) -> Tensor:
 def test_what_no_pinhole_camera_is_is_refused(make: Callable[[], object], error: type[Exception]) -> None:
     with pytest.raises(error):
         make()
-
-
-def test_a_matrix_survives_the_round_trip_in_single_precision_too() -> None:
-    assert Intrinsics.from_matrix(CAMERA.matrix, 640, 480) == CAMERA
-    assert Intrinsics.from_matrix(CAMERA.matrix.float(), 640, 480) == CAMERA
-    assert CAMERA.matrix.dtype == torch.float64
 
 
 # The crop to the trained shape

@@ -11,7 +11,7 @@ from torch import Tensor
 from gcd_model import RenderOptions, Sampler, Schedule, sampler_of
 from gcd_model.clip import QUALITIES, Quality, SolverName
 from gcd_model.config import PLAIN_SMALL, SVD_14, SamplingConfig
-from gcd_model.diffusion import FAST, FASTEST, edm_sigmas, sample, solver_steps
+from gcd_model.diffusion import PRESETS, edm_sigmas, sample, solver_steps
 
 PUBLISHED = SamplingConfig()
 
@@ -79,8 +79,8 @@ def test_what_is_not_named_is_as_the_quality_has_it() -> None:
 
 
 def test_fast_is_no_farther_from_the_limit_than_25_euler_steps_are() -> None:
-    assert error(FAST.solver, FAST.steps) <= error("euler", 25)
+    assert error(*PRESETS["fast"]) <= error("euler", 25)
 
 
 def test_fastest_is_at_most_three_times_as_far() -> None:
-    assert error("euler", 25) < error(FASTEST.solver, FASTEST.steps) <= 3 * error("euler", 25)
+    assert error("euler", 25) < error(*PRESETS["fastest"]) <= 3 * error("euler", 25)

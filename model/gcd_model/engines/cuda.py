@@ -180,9 +180,8 @@ def _settle_decoder(networks: Networks, precision: str) -> None:
     if precision == "bfloat16":
         networks.decoder = copy.deepcopy(networks.decoder).to(torch.bfloat16)  # others may share its weights
     elif precision == "checked":
-        choice = checked_decoder(networks)
-        networks.decoder = choice.decoder
-        _LOG.info("decoder in %s: %.1f dB from float32 in bfloat16", choice.decoder.stem.weight.dtype, choice.psnr_db)
+        networks.decoder, psnr = checked_decoder(networks)
+        _LOG.info("decoder in %s: %.1f dB from float32 in bfloat16", networks.decoder.stem.weight.dtype, psnr)
 
 
 def _compiled(networks: Networks, options: CudaOptions) -> Update:
@@ -279,24 +278,16 @@ _SEED = 11
 _FRAMES = 4  # decoding all of a clip in float32 without graphs takes more memory than anything else does
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class DecoderChoice:
-    """The decoder that is used. psnr_db: of its pictures in bfloat16 against float32."""
-
-    decoder: TemporalDecoder
-    psnr_db: float
-
-
 @torch.inference_mode()
-def checked_decoder(networks: Networks) -> DecoderChoice:
-    """The decoder in bfloat16 if its pictures of a test clip are good enough for that, else as it is."""
+def checked_decoder(networks: Networks) -> tuple[TemporalDecoder, float]:
+    """The decoder, in bfloat16 if its pictures of a test clip are good enough for that; and their PSNR."""
     config, full = networks.config, networks.decoder
     frames = drifting_clip(min(config.frames, _FRAMES), config.height, config.width)
     encoder = networks.condition_encoder
     latents = torch.cat([encoder(each[None].to(encoder.stem.weight)).mean for each in frames]).float()
     half = copy.deepcopy(full).to(torch.bfloat16)
     psnr = psnr_db(*(to_pixels(each(latents.to(each.stem.weight), len(latents))) for each in (half, full)))
-    return DecoderChoice(decoder=half if psnr > WANTED_DB else full, psnr_db=psnr)
+    return half if psnr > WANTED_DB else full, psnr
 
 
 def drifting_clip(frames: int, height: int, width: int) -> Tensor:
