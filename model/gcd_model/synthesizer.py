@@ -1,7 +1,6 @@
 """The door: `encode` a clip once, `render` it as other cameras would have seen it."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import wraps
 from typing import ParamSpec, Protocol, TypeVar, runtime_checkable
 
@@ -211,9 +210,9 @@ class Synthesizer:
     ) -> list[View]:
         options = RenderOptions() if options is None else options
         self._check_lengths(features, trajectories)
-        buckets = [self._bucket(path, options) for path in trajectories]
-        job = _Job(features, tuple(trajectories), tuple(buckets), options)
-        made = self._denoise(job)
+        given = options.motion_bucket
+        buckets = [self._traits.motion_bucket(path) if given is None else given for path in trajectories]
+        made = self._denoise(features, trajectories, buckets, options)
         pictures = self._decode(made / self._config.vae.scale, as_levels=options.whole_levels)
         latents = made.cpu()
         return [
@@ -245,47 +244,53 @@ class Synthesizer:
             if length != frames:
                 raise ShapeError(f"{self._traits.name} works on {frames} frames, got {length}")
 
-    def _bucket(self, trajectory: Trajectory, options: RenderOptions) -> float:
-        given = options.motion_bucket
-        return self._traits.motion_bucket(trajectory) if given is None else given
-
     def _tokens(self, video: Tensor) -> Tensor | None:
         chunks = [self._engine.tokens(frames) for frames in video.split(_ENCODE_FRAMES)]
         made = [each for each in chunks if each is not None]
         return torch.cat(made) if made else None
 
-    def _denoise(self, job: "_Job") -> Tensor:
-        """Scaled latents, [V, S, T, C, h, w]."""
-        config, options = self._config, job.options
+    def _denoise(
+        self,
+        features: SourceFeatures,
+        trajectories: Sequence[Trajectory],
+        buckets: Sequence[float],
+        options: RenderOptions,
+    ) -> Tensor:
+        """Scaled latents, [V, S, T, C, h, w]; rows of the batch are ordered view by view, sample by sample."""
+        config, samples, views = self._config, options.samples, len(trajectories)
         schedule = Schedule.of(config, options)
-        given = self._condition(job, unconditional=schedule.branches == 2)
-        noise = job.noise(config.frames, shared=config.sampling.shared_noise)  # [S, T, C, h, w]
-        start = schedule.start(noise.to(self._like.device), len(job.trajectories))
-        latents = self._engine.sample(start, given, schedule, options)
+        width, strength = config.unet.vector_width, features.augmentation
+        vectors = [micro_conditioning(features.fps, bucket, strength, width) for bucket in buckets]
+        told = [self._engine.camera(path) for path in trajectories]
+        cameras = [each.repeat(samples, 1) for each in told if each is not None]
+        unconditional = schedule.branches == 2
+        given = Conditioning(
+            vector=torch.cat([vector.expand(samples * config.frames, -1) for vector in vectors]).to(self._like),
+            camera=torch.cat(cameras) if cameras else None,
+            tokens=condition_tokens(features, views * samples, unconditional=unconditional),
+            latents=condition_latents(features, views * samples, unconditional=unconditional),
+            branches=schedule.branches,
+        )
+        noise = self._noise(tuple(features.latents.shape[1:]), options)
+        latents = self._engine.sample(schedule.start(noise.to(self._like.device), views), given, schedule, options)
         if not latents.isfinite().all():
             raise NonFiniteError(
                 f"{self._traits.name} produced NaN or Inf in the latents (precision {self._traits.precision}, seed "
                 f"{options.seed}); try --dtype float32, and look at the weights with `gcd-node weights inspect`"
             )
-        return latents.unflatten(0, (len(job.trajectories), options.samples))
+        return latents.unflatten(0, (views, samples))
 
-    def _condition(self, job: "_Job", *, unconditional: bool) -> Conditioning:
-        """Rows are ordered view by view, sample by sample."""
-        samples, width = job.options.samples, self._config.unet.vector_width
-        vectors = [
-            micro_conditioning(job.features.fps, bucket, job.features.augmentation, width) for bucket in job.buckets
-        ]
-        per_frame = samples * job.features.frames
-        told = [self._engine.camera(path) for path in job.trajectories]
-        cameras = [each.repeat(samples, 1) for each in told if each is not None]
-        views = samples * len(job.trajectories)
-        return Conditioning(
-            vector=torch.cat([vector.expand(per_frame, -1) for vector in vectors]).to(self._like),
-            camera=torch.cat(cameras) if cameras else None,
-            tokens=condition_tokens(job.features, views, unconditional=unconditional),
-            latents=condition_latents(job.features, views, unconditional=unconditional),
-            branches=2 if unconditional else 1,
-        )
+    def _noise(self, each: tuple[int, ...], options: RenderOptions) -> Tensor:
+        """Unit noise the sampling starts from, [S, T, C, h, w]; the same for every view, and if shared every frame."""
+        samples, frames, given = options.samples, self._config.frames, options.initial_noise
+        if given is None:
+            shape = (1 if self._config.sampling.shared_noise else frames, *each)
+            draws = [unit_noise(shape, options.seed, 1 + s).expand(frames, *each) for s in range(samples)]
+            return torch.stack(draws)
+        given = given[None] if given.ndim == 4 else given
+        if tuple(given.shape) != (samples, frames, *each):
+            raise OptionError(f"initial noise must be {[samples, frames, *each]}, got {list(given.shape)}")
+        return given.float()
 
     def _decode(self, latents: Tensor, *, as_levels: bool) -> list[tuple[Tensor, Tensor | None]]:
         """Of every view pixels [S, T, 3, H, W] and class ids, on the CPU. latents: [V, S, T, C, h, w], unscaled.
@@ -312,25 +317,3 @@ class Synthesizer:
             )
             for view in arrived
         ]
-
-
-@dataclass(frozen=True, slots=True)
-class _Job:
-    """What one call of `render` was asked for."""
-
-    features: SourceFeatures
-    trajectories: tuple[Trajectory, ...]
-    buckets: tuple[float, ...]
-    options: RenderOptions
-
-    def noise(self, frames: int, *, shared: bool) -> Tensor:
-        """Unit noise the sampling starts from, [S, T, C, h, w]; the same for every view, and if `shared` frame."""
-        samples, given = self.options.samples, self.options.initial_noise
-        each = self.features.latents.shape[1:]
-        if given is None:
-            shape, seed = (1 if shared else frames, *each), self.options.seed
-            return torch.stack([unit_noise(shape, seed, 1 + s).expand(frames, *each) for s in range(samples)])
-        given = given[None] if given.ndim == 4 else given
-        if tuple(given.shape) != (samples, frames, *each):
-            raise OptionError(f"initial noise must be {[samples, frames, *each]}, got {list(given.shape)}")
-        return given.float()
