@@ -7,7 +7,7 @@ imported when the first export is loaded.
 import importlib.util
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -87,20 +87,12 @@ def provider_options(device: str, names: Sequence[str], cache: Path, *, half: bo
     return [*((name, options.get(name, {})) for name in names if name != CPU_PROVIDER), (CPU_PROVIDER, {})]
 
 
-class Graphs(Protocol):
-    """The graphs of one export, ready to run."""
-
-    def run(self, name: str, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """One run. inputs: in the graph's order."""
-        ...
-
-
 class OnnxEngine:
-    """The networks of an export, clip by clip. Source: `Engine`."""
+    """The networks of an export, clip by clip. Implements Engine, and Backbone with graphs for the U-Net."""
 
-    def __init__(self, graphs: Graphs, config: ModelConfig) -> None:
+    def __init__(self, graphs: "Sessions", config: ModelConfig) -> None:
         self._graphs, self._config = graphs, config
-        self._backbone = OnnxBackbone(graphs, config.frames)
+        self._frames = config.frames
         self.like = torch.zeros(())
         """See Engine: float32 on the CPU; onnxruntime copies to its own device."""
 
@@ -127,7 +119,7 @@ class OnnxEngine:
         return None if control == "none" else camera_features(control, path)
 
     def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
-        denoiser = planned_denoiser(self._backbone, given, schedule)
+        denoiser = planned_denoiser(self, given, schedule)
         return sample(denoiser, start, schedule.steps, progress=options.progress, cancel=options.cancel)
 
     def decode(self, latents: Tensor) -> Tensor:
@@ -135,13 +127,6 @@ class OnnxEngine:
 
     def _frame_by_frame(self, name: str, frames: Tensor) -> Tensor:
         return torch.cat([self._graphs.run(name, frame)[0] for frame in frames.split(1)])
-
-
-class OnnxBackbone:
-    """The U-Net as graphs. Source: `Backbone`."""
-
-    def __init__(self, graphs: Graphs, frames: int) -> None:
-        self._graphs, self._frames = graphs, frames
 
     def plan(self, labels: Tensor, given: Conditioning) -> UNetPlan:
         rows = [given.vector] if given.camera is None else [given.vector, given.camera]
@@ -180,7 +165,7 @@ class _Session(nn.Module):
 
 
 class Sessions:
-    """Graphs in onnxruntime's hands. Source: `Graphs`."""
+    """The graphs of one export, in onnxruntime's hands."""
 
     def __init__(self, files: dict[str, Path], providers: Sequence[Provider] = ((CPU_PROVIDER, {}),)) -> None:
         """Raises: OptionError if onnxruntime or a provider is not there; ModelError if it refuses a graph."""
@@ -198,7 +183,7 @@ class Sessions:
         self._sessions = {name: _Session(_session(onnxruntime, path, providers)) for name, path in files.items()}
 
     def run(self, name: str, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """See Graphs. Raises: DeviceMemoryError, ModelError."""
+        """One run. inputs: in the graph's order. Raises: DeviceMemoryError, ModelError."""
         try:
             return self._sessions[name](inputs)
         except Exception as error:
