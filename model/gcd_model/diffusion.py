@@ -13,7 +13,7 @@ from gcd_model.clip import CancelSignal, Guidance, NoiseInterval, Quality, Rende
 from gcd_model.conditioning import Conditioning
 from gcd_model.config import ModelConfig, Prediction, SamplingConfig
 from gcd_model.errors import Cancelled
-from gcd_model.unet import StageInputs, UNetPlan, VideoUNet
+from gcd_model.unet import StageInputs, UNetPlan
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,20 +262,6 @@ class Backbone(Protocol):
     def predict(self, rows: Tensor, condition: Tensor, inputs: StageInputs) -> Tensor:
         """One evaluation, see `VideoUNet.forward`. rows: float32 [N, C, h, w] -> float32, the same shape."""
         ...
-
-
-class TorchBackbone:
-    """The U-Net as it is, in its own precision. Source: `Backbone`."""
-
-    def __init__(self, unet: VideoUNet) -> None:
-        self._unet = unet
-
-    def plan(self, labels: Tensor, given: Conditioning) -> UNetPlan:
-        on_device = labels.to(self._unet.stem.weight.device)
-        return self._unet.plan(on_device, given.vector, given.camera, given.tokens, repeats=given.branches)
-
-    def predict(self, rows: Tensor, condition: Tensor, inputs: StageInputs) -> Tensor:
-        return self._unet(rows.to(self._unet.stem.weight), condition, inputs).float()
 
 
 Network = Callable[[Tensor, int, int], Tensor]

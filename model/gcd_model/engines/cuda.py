@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from gcd_model.clip import RenderOptions
 from gcd_model.conditioning import Conditioning
-from gcd_model.diffusion import Schedule, TorchBackbone, unit_noise
+from gcd_model.diffusion import Schedule, unit_noise
 from gcd_model.engines.graphs import (
     CudaGraphs,
     Pace,
@@ -108,7 +108,6 @@ class CudaEngine:
         update = _compiled(networks, options)
         self._networks, self._update = networks, update
         self._plain = TorchEngine(networks)
-        self._backbone = TorchBackbone(networks.unet)
         on_gpu = options.graphs and self.like.device.type == "cuda"
         self._recorder = recorder or (CudaGraphs() if on_gpu else Unrecorded())
         self._memories: Recent[StepMemory] = Recent()
@@ -149,7 +148,7 @@ class CudaEngine:
         widths = [2 if guided else 1 for guided in schedule.guided]
         memory = self._memories.get(
             (start.shape, given.latents.shape, given.tokens is None),
-            lambda: StepMemory(self._backbone, self._update, start, given, schedule),
+            lambda: StepMemory(self._plain, self._update, start, given, schedule),
         )
         memory.begin(start, given, schedule)
         if memory.record(set(widths), self._recorder):

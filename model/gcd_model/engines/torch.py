@@ -11,12 +11,12 @@ from torch import Tensor, nn
 
 from gcd_model.clip import RenderOptions
 from gcd_model.conditioning import Conditioning
-from gcd_model.diffusion import Schedule, TorchBackbone, planned_denoiser, sample
+from gcd_model.diffusion import Schedule, planned_denoiser, sample
 from gcd_model.geometry import Trajectory
 from gcd_model.image_encoder import clip_pixels
 from gcd_model.layers import Attention, FeedForward, ResBlock, Upsample
 from gcd_model.networks import Networks
-from gcd_model.unet import StageInputs, VideoUNet
+from gcd_model.unet import StageInputs, UNetPlan, VideoUNet
 
 
 class Engine(Protocol):
@@ -55,11 +55,10 @@ class Engine(Protocol):
 
 
 class TorchEngine:
-    """The networks as torch runs them."""
+    """The networks as torch runs them. Implements Engine, and Backbone with the U-Net in its own precision."""
 
     def __init__(self, networks: Networks) -> None:
         self._networks = networks
-        self._backbone = TorchBackbone(networks.unet)
 
     @property
     def like(self) -> Tensor:
@@ -79,9 +78,16 @@ class TorchEngine:
         return None if embedder is None else embedder(path)
 
     def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
-        denoiser = planned_denoiser(self._backbone, given, schedule)
+        denoiser = planned_denoiser(self, given, schedule)
         start = start.to(self.like.device)
         return sample(denoiser, start, schedule.steps, progress=options.progress, cancel=options.cancel)
+
+    def plan(self, labels: Tensor, given: Conditioning) -> UNetPlan:
+        unet, on_device = self._networks.unet, labels.to(self.like.device)
+        return unet.plan(on_device, given.vector, given.camera, given.tokens, repeats=given.branches)
+
+    def predict(self, rows: Tensor, condition: Tensor, inputs: StageInputs) -> Tensor:
+        return self._networks.unet(rows.to(self.like), condition, inputs).float()
 
     def decode(self, latents: Tensor) -> Tensor:
         decoder = self._networks.decoder
