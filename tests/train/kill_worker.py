@@ -9,10 +9,10 @@ import msgspec
 import torch
 from two_processes import LOG, Never, Task, options, recipe_of
 
-from gcd_train.engine.processes import ALONE
-from gcd_train.loop import Loop, Progress, StepLoss
-from gcd_train.recipe import Budget
-from gcd_train.run_folder import RunFolder
+from gcd_train.recipe_data import Budget
+from gcd_train.training.distributed import ALONE
+from gcd_train.training.loop import Loop, Progress, StepLoss
+from gcd_train.training.monitor import RunFolder
 
 UPDATES = 120
 

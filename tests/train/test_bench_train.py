@@ -10,9 +10,9 @@ from rich.console import Console
 from gcd_model import ModelConfig
 from gcd_model.config import SMALL, SVD_14
 from gcd_model.unet import VideoUNet
-from gcd_train.bench_train import BenchTrainOptions, MemoryRow, SpeedRow, TrainReport, bench_train, memory_rows
 from gcd_train.cli.bench import memory_table, speed_table
-from gcd_train.memory_account import PLANS, Kept, LiveBytes, account, kept_by_update, parameters_of
+from gcd_train.training.bench import BenchTrainOptions, MemoryRow, SpeedRow, TrainReport, bench_train, memory_rows
+from gcd_train.training.memory import PLANS, Kept, LiveBytes, account, kept_by_update, parameters_of
 
 TINY = msgspec.structs.replace(
     SMALL,

@@ -5,14 +5,14 @@ from pathlib import Path
 import msgspec
 import pytest
 import torch
-from tiny_world import Never, TinyClips, tiny_recipe
+from tiny_world import Never, TinyClips, saved, tiny_recipe
 
-from gcd_train.checkpoint import StageState, load_state
-from gcd_train.run_folder import RunFolder
-from gcd_train.trainer import RunInputs, Trainer
+from gcd_train.training.checkpoint import SavedWeights
+from gcd_train.training.monitor import RunFolder
+from gcd_train.training.run import RunInputs, Trainer
 
 
-def unet_of(path: Path, *, compiled: bool, recompute: bool = False) -> StageState:
+def unet_of(path: Path, *, compiled: bool, recompute: bool = False) -> SavedWeights:
     """The U-Net's state after all updates of the tiny recipe; the stages before it are taken as they lie there."""
     recipe = tiny_recipe()
     compute = msgspec.structs.replace(recipe.compute, compile=compiled, checkpoint_activations=recompute)
@@ -25,7 +25,7 @@ def unet_of(path: Path, *, compiled: bool, recompute: bool = False) -> StageStat
     )
     for stage in ("vae", "latents", "unet"):
         Trainer(inputs).run(stage)
-    return load_state(path / "unet" / "state.pt", "unet")
+    return saved(path / "unet", "unet")
 
 
 @pytest.mark.slow

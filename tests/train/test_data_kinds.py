@@ -17,10 +17,11 @@ from gcd_train.data.cache_writer import CacheJob, cache_scenes
 from gcd_train.data.latents import only_writer
 from gcd_train.data.open import DataPlaces, RunData, open_data, sampling_of
 from gcd_train.data.paths import DrivingSampling, OrbitSampling
-from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.precision import Precision
-from gcd_train.recipe import DataRecipe, FramesRecipe, LossRecipe, OrbitRecipe, Recipe
+from gcd_train.recipe import LossRecipe, Recipe
+from gcd_train.recipe_data import DataRecipe, FramesRecipe, OrbitRecipe
+from gcd_train.training.draws import Draws
+from gcd_train.training.setup import Precision
 
 VIEWS = tuple(f"view{number}" for number in range(4))
 CONFIG = ModelConfig(frames=3, height=32, width=48)

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_training_run import assert_same
 from tiny_driving import smaller
-from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips
+from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips, assert_same_states, saved
 
 from gcd_model import Clip, RenderOptions, Synthesizer, Traits, load_synthesizer
 from gcd_model.config import DRIVING_CLASSES, SVD_14
@@ -16,31 +15,35 @@ from gcd_model.networks import Networks, random_networks
 from gcd_model.weights.card import Card
 from gcd_model.weights.families import FAMILIES
 from gcd_model.weights.load import load_weights, read_adapter, save_weights
-from gcd_train.batches import PixelBatches
-from gcd_train.checkpoint import load_state
 from gcd_train.data.open import RunData
 from gcd_train.data.sample import to_network
-from gcd_train.distillation.distiller import Distiller, DistillInputs
-from gcd_train.distillation.paired import sampled, schedule_of
-from gcd_train.distillation.recipe import (
+from gcd_train.errors import Interrupted, RecipeError
+from gcd_train.recipe import OptimiserRecipe, UNetRecipe
+from gcd_train.recipe_data import Budget, ComputeRecipe
+from gcd_train.recipe_files import checked_recipe
+from gcd_train.stop import StopSignal
+from gcd_train.training.batches import PixelBatches
+from gcd_train.training.distill import (
+    Distiller,
+    DistillInputs,
+    SampleLoss,
+    colour_loss,
+    sampled,
+    schedule_of,
+    student_config,
+    teacher_of,
+)
+from gcd_train.training.distill_recipe import (
     DistillRecipe,
     SampleLossRecipe,
     StudentRecipe,
     load_distillation,
     packaged_distillations,
 )
-from gcd_train.distillation.sample_losses import SampleLoss, colour_loss
-from gcd_train.distillation.teacher import student_config, teacher_of
-from gcd_train.draws import Draws
-from gcd_train.errors import Interrupted, RecipeError
-from gcd_train.objective import Batch, denoiser_of
-from gcd_train.precision import Precision
-from gcd_train.recipe import ComputeRecipe, OptimiserRecipe, UNetRecipe
-from gcd_train.recipe.loading import checked_recipe
-from gcd_train.recipe.values import Budget
-from gcd_train.run_folder import RunFolder
-from gcd_train.start import loaded_base
-from gcd_train.stop import StopSignal
+from gcd_train.training.draws import Draws
+from gcd_train.training.monitor import RunFolder
+from gcd_train.training.objective import Batch, denoiser_of
+from gcd_train.training.setup import Precision, loaded_base
 
 CPU = Precision.of(ComputeRecipe(device="cpu"))
 STAGE = {"budget": {"updates": 2}, "optimiser": {"rate": 1e-3}}
@@ -194,15 +197,13 @@ def test_a_stopped_distillation_goes_on_to_the_same_weights(run: Path, teacher: 
     (tmp_path / "latents").symlink_to(run / "latents")
     with pytest.raises(Interrupted):
         distiller(tiny(teacher), tmp_path, After(1)).run("paired")
-    assert load_state(tmp_path / "paired" / "state.pt", "paired").updates == 1
+    assert saved(tmp_path / "paired", "paired").note.updates == 1
     distiller(tiny(teacher), tmp_path).run("paired")
-    ended, whole = (load_state(path / "paired" / "state.pt", "paired") for path in (tmp_path, run))
-    assert_same(ended.best, whole.best)
-    assert_same(ended.optimiser, whole.optimiser)
+    assert_same_states(tmp_path, run, "paired")
 
 
 def test_the_student_is_exported_as_weights_and_as_an_adapter(run: Path, teacher: Path) -> None:
-    paired = load_state(run / "paired" / "state.pt", "paired").best
+    paired = saved(run / "paired", "paired").best
     adapter = read_adapter(run / "tiny-student-adapter.safetensors")
     assert adapter.tensors.keys() == paired.keys()
     assert all(torch.equal(adapter.tensors[name], paired[name]) for name in paired)

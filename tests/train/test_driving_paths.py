@@ -12,10 +12,11 @@ from gcd_train.data.open import DataPlaces, RunData, open_data
 from gcd_train.data.pairs import PairedClips
 from gcd_train.errors import DataError
 from gcd_train.evaluation.clips import cameras_of
-from gcd_train.model_setup import family_of, model_config
-from gcd_train.recipe import Recipe, load_recipe
-from gcd_train.scenes.driving import driving_scene
+from gcd_train.recipe import Recipe
+from gcd_train.recipe_files import load_recipe
+from gcd_train.scenes.driving.world import driving_scene
 from gcd_train.scenes.pair_world import CameraWay, PairForm, World, WorldOptions, agree, driving_world, read_world
+from gcd_train.training.setup import family_of, model_config
 
 FORM = PairForm(width=48, height=32, frames=3, oversample=1)
 

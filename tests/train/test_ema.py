@@ -2,8 +2,8 @@ import pytest
 import torch
 from torch import nn
 
-from gcd_train.ema import Ema, ema_decay
 from gcd_train.recipe import EmaRecipe
+from gcd_train.training.optimiser import Ema, ema_decay
 
 
 @pytest.mark.parametrize(("update", "decay"), [(0, 0.1), (1, 2 / 11), (90, 0.91), (8990, 0.999), (10**6, 0.999)])

@@ -16,21 +16,18 @@ from two_processes import FRAMES, LOG, UPDATES, AfterUpdates, Never, Noise, Task
 
 from gcd_model.networks import random_networks
 from gcd_model.unet import VideoUNet
-from gcd_train.draws import Draws
-from gcd_train.ema import Ema
-from gcd_train.engine import optimisers
-from gcd_train.engine.blocks import recompute_blocks, stages_of
-from gcd_train.engine.engine import Engine
-from gcd_train.engine.optimisers import build_optimiser, set_rate
-from gcd_train.engine.processes import ALONE, Processes, processes_of
-from gcd_train.engine.states import newest_weights
 from gcd_train.errors import Interrupted, RecipeError
-from gcd_train.loop import Loop, Progress, StepLoss
-from gcd_train.model_setup import model_config
-from gcd_train.precision import Precision
-from gcd_train.recipe import Budget, ComputeRecipe, EmaRecipe, OptimiserRecipe
-from gcd_train.run_folder import RunFolder
-from gcd_train.schedule import ParameterGroup
+from gcd_train.recipe import EmaRecipe, OptimiserRecipe
+from gcd_train.recipe_data import Budget, ComputeRecipe
+from gcd_train.recipe_files import load_recipe, packaged_recipes
+from gcd_train.training import optimiser as optimisers
+from gcd_train.training.checkpoint import newest_weights
+from gcd_train.training.distributed import ALONE, Engine, Processes, processes_of, recompute_blocks, stages_of
+from gcd_train.training.draws import Draws
+from gcd_train.training.loop import Loop, Progress, StepLoss
+from gcd_train.training.monitor import RunFolder
+from gcd_train.training.optimiser import Ema, ParameterGroup, build_optimiser, set_rate
+from gcd_train.training.setup import Precision, model_config
 
 RATE = OptimiserRecipe(rate=0.1, kind="adam")
 
@@ -130,12 +127,21 @@ def test_the_average_of_bfloat16_weights_is_finer_than_they_are() -> None:
     assert ema.state_dict()["weight"].item() == pytest.approx(average, abs=1e-6)
 
 
-def test_an_updates_batches_are_shared_equally() -> None:
-    shares = [list(Processes(rank, 3).batches(6)) for rank in range(3)]
-    assert sorted(part for share in shares for part in share) == list(range(6))
-    assert {len(share) for share in shares} == {2}
-    with pytest.raises(RecipeError, match="cannot be shared by 4 processes"):
-        Processes(0, 4).batches(6)
+@pytest.mark.parametrize(("parts", "count"), [(6, 3), (14, 4), (24, 7), (2, 5)])
+def test_every_batch_of_an_update_counts_once_and_all_processes_compute_equally_many(parts: int, count: int) -> None:
+    shares = [Processes(rank, count).batches(parts) for rank in range(count)]
+    assert sorted(part for share in shares for part, counts in share if counts) == list(range(parts))
+    assert {len(share) for share in shares} == {-(-parts // count)}
+
+
+@pytest.mark.parametrize("name", [name for name in packaged_recipes() if name.startswith(("kubric-", "pardom-"))])
+def test_a_published_recipe_runs_as_it_ships_on_one_to_eight_processes(name: str) -> None:
+    recipe = load_recipe(f"package:{name}")
+    for count in (1, 2, 4, 7, 8):
+        rounds = {len(Processes(rank, count).batches(recipe.unet.parts)) for rank in range(count)}
+        assert rounds == {-(-recipe.unet.batch // count)}  # clip by clip: no process waits for more than one
+    assert (recipe.compute.parallel, recipe.log.save_s, recipe.log.keep) == ("ddp", 1800.0, 2)
+    assert (recipe.log.measure_every, recipe.log.keep_every) == (1250, None)
 
 
 def test_without_torchrun_there_is_one_process_whatever_the_recipe_says(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -143,13 +149,6 @@ def test_without_torchrun_there_is_one_process_whatever_the_recipe_says(monkeypa
     with processes_of(ComputeRecipe(parallel="fsdp")) as processes:
         assert processes is ALONE
         assert (processes.first, processes.several) == (True, False)
-
-
-def test_several_processes_want_to_be_told_how_they_share(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("RANK", "0")
-    monkeypatch.setenv("WORLD_SIZE", "2")
-    with pytest.raises(RecipeError, match=r'compute.parallel is "none"'), processes_of(ComputeRecipe()):
-        pass
 
 
 def test_a_recipe_of_bfloat16_weights_computes_gradients_in_them() -> None:

@@ -10,19 +10,18 @@ from tiny_world import FRAMES, Never, TinyClips, TinyOrbits
 
 from gcd_model import FAMILIES, load_synthesizer
 from gcd_model.networks import Networks, random_networks
-from gcd_train.conditioner import Conditioner
 from gcd_train.data.files import Skips
 from gcd_train.data.latents import LatentClips, LatentVideos
 from gcd_train.data.latents_writer import LatentsJob, encode_clips
 from gcd_train.data.open import DataPlaces, open_data
 from gcd_train.data.sample import ClipSource, Sample, VideoClips, VideoSamples
 from gcd_train.errors import RecipeError
-from gcd_train.model_setup import family_of, model_config
-from gcd_train.precision import Precision
-from gcd_train.recipe import Recipe, load_recipe
-from gcd_train.run_folder import RunFolder
-from gcd_train.start import start_networks
-from gcd_train.trainer import RunInputs, Trainer
+from gcd_train.recipe import Recipe
+from gcd_train.recipe_files import load_recipe
+from gcd_train.training.conditioner import Conditioner
+from gcd_train.training.monitor import RunFolder
+from gcd_train.training.run import RunInputs, Trainer
+from gcd_train.training.setup import Precision, family_of, model_config, start_networks
 
 CPU = torch.device("cpu")
 SMALLER = ("model.unet.multipliers=[1,2,2]", "model.vae.width=16", "model.vae.multipliers=[1,1,2]", "log.valid_clips=1")

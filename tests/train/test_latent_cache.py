@@ -26,10 +26,10 @@ from gcd_train.data.latents import only_writer, read_index
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.pictures import PictureOptions
 from gcd_train.data.sample import to_network
-from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError, RunError
-from gcd_train.precision import Precision
 from gcd_train.recipe import LossRecipe
+from gcd_train.training.draws import Draws
+from gcd_train.training.setup import Precision
 
 CPU = torch.device("cpu")
 

@@ -24,7 +24,7 @@ from gcd_train.lerobot.folder import CAMERA_FILE, CameraCalibration
 from gcd_train.lerobot.pairs import LeRobotOptions, LeRobotPairs
 from gcd_train.lerobot.tabletop_export import TabletopExport, export_tabletop
 from gcd_train.lerobot.writer import ExportOptions, LeRobotWriter, LoggedEpisode
-from gcd_train.recipe import DataRecipe
+from gcd_train.recipe_data import DataRecipe
 
 pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra `lerobot`: pip install 'gcd-node[lerobot]'")
 av = pytest.importorskip("av", reason="needs the extra `lerobot`: pip install 'gcd-node[lerobot]'")

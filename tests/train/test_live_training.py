@@ -26,7 +26,6 @@ from gcd_model.live.depth_net import (
 )
 from gcd_model.live.paint_net import Painted, PaintNet, Seen, filled
 from gcd_model.networks import LiveNetworks
-from gcd_train.engine.processes import processes_of
 from gcd_train.errors import DataError, Interrupted, RecipeError
 from gcd_train.live.batches import FrameBatches, lens_rays, pictures_of, training_paths
 from gcd_train.live.calibration import calibrate
@@ -39,8 +38,10 @@ from gcd_train.live.paint_training import HeldOutViews, PaintTask
 from gcd_train.live.recipe import LiveRecipe, LiveStage, live_recipes, load_live_recipe
 from gcd_train.live.target_views import ViewBatches, Views, carried_through, carry, views_of
 from gcd_train.live.training import LivePlaces, train_live
-from gcd_train.loop import Progress
-from gcd_train.recipe import Budget, ComputeRecipe, LogRecipe, OptimiserRecipe
+from gcd_train.recipe import OptimiserRecipe
+from gcd_train.recipe_data import Budget, ComputeRecipe, LogRecipe
+from gcd_train.training.distributed import processes_of
+from gcd_train.training.loop import Progress
 
 TINY = LiveConfig(
     height=HEIGHT,

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 import torch
 from test_start import SEED, given, published, random_batch, updated
-from tiny_world import FRAMES, HEIGHT, WIDTH, Never, TinyClips
+from tiny_world import FRAMES, HEIGHT, WIDTH, Never, TinyClips, saved
 from torch import Tensor
 from torch.testing import assert_close
 from typer.testing import CliRunner
@@ -16,16 +16,15 @@ from gcd_model.networks import Networks, empty_networks, random_networks
 from gcd_model.weights.adapter import adapted, base_digest
 from gcd_model.weights.card import Card
 from gcd_model.weights.load import load_adapted, load_weights, read_adapter, save_weights
-from gcd_train.checkpoint import load_state
 from gcd_train.cli.main import app
 from gcd_train.errors import RecipeError
-from gcd_train.lora import adapter_of, merge_lora, plain_weights
-from gcd_train.model_setup import copy_of, model_config
-from gcd_train.objective import Denoiser
-from gcd_train.recipe import LoraRecipe, ModelRecipe, Recipe, parse_recipe
-from gcd_train.run_folder import RunFolder
-from gcd_train.trained_part import halve_frozen, is_temporal, let_train
-from gcd_train.trainer import RunInputs, Trainer
+from gcd_train.recipe import LoraRecipe, ModelRecipe, Recipe
+from gcd_train.recipe_files import parse_recipe
+from gcd_train.training.monitor import RunFolder
+from gcd_train.training.objective import Denoiser
+from gcd_train.training.run import RunInputs, Trainer
+from gcd_train.training.setup import copy_of, model_config
+from gcd_train.training.trainable import adapter_of, halve_frozen, is_temporal, let_train, merge_lora, plain_weights
 
 LORA = LoraRecipe(rank=2, alpha=4.0)
 ADAPTED = ModelRecipe(base="small", family="kubric90", weights="given.safetensors", train="lora", lora=LORA)
@@ -143,7 +142,7 @@ def test_a_run_leaves_the_adapter_apart_and_merged_weights(tmp_path: Path) -> No
     valid = TinyClips(1, seed=9)
     inputs = RunInputs(recipe=recipe(base), clips=TinyClips(1), valid=valid, folder=RunFolder(out), stop=Never())
     Trainer(inputs).run()
-    state = load_state(out / "unet" / "state.pt", "unet").module
+    state = saved(out / "unet", "unet").module
     assert all(name.endswith((".down", ".up")) for name in state)
     joined = load_adapted(load_weights(base, ask_family=False), read_adapter(out / "mine-adapter.safetensors"))
     merged = load_weights(out / "mine.safetensors")

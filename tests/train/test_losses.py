@@ -3,7 +3,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from gcd_train.losses import (
+from gcd_train.training.losses import (
     PARALLEL_DOMAIN_WEIGHTS,
     PLAIN_BLEND,
     RELEASED_BLEND,

@@ -7,11 +7,9 @@ import pytest
 import torch
 
 from gcd_train.errors import RunError, TrainError
-from gcd_train.loop import peak_memory_gb
-from gcd_train.monitor.board import TensorBoard
-from gcd_train.monitor.finite import FiniteGuard
 from gcd_train.pictures import write_sheet
-from gcd_train.run_folder import RunFolder
+from gcd_train.training.loop import peak_memory_gb
+from gcd_train.training.monitor import FiniteGuard, RunFolder, TensorBoard
 
 
 def test_a_loss_that_is_no_number_names_update_and_clips(tmp_path: Path) -> None:

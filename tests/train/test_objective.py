@@ -11,13 +11,12 @@ from torch.testing import assert_close
 
 from gcd_model.diffusion import preconditioning
 from gcd_model.networks import Networks, random_networks
-from gcd_train.batches import PixelBatches
 from gcd_train.data.sample import to_network
-from gcd_train.draws import Draws
-from gcd_train.model_setup import model_config
-from gcd_train.objective import Batch, Denoiser, diffusion_loss, draw_noise, draw_sigma, drop_streams
-from gcd_train.precision import Precision
 from gcd_train.recipe import LossRecipe, NoiseRecipe, UNetRecipe
+from gcd_train.training.batches import PixelBatches
+from gcd_train.training.draws import Draws
+from gcd_train.training.objective import Batch, Denoiser, diffusion_loss, draw_noise, draw_sigma, drop_streams
+from gcd_train.training.setup import Precision, model_config
 
 CPU = torch.device("cpu")
 PRECISION = Precision(CPU, half=False, channels_last=False)

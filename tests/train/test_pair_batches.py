@@ -24,12 +24,11 @@ from gcd_train.data.paths import FrameSampling, OrbitSampling
 from gcd_train.data.pictures import PictureOptions
 from gcd_train.data.sample import Sample, SampleClips, collate
 from gcd_train.data.views import ViewPairs
-from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError, RunError
-from gcd_train.precision import Precision
-from gcd_train.recipe import LoaderRecipe, UNetRecipe
-from gcd_train.recipe.optimiser import OptimiserRecipe
-from gcd_train.recipe.values import Budget
+from gcd_train.recipe import OptimiserRecipe, UNetRecipe
+from gcd_train.recipe_data import Budget, LoaderRecipe
+from gcd_train.training.draws import Draws
+from gcd_train.training.setup import Precision
 
 CPU = torch.device("cpu")
 PRECISION = Precision(CPU, half=False, channels_last=False)

@@ -5,7 +5,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from gcd_model.vae import Posterior
-from gcd_train.picture_losses import energy_l1, gradient_l1, kl_to_normal, ssim
+from gcd_train.training.losses import energy_l1, gradient_l1, kl_to_normal, ssim
 
 
 def pictures(seed: int) -> Tensor:

@@ -10,9 +10,9 @@ from gcd_train.data.open import sampling_of
 from gcd_train.data.paths import DRIVING, MAX90, MAX180
 from gcd_train.errors import RecipeError
 from gcd_train.live.recipe import LiveRecipe, live_recipes, load_live_recipe
-from gcd_train.model_setup import family_of, model_config, require_exportable
-from gcd_train.recipe import load_recipe, packaged_recipes, parse_recipe
-from gcd_train.run_folder import RunFolder
+from gcd_train.recipe_files import load_recipe, packaged_recipes, parse_recipe
+from gcd_train.training.monitor import RunFolder
+from gcd_train.training.setup import family_of, model_config, require_exportable
 
 
 @pytest.mark.parametrize("name", packaged_recipes())

@@ -6,8 +6,7 @@ import pytest
 from tiny_world import RECIPE
 
 from gcd_train.errors import RecipeError
-from gcd_train.recipe import load_recipe, packaged_recipes, parse_recipe, to_toml
-from gcd_train.recipe.merging import merged, on_top
+from gcd_train.recipe_files import load_recipe, merged, on_top, packaged_recipes, parse_recipe, to_toml
 
 TINY = RECIPE.decode()
 

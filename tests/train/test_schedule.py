@@ -1,7 +1,8 @@
 import pytest
 
-from gcd_train.recipe import Budget, OptimiserRecipe
-from gcd_train.schedule import rate_factor
+from gcd_train.recipe import OptimiserRecipe
+from gcd_train.recipe_data import Budget
+from gcd_train.training.optimiser import rate_factor
 
 SMALL = OptimiserRecipe(rate=1.5e-3, warm_up=50, flat=0.3, final=0.02)
 

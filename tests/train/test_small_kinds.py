@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from tiny_scenes4d import DRIVING_POSES, write_driving
-from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips, TinyOrbits, tiny_recipe
+from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips, TinyOrbits, saved, tiny_recipe
 from torch import Tensor
 
 from gcd_model import FAMILIES, Clip, load_synthesizer
@@ -17,23 +17,21 @@ from gcd_model.conditioning import micro_conditioning, spherical_features
 from gcd_model.config import DRIVING_CLASSES
 from gcd_model.geometry import SphericalDelta, Trajectory
 from gcd_model.networks import random_networks
-from gcd_train.batches import EncodedBatches, PixelBatches
-from gcd_train.checkpoint import load_state
-from gcd_train.conditioner import Conditioner, mirrored_path
 from gcd_train.data.latents import LatentClips, LatentRows
 from gcd_train.data.latents_writer import LatentsJob, encode_clips
 from gcd_train.data.open import DataPlaces, open_data
 from gcd_train.data.sample import ClipSource, PaintedClips, SomeClips, to_network
-from gcd_train.draws import Draws
 from gcd_train.errors import DataError, Interrupted
-from gcd_train.losses import COLOUR_WEIGHTS, class_emphasis
-from gcd_train.model_setup import model_config, sampled_as_trained
-from gcd_train.precision import Precision
-from gcd_train.recipe import Budget, ClassWeightsName, DataRecipe, FramesRecipe, NoiseRecipe, Recipe
-from gcd_train.run_folder import RunFolder
-from gcd_train.start import start_networks
+from gcd_train.recipe import ClassWeightsName, NoiseRecipe, Recipe
+from gcd_train.recipe_data import Budget, DataRecipe, FramesRecipe
 from gcd_train.stop import StopSignal
-from gcd_train.trainer import RunInputs, Trainer
+from gcd_train.training.batches import EncodedBatches, PixelBatches
+from gcd_train.training.conditioner import Conditioner, mirrored_path
+from gcd_train.training.draws import Draws
+from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
+from gcd_train.training.monitor import RunFolder
+from gcd_train.training.run import RunInputs, Trainer
+from gcd_train.training.setup import Precision, model_config, sampled_as_trained, start_networks
 
 CPU = torch.device("cpu")
 PRECISION = Precision(CPU, half=False, channels_last=False)
@@ -116,7 +114,7 @@ def test_a_run_on_orbits_ends_in_a_file_that_is_steered(orbit_run: Path) -> None
 
 
 def test_what_steers_is_trained_too(orbit_run: Path) -> None:
-    trained = load_state(orbit_run / "unet" / "state.pt", "unet").module
+    trained = saved(orbit_run / "unet", "unet").module
     assert trained["camera.proj.weight"].shape[1] == 13
     recipe = orbit_recipe()
     start = start_networks(recipe.model, model_config(recipe.model), recipe.seed).camera
@@ -173,7 +171,7 @@ def test_a_resumed_run_on_orbits_equals_an_uninterrupted_one(orbit_run: Path, tm
     assert torch.equal(one.source, other.source)
     assert torch.equal(one.target, other.target)
     assert_alike(one.control, other.control)
-    resumed, whole = (load_state(folder / "unet" / "state.pt", "unet").module for folder in (tmp_path, orbit_run))
+    resumed, whole = (saved(folder / "unet", "unet").module for folder in (tmp_path, orbit_run))
     assert all(torch.equal(resumed[name], value) for name, value in whole.items())
 
 

@@ -14,8 +14,9 @@ from typer.testing import CliRunner
 
 from gcd_model.config import PLAIN_SMALL
 from gcd_train.cli.main import app
-from gcd_train.model_setup import model_config, sampled_as_trained
-from gcd_train.recipe import Recipe, load_recipe
+from gcd_train.recipe import Recipe
+from gcd_train.recipe_files import load_recipe
+from gcd_train.training.setup import model_config, sampled_as_trained
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "launch" / "small-study.sh"

@@ -1,5 +1,7 @@
 """Where training starts, which part of the networks it changes, and what it leaves as it was, bit for bit."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import msgspec
@@ -13,14 +15,13 @@ from gcd_model.networks import Networks, empty_networks, random_networks
 from gcd_model.weights.card import Card
 from gcd_model.weights.load import save_weights
 from gcd_model.weights.save import gcd_state, write_published
-from gcd_train.draws import Draws
 from gcd_train.errors import RecipeError
-from gcd_train.model_setup import model_config
-from gcd_train.objective import Batch, Denoiser, diffusion_loss
-from gcd_train.precision import Precision
-from gcd_train.recipe import LossRecipe, ModelRecipe, NoiseRecipe, load_recipe
-from gcd_train.start import fresh_networks, start_networks
-from gcd_train.trained_part import is_temporal, keep_trained_alone, let_train
+from gcd_train.recipe import LossRecipe, ModelRecipe, NoiseRecipe
+from gcd_train.recipe_files import load_recipe
+from gcd_train.training.draws import Draws
+from gcd_train.training.objective import Batch, Denoiser, diffusion_loss
+from gcd_train.training.setup import Precision, fresh_networks, model_config, start_networks
+from gcd_train.training.trainable import is_temporal, keep_trained_alone, let_train
 
 CPU = torch.device("cpu")
 SEED = 3
@@ -211,3 +212,19 @@ def test_a_missing_weight_file_is_told_with_its_key_before_networks_are_made() -
     recipe = load_recipe("package:kubric-gradual-max90").model
     with pytest.raises(RecipeError, match=r"svd\.safetensors, is not there; .*--set model\.weights=FILE"):
         start_networks(recipe, model_config(recipe), seed=0)
+
+
+def test_the_temporal_part_trains_on_a_cpu_with_channels_last() -> None:
+    """In a process of its own, which torch's group norm would crash."""
+    program = (
+        "import torch; from test_start import *; from tiny_driving import smaller\n"
+        "from gcd_train.training.objective import denoiser_of\n"
+        "networks = random_networks(smaller(4, 32, 64), seed=0); unet = networks.config.unet\n"
+        "let_train(networks, ModelRecipe(weights='x', train='temporal'), SEED)\n"
+        "denoiser = Precision(CPU, half=False, channels_last=True).placed(denoiser_of(networks))\n"
+        "shapes = (unet.latent_channels, 4, 8), (unet.condition_channels, 4, 8), (unet.vector_width,)\n"
+        "target, condition, vector = (torch.randn(4, *shape) for shape in shapes)\n"
+        "batch = Batch(target=target, condition=condition, vector=vector, tokens=None, emphasis=None, frames=4)\n"
+        "denoiser(batch.target, torch.ones(4), batch).square().mean().backward()"
+    )
+    subprocess.run([sys.executable, "-c", program], cwd=Path(__file__).parent, check=True)

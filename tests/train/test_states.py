@@ -1,8 +1,8 @@
 """States on disk: what is kept, what is refused, and that a killed run goes on to the same bits."""
 
-import logging
 import os
 import pickle
+import shutil
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -11,22 +11,21 @@ from typing import Any
 import msgspec
 import pytest
 import torch
-from tiny_world import Never
+from tiny_world import Never, saved
 from torch import nn
-from torch.distributed.checkpoint.filesystem import FileSystemWriter
-from torch.distributed.checkpoint.state_dict_saver import save
+from torch.distributed.checkpoint.hf_storage import HuggingFaceStorageWriter
 
-from gcd_train import checkpoint
-from gcd_train.checkpoint import DamagedStateError, load_state
-from gcd_train.engine.sharded import FolderNote, checked_note, close_folder, read_weights
-from gcd_train.engine.states import newest_weights
 from gcd_train.errors import RunError
-from gcd_train.loop import Loop, LoopOptions, Progress, StepLoss
-from gcd_train.recipe import Budget, EmaRecipe, LogRecipe, OptimiserRecipe
-from gcd_train.run_folder import RunFolder
-from gcd_train.schedule import ParameterGroup
+from gcd_train.recipe import EmaRecipe, OptimiserRecipe
+from gcd_train.recipe_data import Budget, LogRecipe
+from gcd_train.training.checkpoint import DamagedStateError, close_folder, newest_weights, read_weights
+from gcd_train.training.loop import Loop, LoopOptions, Progress, StepLoss
+from gcd_train.training.monitor import RunFolder
+from gcd_train.training.optimiser import ParameterGroup
 
 LOG = LogRecipe(log_s=1e6, save_s=1e6, measure_s=1e6, keep=3, keep_every=1)
+
+EMA = EmaRecipe(limit=0.9)
 
 
 class Slope:
@@ -54,14 +53,20 @@ class Slope:
         return {"bias": self.module.bias.item()}
 
 
-def run(path: Path, updates: int, log: LogRecipe = LOG) -> Slope:
+def run(
+    path: Path,
+    updates: int,
+    log: LogRecipe = LOG,
+    identity: str = "slope",
+    ema: EmaRecipe | None = EMA,
+) -> Slope:
     task = Slope()
     options = LoopOptions(
         stage="unet",
-        identity="slope",
+        identity=identity,
         budget=Budget(updates=updates),
         optimiser=OptimiserRecipe(rate=0.1),
-        ema=EmaRecipe(limit=0.9),
+        ema=ema,
         log=log,
         stop=Never(),
         frames_per_clip=1,
@@ -76,14 +81,13 @@ def states(path: Path) -> list[str]:
 
 def test_the_newest_states_are_kept_and_those_of_every_so_many_updates(tmp_path: Path) -> None:
     run(tmp_path, 9, msgspec.structs.replace(LOG, keep=2, keep_every=4))
-    assert states(tmp_path) == ["0000004.pt", "0000008.pt"]
-    assert load_state(tmp_path / "unet" / "state.pt", "unet").updates == 9
+    assert states(tmp_path) == ["0000004", "0000008", "0000009"]
 
 
 def test_without_keep_every_only_the_newest_stay(tmp_path: Path) -> None:
     for updates in range(1, 6):
         run(tmp_path, updates, msgspec.structs.replace(LOG, keep_every=None))
-    assert states(tmp_path) == ["0000003.pt", "0000004.pt"]
+    assert states(tmp_path) == ["0000003", "0000004", "0000005"]
 
 
 def truncate(path: Path) -> None:
@@ -96,43 +100,67 @@ def flip(path: Path) -> None:
     path.write_bytes(data)
 
 
-@pytest.mark.parametrize("harm", [truncate, flip, Path.unlink])
-def test_a_damaged_state_is_refused_and_the_one_before_it_is_used(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, harm: Callable[[Path], None]
+def tensors(state: Path) -> Path:
+    """The file that a state of one process has its tensors in."""
+    (file,) = state.glob("*.safetensors")
+    return file
+
+
+def extra(path: Path) -> None:
+    (path.parent / "extra.safetensors").write_bytes(path.read_bytes())
+
+
+HARMS = [("tensors", truncate), ("tensors", flip), ("tensors", Path.unlink), ("tensors", extra)]
+HARMS += [("note", truncate), ("note", flip), ("note", Path.unlink)]
+
+
+@pytest.mark.parametrize(("which", "harm"), HARMS)
+def test_a_damaged_state_is_put_aside_and_the_one_before_it_is_used(
+    tmp_path: Path, which: str, harm: Callable[[Path], None]
 ) -> None:
     whole = run(tmp_path / "whole", 6)
     run(tmp_path / "harmed", 4)
-    harm(tmp_path / "harmed" / "unet" / "state.pt")
-    with caplog.at_level(logging.WARNING):
-        resumed = run(tmp_path / "harmed", 6)
+    newest = tmp_path / "harmed" / "unet" / "states" / "0000004"
+    harm(newest / "state.json" if which == "note" else tensors(newest))
+    with pytest.raises(RunError):  # weights are not exchanged for less trained ones
+        newest_weights(tmp_path / "harmed" / "unet", "unet")
+    resumed = run(tmp_path / "harmed", 6)
     assert resumed.losses == {update: whole.losses[update] for update in (3, 4, 5)}  # the fourth update once more
-    said = harm is not Path.unlink
-    assert ("going on from the state before it" in caplog.text) == said
-    assert (tmp_path / "harmed" / "unet" / "state.pt.damaged").exists() == said
+    assert newest.with_suffix(".damaged").exists()
 
 
 def test_a_run_whose_states_are_all_damaged_does_not_start_anew_by_itself(tmp_path: Path) -> None:
     run(tmp_path, 3)
-    for path in (tmp_path / "unet").rglob("*.pt"):
+    for path in (tmp_path / "unet").rglob("*.safetensors"):
         flip(path)
-    with pytest.raises(RunError, match="all 3 states of the stage are damaged"):
+    with pytest.raises(RunError):
         run(tmp_path, 6)
+    assert not list((tmp_path / "unet").rglob("*.damaged"))
 
 
-def test_damaged_weights_are_not_exchanged_for_less_trained_ones(tmp_path: Path) -> None:
-    run(tmp_path, 3)
-    flip(tmp_path / "unet" / "state.pt")
-    with pytest.raises(RunError, match="not those that were written; run the stage 'unet' again"):
-        newest_weights(tmp_path / "unet", "unet")
-
-
-def test_no_byte_of_a_state_can_change_unnoticed(tmp_path: Path) -> None:
+def test_the_state_of_another_stage_or_model_is_refused(tmp_path: Path) -> None:
     run(tmp_path, 1)
-    path = tmp_path / "unet" / "state.pt"
-    data = path.read_bytes()
-    for place in (*range(0, len(data), 97), *range(len(data) - 110, len(data))):
-        path.write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
-        assert checkpoint.damage(path) is not None, place
+    shutil.copytree(tmp_path / "unet", tmp_path / "vae")
+    with pytest.raises(RunError):
+        newest_weights(tmp_path / "vae", "vae")
+    with pytest.raises(RunError):
+        run(tmp_path, 2, identity="another")
+    with pytest.raises(RunError):
+        run(tmp_path, 2, ema=None)
+
+
+def test_a_full_disk_leaves_the_older_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run(tmp_path, 1)
+
+    def full(*_args: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    for owner, name in ((os, "fsync"), (HuggingFaceStorageWriter, "write_data")):
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, full)
+            with pytest.raises(RunError):
+                run(tmp_path, 2)
+        assert saved(tmp_path / "unet", "unet").note.updates == 1
 
 
 class Killed(BaseException):
@@ -140,43 +168,39 @@ class Killed(BaseException):
 
 
 class Assassin:
-    """Ends the process at the n-th thing it does to the disk; a write is cut in half."""
+    """Ends the process at the n-th thing it does to the disk; what tensors are written is cut in half."""
 
     def __init__(self, at: int, patch: pytest.MonkeyPatch) -> None:
         self._left = at
-        for owner, name in ((Path, "replace"), (Path, "rename"), (Path, "unlink"), (Path, "mkdir"), (os, "fsync")):
+        for owner, name in ((Path, "rename"), (Path, "mkdir"), (os, "fsync"), (shutil, "rmtree")):
             patch.setattr(owner, name, self._watched(getattr(owner, name)))
-        write: Any = checkpoint._Hashing.write  # pyright: ignore[reportPrivateUsage]
-
-        def cut(hashing: Any, data: Any) -> int:
-            if self._strikes():
-                write(hashing, bytes(data)[: len(bytes(data)) // 2])
-                hashing._file.flush()
-                raise Killed
-            self._stay_dead()
-            return write(hashing, data)
-
-        patch.setattr(checkpoint._Hashing, "write", cut)  # pyright: ignore[reportPrivateUsage]
+        patch.setattr(HuggingFaceStorageWriter, "write_data", self._cut(HuggingFaceStorageWriter.write_data))
 
     @property
     def struck(self) -> bool:
         return self._left <= 0
 
-    def _strikes(self) -> bool:
+    def _strike(self) -> None:
         self._left -= 1
-        return self._left == 0
-
-    def _stay_dead(self) -> None:
         if self.struck:
             raise Killed
 
     def _watched(self, done: Callable[..., Any]) -> Callable[..., Any]:
         def watched(*args: Any, **named: Any) -> Any:
-            self._strikes()
-            self._stay_dead()
+            self._strike()
             return done(*args, **named)
 
         return watched
+
+    def _cut(self, write: Callable[..., Any]) -> Callable[..., Any]:
+        def cut(writer: Any, *args: Any) -> Any:
+            made = write(writer, *args)
+            if self._left == 1:
+                truncate(tensors(Path(writer.path)))
+            self._strike()
+            return made
+
+        return cut
 
 
 def test_a_run_killed_at_any_write_goes_on_to_the_same_losses(tmp_path: Path) -> None:
@@ -184,8 +208,8 @@ def test_a_run_killed_at_any_write_goes_on_to_the_same_losses(tmp_path: Path) ->
     while True:
         path = tmp_path / f"{kills}"
         with pytest.MonkeyPatch.context() as patch:
-            assassin = Assassin(1 + 11 * kills, patch)  # 11: of all the writes of one state, some
-            with suppress(Killed, RuntimeError):  # torch closes its archive, and complains that it cannot
+            assassin = Assassin(1 + kills, patch)
+            with suppress(Killed, RunError):  # torch passes on what ends its writer as an error of its own
                 run(path, 4, msgspec.structs.replace(LOG, keep=2, keep_every=None, save_s=1e-9))
         if not assassin.struck:
             break
@@ -193,50 +217,9 @@ def test_a_run_killed_at_any_write_goes_on_to_the_same_losses(tmp_path: Path) ->
         resumed = run(path, 4)
         assert resumed.losses == {update: whole.losses[update] for update in resumed.losses}
         assert torch.equal(resumed.module.weight, whole.module.weight)
-        assert 3 in resumed.losses or load_state(path / "unet" / "state.pt", "unet").updates == 4
+        assert saved(path / "unet", "unet").note.updates == 4
+        assert {name.partition(".")[2] for name in states(path)} == {""}  # nothing half written is left
     assert kills > 10
-
-
-NOTE = FolderNote(stage="unet", identity="x", updates=1250, seconds=2.0, moments="torch.optim.adam.Adam")
-
-
-def folder_of(path: Path) -> Path:
-    unfinished = path / "0001250.part"
-    unfinished.mkdir()
-    for number in range(2):
-        (unfinished / f"__{number}_0.distcp").write_bytes(bytes([number]) * 1000)
-    close_folder(unfinished, path / "0001250", NOTE)
-    assert not unfinished.exists()
-    return path / "0001250"
-
-
-def test_a_folder_says_what_it_holds(tmp_path: Path) -> None:
-    note = checked_note(folder_of(tmp_path), "unet")
-    assert replace_files(note) == NOTE
-    assert len(note.files) == 2
-
-
-def replace_files(note: FolderNote) -> FolderNote:
-    return msgspec.structs.replace(note, files={})
-
-
-@pytest.mark.parametrize(
-    ("name", "harm", "words"),
-    [
-        ("__0_0.distcp", Path.unlink, "is missing"),
-        ("__1_0.distcp", truncate, "not those that were written"),
-        ("__1_0.distcp", flip, "not those that were written"),
-        ("digest.json", Path.unlink, "digest.json cannot be read: No such file"),
-        ("digest.json", flip, "not as it was written"),
-    ],
-)
-def test_a_folder_with_a_damaged_file_is_refused(
-    tmp_path: Path, name: str, harm: Callable[[Path], None], words: str
-) -> None:
-    folder = folder_of(tmp_path)
-    harm(folder / name)
-    with pytest.raises(DamagedStateError, match=words):
-        checked_note(folder, "unet")
 
 
 class Hostile:
@@ -249,27 +232,23 @@ class Hostile:
         return Path.touch, (self.mark,)
 
 
-def written_state(path: Path, values: dict[str, object]) -> Path:
-    unfinished = path / "0001250.part"
-    save(values, storage_writer=FileSystemWriter(unfinished), no_dist=True)
-    return unfinished
-
-
-@pytest.mark.filterwarnings("ignore::UserWarning")
-def test_a_folder_that_somebody_else_made_runs_nothing(tmp_path: Path) -> None:
-    unfinished, mark = written_state(tmp_path, {"module.weight": torch.ones(2)}), tmp_path / "ran"
-    (unfinished / ".metadata").write_bytes(pickle.dumps(Hostile(mark)))
-    close_folder(unfinished, tmp_path / "0001250", NOTE)
-    with pytest.raises(DamagedStateError):
-        read_weights(tmp_path / "0001250", "unet")
-    assert not mark.exists()
-
-
-@pytest.mark.filterwarnings("ignore::UserWarning")
-def test_a_folder_holds_tensors_alone(tmp_path: Path) -> None:
-    mark = tmp_path / "ran"
-    unfinished = written_state(tmp_path, {"module.weight": torch.ones(2), "module.note": Hostile(mark)})
-    close_folder(unfinished, tmp_path / "0001250", NOTE)
-    with pytest.raises(DamagedStateError):
-        read_weights(tmp_path / "0001250", "unet")
-    assert not mark.exists()
+@pytest.mark.parametrize("name", ["tensors", "state.json", ".metadata", "__0_0.distcp", "0000005.pt", "state.pt"])
+def test_a_run_folder_that_somebody_else_made_runs_nothing(tmp_path: Path, name: str) -> None:
+    """Every file of it a pickle, and digests that match."""
+    run(tmp_path, 1)
+    state, mark = tmp_path / "unet" / "states" / "0000001", tmp_path / "ran"
+    note = read_weights(state, "unet").note
+    pickled = pickle.dumps(Hostile(mark))
+    place = {"tensors": tensors(state), "0000005.pt": state.parent / name, "state.pt": state.parent.parent / name}
+    place.get(name, state / name).write_bytes(pickled)
+    if name != "state.json":
+        unfinished = state.rename(state.with_suffix(".part"))
+        (unfinished / "state.json").unlink()
+        close_folder(unfinished, note)
+    for attempt in (lambda: read_weights(state, "unet"), lambda: run(tmp_path, 2)):
+        with suppress(RunError):
+            attempt()
+        assert not mark.exists()
+    if name in ("tensors", "state.json"):
+        with pytest.raises(DamagedStateError):
+            read_weights(next((tmp_path / "unet" / "states").glob("0000001*")), "unet")

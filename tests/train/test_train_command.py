@@ -3,7 +3,7 @@ from pathlib import Path
 from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
-from gcd_train.recipe import packaged_recipes
+from gcd_train.recipe_files import packaged_recipes
 
 
 def test_train_explains_itself() -> None:

@@ -2,24 +2,23 @@
 
 import json
 import shutil
-from collections.abc import Mapping
 from pathlib import Path
 
 import msgspec
 import pytest
 import torch
-from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips, tiny_recipe
+from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips, assert_same_states, saved, tiny_recipe
 
 from gcd_model import Clip, load_synthesizer
-from gcd_train.checkpoint import load_state
 from gcd_train.data.latents import LatentClips, write_index
 from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, Interrupted, RecipeError, RunError
-from gcd_train.model_setup import model_config, sampled_as_trained
-from gcd_train.recipe import Budget, Recipe, StageName
-from gcd_train.run_folder import RunFolder
+from gcd_train.recipe import Recipe
+from gcd_train.recipe_data import Budget, StageName
 from gcd_train.stop import StopSignal
-from gcd_train.trainer import RunInputs, Trainer
+from gcd_train.training.monitor import RunFolder
+from gcd_train.training.run import RunInputs, Trainer
+from gcd_train.training.setup import model_config, sampled_as_trained
 
 
 def trainer(path: Path, recipe: Recipe | None = None, stop: StopSignal | None = None, clips: int = 2) -> Trainer:
@@ -57,8 +56,7 @@ def test_a_run_ends_in_a_weight_file_that_renders(run: Path) -> None:
 
 def test_the_weight_file_holds_the_averaged_weights_in_half_precision(run: Path) -> None:
     networks = load_synthesizer(run / "tiny.safetensors", device="cpu", dtype="float16").networks
-    average = load_state(run / "unet" / "state.pt", "unet").average
-    assert average is not None
+    average = saved(run / "unet", "unet").average
     assert torch.equal(networks.unet.conv_out.weight, average["unet.conv_out.weight"].half())
 
 
@@ -77,7 +75,7 @@ def test_a_finished_run_does_nothing_but_export_again(run: Path) -> None:
     before = {
         path: path.stat().st_mtime_ns
         for path in run.rglob("*")
-        if path.suffix == ".pt" or path.parent.name == "latents"
+        if path.parent.name == "latents" or path.name == "state.json"
     }
     trainer(run).run()
     assert {path: path.stat().st_mtime_ns for path in before} == before
@@ -98,21 +96,6 @@ def test_rows_are_the_encoded_frames_and_mirroring_mirrors_the_rest(run: Path) -
     rows = clips.rows(both, frame, torch.tensor([False, True]), torch.device("cpu"))
     assert not torch.equal(rows.source[0], rows.source[1])
     assert not torch.equal(rows.target[0], rows.target[1])
-
-
-def assert_same(first: object, second: object, where: str = "state") -> None:
-    assert type(first) is type(second), where
-    if isinstance(first, torch.Tensor):
-        assert torch.equal(first, second), where  # pyright: ignore[reportArgumentType]
-    elif isinstance(first, Mapping):
-        assert first.keys() == second.keys(), where  # pyright: ignore[reportAttributeAccessIssue]
-        for key, value in first.items():
-            assert_same(value, second[key], f"{where}.{key}")  # pyright: ignore[reportIndexIssue]
-    elif isinstance(first, list):
-        for i, (a, b) in enumerate(zip(first, second, strict=True)):  # pyright: ignore[reportArgumentType]
-            assert_same(a, b, f"{where}.{i}")
-    else:
-        assert first == second, where
 
 
 def folder_with(run: Path, path: Path, *parts: str) -> Path:
@@ -139,11 +122,9 @@ def test_a_resumed_stage_equals_an_uninterrupted_one_bit_for_bit(
     path = folder_with(run, tmp_path / "again", *before)
     with pytest.raises(Interrupted, match=f"update {at}"):
         trainer(path, stop=After(at + 1)).run(stage)  # asked once before the first update, then after each
-    assert load_state(path / stage / "state.pt", stage).updates == at
+    assert saved(path / stage, stage).note.updates == at
     trainer(path).run(stage)
-    resumed, whole = (load_state(folder / stage / "state.pt", stage) for folder in (path, run))
-    for name in ("updates", "identity", "module", "optimiser", "average"):
-        assert_same(getattr(resumed, name), getattr(whole, name), name)
+    assert_same_states(path, run, stage)
 
 
 def test_encoding_goes_on_where_it_stopped(run: Path, tmp_path: Path) -> None:
@@ -162,13 +143,12 @@ def test_encoding_goes_on_where_it_stopped(run: Path, tmp_path: Path) -> None:
 
 def test_a_longer_budget_trains_on(run: Path, tmp_path: Path) -> None:
     path = folder_with(run, tmp_path / "again", "latents")
-    (path / "vae").mkdir()
-    (path / "vae" / "state.pt").write_bytes((run / "vae" / "state.pt").read_bytes())
+    shutil.copytree(run / "vae" / "states", path / "vae" / "states")
     recipe = tiny_recipe()
     assert recipe.vae is not None
     longer = msgspec.structs.replace(recipe.vae, budget=Budget(updates=7))
     trainer(path, recipe=tiny_recipe(vae=longer)).run("vae")
-    assert load_state(path / "vae" / "state.pt", "vae").updates == 7
+    assert saved(path / "vae", "vae").note.updates == 7
     with pytest.raises(RunError, match="another autoencoder"):
         trainer(path, recipe=tiny_recipe(vae=longer)).run("unet")
 
@@ -232,15 +212,14 @@ def test_weights_of_two_runs_are_never_exported_together(run: Path, tmp_path: Pa
     shorter = msgspec.structs.replace(tiny_recipe().vae, budget=Budget(updates=2))
     trainer(other, recipe=tiny_recipe(vae=shorter)).run("vae")
     (path / "vae").symlink_to(other / "vae")
-    with pytest.raises(RunError, match=r"unet/state\.pt belongs to another"):
+    with pytest.raises(RunError, match="belongs to another"):
         trainer(path).run("export")
     assert not (path / "tiny.safetensors").exists()
 
 
 def test_a_stage_killed_before_its_last_measurement_measures_when_run_again(run: Path, tmp_path: Path) -> None:
     path = folder_with(run, tmp_path / "again", "latents")
-    (path / "vae").mkdir()
-    (path / "vae" / "state.pt").write_bytes((run / "vae" / "state.pt").read_bytes())
+    shutil.copytree(run / "vae" / "states", path / "vae" / "states")
     trainer(path).run("vae")
     assert len(list((path / "vae" / "samples").glob("*.png"))) == 1
 

@@ -14,12 +14,13 @@ from torch.testing import assert_close
 
 from gcd_model.networks import Networks, random_networks
 from gcd_train.errors import TrainError
-from gcd_train.loop import Loop, LoopOptions, Progress, StepLoss
-from gcd_train.model_setup import model_config
-from gcd_train.recipe import Budget, LogRecipe, OptimiserRecipe
-from gcd_train.run_folder import RunFolder
-from gcd_train.schedule import ParameterGroup
-from gcd_train.stages.vae import normalise_latents, start_from_components
+from gcd_train.recipe import OptimiserRecipe
+from gcd_train.recipe_data import Budget, LogRecipe
+from gcd_train.training.loop import Loop, LoopOptions, Progress, StepLoss
+from gcd_train.training.monitor import RunFolder
+from gcd_train.training.optimiser import ParameterGroup
+from gcd_train.training.setup import model_config
+from gcd_train.training.vae import normalise_latents, start_from_components
 
 
 def networks() -> Networks:
@@ -106,7 +107,14 @@ def test_a_loss_that_is_no_number_stops_the_run_and_is_not_saved(tmp_path: Path)
     loop = Loop(Parabola(fails_at=3), RunFolder(tmp_path), options(Budget(updates=5), Clock()))
     with pytest.raises(TrainError, match="lower the learning rate"):
         loop.run()
-    assert not (tmp_path / "vae" / "state.pt").exists()
+    assert not (tmp_path / "vae" / "states").exists()
+
+
+def test_a_run_measures_after_so_many_updates(tmp_path: Path) -> None:
+    log = LogRecipe(log_s=1000.0, save_s=1000.0, measure_s=1e-9, measure_every=2)
+    Loop(Parabola(), RunFolder(tmp_path), replace(options(Budget(updates=5), Clock()), log=log)).run()
+    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [line["updates"] for line in lines if line["kind"] == "measured"] == [2, 4, 5]
 
 
 class Distances:

@@ -1,7 +1,11 @@
 """Clips, networks and recipes small enough to train in a second."""
 
+from pathlib import Path
+
 import msgspec
 import numpy as np
+import torch
+from safetensors.torch import load_file
 
 from gcd_model.config import DRIVING_CLASSES, CameraControl, SemanticClass
 from gcd_model.geometry import (
@@ -13,7 +17,9 @@ from gcd_model.geometry import (
     spherical_trajectory,
 )
 from gcd_train.data.sample import ClipSource, Sample
-from gcd_train.recipe import Recipe, parse_recipe
+from gcd_train.recipe import Recipe
+from gcd_train.recipe_files import parse_recipe
+from gcd_train.training.checkpoint import SavedWeights, newest_weights
 
 FRAMES, HEIGHT, WIDTH = 4, 32, 64
 
@@ -135,3 +141,19 @@ class After:
 def tiny_recipe(**changes: object) -> Recipe:
     """The tiny recipe, with top-level fields replaced."""
     return msgspec.structs.replace(parse_recipe(RECIPE, "tiny"), **changes)
+
+
+def saved(stage_folder: Path, stage: str) -> SavedWeights:
+    """The newest state of a stage."""
+    found = newest_weights(stage_folder, stage)
+    assert found is not None, f"{stage_folder} has no state"
+    return found
+
+
+def assert_same_states(first: Path, second: Path, stage: str) -> None:
+    """The newest states of two runs of a stage hold the same bits: weights, averages and moments."""
+    (a, b) = (saved(folder / stage, stage) for folder in (first, second))
+    assert (a.note.updates, a.note.identity) == (b.note.updates, b.note.identity)
+    one, other = ({n: v for f in each.path.glob("*.safetensors") for n, v in load_file(f).items()} for each in (a, b))
+    assert one.keys() == other.keys()
+    assert [name for name, value in one.items() if not torch.equal(value, other[name])] == []

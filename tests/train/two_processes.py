@@ -15,25 +15,21 @@ from pathlib import Path
 
 import msgspec
 import torch
-from tiny_world import FRAMES, tiny_recipe
+from tiny_world import FRAMES, saved, tiny_recipe
 from torch import Tensor
 
 from gcd_model.networks import random_networks
-from gcd_train.checkpoint import StageState
-from gcd_train.draws import Draws
-from gcd_train.engine.engine import Engine
-from gcd_train.engine.parallel import whole
-from gcd_train.engine.processes import ALONE, Processes, processes_of
-from gcd_train.engine.states import newest_weights
 from gcd_train.errors import Interrupted, TrainError
-from gcd_train.loop import Loop, LoopOptions, Progress, StepLoss
-from gcd_train.model_setup import model_config
-from gcd_train.objective import Batch, diffusion_loss
-from gcd_train.precision import Precision
-from gcd_train.recipe import Budget, ComputeRecipe, LogRecipe, Recipe
-from gcd_train.run_folder import RunFolder
-from gcd_train.stages.unet import UNetTask
+from gcd_train.recipe import Recipe
+from gcd_train.recipe_data import Budget, ComputeRecipe, LogRecipe
 from gcd_train.stop import StopSignal
+from gcd_train.training.checkpoint import SavedWeights
+from gcd_train.training.distributed import ALONE, Engine, Processes, processes_of, whole
+from gcd_train.training.draws import Draws
+from gcd_train.training.loop import Loop, LoopOptions, Progress, StepLoss
+from gcd_train.training.monitor import RunFolder
+from gcd_train.training.objective import Batch, UNetTask, diffusion_loss
+from gcd_train.training.setup import Precision, model_config
 
 CPU = torch.device("cpu")
 PRECISION = Precision(CPU, half=False, channels_last=False)  # one layout, so that all use the same kernels
@@ -124,14 +120,14 @@ class TwiceTheBatch(Task):
         )  # fmt: skip
 
 
-def recipe_of() -> Recipe:
+def recipe_of(batch: int = 2) -> Recipe:
     recipe = tiny_recipe()
     loss = msgspec.structs.replace(recipe.unet.loss, sensitivity=False)
     # half the published rate: where a gradient is next to nothing, Adam makes a whole step of its rounding
     optimiser = msgspec.structs.replace(recipe.unet.optimiser, kind="adam", rate=1e-5)
     budget = Budget(updates=UPDATES)
     return tiny_recipe(
-        unet=msgspec.structs.replace(recipe.unet, batch=2, loss=loss, budget=budget, optimiser=optimiser)
+        unet=msgspec.structs.replace(recipe.unet, batch=batch, loss=loss, budget=budget, optimiser=optimiser)
     )
 
 
@@ -180,6 +176,7 @@ def alone(folder: Path) -> dict[str, dict[str, Tensor]]:
     return {
         "two batches": trained(folder / "two", Task(recipe), options(ALONE, Never(), LOG)),
         "twice the batch": trained(folder / "twice", TwiceTheBatch(recipe), once),
+        "three batches": trained(folder / "three", Task(recipe_of(3)), replace(options(ALONE, Never(), LOG), parts=3)),
         "start": Task(recipe).module.state_dict(),
     }
 
@@ -210,11 +207,17 @@ class Together:
             found[f"{parallel} share of the way"] = off / distance(weights, self.single["start"])
         return found
 
+    def uneven(self) -> dict[str, object]:
+        """Three batches an update, of which one process computes two."""
+        chosen = replace(options(self.processes, Never(), LOG, parallel="ddp"), parts=3)
+        weights = trained(self.folder / "uneven", Task(recipe_of(3)), chosen)
+        return {"uneven": furthest(weights, self.single["three batches"])}
+
     def stopped_and_resumed(self, parallel: str) -> dict[str, object]:
         """Only the second process hears the signal; both stop, and go on to the bits of an undisturbed run."""
         weights, name = self.run(f"{parallel}-whole", parallel=parallel), f"{parallel}-stopped"
         self.run(name, 2 if self.processes.rank == 1 else 1000, parallel=parallel)
-        found: dict[str, object] = {f"{parallel} stopped at": self.newest(name).updates}
+        found: dict[str, object] = {f"{parallel} stopped at": self.newest(name).note.updates}
         self.processes.told(None)
         found[f"{parallel} resumed"] = furthest(self.run(name, parallel=parallel), weights)
         found[f"{parallel} read by one"] = furthest(self.newest(name).module, weights)
@@ -229,7 +232,7 @@ class Together:
         names = sorted(path.name for path in states.iterdir())
         self.processes.told(None)
         if self.processes.first:
-            part = next((states / f"{UPDATES:07d}").glob("*.distcp"))
+            part = next((states / f"{UPDATES:07d}").glob("*.safetensors"))
             data = bytearray(part.read_bytes())
             data[len(data) // 2] ^= 1
             part.write_bytes(data)
@@ -268,10 +271,8 @@ class Together:
             return {"lost": str(error)}
         return {"lost": "nothing happened"}
 
-    def newest(self, name: str) -> StageState:
-        state = newest_weights(self.folder / name / "unet", "unet")
-        assert state is not None
-        return state[1]
+    def newest(self, name: str) -> SavedWeights:
+        return saved(self.folder / name / "unet", "unet")
 
 
 def free_port() -> int:
@@ -288,7 +289,7 @@ def main(folder: Path, what: Sequence[str]) -> None:
     with processes_of(ComputeRecipe(device="cpu", parallel="ddp", timeout_s=240.0)) as processes:
         single = processes.told(alone(folder / "alone") if processes.first else None)
         both = Together(folder, processes, single)
-        found = both.equal_one("ddp")
+        found = both.equal_one("ddp") | both.uneven()
         if "more" in what:
             found |= both.equal_one("fsdp")
             for parallel in ("ddp", "fsdp"):

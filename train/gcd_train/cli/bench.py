@@ -12,7 +12,7 @@ from rich.table import Table
 from gcd_train.cli.errors import errors_shown
 
 if TYPE_CHECKING:
-    from gcd_train.bench_train import TrainReport
+    from gcd_train.training.bench import TrainReport
 
 app = typer.Typer(no_args_is_help=True, help="Measure on this machine.")
 
@@ -40,7 +40,7 @@ def train(
     """
     import torch
 
-    from gcd_train.bench_train import BenchTrainOptions, bench_train
+    from gcd_train.training.bench import BenchTrainOptions, bench_train
 
     options = BenchTrainOptions(
         full=torch.cuda.is_available() if full is None else full,

@@ -20,11 +20,11 @@ from gcd_train.cli.training_run import (
     stop_when_asked,
 )
 from gcd_train.errors import RecipeError
-from gcd_train.recipe import DistillStageName
+from gcd_train.recipe_data import DistillStageName
 
 if TYPE_CHECKING:
     from gcd_train.data.open import DataPlaces
-    from gcd_train.distillation.recipe import DistillRecipe
+    from gcd_train.training.distill_recipe import DistillRecipe
 
 RecipeFile: TypeAlias = Annotated[
     str,
@@ -52,7 +52,7 @@ def distill(
     """
     prepare_process(threads)
     from gcd_train.data.open import DataPlaces
-    from gcd_train.distillation.recipe import load_distillation
+    from gcd_train.training.distill_recipe import load_distillation
 
     with errors_shown():
         _require_one_process()
@@ -64,10 +64,8 @@ def _run(
     recipe: "DistillRecipe", places: "DataPlaces", out: Path, latents: Path | None, stage: DistillStageName | None
 ) -> None:
     from gcd_train.data.open import open_data
-    from gcd_train.distillation.distiller import Distiller, DistillInputs
-    from gcd_train.distillation.teacher import as_training, teacher_of
-    from gcd_train.monitor.board import TensorBoard
-    from gcd_train.run_folder import RunFolder
+    from gcd_train.training.distill import Distiller, DistillInputs, as_training, teacher_of
+    from gcd_train.training.monitor import RunFolder, TensorBoard
 
     stop = stop_when_asked()
     teacher = teacher_of(recipe)

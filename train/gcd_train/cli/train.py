@@ -25,11 +25,13 @@ from gcd_train.cli.training_run import (
 )
 from gcd_train.errors import RecipeError
 from gcd_train.live.recipe import LiveRecipe, is_live, live_recipes, live_toml, load_live_recipe
-from gcd_train.recipe import ComputeRecipe, Recipe, StageName, load_recipe, packaged_recipes, to_toml
+from gcd_train.recipe import Recipe
+from gcd_train.recipe_data import ComputeRecipe, StageName
+from gcd_train.recipe_files import load_recipe, packaged_recipes, to_toml
 
 if TYPE_CHECKING:
     from gcd_train.data.open import DataPlaces
-    from gcd_train.engine.processes import Processes
+    from gcd_train.training.distributed import Processes
 
 RecipeFile: TypeAlias = Annotated[
     str, Argument(metavar="RECIPE", help="A TOML file, or package:NAME for one that ships (`gcd-train recipes`).")
@@ -69,9 +71,9 @@ def train(
 
 
 def _train_live(recipe: str, data: Path, valid: Path | None, out: Path) -> None:
-    from gcd_train.engine.processes import processes_of
     from gcd_train.live.training import LivePlaces, train_live
-    from gcd_train.run_folder import RunFolder
+    from gcd_train.training.distributed import processes_of
+    from gcd_train.training.monitor import RunFolder
 
     if valid is None:
         raise RecipeError("a live model is measured on clips of their own: give --valid, see `gcd-train generate live`")
@@ -123,7 +125,7 @@ def _live_row(recipe: LiveRecipe) -> tuple[str, ...]:
 def _in_processes(
     recipe: Recipe, places: "DataPlaces", out: Path, latents: Path | None, stage: StageName | None
 ) -> None:
-    from gcd_train.engine.processes import processes_of
+    from gcd_train.training.distributed import processes_of
 
     with processes_of(recipe.compute) as processes:
         if not processes.first:
@@ -140,10 +142,9 @@ def _run(
     processes: "Processes",
 ) -> None:
     from gcd_train.data.open import open_data
-    from gcd_train.model_setup import family_of, model_config
-    from gcd_train.monitor.board import TensorBoard
-    from gcd_train.run_folder import RunFolder
-    from gcd_train.trainer import RunInputs, Trainer
+    from gcd_train.training.monitor import RunFolder, TensorBoard
+    from gcd_train.training.run import RunInputs, Trainer
+    from gcd_train.training.setup import family_of, model_config
 
     stop = stop_when_asked()
     board = TensorBoard(out / "tensorboard") if recipe.log.tensorboard and processes.first else None

@@ -17,16 +17,17 @@ from gcd_model.conditioning import micro_conditioning
 from gcd_model.geometry import Trajectory
 from gcd_model.image_encoder import clip_pixels
 from gcd_model.networks import Networks
-from gcd_train.conditioner import Conditioner
 from gcd_train.data.cache import CachedClip, CachedLatents, PathKind, encoders_digest
 from gcd_train.data.loader import LoadedBatch, SampleLoader
 from gcd_train.data.sample import Samples, to_network
-from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.losses import COLOUR_WEIGHTS, class_emphasis
-from gcd_train.objective import Batch, drop_streams
-from gcd_train.precision import Precision
-from gcd_train.recipe import LoaderRecipe, UNetRecipe
+from gcd_train.recipe import UNetRecipe
+from gcd_train.recipe_data import LoaderRecipe
+from gcd_train.training.conditioner import Conditioner
+from gcd_train.training.draws import Draws
+from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
+from gcd_train.training.objective import Batch, drop_streams
+from gcd_train.training.setup import Precision
 
 Made = TypeVar("Made")
 _AT_ONCE = 14  # frames; changes memory, not the result

@@ -32,8 +32,8 @@ from gcd_model.networks import Networks, weights_digest
 from gcd_model.vae import Posterior
 from gcd_train.data.files import Recent
 from gcd_train.data.latents import Index, Shard, read_index, read_shard
-from gcd_train.draws import Draws
 from gcd_train.errors import DataError
+from gcd_train.training.draws import Draws
 
 PathKind = Literal["gradual", "direct"]
 Moments = Literal["both", "mean"]

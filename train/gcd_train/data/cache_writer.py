@@ -41,10 +41,10 @@ from gcd_train.data.latents import fault, read_index, write_index, write_shard
 from gcd_train.data.paths import Draw
 from gcd_train.data.pictures import PictureOptions, pictures_of, trained_picture
 from gcd_train.data.sample import Bytes, to_network
-from gcd_train.draws import Draws
 from gcd_train.errors import DataError, RecipeError, RunError
-from gcd_train.losses import PARALLEL_DOMAIN_WEIGHTS, class_emphasis
 from gcd_train.parallel import map_items
+from gcd_train.training.draws import Draws
+from gcd_train.training.losses import PARALLEL_DOMAIN_WEIGHTS, class_emphasis
 
 _log = logging.getLogger(__name__)
 _MARGIN_BYTES = 64 * 2**20

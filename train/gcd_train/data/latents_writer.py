@@ -12,7 +12,6 @@ from torch import Tensor
 
 from gcd_model import Family, ModelConfig
 from gcd_model.networks import Networks, weights_digest
-from gcd_train.conditioner import Conditioner, mirrored_path
 from gcd_train.data.latents import (
     EncodedClips,
     LatentClips,
@@ -25,13 +24,13 @@ from gcd_train.data.latents import (
     write_shard,
 )
 from gcd_train.data.sample import ClipSource, numbers_of, to_network
-from gcd_train.draws import Draws
 from gcd_train.errors import DataError, Interrupted, RunError
-from gcd_train.losses import COLOUR_WEIGHTS, ClassWeight, class_emphasis
-from gcd_train.model_setup import digest_of
-from gcd_train.precision import Precision
 from gcd_train.recipe import LatentsRecipe, Recipe
 from gcd_train.stop import StopSignal
+from gcd_train.training.conditioner import Conditioner, mirrored_path
+from gcd_train.training.draws import Draws
+from gcd_train.training.losses import COLOUR_WEIGHTS, ClassWeight, class_emphasis
+from gcd_train.training.setup import Precision, digest_of
 
 _log = logging.getLogger(__name__)
 _SHARD = 32  # clips

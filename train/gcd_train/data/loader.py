@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader, Dataset
 from gcd_train.data.sample import Sample, SampleBatch, Samples, collate
 from gcd_train.errors import RunError, TrainError
 from gcd_train.parallel import one_thread_each
-from gcd_train.recipe import LoaderRecipe
+from gcd_train.recipe_data import LoaderRecipe
 
 
 @dataclass(slots=True)

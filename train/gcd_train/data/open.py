@@ -6,7 +6,6 @@ from typing import TypeVar
 
 from gcd_model import Family, ModelConfig
 from gcd_model.networks import Networks
-from gcd_train.batches import BatchMaker, BatchSource
 from gcd_train.data.batches import CachedBatches, SampleBatches
 from gcd_train.data.cache import CachedLatents
 from gcd_train.data.dataset4d import Dataset4D, Ontology
@@ -24,9 +23,10 @@ from gcd_train.errors import DataError, RecipeError
 from gcd_train.layouts import kubric4d, parallel_domain4d
 from gcd_train.layouts.manifest import MANIFEST, read_manifest
 from gcd_train.lerobot.pairs import LeRobotOptions, LeRobotPairs
-from gcd_train.model_setup import digest_of
-from gcd_train.precision import Precision
-from gcd_train.recipe import DataRecipe, Recipe
+from gcd_train.recipe import Recipe
+from gcd_train.recipe_data import DataRecipe
+from gcd_train.training.objective import BatchMaker, BatchSource
+from gcd_train.training.setup import Precision, digest_of
 
 _FIXED_SEED = 0  # of the clips that are measured on: the same ones in every run
 _VIDEO_FAMILY = "svd"

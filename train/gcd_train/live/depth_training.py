@@ -31,8 +31,8 @@ from gcd_train.live.batches import (
 )
 from gcd_train.live.clips import evenly, read_clip
 from gcd_train.live.look import depth_sheet
-from gcd_train.loop import Progress, StepLoss
-from gcd_train.schedule import ParameterGroup
+from gcd_train.training.loop import Progress, StepLoss
+from gcd_train.training.optimiser import ParameterGroup
 
 _CLASS_POWER = -0.25
 _EDGE, _EDGE_WEIGHT, _THIN_WEIGHT = 0.05, 2.0, 12.0

@@ -22,8 +22,8 @@ from gcd_model.live.painter import movable_classes
 from gcd_train.live.batches import Ahead, autocast, on
 from gcd_train.live.paint_training import HeldOutViews
 from gcd_train.live.target_views import ViewBatches, Views, carried_through, mirrored
-from gcd_train.loop import Progress, StepLoss
-from gcd_train.schedule import ParameterGroup
+from gcd_train.training.loop import Progress, StepLoss
+from gcd_train.training.optimiser import ParameterGroup
 
 _FEATURES, _CRITIC, _ENERGY, _KEEP, _CLOSE = 1.0, 0.1, 0.5, 1.0, 0.3
 _CRITIC_WIDTHS = (32, 64, 96)

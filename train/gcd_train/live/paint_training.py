@@ -18,9 +18,9 @@ from gcd_train.live.clips import read_clip
 from gcd_train.live.inputs import read_inputs
 from gcd_train.live.look import picture, write_rows
 from gcd_train.live.target_views import VIEW_ARRAYS, ViewBatches, Views, carried_through, halved, mirrored, views_of
-from gcd_train.loop import Progress, StepLoss
-from gcd_train.picture_losses import gradient_l1, ssim
-from gcd_train.schedule import ParameterGroup
+from gcd_train.training.loop import Progress, StepLoss
+from gcd_train.training.losses import gradient_l1, ssim
+from gcd_train.training.optimiser import ParameterGroup
 
 _CLASS_POWER = -0.45
 _NEVER_WEIGHT = 0.5

@@ -10,8 +10,8 @@ from gcd_model.errors import FileError
 from gcd_model.live.config import LiveConfig
 from gcd_model.small_files import decode_toml, read_small
 from gcd_train.errors import RecipeError
-from gcd_train.recipe import Budget, EmaRecipe, LogRecipe, OptimiserRecipe
-from gcd_train.recipe.values import LiveStageName
+from gcd_train.recipe import EmaRecipe, OptimiserRecipe
+from gcd_train.recipe_data import Budget, LiveStageName, LogRecipe
 
 PACKAGED = Path(__file__).parent.parent / "recipes" / "live"
 """Recipes that ship."""

@@ -18,8 +18,6 @@ from gcd_model.live.depth_net import DepthNet
 from gcd_model.live.synthesizer import LiveSynthesizer, save_live
 from gcd_model.loading import load_synthesizer
 from gcd_model.networks import LiveNetworks
-from gcd_train.engine.engine import Engine
-from gcd_train.engine.processes import ALONE, Processes
 from gcd_train.errors import DataError
 from gcd_train.live.batches import PART_SEED, training_paths
 from gcd_train.live.calibration import calibrate
@@ -30,12 +28,12 @@ from gcd_train.live.inputs import make_inputs
 from gcd_train.live.paint_training import HeldOutViews, PaintTask
 from gcd_train.live.recipe import LiveRecipe, LiveStage
 from gcd_train.live.target_views import ViewBatches
-from gcd_train.loop import Loop, LoopOptions, Task
 from gcd_train.parallel import map_items
-from gcd_train.recipe import ComputeRecipe
-from gcd_train.recipe.values import LiveStageName
-from gcd_train.run_folder import RunFolder
+from gcd_train.recipe_data import ComputeRecipe, LiveStageName
 from gcd_train.stop import StopSignal
+from gcd_train.training.distributed import ALONE, Engine, Processes
+from gcd_train.training.loop import Loop, LoopOptions, Task
+from gcd_train.training.monitor import RunFolder
 
 _log = logging.getLogger(__name__)
 _VALID_SHARE = 8

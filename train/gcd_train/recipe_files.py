@@ -1,0 +1,239 @@
+"""Recipe files: read on their bases, changed for one run, checked, and written."""
+
+import difflib
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias, TypeVar, cast
+
+import msgspec
+import tomli_w
+
+from gcd_model import explain_settings_error
+from gcd_model.errors import FileError
+from gcd_model.small_files import decode_toml, read_small
+from gcd_train.errors import RecipeError
+from gcd_train.recipe import Recipe
+
+PACKAGED = Path(__file__).parent / "recipes"
+"""Where the recipes that ship with the package lie; those that only serve as a base, in `bases/`."""
+BASE, WITHOUT, SMALL = "base", "without", "small"
+_DEEPEST = 20
+
+Table: TypeAlias = dict[str, object]
+
+
+@dataclass(frozen=True, slots=True)
+class MergedTable:
+    """What a recipe states together with its bases. files: the recipe's, then its base, and so on."""
+
+    table: Table
+    files: tuple[str, ...]
+
+    @property
+    def place(self) -> str:
+        """The files, for a message."""
+        first, *rest = self.files
+        return first if not rest else f"{first} (based on {', '.join(rest)})"
+
+
+def recipe_path(source: str | Path, beside: Path | None = None) -> Path:
+    """Where a recipe lies: a path, taken from the folder `beside` if it is not absolute, or `package:NAME`."""
+    kind, _, name = str(source).partition(":")
+    if kind == "package":
+        return PACKAGED / f"{name}.toml"
+    return Path(source) if beside is None else beside / source
+
+
+def packaged_recipes() -> list[str]:
+    """Names of the recipes that ship."""
+    return sorted(file.stem for file in PACKAGED.glob("*.toml"))
+
+
+def read_merged(source: str | Path) -> MergedTable:
+    """A recipe file on its bases, as plain tables. `name` is the file's own: told in it, or the file's name.
+
+    Raises:
+        RecipeError: a file of the chain is missing or not TOML, or bases go in a circle; names the files.
+    """
+    return _read(recipe_path(source), ())
+
+
+def parsed(text: str | bytes, name: str) -> Table:
+    """A TOML file's content. Raises RecipeError naming it."""
+    try:
+        return decode_toml(text)
+    except FileError as error:
+        raise RecipeError(f"{name} {error}") from error
+
+
+def merged(base: Mapping[str, object], over: Mapping[str, object]) -> Table:
+    """Tables merged key by key; anything else, lists too, is replaced."""
+    table = dict(base)
+    for key, value in over.items():
+        below = table.get(key)
+        both = isinstance(below, dict) and isinstance(value, dict)
+        table[key] = merged(cast(Table, below), cast(Table, value)) if both else value
+    return table
+
+
+def on_top(base: Mapping[str, object], over: Mapping[str, object], name: str) -> Table:
+    """What `over` makes of a base: first what it does without is taken out, then the rest is merged.
+
+    Raises: RecipeError if it does without something that the base does not have.
+    """
+    wanted = over.get(WITHOUT, [])
+    keys = cast(list[object], wanted) if isinstance(wanted, list) else [None]
+    if not all(isinstance(key, str) for key in keys):
+        raise RecipeError(f'{name}: `without` is a list of keys of the base, such as ["unet.ema"], got {wanted!r}')
+    table = dict(base)
+    for key in cast(Sequence[str], keys):
+        table = _removed(table, key.split("."), key, name)
+    return merged(table, {key: value for key, value in over.items() if key != WITHOUT})
+
+
+def require_known(table: Mapping[str, object], known: Sequence[str], name: str) -> None:
+    """Raises RecipeError for a key at the top of a file that no recipe has."""
+    for key in table:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+            hint = f"did you mean `{near[0]}`?" if near else f"known are {', '.join(known)}"
+            raise RecipeError(f"{name}: unknown key `{key}`; {hint}")
+
+
+def _read(path: Path, above: tuple[Path, ...]) -> MergedTable:
+    here = Path(os.path.realpath(path))
+    chain = (*above, here)
+    if here in above or len(chain) > _DEEPEST:
+        raise RecipeError(f"recipes are based on each other in a circle: {_told(chain)}; take out one `base`")
+    try:
+        own = parsed(read_small(path), _told((*above, path)))
+    except FileError as error:
+        raise RecipeError(f"the recipe {_told((*above, path))} {error}; {_instead(path)}") from error
+    base = own.pop(BASE, None)
+    own.setdefault("name", path.stem)
+    if base is None:
+        return MergedTable(own, (str(path),))
+    if not isinstance(base, str):
+        raise RecipeError(f"{path}: `base` is a path from here, or package:NAME, got {base!r}")
+    below = _read(recipe_path(base, path.parent), chain)
+    return MergedTable(on_top(below.table, own, str(path)), (str(path), *below.files))
+
+
+def _instead(path: Path) -> str:
+    """What to give in place of a recipe file that is not there."""
+    near = difflib.get_close_matches(path.stem, packaged_recipes(), n=2, cutoff=0.6)
+    meant = f"did you mean {' or '.join(f'package:{name}' for name in near)}? " if near else ""
+    return f"{meant}give a TOML file, or a name that `gcd-train recipes` lists"
+
+
+def _told(chain: Sequence[Path]) -> str:
+    """The last file, and who led there."""
+    last, *before = reversed([str(path) for path in chain])
+    return last if not before else f"{last} (the base of {', the base of '.join(before)})"
+
+
+def _removed(table: Mapping[str, object], keys: Sequence[str], told: str, name: str) -> Table:
+    first, *rest = keys
+    if first not in table:
+        raise RecipeError(f"{name} is to do without `{told}`, which its base does not have; take it out of `without`")
+    if not rest:
+        return {key: value for key, value in table.items() if key != first}
+    below = table[first]
+    if not isinstance(below, dict):
+        raise RecipeError(f"{name} is to do without `{told}`, but `{first}` is no table")
+    return {**table, first: _removed(cast(Table, below), rest, told, name)}
+
+
+Kind = TypeVar("Kind", bound=msgspec.Struct)
+_KEYS = (*Recipe.__struct_fields__, BASE, WITHOUT, SMALL)
+
+
+def load_recipe(source: str | Path, *, small: bool = False, changes: Sequence[str] = ()) -> Recipe:
+    """Read a recipe: a path, or `package:NAME`, on top of the bases it names.
+
+    small: with what its table [small] says: a model, size, batch and budget for a CPU. changes: `KEY=VALUE` each, on
+    top of all, such as `model.weights=svd.safetensors`.
+
+    Raises:
+        RecipeError: missing, not TOML, a base that is missing or goes in a circle, an unknown key (the nearest known
+            one is named), a value out of range, or no table [small] where it is asked for.
+    """
+    read = read_merged(source)
+    return _recipe(read, small=small, changes=changes)
+
+
+def parse_recipe(text: bytes, name: str) -> Recipe:
+    """Read a recipe file's content, without a base; `name` is for the message. Raises RecipeError as `load_recipe`."""
+    return _recipe(MergedTable(parsed(text, name), (name,)), small=False, changes=())
+
+
+def checked_recipe(table: Table, place: str, kind: type[Kind], changes: Sequence[str] = ()) -> Kind:
+    """A table as a recipe of some kind, changed for this run; `place` is for the message. Raises RecipeError."""
+    try:
+        return msgspec.convert(_changed(table, changes), kind)
+    except msgspec.ValidationError as error:
+        raise RecipeError(f"{place}: {explain_settings_error(str(error), kind)}") from error
+
+
+def _recipe(read: MergedTable, *, small: bool, changes: Sequence[str]) -> Recipe:
+    require_known(read.table, _KEYS, read.place)
+    own = {key: value for key, value in read.table.items() if key not in (SMALL, WITHOUT)}
+    if not small:
+        recipe = _checked(_changed(own, changes), read.place)
+        _smaller(own, read)  # what is wrong in it is told now, not to whoever asks for it
+        return recipe
+    table = _smaller(own, read)
+    if table is None:
+        raise RecipeError(f"{read.place} has no table [small], which would say what a CPU can do; leave out --small")
+    return _checked(_changed(table, changes), read.place)
+
+
+def _smaller(own: Table, read: MergedTable) -> Table | None:
+    """The recipe as its table [small] wants it; named so, too, lest the one be taken for the other."""
+    smaller, place = read.table.get(SMALL), f"[small] of {read.place}"
+    if smaller is None:
+        return None
+    if not isinstance(smaller, dict):
+        raise RecipeError(f"{place} must be a table, got {smaller!r}")
+    table = on_top(own, {"name": f"{own.get('name')}-small", **smaller}, place)
+    _checked(table, place)
+    return table
+
+
+def _changed(table: Table, changes: Sequence[str]) -> Table:
+    for change in changes:
+        table = merged(table, _change(change))
+    return table
+
+
+def _checked(table: Table, place: str) -> Recipe:
+    return checked_recipe(table, place, Recipe)
+
+
+def _change(change: str) -> Table:
+    """`unet.batch=8` as a table of tables; what is no TOML value is text."""
+    key, equals, value = change.partition("=")
+    if not equals or not all(key.split(".")):
+        raise RecipeError(f"a change is KEY=VALUE, such as unet.batch=8, got {change!r}")
+    try:
+        made: object = parsed(f"value = {value}".encode(), change)["value"]
+    except RecipeError:
+        made = value
+    for part in reversed(key.split(".")):
+        made = {part: made}
+    assert isinstance(made, dict), "a key has at least one part"
+    return made
+
+
+def to_toml(recipe: msgspec.Struct) -> str:
+    """The whole recipe; reading it gives the same one."""
+    return tomli_w.dumps(cast(dict[str, object], _said(msgspec.to_builtins(recipe))))
+
+
+def _said(value: object) -> object:
+    """None cannot be said in TOML and is the same as left out."""
+    if isinstance(value, dict):
+        return {key: _said(each) for key, each in cast(dict[str, object], value).items() if each is not None}
+    return [_said(each) for each in cast(list[object], value)] if isinstance(value, list | tuple) else value

@@ -1,0 +1,142 @@
+"""Held-out clips through the synthesizer that is shipped, and the weight files of a run."""
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gcd_model import Clip, Family, ModelError, Synthesizer, Traits
+from gcd_model.colours import palette
+from gcd_model.networks import Networks
+from gcd_model.weights.adapter import Adapter
+from gcd_model.weights.card import Card, precision
+from gcd_model.weights.load import load_weights, save_weights
+from gcd_model.weights.save import write_adapter, write_published
+from gcd_train.data.sample import ClipSource, to_network
+from gcd_train.errors import RunError
+from gcd_train.evaluation.metrics import NO_CLASS, mean_iou, named_confusion, psnr
+from gcd_train.pictures import write_sheet
+from gcd_train.recipe import ExportRecipe
+from gcd_train.training.monitor import RunFolder
+from gcd_train.training.setup import copy_of
+
+_SHOWN_CLIPS = 4
+
+
+class Validation:
+    """Held-out clips and how the model takes them."""
+
+    def __init__(self, clips: ClipSource, family: Family, *, count: int) -> None:
+        self._clips, self._family = clips, family
+        self._count = min(count, len(clips))
+
+    def measure(self, networks: Networks, picture: Path) -> dict[str, float]:
+        """PSNR over frames 2 to T and of the last, mean IoU of the class map at picture size; writes a sample sheet.
+
+        One row shows source, view, target and, of a model that paints classes, predicted and true class map of a frame.
+        """
+        synthesizer = self._synthesizer(networks)
+        scores: list[Tensor] = []
+        counts: Tensor | None = None
+        shown: list[list[Tensor]] = []
+        for number in range(self._count):
+            source, target = (to_network(side) for side in self._clips.rgb(number))
+            clip = Clip(video=source, fps=self._clips.fps)
+            view = synthesizer.render(synthesizer.encode(clip), [self._clips.trajectory(number)])[0]
+            scores.append(psnr(view.video, (target + 1) / 2)[1:])
+            rows = [source, view.video * 2 - 1, target]
+            if view.classes is not None:
+                truth = torch.from_numpy(self._clips.target_classes(number).copy())
+                met = named_confusion(view.classes[0, 1:], truth[1:], [kind.name for kind in self._clips.classes])
+                counts = met if counts is None else counts + met
+                rows += [self._painted(view.classes[0]), self._painted(truth)]
+            if number < _SHOWN_CLIPS:
+                shown += _excerpt(rows)
+        write_sheet(picture, shown)
+        table = torch.stack(scores)  # [clips, T - 1]
+        values = {"psnr": float(table.mean()), "psnr_last": float(table[:, -1].mean())}
+        return values if counts is None else {**values, "miou_full": mean_iou(counts)}
+
+    def _synthesizer(self, networks: Networks) -> Synthesizer:
+        """A copy of the networks behind the door that users take."""
+        copy = copy_of(networks)
+        config = copy.config
+        device = networks.unet.stem.weight.device
+        traits = Traits(
+            name="validation",
+            config=config,
+            family=self._family,
+            move_time=config.frames - 1,
+            sha256_12="0" * 12,
+            precision="float32",
+            device=str(device),
+        )
+        return Synthesizer(copy.to(device), traits)
+
+    def _painted(self, ids: Tensor) -> Tensor:
+        """Class ids [T, H, W] as pictures [T, 3, H, W] in [-1, 1], black where no class is."""
+        named = palette(tuple(self._clips.classes)).float() / 127.5 - 1
+        colours = torch.cat([named, torch.full((NO_CLASS + 1 - len(named), 3), -1.0)])
+        return colours[ids.long().cpu()].permute(0, 3, 1, 2)
+
+
+def _excerpt(rows: list[Tensor]) -> list[list[Tensor]]:
+    frames = rows[0].shape[0]
+    return [[video[t] for video in rows] for t in (frames // 2, frames - 1)]
+
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ExportJob:
+    """What is written under which name.
+
+    move_time: frame in which the goal pose is reached. updates: of the U-Net, for the published layout.
+    leftovers: gives weights of the file training started from that nothing here uses, for the published layout.
+    adapter: of a run that trained one, by the card of base and adapter together; None otherwise.
+    """
+
+    name: str
+    family: Family
+    move_time: int
+    updates: int
+    recipe: ExportRecipe
+    leftovers: Callable[[], Mapping[str, Tensor]]
+    adapter: Callable[[Card], Adapter] | None = None
+
+
+def export(networks: Networks, folder: RunFolder, job: ExportJob, validation: Validation) -> None:
+    """Write `NAME.safetensors` into the run's folder, and measure what a user would load from it.
+
+    Beside it `NAME.ckpt` in the published layout where the recipe asks for it, and `NAME-adapter.safetensors` of a run
+    with adapters, which are merged into the others. Files of an earlier export are replaced. Raises RunError.
+    """
+    networks, path = networks.cpu(), folder.path / f"{job.name}.safetensors"
+    card = Card(name=job.name, config=networks.config, family=job.family.name, move_time=job.move_time, trained=True)
+    try:
+        others = _write_others(networks, folder.path, card, job)
+        save_weights(networks.to(precision(job.recipe.dtype)), path, card, overwrite=True)
+        loaded = load_weights(path)
+    except ModelError as error:
+        raise RunError(f"cannot export to {path}: {error}") from error
+    values = validation.measure(loaded.diffusion.float(), folder.stage("export") / "samples.png")
+    size = {"bytes": path.stat().st_size, "sha256_12": loaded.sha256_12}
+    folder.record("export", "measured", {**size, **values})
+    _log.info("wrote %s", ", ".join([str(path), *(str(other) for other in others)]))
+
+
+def _write_others(networks: Networks, folder: Path, card: Card, job: ExportJob) -> list[Path]:
+    """What is written in float32, while the networks are; returns the files."""
+    written = list[Path]()
+    if "gcd-ckpt" in job.recipe.layouts:
+        out, weights, carried = folder / f"{job.name}.ckpt", networks.state_dict(), job.leftovers()
+        write_published(out, weights, card, carried=carried, updates=job.updates, overwrite=True)
+        written.append(out)
+    if job.adapter is not None:
+        written.append(folder / f"{job.name}-adapter.safetensors")
+        write_adapter(written[-1], job.adapter(card), overwrite=True)
+    return written

@@ -1,0 +1,178 @@
+"""The folder of a run (recipe, metrics, samples), TensorBoard, and the guard against losses that are no number."""
+
+import json
+import logging
+import math
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import cv2
+from msgspec import Struct
+from torch import Tensor
+
+from gcd_model.errors import FileError
+from gcd_model.small_files import decode_toml, read_small
+from gcd_train.errors import RecipeError, RunError, TrainError
+from gcd_train.recipe_data import AnyStageName
+from gcd_train.recipe_files import to_toml
+
+_log = logging.getLogger(__name__)
+
+
+class TensorBoard:
+    """Event files in a folder, tags STAGE/KIND/NAME, steps are updates; a resumed run goes on in a further file.
+
+    Raises RecipeError if TensorBoard is not installed, RunError if the folder cannot be written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        try:
+            from torch.utils.tensorboard.writer import SummaryWriter
+        except ImportError as error:
+            raise RecipeError(
+                "log.tensorboard is on, but TensorBoard is not installed; `pip install 'gcd-node[train]'`, or turn "
+                "it off"
+            ) from error
+        try:
+            self._writer = SummaryWriter(str(folder), flush_secs=30)
+        except OSError as error:
+            raise RunError(f"cannot write in {folder}: {error.strerror}; choose another --out") from error
+
+    def add(self, stage: str, kind: str, values: Mapping[str, float | int | str], picture: Path | None) -> None:
+        """Figures of a stage; `kind` is "loss" or "measured". picture: a PNG that belongs to them."""
+        step = int(values.get("updates", 0))
+        for name, value in values.items():
+            if isinstance(value, float | int) and name != "updates":
+                self._writer.add_scalar(f"{stage}/{kind}/{name}", value, step)
+        pixels = None if picture is None else cv2.imread(str(picture))
+        if pixels is not None:
+            self._writer.add_image(f"{stage}/samples", pixels[..., ::-1].copy(), step, dataformats="HWC")
+        self._writer.flush()
+
+    def close(self) -> None:
+        """Write what is left."""
+        self._writer.close()
+
+
+_NAMED = 6
+
+
+@dataclass(frozen=True, slots=True)
+class RunFolder:
+    """The folder of one run: `recipe.toml`, `commands.txt`, `metrics.jsonl`, `STAGE/states/`, `STAGE/samples/`, and
+    the weights at the end.
+
+    board: gets every figure, too.
+    """
+
+    path: Path
+    board: TensorBoard | None = None
+
+    def begin(self, recipe: Struct, command: str) -> None:
+        """Keep the recipe and one more command line, and log what differs from the last recipe. Raises RunError."""
+        path, now = self.path / "recipe.toml", to_toml(recipe)
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            was = decode_toml(read_small(path)) if path.exists() else None
+            path.write_text(now)
+            with (self.path / "commands.txt").open("a") as file:
+                file.write(f"# {time.strftime('%Y-%m-%dT%H:%M:%S%z')}\n{command}\n")
+        except OSError as error:
+            raise RunError(f"cannot write in {self.path}: {error.strerror}; choose another --out") from error
+        except FileError as error:
+            raise RunError(f"{path} {error}; delete it to go on without a word of what changed") from error
+        if was is not None:
+            for line in _changes(_flat(was), _flat(decode_toml(now.encode()))):
+                _log.warning("another recipe than this run's last: %s", line)
+
+    def stage(self, name: AnyStageName) -> Path:
+        """The folder of a stage."""
+        return self.path / name
+
+    def sample(self, name: AnyStageName, updates: int) -> Path:
+        """A sample picture after so many updates."""
+        return self.stage(name) / "samples" / f"{updates:07d}.png"
+
+    def record(
+        self, stage: AnyStageName, kind: str, values: dict[str, float | int | str], picture: Path | None = None
+    ) -> None:
+        """Append one line to metrics.jsonl: stage, kind, time of day, then the values. Raises RunError.
+
+        picture: a PNG that belongs to them, for the board.
+        """
+        line = json.dumps({"stage": stage, "kind": kind, "time": round(time.time(), 3), **values})
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            with (self.path / "metrics.jsonl").open("a") as file:
+                file.write(line + "\n")
+        except OSError as error:
+            raise RunError(f"cannot write in {self.path}: {error.strerror}; choose another --out") from error
+        if self.board is not None:
+            self.board.add(stage, kind, values, picture)
+
+
+def _flat(table: Mapping[str, object], place: str = "") -> dict[str, object]:
+    """Values by their dotted keys."""
+    found: dict[str, object] = {}
+    for key, value in table.items():
+        told = f"{place}{key}"
+        found |= _flat(cast(Mapping[str, object], value), f"{told}.") if isinstance(value, dict) else {told: value}
+    return found
+
+
+def _changes(was: Mapping[str, object], now: Mapping[str, object]) -> list[str]:
+    keys = [key for key in dict.fromkeys([*was, *now]) if was.get(key) != now.get(key)]
+    return [f"{key} was {was.get(key, 'not given')}, is {now.get(key, 'not given')}" for key in keys]
+
+
+Values = Mapping[str, float | int | str]
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    update: int
+    what: str
+    value: Tensor
+    ids: tuple[str, ...]
+
+
+class FiniteGuard:
+    """Remembers losses and gradient norms without looking at them, so that a GPU need not wait; `check` looks.
+
+    stage: for the message. note: a JSON file that is written when something is wrong, with all clips' names.
+    at_once: look at values on the CPU right away, before anything is done with them.
+    """
+
+    def __init__(self, stage: str, note: Path, *, at_once: bool = True) -> None:
+        self._stage, self._note, self._at_once = stage, note, at_once
+        self._seen: list[_Seen] = []
+
+    def saw(self, update: int, what: str, value: Tensor, ids: tuple[str, ...] = ()) -> None:
+        """A value that must be finite. Raises TrainError as `check`."""
+        self._seen.append(_Seen(update, what, value.detach(), ids))
+        if self._at_once and value.device.type == "cpu":
+            self.check()
+
+    def check(self) -> None:
+        """Raises TrainError for the first value since the last check that is no number, or infinite."""
+        seen, self._seen = self._seen, []
+        for each in seen:
+            value = float(each.value)
+            if not math.isfinite(value):
+                self._stop(each, value, [name for other in seen if other.update == each.update for name in other.ids])
+
+    def _stop(self, wrong: _Seen, value: float, ids: list[str]) -> None:
+        told = {"stage": self._stage, "update": wrong.update, "what": wrong.what, "value": str(value), "clips": ids}
+        with suppress(OSError):  # a full disk must not hide what is wrong
+            self._note.parent.mkdir(parents=True, exist_ok=True)
+            self._note.write_text(json.dumps(told, indent=1))
+        named = ", ".join(ids[:_NAMED]) + (f" and {len(ids) - _NAMED} more" if len(ids) > _NAMED else "")
+        raise TrainError(
+            f"the {wrong.what} of {self._stage} is {value} at update {wrong.update}"
+            f"{f', on clips {named}' if ids else ''} (see {self._note}); the state saved before is untouched: look at "
+            "these clips, or lower the learning rate in the recipe, and run again"
+        )

@@ -1,0 +1,253 @@
+"""The diffusion objective on one batch, through the networks that are shipped.
+
+Source: Van Hoorick et al. 2024 (GCD), section 3: noise level per clip, v-prediction, conditioning dropped per frame,
+conditioning augmentation in pixel space; x0-prediction, fixed noise levels, shared noise and the class map are ours.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import torch
+from torch import Tensor, nn
+
+from gcd_model.conditioning import CameraEmbedder
+from gcd_model.config import Prediction
+from gcd_model.diffusion import preconditioning
+from gcd_model.networks import Networks
+from gcd_model.unet import VideoUNet
+from gcd_train.recipe import FocalBlendName, LossRecipe, NoiseRecipe, UNetRecipe
+from gcd_train.training.draws import Draws
+from gcd_train.training.export import Validation
+from gcd_train.training.loop import Progress, StepLoss
+from gcd_train.training.losses import PLAIN_BLEND, RELEASED_BLEND, FocalBlend, edm_weight, focal_fraction, frame_losses
+from gcd_train.training.optimiser import ParameterGroup
+from gcd_train.training.setup import Precision
+from gcd_train.training.trainable import keep_trained_alone, plain_weights
+
+_BLENDS: dict[FocalBlendName, FocalBlend] = {"released": RELEASED_BLEND, "plain": PLAIN_BLEND}
+
+
+class Denoiser(nn.Module):
+    """U-Net and camera embedder under the names they have in `Networks`."""
+
+    def __init__(self, unet: VideoUNet, prediction: Prediction, camera: CameraEmbedder | None = None) -> None:
+        super().__init__()
+        self.unet, self.camera = unet, camera
+        self.prediction: Prediction = prediction
+
+    def forward(self, noisy: Tensor, sigma: Tensor, batch: "Batch") -> Tensor:
+        """D(x, sigma).
+
+        Args:
+            noisy: [N, C, h, w]. sigma: [N].
+        Returns:
+            [N, C, h, w], float32.
+        """
+        levels = preconditioning(sigma, self.prediction)
+        camera = None if self.camera is None or batch.camera is None else self.camera.proj(batch.camera)
+        plan = self.unet.plan(levels.c_noise[None], batch.vector, camera, batch.tokens)
+        scaled, image_mode = _column(levels.c_in) * noisy, batch.frames == 1
+        if torch.is_grad_enabled() and noisy.device.type == "cpu" and not self.unet.stem.weight.requires_grad:
+            # torch's group norm crashes on a CPU where channels-last pictures need no gradient and its weights do
+            scaled.requires_grad_()
+        raw = self.unet(scaled, batch.condition, plan.step(0), image_mode=image_mode).float()
+        return _column(levels.c_skip) * noisy + _column(levels.c_out) * raw
+
+
+def denoiser_of(networks: Networks) -> Denoiser:
+    """What is trained to denoise: U-Net and camera embedder."""
+    return Denoiser(networks.unet, networks.config.prediction, networks.camera)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Batch:
+    """N rows, time fastest: whole clips of `frames` frames, or unrelated frames with `frames` 1.
+
+    target: [N, C, h, w], scaled latents. condition: [N, C', h, w]. vector: [N, V]. tokens: [N, D] or None.
+    emphasis: [N, 1, h, w] of `class_emphasis`, or None.
+    camera: [N, F], the features a model with camera control is steered by, see `CameraEmbedder`; None without.
+    ids: what the rows were made from, one name a clip, for messages. wait_s: seconds that were waited for the data,
+    None where it was not measured.
+    """
+
+    target: Tensor
+    condition: Tensor
+    vector: Tensor
+    tokens: Tensor | None
+    emphasis: Tensor | None
+    frames: int
+    camera: Tensor | None = None
+    ids: tuple[str, ...] = ()
+    wait_s: float | None = None
+
+
+class BatchSource(Protocol):
+    """Where batches come from."""
+
+    def single_frames(self, draws: Draws, count: int) -> Batch:
+        """`count` frames of random clips."""
+        ...
+
+    def whole_clips(self, draws: Draws, count: int) -> Batch:
+        """`count` random clips."""
+        ...
+
+
+class BatchMaker(Protocol):
+    """Makes batches once the networks are there that encode them."""
+
+    def __call__(self, networks: Networks, precision: Precision, /) -> BatchSource:
+        """Raises RecipeError if model and data do not go together."""
+        ...
+
+
+def draw_sigma(draws: Draws, clips: int, recipe: NoiseRecipe) -> Tensor:
+    """One noise level a clip, [B]: exp(log_mean + log_std * n), or the fixed one. Source: Karras et al. 2022."""
+    sigma = torch.exp(recipe.log_mean + recipe.log_std * draws.normal(clips))
+    fixed = draws.chance(recipe.fixed_share, clips)
+    return torch.where(fixed, torch.full_like(sigma, recipe.fixed_sigma), sigma)
+
+
+def draw_noise(draws: Draws, shape: torch.Size, frames: int, shared: float) -> Tensor:
+    """Unit noise [N, C, h, w], of whose variance the frames of a clip have the given share in common."""
+    own = draws.normal(*shape)
+    if shared == 0 or frames == 1:
+        return own
+    common = draws.normal(shape[0] // frames, *shape[1:]).repeat_interleave(frames, dim=0)
+    return shared**0.5 * common + (1 - shared) ** 0.5 * own
+
+
+def drop_streams(
+    condition: Tensor, tokens: Tensor | None, frames: int, draws: Draws, recipe: UNetRecipe
+) -> tuple[Tensor, Tensor | None]:
+    """Condition channels [N, C', h, w] and image tokens [N, D], set to zero where the network is to do without.
+
+    Per frame and each stream by itself, as released, or per clip, or both streams together: `dropout_per`,
+    `dropout_joint`. What is told of camera, rate and motion always stays.
+    """
+    if recipe.dropout == 0:
+        return condition, tokens
+    each = frames if recipe.dropout_per == "clip" else 1
+    kept = _drawn_kept(draws, recipe.dropout, condition.shape[0], each)
+    condition = _kept(condition, kept)
+    if tokens is None:
+        return condition, None
+    if not recipe.dropout_joint:
+        kept = _drawn_kept(draws, recipe.dropout, tokens.shape[0], each)
+    return condition, _kept(tokens, kept)
+
+
+def _drawn_kept(draws: Draws, probability: float, rows: int, each: int) -> Tensor:
+    """One flag for every `each` rows, [N]."""
+    return ~draws.chance(probability, rows // each).repeat_interleave(each)
+
+
+def _kept(rows: Tensor, kept: Tensor) -> Tensor:
+    return rows * kept.view(-1, *[1] * (rows.ndim - 1)).to(rows.dtype)
+
+
+def diffusion_loss(
+    denoiser: nn.Module,
+    batch: Batch,
+    draws: Draws,
+    precision: Precision,
+    *,
+    noise: NoiseRecipe,
+    loss: LossRecipe,
+    channel_weights: Tensor | None,
+    step: int,
+) -> StepLoss:
+    """The loss of one batch: mean over frames of w(sigma) * frame loss.
+
+    denoiser: a Denoiser, or what wraps one. channel_weights: [C] or None. step: updates of the optimiser so far, for
+    the focal schedule.
+    """
+    sigma = draw_sigma(draws, batch.target.shape[0] // batch.frames, noise).repeat_interleave(batch.frames)
+    unit = draw_noise(draws, batch.target.shape, batch.frames, noise.shared)
+    with precision.arithmetic():
+        denoised = denoiser(batch.target + _column(sigma) * unit, sigma, batch)
+    fraction = focal_fraction(step, final=loss.focal_fraction, steps=loss.focal_steps) if loss.focal else 1.0
+    rows = frame_losses(
+        denoised,
+        batch.target,
+        fraction=fraction,
+        emphasis=batch.emphasis,
+        channel_weights=channel_weights,
+        blend=_BLENDS[loss.focal_blend],
+    )
+    total = (rows * edm_weight(sigma, loss.weight_limit)).mean()
+    parts = {"latent": total.detach()}
+    if batch.wait_s is not None:
+        parts["wait_s"] = total.new_tensor(batch.wait_s)
+    return StepLoss(total, parts, batch.target.shape[0], batch.ids)
+
+
+def _column(values: Tensor) -> Tensor:
+    return values.view(-1, 1, 1, 1)
+
+
+class UNetTask:
+    """See `Task`."""
+
+    def __init__(
+        self,
+        networks: Networks,
+        batches: BatchSource,
+        validation: Validation,
+        recipe: UNetRecipe,
+        channel_weights: Tensor | None,
+        precision: Precision,
+        seed: int,
+    ) -> None:
+        self._networks, self._batches, self._validation = networks, batches, validation
+        self._recipe, self._weights, self._precision, self._seed = recipe, channel_weights, precision, seed
+        self._denoiser = precision.placed(denoiser_of(networks))
+        self._network: nn.Module = self._denoiser
+        keep_trained_alone(self._denoiser)
+
+    @property
+    def module(self) -> nn.Module:
+        """U-Net and camera embedder."""
+        return self._denoiser
+
+    def parameter_groups(self) -> Sequence[ParameterGroup]:
+        """Everything that can be trained."""
+        trained = [parameter for parameter in self._denoiser.parameters() if parameter.requires_grad]
+        return [ParameterGroup(parameters=trained)]
+
+    def compute_through(self, network: nn.Module) -> None:
+        """See `SharedTask`."""
+        self._network = network
+
+    def step_loss(self, progress: Progress) -> StepLoss:
+        """The diffusion loss on single frames or on whole clips."""
+        recipe = self._recipe
+        draws = Draws(self._seed, "unet", progress.updates * recipe.parts + progress.part, self._precision.device)
+        if progress.share < recipe.image_share:
+            batch = self._batches.single_frames(draws, recipe.image_batch)
+        else:
+            batch = self._batches.whole_clips(draws, recipe.clip_batch)
+        return diffusion_loss(
+            self._network,
+            batch,
+            draws,
+            self._precision,
+            noise=recipe.noise_at(progress.share),
+            loss=recipe.loss,
+            channel_weights=self._weights,
+            step=progress.updates,
+        )
+
+    def after_update(self, progress: Progress) -> bool:
+        """Nothing to do."""
+        return False
+
+    def measure(self, picture: Path) -> dict[str, float]:
+        """Held-out clips through the shipped synthesizer."""
+        return self._validation.measure(self._networks, picture)
+
+    def gather(self) -> None:
+        """See `ShardedTask`."""
+        plain_weights(self._networks)

@@ -1,0 +1,254 @@
+"""A run: the stages of a recipe in their order, each from where it stopped."""
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Protocol
+
+import msgspec
+import torch
+
+from gcd_model import ModelConfig
+from gcd_model.networks import Networks
+from gcd_model.weights.adapter import Adapter, base_digest
+from gcd_model.weights.card import Card
+from gcd_train.data.latents import EncodedClips
+from gcd_train.data.latents_writer import Encodings, autoencoder_digest
+from gcd_train.data.sample import ClipSource
+from gcd_train.errors import DataError, RecipeError
+from gcd_train.recipe import EmaRecipe, OptimiserRecipe, Recipe, VAERecipe
+from gcd_train.recipe_data import AnyStageName, Budget
+from gcd_train.stop import StopSignal
+from gcd_train.training.batches import EncodedBatches, PixelBatches
+from gcd_train.training.distributed import ALONE, Engine, Processes
+from gcd_train.training.export import ExportJob, Validation, export
+from gcd_train.training.loop import Loop, LoopOptions, Task
+from gcd_train.training.monitor import RunFolder
+from gcd_train.training.objective import BatchMaker, BatchSource, UNetTask
+from gcd_train.training.setup import (
+    Precision,
+    carried_leftovers,
+    digest_of,
+    family_of,
+    fill,
+    model_config,
+    require_exportable,
+    sampled_as_trained,
+    start_networks,
+)
+from gcd_train.training.trainable import adapter_of, halve_frozen, let_train, merge_lora, thaw
+from gcd_train.training.vae import VAETask
+
+_log = logging.getLogger(__name__)
+
+
+class StageTable(Protocol):
+    """What the tables of all training stages state."""
+
+    @property
+    def budget(self) -> Budget: ...
+    @property
+    def optimiser(self) -> OptimiserRecipe: ...
+    @property
+    def ema(self) -> EmaRecipe | None: ...
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RunInputs:
+    """What a run works with. clips: to learn from. valid: held out, to measure on. stop: asked between updates.
+
+    batches: makes the U-Net's batches where they come neither from encoded clips nor from `clips`.
+    parts: see `RunData`. latents: a folder for encoded clips that several runs share; None for the run's own.
+    processes: this one among those of the run.
+    """
+
+    recipe: Recipe
+    clips: ClipSource
+    valid: ClipSource
+    folder: RunFolder
+    stop: StopSignal
+    batches: BatchMaker | None = None
+    parts: tuple[ClipSource, ...] = ()
+    latents: Path | None = None
+    processes: Processes = ALONE
+
+
+class Trainer:
+    """The stages of one run, of a training or a distillation, in their order; each goes on where it stopped.
+
+    config: of the networks, where the recipe's [model] does not say it.
+    """
+
+    denoiser_stage: AnyStageName = "unet"
+    """The stage that trains the denoiser: the one that several processes share."""
+
+    def __init__(self, inputs: RunInputs, config: ModelConfig | None = None) -> None:
+        """Raises RecipeError if the recipe's model cannot be built or exported, or its device is not there."""
+        self._inputs, self._recipe, self._folder = inputs, inputs.recipe, inputs.folder
+        self._family = family_of(inputs.recipe.model)
+        self._config = config or self._trained_config()
+        require_exportable(inputs.recipe, self._config)
+        self._precision = Precision.of(inputs.recipe.compute)
+        self._engine = Engine(processes=inputs.processes, compute=inputs.recipe.compute)
+        self._encodings = Encodings(
+            recipe=inputs.recipe,
+            config=self._config,
+            family=self._family,
+            precision=self._precision,
+            sets=inputs.parts or (inputs.clips,),
+            as_videos=bool(inputs.parts),
+            folder=inputs.folder.stage("latents"),
+            shared=inputs.latents,
+            stop=inputs.stop,
+        )
+
+    def run(self, only: AnyStageName | None = None) -> None:
+        """Every stage that is not finished, or just one; several processes train the U-Net, one of them the rest.
+
+        Raises:
+            Interrupted: the stop signal was set; what was done is saved.
+            RunError: the run folder holds something that does not fit. RecipeError: no such stage in the recipe.
+        """
+        steps = self._steps()
+        if only is not None and only not in steps:
+            raise RecipeError(f"this recipe has no stage {only!r}, only {', '.join(steps)}")
+        for stage in (only,) if only else steps:
+            _log.info("stage %s", stage)
+            if stage == self.denoiser_stage:
+                steps[stage]()
+            else:
+                self._inputs.processes.by_the_first(steps[stage], self._inputs.stop)
+
+    def _steps(self) -> dict[AnyStageName, Callable[[], None]]:
+        """The stages that the recipe has, in their order."""
+        steps: dict[AnyStageName, Callable[[], None]] = {}
+        if self._recipe.vae is not None:
+            steps["vae"] = partial(self._train_vae, self._recipe.vae)
+        if self._recipe.latents is not None:
+            steps["latents"] = lambda: self._encodings.encode(self._start())
+        return {**steps, self.denoiser_stage: self._train_denoiser, "export": self._export}
+
+    def _trained_config(self) -> ModelConfig:
+        """The networks' config, by the recipe. Raises DataError for clips that do not fit it."""
+        recipe, inputs = self._recipe, self._inputs
+        config = model_config(recipe.model)
+        if self._family.output == "semantic" and inputs.valid.classes:
+            config = msgspec.structs.replace(config, semantic_classes=tuple(inputs.valid.classes))
+        config = sampled_as_trained(config, recipe.unet)
+        for clips in (inputs.clips, inputs.valid):
+            require_fit(clips, config, recipe.unet.fps)
+        return config
+
+    def _start(self) -> Networks:
+        """The networks as the denoiser's stage begins: with the weights that the stages before it trained."""
+        networks = start_networks(self._recipe.model, self._config, self._recipe.seed)
+        if self._recipe.vae is not None:
+            fill(networks, self._folder, "vae", self._vae_identity())
+        return networks
+
+    def _fill_denoiser(self, networks: Networks) -> int:
+        """Put in what the denoiser's stage trained, adapters beside their layers; returns its updates so far."""
+        identity = self._identity(networks)
+        let_train(networks, self._recipe.model, self._recipe.seed)
+        return fill(networks, self._folder, self.denoiser_stage, identity)
+
+    def _adapter(self, card: Card) -> Adapter:
+        """What the denoiser's stage trained, apart from its base."""
+        networks = self._start()
+        base = base_digest(networks.state_dict())
+        self._fill_denoiser(networks)
+        return adapter_of(networks, self._recipe.model.lora, card, base)
+
+    def _vae_identity(self) -> str:
+        return digest_of(self._config.vae, self._recipe.seed)
+
+    def _identity(self, networks: Networks) -> str:
+        """What the state of the denoiser's stage belongs to; `networks` hold what was trained before it."""
+        config, model = self._config, self._recipe.model
+        shape = digest_of(config.unet, config.prediction, self._recipe.seed)
+        part = "" if model.train == "all" else f"-{base_digest(networks.state_dict())}-{digest_of(model.lora)}"
+        return f"{autoencoder_digest(networks)}-{shape}{part}"
+
+    def _loop(self, task: Task, stage: AnyStageName, table: StageTable, identity: str, parts: int = 1) -> None:
+        options = LoopOptions(
+            stage=stage,
+            identity=identity,
+            budget=table.budget,
+            optimiser=table.optimiser,
+            ema=table.ema,
+            log=self._recipe.log,
+            stop=self._inputs.stop,
+            frames_per_clip=self._config.frames,
+            parts=parts,
+            engine=self._engine if stage == self.denoiser_stage else Engine(),
+        )
+        Loop(task, self._folder, options).run()
+
+    def _train_vae(self, recipe: VAERecipe) -> None:
+        networks = start_networks(self._recipe.model, self._config, self._recipe.seed)
+        task = VAETask(networks, self._inputs.clips, self._inputs.valid, recipe, self._precision, self._recipe.seed)
+        self._loop(task, "vae", recipe, self._vae_identity())
+
+    def _train_denoiser(self) -> None:
+        networks = self._start()
+        identity = self._identity(networks)
+        let_train(networks, self._recipe.model, self._recipe.seed)
+        source = self._recipe.unet.source
+        clips = self._encodings.opened(networks) if source == "latents" else None
+        if self._recipe.compute.frozen == "bfloat16":
+            halve_frozen(networks)
+        self._precision.placed(networks if source == "pixels" else networks.unet)  # encoders only to encode
+        self._train(networks, self._batches(networks, clips), clips, identity)
+
+    def _train(self, networks: Networks, batches: BatchSource, clips: EncodedClips | None, identity: str) -> None:
+        """Train networks that lie ready. clips: encoded ones, where batches are made of such."""
+        recipe, seed = self._recipe.unet, self._recipe.seed
+        weights = self._weights(clips) if recipe.loss.sensitivity else None
+        task = UNetTask(networks, batches, self._validation(), recipe, weights, self._precision, seed)
+        self._loop(task, "unet", recipe, identity, recipe.parts)
+
+    def _export(self) -> None:
+        recipe, networks = self._recipe, self._start()
+        updates = self._fill_denoiser(networks)
+        merge_lora(networks)
+        thaw(networks)
+        job = ExportJob(
+            name=recipe.name,
+            family=self._family,
+            move_time=recipe.data.goal_frame(self._config.frames),
+            updates=updates,
+            recipe=recipe.export,
+            leftovers=lambda: carried_leftovers(recipe.model),
+            adapter=self._adapter if recipe.model.train == "lora" else None,
+        )
+        export(networks, self._folder, job, self._validation())
+
+    def _validation(self) -> Validation:
+        return Validation(self._inputs.valid, self._family, count=self._recipe.log.valid_clips)
+
+    def _batches(self, networks: Networks, clips: EncodedClips | None) -> BatchSource:
+        recipe = self._recipe.unet
+        if clips is not None:
+            return EncodedBatches(clips, self._config, recipe, self._precision)
+        if self._inputs.batches is not None:
+            return self._inputs.batches(networks, self._precision)
+        return PixelBatches(self._inputs.clips, networks, recipe, self._precision, self._family)
+
+    def _weights(self, clips: EncodedClips | None) -> torch.Tensor | None:
+        """Of latent channels, by what the decoder makes of them."""
+        return None if clips is None else torch.tensor(clips.meta.sensitivity, device=self._precision.device)
+
+
+def require_fit(clips: ClipSource, config: ModelConfig, fps: float) -> None:
+    """Raises DataError if the clips are not what the model and its recipe take them for."""
+    if clips.fps != fps:
+        raise DataError(f"the recipe's unet.fps is {fps:g}, the clips have {clips.fps:g}; change one of them")
+    if config.camera == "spherical" and clips.camera != "spherical":
+        raise DataError("the model is steered by angles and radius, and these clips have no orbits; take drop clips")
+    if config.camera == "none" and clips.camera != "none":
+        raise DataError("the model has one fixed view, and each of these clips has its own; take driving clips")
+    classes = config.semantic_classes
+    if classes and [kind.name for kind in classes] != [kind.name for kind in clips.classes]:
+        raise DataError("the clips' classes are not the model's; generate them with this version")

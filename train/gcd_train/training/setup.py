@@ -1,0 +1,259 @@
+"""From a recipe to networks on a device: their config, their arithmetic, the weights they start from."""
+
+import hashlib
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import msgspec
+import torch
+from torch import Tensor, nn
+
+from gcd_model import FAMILIES, Family, ModelConfig, weights_path
+from gcd_model.config import DRIVING_CLASSES, PLAIN_SMALL, SMALL, SVD_14, CameraControl
+from gcd_model.errors import CheckpointError, OptionError
+from gcd_model.networks import LoadedWeights, Networks, empty_networks
+from gcd_model.weights.adapter import DIFFUSION, carried_over
+from gcd_model.weights.load import load_weights
+from gcd_model.weights.save import gcd_state
+from gcd_train.errors import RecipeError, RunError
+from gcd_train.recipe import ModelRecipe, Recipe, UNetChanges, UNetRecipe, VAEChanges
+from gcd_train.recipe_data import AnyStageName, ComputeRecipe
+from gcd_train.training.checkpoint import newest_weights, require_identity
+from gcd_train.training.monitor import RunFolder
+from gcd_train.training.trainable import plain_weights
+
+_BASES: dict[str, ModelConfig] = {
+    "plain-small": PLAIN_SMALL,
+    "svd-14": SVD_14,
+    "small": SMALL,
+}
+_DENOISER = ("unet.", "camera.")
+_PREFIXES: dict[AnyStageName, tuple[str, ...]] = {
+    "vae": ("target_encoder.", "decoder."),
+    "unet": _DENOISER,
+    "paired": _DENOISER,
+}
+
+
+def model_config(recipe: ModelRecipe) -> ModelConfig:
+    """The networks a recipe asks for. Raises RecipeError where its changes contradict each other."""
+    base = _steered(_BASES[recipe.base], _camera(recipe))
+    try:
+        changed = msgspec.structs.replace(
+            base,
+            unet=msgspec.structs.replace(base.unet, **_given(recipe.unet)),
+            vae=msgspec.structs.replace(base.vae, **_given(recipe.vae)),
+            prediction=recipe.prediction or base.prediction,
+            sampling=msgspec.structs.replace(base.sampling, steps=recipe.steps or base.sampling.steps),
+            frames=recipe.frames or base.frames,
+            height=recipe.height or base.height,
+            width=recipe.width or base.width,
+            semantic_classes=DRIVING_CLASSES if recipe.base == "plain-small" and _paints(recipe) else (),
+        )
+        # msgspec does not check what `replace` makes; a round trip does
+        config = msgspec.json.decode(msgspec.json.encode(changed), type=ModelConfig)
+    except (OptionError, msgspec.ValidationError) as error:
+        raise RecipeError(f"the recipe's [model] cannot be built: {error}") from error
+    factor = config.size_factor
+    if config.height % factor or config.width % factor:
+        raise RecipeError(
+            f"model.height and model.width must be multiples of {factor}, which these networks halve down to whole "
+            f"numbers; got {config.height} and {config.width}"
+        )
+    return config
+
+
+def _paints(recipe: ModelRecipe) -> bool:
+    return family_of(recipe).output == "semantic"
+
+
+def require_exportable(recipe: Recipe, config: ModelConfig) -> None:
+    """Raises RecipeError, before anything is trained, if [export] asks for a layout that cannot hold these networks."""
+    if "gcd-ckpt" not in recipe.export.layouts:
+        return
+    try:
+        gcd_state(empty_networks(config).state_dict(), config, {})
+    except OptionError as error:
+        raise RecipeError(
+            f'export.layouts asks for "gcd-ckpt", but {error}; leave it out: --set \'export.layouts=["gcd-node"]\''
+        ) from error
+
+
+def _steered(base: ModelConfig, camera: CameraControl) -> ModelConfig:
+    """The base with that camera control."""
+    if camera == base.camera:
+        return base
+    width = 0 if camera == "none" else base.unet.camera_width or base.unet.vector_width // 6  # as published: 128 of 768
+    return msgspec.structs.replace(base, camera=camera, unet=msgspec.structs.replace(base.unet, camera_width=width))
+
+
+def _camera(recipe: ModelRecipe) -> CameraControl:
+    """How the model is steered. Raises RecipeError if its family has another kind of view."""
+    base, family = _BASES[recipe.base], family_of(recipe)
+    camera = recipe.camera or (base.camera if base.is_ours else family.camera)
+    if (family.camera == "none") != (camera == "none"):
+        raise RecipeError(
+            f"the recipe's [model] is steered by camera = {camera!r}, its family {family.name} by {family.camera!r}; "
+            "change model.camera or model.family"
+        )
+    return camera
+
+
+def sampled_as_trained(config: ModelConfig, recipe: UNetRecipe) -> ModelConfig:
+    """The config with the sampler that suits the recipe's noise: what ships is used as it was trained.
+
+    Raises RecipeError if the sampler visits noise levels that the recipe never trains.
+    """
+    sampling, noise = config.sampling, recipe.noise_at(1.0)
+    if noise.fixed_share == 1 and (sampling.steps, sampling.sigma_max) != (1, noise.fixed_sigma):
+        raise RecipeError(
+            f"the recipe trains sigma {noise.fixed_sigma:g} alone, the model is sampled in {sampling.steps} steps from "
+            f"{sampling.sigma_max:g}: lower unet.noise.fixed_share, or take a base model of one step from that sigma"
+        )
+    shared = sampling.shared_noise if 0 < noise.shared < 1 else noise.shared == 1
+    sampling = msgspec.structs.replace(sampling, augmentation=recipe.augmentation, shared_noise=shared)
+    return msgspec.structs.replace(config, sampling=sampling)
+
+
+def family_of(recipe: ModelRecipe) -> Family:
+    """How the model is trained. Raises RecipeError for a family that is not known."""
+    family = FAMILIES.get(recipe.family)
+    if family is None:
+        raise RecipeError(f"model.family must be one of {', '.join(FAMILIES)}, got {recipe.family!r}")
+    return family
+
+
+def digest_of(*values: object) -> str:
+    """Eight digits that name plain values or structs: what a state belongs to."""
+    return hashlib.sha256(msgspec.json.encode(values, order="deterministic")).hexdigest()[:8]
+
+
+def compute_device(recipe: ComputeRecipe) -> torch.device:
+    """Where to compute. Raises RecipeError if CUDA is asked for and missing."""
+    there = torch.cuda.is_available()
+    if recipe.device == "cuda" and not there:
+        raise RecipeError('compute.device is "cuda" but this machine has no CUDA device; use "auto" or "cpu"')
+    return torch.device("cuda" if there and recipe.device != "cpu" else "cpu")
+
+
+def to_channels_last(module: nn.Module) -> None:
+    """Let 2D convolution kernels have their channels innermost: faster on the CPU and with half precision."""
+    for parameter in module.parameters():
+        if parameter.ndim == 4:
+            parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
+
+
+def fill(networks: Networks, folder: RunFolder, stage: AnyStageName, identity: str) -> int:
+    """Copy what a stage trained into networks, averaged where it averages; returns the updates it took so far.
+
+    identity: what its state must belong to. Weights that take no gradient need not be there. Raises RunError if it has
+    not run, or if identity, names or shapes do not fit.
+    """
+    found = newest_weights(folder.stage(stage), stage)
+    if found is None:
+        raise RunError(f"{folder.stage(stage)} has no state: run `gcd-train train ... --stage {stage}` first")
+    require_identity(found.path, found.note.identity, identity)
+    known, best = networks.state_dict(), found.best
+    given = {name: value for name, value in best.items() if name in known}
+    frozen = {name for name, parameter in networks.named_parameters() if not parameter.requires_grad}
+    wanted = (name for name in known if name.startswith(_PREFIXES.get(stage, ())) and name not in frozen)
+    lacking = sorted(name for name in wanted if name not in given)
+    wrong = [name for name, value in given.items() if value.shape != known[name].shape]
+    if lacking or wrong:
+        raise RunError(
+            f"{found.path} does not fit the model: {len(lacking)} weights missing, {len(wrong)} of another shape, "
+            f"first: {(lacking + wrong)[0]}; use the recipe it was trained with"
+        )
+    networks.load_state_dict(given, strict=False)
+    return found.note.updates
+
+
+def _given(changes: UNetChanges | VAEChanges) -> dict[str, object]:
+    return {name: value for name, value in msgspec.structs.asdict(changes).items() if value is not None}
+
+
+def copy_of(networks: Networks) -> Networks:
+    """The same weights once more, on the CPU, adapters merged."""
+    copy = Networks(networks.config)
+    known = copy.state_dict()
+    copy.load_state_dict({name: value for name, value in plain_weights(networks).items() if name in known})
+    return copy
+
+
+Module = TypeVar("Module", bound=nn.Module)
+
+
+@dataclass(frozen=True, slots=True)
+class Precision:
+    """A device, the arithmetic on it, and the memory layout of pictures."""
+
+    device: torch.device
+    half: bool
+    channels_last: bool
+
+    @classmethod
+    def of(cls, recipe: ComputeRecipe) -> "Precision":
+        """As a recipe asks. Raises RecipeError for a device that is not there."""
+        device = compute_device(recipe)
+        # CPU kernels are slow in it, so only weights kept in it make a CPU compute in it
+        kept = "bfloat16" in (recipe.weights, recipe.frozen)
+        half = kept or (recipe.precision == "bfloat16" and device.type == "cuda")
+        return cls(device, half, recipe.channels_last)
+
+    def arithmetic(self) -> AbstractContextManager[object]:
+        """Context in which networks compute in bfloat16, if asked for; weights stay float32."""
+        return torch.autocast(self.device.type, torch.bfloat16) if self.half else nullcontext()
+
+    def placed(self, module: Module) -> Module:
+        """The module on the device, in training mode."""
+        module.to(self.device).train()
+        if self.channels_last:
+            to_channels_last(module)
+        return module
+
+    def frames(self, rows: Tensor) -> Tensor:
+        """[N, C, H, W] on the device, in the layout the networks like."""
+        rows = rows.to(self.device)
+        return rows.contiguous(memory_format=torch.channels_last) if self.channels_last else rows
+
+
+def fresh_networks(config: ModelConfig, seed: int) -> Networks:
+    """Networks as training starts with them: zero-initialised layers are zero."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return Networks(config)
+
+
+def start_networks(recipe: ModelRecipe, config: ModelConfig, seed: int) -> Networks:
+    """What training starts from: random, or the recipe's weight file in float32 with what it lacks at random.
+
+    Raises RecipeError if the file is missing, or holds another model, whose first weights that differ are named;
+    CheckpointError as `load_weights`.
+    """
+    if recipe.weights is None:
+        return fresh_networks(config, seed)
+    if ":" not in recipe.weights and not Path(recipe.weights).exists():
+        raise RecipeError(f"model.weights, {recipe.weights}, is not there; give its place: --set model.weights=FILE")
+    networks = fresh_networks(config, seed)
+    loaded = loaded_base(recipe.weights)
+    try:
+        over = carried_over(loaded.diffusion, config, anew=DIFFUSION if recipe.scratch else ())
+    except CheckpointError as error:
+        raise RecipeError(
+            f"{recipe.weights} {error}; change [model], or give a file of the model it describes"
+        ) from error
+    networks.load_state_dict({name: value.float() for name, value in over.weights.items()}, strict=False)
+    return networks
+
+
+def carried_leftovers(recipe: ModelRecipe) -> Mapping[str, Tensor]:
+    """Weights of the file training started from that nothing here uses; see gcd_model.weights.save."""
+    return {} if recipe.weights is None else loaded_base(recipe.weights).carried
+
+
+def loaded_base(path: str) -> LoadedWeights:
+    """A weight file of any layout, or `package:NAME`, whatever its family. Raises CheckpointError."""
+    return load_weights(weights_path(path), ask_family=False)
