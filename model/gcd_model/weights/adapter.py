@@ -165,7 +165,10 @@ def carried_over(networks: Networks, config: ModelConfig, *, anew: tuple[str, ..
     fresh = tuple(name for name in wanted if name.startswith(anew))
     weights = {name: tensor for name, tensor in given.items() if not name.startswith(anew)}
     expected = {name: shape for name, shape in shapes_of(wanted).items() if name not in fresh}
-    match_weights(expected, shapes_of(weights), own_source, NO_LEVELS)
+    try:
+        match_weights(expected, shapes_of(weights), own_source, NO_LEVELS)
+    except CheckpointError as error:
+        raise CheckpointError(f"holds another model than is wanted: {error}") from error
     return CarriedOver(weights, fresh)
 
 
