@@ -56,14 +56,12 @@ class CudaOptions:
         graphs. channels_last: lay convolutions out as tensor cores read them.
     decoder: its precision; "checked" means bfloat16 where its pictures reach 50 dB against float32, see
         `checked_decoder`.
-    cache: folder of compiled code; None for the usual one, see `cache_folder`.
     """
 
     backend: str | None = "inductor"
     graphs: bool = True
     channels_last: bool = True
     decoder: Literal["checked", "float32", "bfloat16"] = "checked"
-    cache: Path | None = None
 
     @classmethod
     def of_device(cls, device: torch.device) -> Self:
@@ -187,7 +185,7 @@ def _compiled(networks: Networks, options: CudaOptions) -> Update:
     if options.backend is None:
         return solved
     if options.backend == "inductor":
-        keep_compiled(options.cache or cache_folder())
+        keep_compiled(cache_folder())
     compile_regions(networks, options.backend)
     return torch.compile(solved, backend=options.backend, fullgraph=True, dynamic=False)
 

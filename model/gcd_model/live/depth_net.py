@@ -62,14 +62,13 @@ class DepthOutput:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class DepthReading:
-    """What is read off it. metres: [N, H, W], SKY_M for the sky. confidence: [N, H, W], probability of the peak.
+    """What is read off it. metres: [N, H, W], SKY_M for the sky.
 
     spread: [N, H, W], standard deviation of log-depth within the peak; errors are one to three times as large.
     entropy: [N], mean over pixels of the classes' entropy, in parts of its largest.
     """
 
     metres: Tensor
-    confidence: Tensor
     spread: Tensor
     entropy: Tensor
 
@@ -210,7 +209,6 @@ def read_depth(output: DepthOutput, config: DepthConfig) -> DepthReading:
     metres = torch.where(sky, SKY_M, place.exp())
     return DepthReading(
         metres=torch.where(sky, SKY_M, _smoothed(metres, confidence)),
-        confidence=confidence,
         spread=spread,
         entropy=_entropy(output.classes),
     )

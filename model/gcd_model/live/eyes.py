@@ -162,14 +162,14 @@ class Eyes:
             self.reset()
             self._lens = lens
         motion = self._ego.follow(picture, lens, odometry)
-        if motion.lost:
+        if motion.lost is not None:
             self._references.reset()
         pose = motion.world_from_camera
         if geometry is None:
             geometry = self.look(frame, lens, depth=depth, floor=floor, reference=self._references.chosen(pose))
         self._ego.settle(geometry.metres, geometry.static, geometry.spread)
         self._references.add(picture, pose, geometry.metres)
-        begins, self._begins = self._begins or motion.lost, False
+        begins, self._begins = self._begins or motion.lost is not None, False
         return SeenFrame(
             picture=picture,
             geometry=geometry,
@@ -177,7 +177,7 @@ class Eyes:
             floor=floor,
             world_from_source=pose,
             begins=begins,
-            lost=motion.reason,
+            lost=motion.lost,
         )
 
     def _checked(self, frame: Tensor, lens: Intrinsics) -> Tensor:
