@@ -233,14 +233,4 @@ def _synthesizer(loaded: LoadedWeights, place: _Place) -> Synthesizer:
 
 
 def _traits(loaded: LoadedWeights, place: _Place) -> Traits:
-    return Traits(
-        name=loaded.name,
-        config=loaded.networks.config,
-        family=loaded.family,
-        move_time=loaded.move_time,
-        sha256_12=loaded.sha256_12,
-        precision=place.precision,
-        device=str(place.device),
-        trained=loaded.trained,
-        uncertainty_scale=loaded.uncertainty_scale,
-    )
+    return Traits.of(loaded.card, sha256_12=loaded.sha256_12, precision=place.precision, device=str(place.device))

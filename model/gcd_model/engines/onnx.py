@@ -25,7 +25,6 @@ from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
 from gcd_model.unet import StageInputs, UNetPlan
 from gcd_model.weights.card import Card
-from gcd_model.weights.families import family_named
 
 CPU_PROVIDER, CUDA_PROVIDER = "CPUExecutionProvider", "CUDAExecutionProvider"
 TENSORRT_PROVIDER = "TensorrtExecutionProvider"
@@ -54,17 +53,7 @@ def load_export(folder: str | Path, *, device: str = "auto", providers: Sequence
         raise CheckpointError(f"{folder}: its {MANIFEST} must name {', '.join(sorted(wanted))}; export it again")
     chosen = provider_options(device, providers, folder / "tensorrt", half=manifest.precision == "float16")
     files = {name: folder / record.files[0].name for name, record in manifest.graphs.items()}
-    traits = Traits(
-        name=card.name,
-        config=card.config,
-        family=None if card.family is None else family_named(card.family),
-        move_time=card.move_time,
-        sha256_12=manifest.sha256_12,
-        precision=manifest.precision,
-        device="cpu",
-        trained=card.trained,
-        uncertainty_scale=card.uncertainty_scale,
-    )
+    traits = Traits.of(card, sha256_12=manifest.sha256_12, precision=manifest.precision, device="cpu")
     return Synthesizer(empty_networks(card.diffusion), traits, OnnxEngine(Sessions(files, chosen), card.diffusion))
 
 
