@@ -10,13 +10,13 @@ from gcd_model.errors import OptionError, PoseError
 from gcd_model.geometry import (
     DRIVING_SOURCE_POSITION,
     DRIVING_SOURCE_TARGET,
-    RIGID_TOLERANCE,
     CameraMount,
     invert_rigid,
     look_at,
     relative_pose,
     require_rigid,
 )
+from gcd_model.geometry.pose import RIGID_TOLERANCE
 
 IDENTITY = torch.eye(4, dtype=torch.float64)
 
