@@ -17,8 +17,8 @@ from torch.nn.utils.parametrizations import spectral_norm
 
 from gcd_model.live.config import LiveConfig
 from gcd_model.live.depth_net import DepthNet, depth_inputs
-from gcd_model.live.networks import movable_classes
 from gcd_model.live.paint_net import Painted, PaintNet, Seen, filled
+from gcd_model.live.painter import movable_classes
 from gcd_train.live.batches import Ahead, autocast, on
 from gcd_train.live.paint_training import HeldOutViews
 from gcd_train.live.target_views import ViewBatches, Views, carried_through, mirrored

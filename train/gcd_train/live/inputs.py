@@ -19,7 +19,7 @@ from torch import Tensor
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.config import SKY_M, LiveConfig
 from gcd_model.live.depth_net import DepthNet, depth_inputs, read_depth
-from gcd_model.live.seen_world import SeenWorld
+from gcd_model.live.memory import SeenWorld
 from gcd_model.live.splat import Splat
 from gcd_train.files import whole
 from gcd_train.live.batches import Pictures, Random, autocast, pictures_of, with_true_references

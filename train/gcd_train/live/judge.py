@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from gcd_model.live.ontology import LIVE_CLASSES
+from gcd_model.live.config import LIVE_CLASSES
 from gcd_train.live.batches import to_video, training_paths
 from gcd_train.live.clips import read_clip
 

@@ -24,7 +24,7 @@ from torch import Tensor
 from gcd_model import hatched
 from gcd_model.errors import ModelError
 from gcd_model.live.config import LiveConfig
-from gcd_model.live.networks import LiveNetworks
+from gcd_model.networks import LiveNetworks
 from gcd_train.errors import DataError, TrainError
 from gcd_train.live.clips import LiveClip, clip_paths, evenly, read_clip
 from gcd_train.live.judge import JudgeNet, load_judge, random_judge

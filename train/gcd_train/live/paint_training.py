@@ -11,8 +11,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gcd_model.live.config import LiveConfig
-from gcd_model.live.networks import movable_classes
 from gcd_model.live.paint_net import SIGMA_DATA, Painted, PaintNet, Seen, filled
+from gcd_model.live.painter import movable_classes
 from gcd_train.live.batches import Ahead, Random, autocast, class_weights, on
 from gcd_train.live.clips import read_clip
 from gcd_train.live.inputs import read_inputs

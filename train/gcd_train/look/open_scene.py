@@ -22,7 +22,7 @@ from gcd_train.data.paths import DRIVING, DRIVING_FRAMES, KUBRIC_FRAMES, MAX90, 
 from gcd_train.data.pictures import frames_of, geometry_poses, renderer_kind, trained_picture
 from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError, RecipeError, RenderError
-from gcd_train.evaluation.scene_clips import nearest_resized
+from gcd_train.evaluation.clips import nearest_resized
 from gcd_train.layouts import kubric4d, parallel_domain4d
 from gcd_train.layouts.manifest import GEOMETRY, read_manifest
 from gcd_train.look.clip import Bytes, Footage, Poses, instance_colour
