@@ -77,11 +77,11 @@ def test_a_python_block_is_python(block: Block) -> None:
     assert compile(block.text, block.place, "exec", flags=ast.PyCF_ALLOW_TOP_LEVEL_AWAIT) is not None
 
 
-def planner(mark: str = "planner") -> dict[str, Any]:
-    """What a program of the guide defines."""
-    (block,) = [block for block in BLOCKS if block.mark == mark]
-    defined: dict[str, Any] = {"__name__": "planner"}
-    exec(compile(block.text, block.place, "exec"), defined)
+def planner(name: str = "planner") -> dict[str, Any]:
+    """What a program in launch/clients defines."""
+    path = ROOT / "launch" / "clients" / f"{name}.py"
+    defined: dict[str, Any] = {"__name__": name}
+    exec(compile(path.read_text(), path, "exec"), defined)
     return defined
 
 
