@@ -14,7 +14,18 @@ import msgspec
 import numpy as np
 import pytest
 from cameras import Bench, Camera, until
-from doc_pages import BLOCKS, PAGES, ROOT, WHOLE, Block, dead_links, name_of, wrong_commands
+from doc_pages import (
+    BLOCKS,
+    LINKED,
+    PAGES,
+    ROOT,
+    WHOLE,
+    Block,
+    dead_links,
+    name_of,
+    pages_named_in_code,
+    wrong_commands,
+)
 from fakes import FakeSynthesizer, painting_traits
 from msgspec.structs import replace
 from rig import Rig
@@ -30,7 +41,13 @@ pytestmark = pytest.mark.timeout(120)
 
 
 def test_every_link_leads_somewhere() -> None:
-    assert [dead for page in PAGES for dead in dead_links(page, page.read_text())] == []
+    assert [dead for page in LINKED for dead in dead_links(page, page.read_text())] == []
+
+
+def test_every_page_that_the_code_names_is_there() -> None:
+    named = pages_named_in_code()
+    assert "docs/node.md" in named
+    assert {page: path for page, path in named.items() if not (ROOT / page).exists()} == {}
 
 
 def test_the_index_names_every_page() -> None:
@@ -75,6 +92,13 @@ def test_every_command_and_option_exists() -> None:
 @pytest.mark.parametrize("block", [b for b in BLOCKS if b.language == "python"], ids=lambda block: block.place)
 def test_a_python_block_is_python(block: Block) -> None:
     assert compile(block.text, block.place, "exec", flags=ast.PyCF_ALLOW_TOP_LEVEL_AWAIT) is not None
+
+
+@pytest.mark.parametrize(
+    "block", [b for b in BLOCKS if (b.language, b.mark) == ("python", "run")], ids=lambda b: b.place
+)
+def test_a_python_block_marked_run_runs(block: Block) -> None:
+    exec(compile(block.text, block.place, "exec"), {})
 
 
 def planner(name: str = "planner") -> dict[str, Any]:
