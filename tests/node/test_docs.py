@@ -33,7 +33,6 @@ from wire_messages import class_map, depth, visibility
 
 from gcd_client.protocol import ClassRecord
 from gcd_client.subscriber import ReceivedView
-from gcd_node.auth import AllowFile
 from gcd_node.config import NodeConfig, ViewConfig, parse_config
 from gcd_node.sources import SourceConfig, SourcePose
 
@@ -56,12 +55,9 @@ def test_the_index_names_every_page() -> None:
 
 
 def load_block(block: Block) -> None:
-    """A launch file, a part of one (what it lacks is filled in), or a list of clients. Raises what is wrong with it."""
+    """A launch file, or a part of one (what it lacks is filled in). Raises what is wrong with it."""
     table = tomllib.loads(block.text)
     if block.mark == "other":
-        return
-    if set(table) == {"client"}:
-        msgspec.toml.decode(block.text, type=AllowFile)
         return
     stated = {"source.kind": table.get("source", {}).keys() & {"kind", "path"}, "model.weights": table.get("model")}
     stated["view.topdown.kind"] = table.get("view")
